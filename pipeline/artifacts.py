@@ -1,0 +1,279 @@
+"""What the stages hand to each other: frozen manifests that name files by content.
+
+An artifact is a pydantic model saved as `manifest.json` beside its files. It holds figures and `FileRef`s, never
+arrays and never absolute paths, so that two runs with the same content have the same manifest, wherever they lie.
+
+Frames: every matrix reads `<to>_from_<from>`. Asset coordinates are right-handed, +Y up, origin at the centre of the
+region of interest, metres (nominal metres where `metric` is false).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Generic, Literal, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+Matrix = tuple[tuple[float, ...], ...]
+
+
+def _stays_inside(path: str) -> str:
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or "\\" in path or not pure.parts:
+        raise ValueError(f"{path!r} is not a plain relative path")
+    return path
+
+
+RelativePath = Annotated[str, AfterValidator(_stays_inside)]
+
+
+class Artifact(BaseModel):
+    """Base of every manifest."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def canonical_json(self) -> str:
+        """One string per content: sorted keys, no spaces."""
+        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+
+    def digest(self) -> str:
+        """sha256 of the canonical manifest, and through its FileRefs of every byte that it names."""
+        return hashlib.sha256(self.canonical_json().encode()).hexdigest()
+
+
+class FileRef(Artifact):
+    """A file of an artifact: where it lies in the artifact's folder and what is in it."""
+
+    path: RelativePath
+    sha256: str
+    size: int
+
+    @classmethod
+    def of(cls, folder: Path, path: Path | str) -> FileRef:
+        """Hash `path` (relative to `folder`, or inside it)."""
+        full = folder / path
+        return cls(path=full.relative_to(folder).as_posix(), sha256=sha256_of(full), size=full.stat().st_size)
+
+
+def sha256_of(path: Path) -> str:
+    """Hex digest of a file's bytes, read in blocks."""
+    with path.open("rb") as f:
+        return hashlib.file_digest(f, "sha256").hexdigest()
+
+
+A = TypeVar("A", bound=Artifact, covariant=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Located(Generic[A]):
+    """An artifact and the folder that its files are in. Only the artifact counts for the content key."""
+
+    artifact: A
+    folder: Path
+
+    def path(self, ref: FileRef) -> Path:
+        """The absolute path of one of the artifact's files."""
+        return self.folder / ref.path
+
+
+# ------------------------------------------------------------------ capture
+class CaptureSource(Artifact):
+    """What was found in the user's folder, by content; the folder itself is not part of it."""
+
+    kind: Literal["facescape", "photos"]
+    photos: tuple[FileRef, ...]
+    params: FileRef | None = None
+    masks: tuple[FileRef, ...] = ()
+
+
+class GivenCamera(Artifact):
+    """A camera that came with the capture, in the capture's own world.
+
+    K: pixels, centre of the first pixel at (0.5, 0.5). cam_from_world: OpenCV axes. distortion: k1 k2 p1 p2 k3.
+    """
+
+    K: Matrix
+    cam_from_world: Matrix
+    distortion: tuple[float, ...]
+
+
+class CaptureView(Artifact):
+    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit."""
+
+    index: int
+    name: str
+    image: FileRef
+    width: int
+    height: int
+    camera: GivenCamera | None = None
+    mask: FileRef | None = None
+    focal_px: float | None = None
+    camera_group: str = ""
+    holdout: bool = False
+
+
+class Capture(Artifact):
+    """The photos that take part, checked and in one place."""
+
+    kind: Literal["facescape", "photos"]
+    views: tuple[CaptureView, ...]
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ poses
+class Camera(Artifact):
+    """A solved or given camera, in asset coordinates.
+
+    K: pixels, centre of the first pixel at (0.5, 0.5). world_from_cam: OpenCV axes (x right, y down, z forward).
+    distortion: k1 k2 p1 p2 k3. Photos are never resampled: rays go through the exact inverse of the distortion.
+    """
+
+    index: int
+    name: str
+    width: int
+    height: int
+    K: Matrix
+    world_from_cam: Matrix
+    distortion: tuple[float, float, float, float, float]
+
+
+class CameraSet(Artifact):
+    """Cameras around the subject.
+
+    capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin.
+    """
+
+    source: Literal["given", "colmap"]
+    metric: bool
+    capture_from_asset: Matrix
+    roi_radius: float
+    cameras: tuple[Camera, ...]
+    unregistered: tuple[str, ...] = ()
+    reprojection_error_px: float | None = None
+    points: FileRef | None = None
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ masks
+class ViewMask(Artifact):
+    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull."""
+
+    index: int
+    mask: FileRef
+    source: str
+    coverage: float
+    hull_iou: float | None = None
+
+
+class MaskSet(Artifact):
+    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted."""
+
+    masks: tuple[ViewMask, ...]
+    dropped: tuple[int, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ inverse rendering
+class HeldOutView(Artifact):
+    """A prediction from the fitted field, linear Rec.709 RGBA, premultiplied: EXR, and PNG for people."""
+
+    index: int
+    exr: FileRef
+    png: FileRef
+    scale: int
+
+
+class FittedFace(Artifact):
+    """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). Figures are from the fit itself."""
+
+    field: FileRef
+    light: FileRef
+    rank: int
+    light_order: int
+    fitted_views: tuple[int, ...]
+    held_out: tuple[HeldOutView, ...]
+    steps: int
+    loss: float
+    psnr: float
+    beta: float
+    cell: float
+    model: dict[str, dict[str, str | float | bool]]
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ mesh
+class Surface(Artifact):
+    """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32."""
+
+    mesh: FileRef
+    vertices: int
+    faces: int
+    watertight: bool
+    components: int
+    removed_components: int
+    cell: float
+    warnings: tuple[str, ...] = ()
+
+
+class UvMesh(Artifact):
+    """A mesh with charts. npz: vertices (V, 3), normals (V, 3), faces (F, 3), uvs (U, 2) float32, uv_faces (F, 3).
+
+    UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs.
+    """
+
+    mesh: FileRef
+    proxy: FileRef | None = None
+    vertices: int
+    faces: int
+    charts: int
+    utilisation: float
+    stretch: float
+    overlap: float
+    deviation_mm: float
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ maps
+class TextureMap(Artifact):
+    """One map. `files` by format ("exr", "png"). space: "srgb_png" (EXR linear) or "raw"."""
+
+    name: str
+    channels: int
+    files: dict[str, FileRef]
+    space: Literal["srgb_png", "raw"]
+    minimum: float
+    mean: float
+    maximum: float
+
+
+class TextureSet(Artifact):
+    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1)."""
+
+    size: int
+    padding: int
+    maps: dict[str, TextureMap]
+    coverage: float
+    warnings: tuple[str, ...] = ()
+
+
+# ------------------------------------------------------------------ asset and report
+class UsdAsset(Artifact):
+    """The exported component. `root` is the file to open; `files` are all of it, relative paths kept."""
+
+    name: str
+    root: RelativePath
+    files: tuple[FileRef, ...]
+    views: tuple[HeldOutView, ...] = ()
+    checks: int
+    warnings: tuple[str, ...] = ()
+
+
+class Report(Artifact):
+    """One self-contained page and its figures."""
+
+    files: tuple[FileRef, ...]
+    warnings: tuple[str, ...] = ()

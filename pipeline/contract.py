@@ -1,0 +1,185 @@
+"""The stage contract: a stage is a pure function from artifacts and a config to an artifact.
+
+`key` is a hash of content (stage, version, config, the inputs' manifests), never of paths or times. `execute` looks
+the key up in the store, runs the stage into a partial folder if it is not there, and seals the result by one rename.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import logging
+import platform
+import resource
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.artifacts import Artifact, FileRef, Located
+from pipeline.errors import Cancelled, stage_error_from_os_error
+from pipeline.store import Store
+
+log = logging.getLogger(__name__)
+
+
+class StageConfig(BaseModel):
+    """Base of every stage's settings. All of it is in the key: what can't change the result does not belong here."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Progress(Protocol):
+    """Told how far a stage is: `done` of `total`, and figures worth showing (loss, psnr, ...)."""
+
+    def __call__(self, done: int, total: int, message: str = "", **figures: float) -> None: ...
+
+
+def no_progress(done: int, total: int, message: str = "", **figures: float) -> None:
+    """A Progress that shows nothing."""
+
+
+def never_cancelled() -> bool:
+    """A cancel check for runs that nobody can stop."""
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What a stage gets besides inputs and config.
+
+    workdir: empty, becomes the artifact's folder. scratch: survives a killed run with the same key (checkpoints).
+    device: "cpu" or "cuda"; it may change digits, never meaning, so it is recorded and not part of the key.
+    """
+
+    workdir: Path
+    scratch: Path
+    device: str = "cpu"
+    progress: Progress = no_progress
+    cancelled: Callable[[], bool] = never_cancelled
+    log: logging.Logger = field(default_factory=lambda: logging.getLogger("neuface"))
+
+    def file(self, path: Path | str) -> FileRef:
+        """The reference to a file that was written into workdir."""
+        return FileRef.of(self.workdir, path)
+
+    def check(self) -> None:
+        """Raise Cancelled if the user asked to stop."""
+        if self.cancelled():
+            raise Cancelled("stopped by the user; finished stages and checkpoints are kept")
+
+
+I = TypeVar("I")  # noqa: E741  (a frozen dataclass whose fields are Located artifacts, named by the stage they are from)
+C = TypeVar("C", bound=StageConfig)
+O = TypeVar("O", bound=Artifact)  # noqa: E741
+
+
+@dataclass(frozen=True, slots=True)
+class Stage(Generic[I, C, O]):
+    """A step of the pipeline. Bump `version` when the meaning of its output changes."""
+
+    name: str
+    version: int
+    inputs: type[I]
+    config: type[C]
+    output: type[O]
+    run: Callable[[I, C, Context], O]
+
+
+@dataclass(frozen=True, slots=True)
+class Done(Generic[O]):
+    """A finished stage: its artifact, where it is, and what it took."""
+
+    stage: str
+    key: str
+    located: Located[O]
+    reused: bool
+    run: dict[str, Any]
+
+
+def inputs_from(stage: Stage[I, C, O], finished: Mapping[str, Located[Artifact]]) -> I:
+    """A stage's inputs, picked by name from the artifacts of the stages before it."""
+    return stage.inputs(**{f.name: finished[f.name] for f in dataclasses.fields(stage.inputs)})  # type: ignore[arg-type]
+
+
+def key(stage: Stage[I, C, O], inputs: I, config: C) -> str:
+    """Content key, 64 hex digits."""
+    named = {f.name: getattr(inputs, f.name).artifact.digest() for f in dataclasses.fields(inputs)}  # type: ignore[arg-type]
+    parts = {"stage": stage.name, "version": stage.version, "config": config.model_dump(mode="json"), "inputs": named}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def execute(
+    stage: Stage[I, C, O],
+    inputs: I,
+    config: C,
+    store: Store,
+    *,
+    device: str = "cpu",
+    progress: Progress = no_progress,
+    cancelled: Callable[[], bool] = never_cancelled,
+) -> Done[O]:
+    """Run a stage, or hand back what the store has of it.
+
+    Raises:
+        StageError: bad input or a disk fault; nothing half-written stays.
+        Cancelled: the user stopped it; checkpoints in scratch stay.
+    """
+    k = key(stage, inputs, config)
+    with store.lock(stage.name, k):
+        found = store.load(stage.name, k, stage.output)
+        if found is not None:
+            log.info("%s: reused %s", stage.name, k[:12])
+            return Done(stage.name, k, found, True, store.load_run(stage.name, k))
+        try:
+            return _run(stage, inputs, config, store, k, device, progress, cancelled)
+        except OSError as e:
+            raise stage_error_from_os_error(e, store.root) or e from e
+
+
+def _run(
+    stage: Stage[I, C, O], inputs: I, config: C, store: Store, k: str, device: str, progress: Progress,
+    cancelled: Callable[[], bool],
+) -> Done[O]:
+    partial, scratch = store.begin(stage.name, k), store.scratch(stage.name, k)
+    scratch.mkdir(parents=True, exist_ok=True)
+    context = Context(partial, scratch, device, progress, cancelled, logging.getLogger(f"neuface.{stage.name}"))
+    start = time.perf_counter()
+    try:
+        context.check()
+        artifact = stage.run(inputs, config, context)
+        run: dict[str, Any] = {
+            "seconds": round(time.perf_counter() - start, 3), "peak_memory_mb": peak_memory_mb(), "device": device,
+            "config": config.model_dump(mode="json"), "versions": versions(),
+        }
+        located = store.finish(stage.name, k, partial, artifact, run)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        if scratch.is_dir() and not any(scratch.iterdir()):
+            scratch.rmdir()
+        raise
+    log.info("%s: done in %.1f s, %s", stage.name, run["seconds"], k[:12])
+    return Done(stage.name, k, located, False, run)
+
+
+def peak_memory_mb() -> float:
+    """Largest resident size of this process so far, in MB."""
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result may depend on."""
+    names = ("neuface-asset", "torch", "numpy", "pycolmap", "opencv-contrib-python-headless", "xatlas", "usd-core")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found

@@ -1,0 +1,68 @@
+"""What the stages after the fit may ask of a fitted field, in plain arrays.
+
+Points are (N, 3) in asset coordinates. Calls are chunked inside: any N is fine. Nothing here keeps gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """Appearance at N points.
+
+    albedo: (N, 3) linear reflectance in [0, 1]. rho: (N,) specular intensity in [0, 1]. coefficients: (N, k), the
+    c_j(x) of [NeuFace eq. 7]. inv_kappa: (N,) 1/kappa > 0, the lobe's width in [NeuFace eq. 10].
+    """
+
+    albedo: F32
+    rho: F32
+    coefficients: F32
+    inv_kappa: F32
+
+
+class Field(Protocol):
+    """A fitted face (see pipeline.fields.face.load_face) or any stand-in with the same questions."""
+
+    @property
+    def bounds(self) -> tuple[F32, F32]:
+        """(3,) lower and (3,) upper corner of the box in which the SDF is defined."""
+        ...
+
+    @property
+    def cell(self) -> float:
+        """Edge of the finest SDF cell."""
+        ...
+
+    @property
+    def rank(self) -> int:
+        """k, the number of specular bases."""
+        ...
+
+    @property
+    def light(self) -> F32:
+        """(121, 3) real orthonormal SH coefficients of the captured light, index l(l+1)+m."""
+        ...
+
+    def sdf(self, points: F32) -> F32:
+        """(N,) signed distance, negative inside."""
+        ...
+
+    def sdf_and_gradient(self, points: F32) -> tuple[F32, F32]:
+        """(N,) signed distance and its gradient (N, 3), outward, about unit length near the surface."""
+        ...
+
+    def material(self, points: F32) -> Material:
+        """Appearance; meaningful within a few cells of the surface."""
+        ...
+
+    def basis(self, wo: F32, normal: F32) -> F32:
+        """(N, k) integrated bases B_j(wo, n) >= 0 of [NeuFace eq. 9]; both (N, 3), unit; wo leaves the surface."""
+        ...

@@ -1,0 +1,115 @@
+"""Reading and writing pictures. Arrays are RGB(A), row 0 on top; what is linear and what is encoded is said per function."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+import numpy.typing as npt  # noqa: E402
+
+from pipeline.colour import linear_from_srgb, srgb_from_linear  # noqa: E402
+from pipeline.errors import StageError  # noqa: E402
+
+F32 = npt.NDArray[np.float32]
+MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
+
+
+def read_encoded(path: Path) -> npt.NDArray[np.generic]:
+    """(H, W, C) as stored, RGB order. Raises StageError if the file is empty, corrupt or absurdly large."""
+    size = path.stat().st_size if path.is_file() else 0
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if size else None
+    if image is None:
+        raise StageError("the image can't be decoded", where=path.name, value=f"{size} bytes, not a readable image",
+                         limit="a complete JPEG, PNG, TIFF or EXR file", remedy="copy the file again from the camera, "
+                         "or take it out of the folder")
+    if image.shape[0] * image.shape[1] > MAX_PIXELS:
+        raise StageError("the image is too large", where=path.name, value=f"{image.shape[1]} x {image.shape[0]}",
+                         limit=f"{MAX_PIXELS / 1e6:.0f} megapixels", remedy="scale it down")
+    if image.ndim == 2:
+        image = image[..., None]
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
+    return np.ascontiguousarray(image[..., order])
+
+
+def read_linear(path: Path) -> F32:
+    """(H, W, 3) linear Rec.709 float32. Integer files are taken as sRGB, float files as linear."""
+    image = read_encoded(path)
+    rgb = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
+    if not np.issubdtype(rgb.dtype, np.integer):
+        return rgb.astype(np.float32)
+    levels = np.iinfo(rgb.dtype).max
+    table = linear_from_srgb(np.arange(levels + 1, dtype=np.float64) / levels).astype(np.float32)
+    return table[rgb]
+
+
+def read_alpha(path: Path) -> F32:
+    """(H, W) in [0, 1]: a mask's grey value, or the alpha channel of an RGBA file."""
+    image = read_encoded(path)
+    plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
+    peak = float(np.iinfo(plane.dtype).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
+    return (plane.astype(np.float32) / peak).clip(0, 1)
+
+
+def write_png(path: Path, image: npt.NDArray[np.generic], bits: int = 8) -> None:
+    """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] as they are (no transfer curve)."""
+    peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
+    data = np.asarray(image, np.float64)
+    data = data[..., 0] if data.ndim == 3 and data.shape[2] == 1 else data
+    whole = np.round(np.nan_to_num(data).clip(0, 1) * peak).astype(kind)
+    if whole.ndim == 3:
+        whole = whole[..., [2, 1, 0, 3][: whole.shape[2]]]
+    _encode(path, ".png", whole)
+
+
+def write_png_from_linear(path: Path, image: F32) -> None:
+    """Write linear (H, W, 3) as 8-bit sRGB."""
+    write_png(path, srgb_from_linear(np.asarray(image, np.float32).clip(0, 1)))
+
+
+def _encode(path: Path, kind: str, data: npt.NDArray[np.generic]) -> None:
+    ok, buffer = cv2.imencode(kind, data)
+    if not ok:
+        raise RuntimeError(f"{path.name}: {kind} can't hold an array of {data.shape} {data.dtype}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(buffer.tobytes())
+
+
+def write_exr(path: Path, image: F32, channels: tuple[str, ...] | None = None, *, half: bool = False) -> None:
+    """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ..."""
+    import OpenEXR
+
+    data = np.atleast_3d(np.asarray(image, np.float16 if half else np.float32))
+    count = data.shape[2]
+    names = channels or {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(count, tuple(
+        f"c{i}" for i in range(count)))
+    if len(names) != count:
+        raise ValueError(f"{len(names)} channel names for {count} channels")
+    planes = {n: np.ascontiguousarray(data[..., i]) for i, n in enumerate(names)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    OpenEXR.File(header, planes).write(str(path))
+
+
+def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:
+    """(H, W, C) float32 and the channels' names, RGBA first in that order, others by name."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as f:
+        planes = {n: np.asarray(c.pixels, np.float32) for n, c in f.channels().items()}
+    names = tuple(sorted(planes, key=lambda n: ("RGBA".find(n) if n in "RGBA" else 9, n)))
+    return np.stack([planes[n] for n in names], -1), names
+
+
+def shrink(image: F32, factor: int) -> F32:
+    """Mean over factor x factor blocks of (H, W) or (H, W, C); H and W must be multiples of the factor."""
+    if factor == 1:
+        return image
+    h, w = image.shape[0] // factor, image.shape[1] // factor
+    if (h * factor, w * factor) != image.shape[:2]:
+        raise ValueError(f"{image.shape[1]} x {image.shape[0]} is not a multiple of {factor}")
+    blocks = image.reshape(h, factor, w, factor, *image.shape[2:])
+    return np.asarray(blocks.mean((1, 3)), np.float32)

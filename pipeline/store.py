@@ -1,0 +1,160 @@
+"""Content-addressed store of finished artifacts.
+
+Layout: `<root>/<stage>/<key>/` is finished and holds `manifest.json`, the artifact's files and `run.json`;
+`<key>.partial-*` is being written; `<key>.scratch/` holds checkpoints of work under way; `.locks/<stage>-<key>` is
+held while one process works on the key. Only a rename turns a partial folder into a finished one, so that a process killed at
+any moment leaves nothing that could be taken for finished.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from pipeline.artifacts import Artifact, FileRef, Located, sha256_of
+from pipeline.errors import stage_error_from_os_error
+
+log = logging.getLogger(__name__)
+A = TypeVar("A", bound=Artifact)
+MANIFEST, RUN = "manifest.json", "run.json"
+
+
+class Store:
+    """Finished artifacts under `root`, found by stage name and content key."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    # ---------------------------------------------------------------- where things are
+    def folder(self, stage: str, key: str) -> Path:
+        """The finished artifact's folder (which may not exist yet)."""
+        return self.root / stage / key
+
+    def scratch(self, stage: str, key: str) -> Path:
+        """Checkpoints of unfinished work on this key."""
+        return self.root / stage / f"{key}.scratch"
+
+    # ---------------------------------------------------------------- reading
+    def load(self, stage: str, key: str, kind: type[A]) -> Located[A] | None:
+        """The finished artifact, or None. One that does not match its hashes is set aside and reported."""
+        folder = self.folder(stage, key)
+        if not folder.is_dir():
+            return None
+        try:
+            artifact = kind.model_validate_json((folder / MANIFEST).read_bytes())
+        except (OSError, ValidationError) as e:
+            self._discard(folder, f"manifest unreadable: {e}")
+            return None
+        for ref in file_refs(artifact):
+            fault = _fault(folder, ref)
+            if fault:
+                self._discard(folder, fault)
+                return None
+        return Located(artifact, folder)
+
+    def load_run(self, stage: str, key: str) -> dict[str, object]:
+        """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is not there."""
+        path = self.folder(stage, key) / RUN
+        found: dict[str, object] = json.loads(path.read_text()) if path.is_file() else {}
+        return found
+
+    def _discard(self, folder: Path, fault: str) -> None:
+        log.warning("stored artifact %s/%s is damaged (%s); it is made anew", folder.parent.name, folder.name, fault)
+        shutil.rmtree(folder)
+
+    # ---------------------------------------------------------------- writing
+    @contextmanager
+    def lock(self, stage: str, key: str) -> Iterator[None]:
+        """Exclusive work on one key. The kernel lets go of it when the process dies, however it dies."""
+        folder = self.root / ".locks"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            handle = (folder / f"{stage}-{key}").open("w")
+        except OSError as e:
+            raise stage_error_from_os_error(e, folder) or e from e
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:  # the file stays: removing it would let a waiter and a newcomer hold two different locks
+            handle.close()
+
+    def begin(self, stage: str, key: str) -> Path:
+        """An empty partial folder. Call with the lock held: leftovers of dead processes are swept here."""
+        for stale in (self.root / stage).glob(f"{key}.partial-*"):
+            shutil.rmtree(stale)
+        partial = self.root / stage / f"{key}.partial-{uuid.uuid4().hex[:8]}"
+        partial.mkdir(parents=True)
+        return partial
+
+    def finish(self, stage: str, key: str, partial: Path, artifact: A, run: dict[str, object]) -> Located[A]:
+        """Seal a partial folder: every named file there and on disk, then one rename."""
+        for ref in file_refs(artifact):
+            fault = _fault(partial, ref)
+            if fault:
+                raise RuntimeError(f"stage {stage} returned a manifest that does not match its files: {fault}")
+            sync(partial / ref.path)
+        write_synced(partial / MANIFEST, artifact.model_dump_json(indent=1))
+        write_synced(partial / RUN, json.dumps(run, indent=1))
+        sync(partial)
+        final = self.folder(stage, key)
+        partial.rename(final)
+        sync(final.parent)
+        shutil.rmtree(self.scratch(stage, key), ignore_errors=True)
+        return Located(artifact, final)
+
+
+def file_refs(model: BaseModel) -> Iterator[FileRef]:
+    """Every FileRef anywhere inside a model."""
+    if isinstance(model, FileRef):
+        yield model
+        return
+    for name in type(model).model_fields:
+        yield from _refs_in(getattr(model, name))
+
+
+def _refs_in(value: object) -> Iterator[FileRef]:
+    if isinstance(value, BaseModel):
+        yield from file_refs(value)
+    elif isinstance(value, dict):
+        for v in value.values():
+            yield from _refs_in(v)
+    elif isinstance(value, tuple):
+        for v in value:
+            yield from _refs_in(v)
+
+
+def _fault(folder: Path, ref: FileRef) -> str | None:
+    path = folder / ref.path
+    if not path.is_file():
+        return f"{ref.path} is missing"
+    size = path.stat().st_size
+    if size != ref.size:
+        return f"{ref.path} has {size} bytes, not {ref.size}"
+    return None if sha256_of(path) == ref.sha256 else f"{ref.path} does not match its sha256"
+
+
+def sync(path: Path) -> None:
+    """Flush a file or folder to the disk, so that a power cut after the rename finds it whole."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_synced(path: Path, text: str) -> None:
+    """Write text and flush it to the disk."""
+    with path.open("w") as f:
+        f.write(text)
+        f.flush()
+        os.fsync(f.fileno())

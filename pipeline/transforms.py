@@ -1,0 +1,129 @@
+"""The only place where frames and pixel conventions are converted, and where cameras project.
+
+Symbols: `<to>_from_<from>` matrices act on column vectors. Cameras have OpenCV axes (x right, y down, z forward).
+Image positions `uv` are in pixels from the image's corner: the first pixel's centre is (0.5, 0.5).
+Distortion d = (k1, k2, p1, p2, k3) of OpenCV's model; depth_z is along the optical axis, ray_t along the ray.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+F64 = npt.NDArray[np.float64]
+UNDISTORT_STEPS, UNDISTORT_TOLERANCE = 50, 1e-12
+
+USD_CAM_FROM_OPENCV_CAM: F64 = np.diag([1.0, -1.0, -1.0, 1.0])  # USD cameras look along -z with +y up
+
+
+def matrix(rows: object) -> F64:
+    """A float64 array from a manifest's nested tuples."""
+    return np.array(rows, np.float64)
+
+
+def rows(array: npt.NDArray[np.generic]) -> tuple[tuple[float, ...], ...]:
+    """A manifest's nested tuples from an array."""
+    return tuple(tuple(float(x) for x in r) for r in np.asarray(array, np.float64))
+
+
+def corner_K_from_centre_K(K: F64) -> F64:
+    """Intrinsics with the first pixel's centre at (0.5, 0.5), from those with it at (0, 0) (FaceScape, OpenCV)."""
+    out = np.array(K, np.float64)
+    out[:2, 2] += 0.5
+    return out
+
+
+def centre_K_from_corner_K(K: F64) -> F64:
+    """Inverse of `corner_K_from_centre_K`."""
+    out = np.array(K, np.float64)
+    out[:2, 2] -= 0.5
+    return out
+
+
+def rigid(rotation: F64, translation: F64) -> F64:
+    """4x4 from a 3x3 rotation and a (3,) translation."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation, translation
+    return out
+
+
+def inverse_rigid(m: F64) -> F64:
+    """Inverse of a 4x4 rigid motion, without a general solve."""
+    return rigid(m[:3, :3].T, -m[:3, :3].T @ m[:3, 3])
+
+
+def similarity(scale: float, rotation: F64, translation: F64) -> F64:
+    """4x4 of x -> scale * rotation @ x + translation."""
+    return rigid(scale * rotation, translation)
+
+
+def rescale_camera(to_from_world: F64, world_from_cam: F64) -> F64:
+    """A camera's rigid pose after its world went through a similarity (scale moves the centre, not the axes)."""
+    scale = float(np.cbrt(np.linalg.det(to_from_world[:3, :3])))
+    turned = to_from_world[:3, :3] / scale @ world_from_cam[:3, :3]
+    return rigid(turned, to_from_world[:3, :3] @ world_from_cam[:3, 3] + to_from_world[:3, 3])
+
+
+def apply(m: F64, points: npt.NDArray[np.floating]) -> F64:
+    """(N, 3) points through a 4x4 affine matrix."""
+    out: F64 = np.asarray(points, np.float64) @ m[:3, :3].T + m[:3, 3]
+    return out
+
+
+def distort(xy: F64, d: F64) -> F64:
+    """(N, 2) positions on the z = 1 plane as the lens shows them."""
+    k1, k2, p1, p2, k3 = d
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                     y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)
+
+
+def undistort(xy: F64, d: F64) -> F64:
+    """Exact inverse of `distort` by Newton's method with the analytic Jacobian. (N, 2) -> (N, 2)."""
+    if not np.any(d):
+        return xy.copy()
+    k1, k2, p1, p2, k3 = d
+    out = xy.copy()
+    for _ in range(UNDISTORT_STEPS):
+        x, y = out[:, 0], out[:, 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d x = slope * x
+        error = distort(out, d) - xy
+        a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        b = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        c = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        determinant = a * c - b * b
+        step = np.stack([c * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], -1)
+        out -= step / np.where(np.abs(determinant) > 1e-9, determinant, 1.0)[:, None]
+        if np.abs(error).max(initial=0) < UNDISTORT_TOLERANCE:
+            break
+    return out
+
+
+def project(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np.floating]) -> tuple[F64, F64]:
+    """Image positions (N, 2) and depth_z (N,) of world points. Behind the camera (depth_z <= 0) uv is NaN."""
+    p = apply(cam_from_world, points)
+    z = p[:, 2]
+    safe = np.where(z > 1e-9, z, np.nan)
+    xy = distort(p[:, :2] / safe[:, None], distortion) if np.any(distortion) else p[:, :2] / safe[:, None]
+    return xy @ K[:2, :2].T + K[:2, 2], z
+
+
+def rays(K: F64, world_from_cam: F64, distortion: F64, uv: F64) -> tuple[F64, F64]:
+    """Origin (3,) and unit directions (N, 3), in the world, through image positions uv (N, 2)."""
+    xy = np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T
+    xy = undistort(xy, distortion)
+    directions = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ world_from_cam[:3, :3].T
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return world_from_cam[:3, 3].copy(), directions
+
+
+def pixel_centres(width: int, height: int, step: int = 1) -> F64:
+    """(H * W, 2) image positions of pixel centres, row by row; with `step`, of step x step blocks' centres."""
+    u = (np.arange(width // step) + 0.5) * step
+    v = (np.arange(height // step) + 0.5) * step
+    grid = np.stack(np.meshgrid(u, v), -1)
+    return grid.reshape(-1, 2)
