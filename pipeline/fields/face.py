@@ -1,0 +1,185 @@
+"""The whole model as one module, its file, and the fitted face in plain arrays.
+
+File: npz with `spec` (JSON, utf-8 bytes) and one array a parameter or buffer, by its name in the module.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.errors import StageError
+from pipeline.fields.appearance import IntegratedBasis, SpatialField
+from pipeline.fields.calibration import Calibration
+from pipeline.fields.encodings import HashEncoding
+from pipeline.fields.geometry import GridSdf
+from pipeline.fields.light import ShLight
+from pipeline.fields.protocol import F32, Material
+from pipeline.maths import brdf
+from pipeline.maths.sdf import unit
+
+FORMAT = 1
+CHUNK = 131_072
+
+
+@dataclass(frozen=True, slots=True)
+class FaceSpec:
+    """What is needed to build the modules before their parameters are read."""
+
+    lo: tuple[float, float, float]
+    hi: tuple[float, float, float]
+    views: int
+    rank: int = 3
+    light_order: int = 10
+    light_start: float = 1.0
+    attenuation: str = "exponential"
+    basis_inputs: str = "cosine"
+    specular: bool = True
+    calibrated: bool = False
+    levels: int = 10
+    log2_size: int = 17
+    coarse: float = 0.03
+    fine: float = 0.0006
+    width: int = 64
+    depth: int = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """Radiance at N surface points: total = diffuse + specular, (N, 3) each, linear, before the calibration."""
+
+    total: Tensor
+    diffuse: Tensor
+    specular: Tensor
+    albedo: Tensor
+
+
+class FaceModel(nn.Module):
+    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width."""
+
+    beta: Tensor
+
+    def __init__(self, spec: FaceSpec, values: Tensor, lo: Tensor, cell: float) -> None:
+        super().__init__()
+        self.spec = spec
+        self.geometry = GridSdf(values, lo, cell)
+        encoding = HashEncoding(torch.tensor(spec.lo), torch.tensor(spec.hi), spec.coarse, spec.fine, spec.levels,
+                                spec.log2_size)
+        self.spatial = SpatialField(encoding, spec.rank, spec.width, spec.depth)
+        self.basis = IntegratedBasis(spec.rank, 64, 2, spec.basis_inputs == "cosine")
+        self.light = ShLight(spec.light_order, spec.light_start)
+        self.calibration = Calibration(spec.views)
+        self.register_buffer("beta", torch.tensor(cell))
+
+    def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
+        """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
+        albedo, rho, c, inv_kappa = self.spatial(x)
+        light = self.light()
+        diffuse = brdf.diffuse(albedo, n, light)
+        if not self.spec.specular:
+            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo)
+        incident = brdf.light_integral(brdf.reflect(wo, n), inv_kappa, light, self.spec.attenuation)
+        specular = brdf.specular(rho, (c * self.basis(wo, n)).sum(-1), incident)
+        return Shaded(diffuse + specular, diffuse, specular, albedo)
+
+    def save(self, path: Path) -> None:
+        """Write the file that `load_model` reads."""
+        spec = {"format": FORMAT, "cell": self.geometry.cell, **asdict(self.spec)}
+        arrays = {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
+        np.savez(path, spec=np.frombuffer(json.dumps(spec).encode(), np.uint8), **arrays)
+
+
+def load_model(path: Path, device: str = "cpu") -> FaceModel:
+    """Rebuild a model from its file. Raises StageError if the file is of another format or a shape is wrong."""
+    with np.load(path, allow_pickle=False) as file:
+        spec: dict[str, Any] = json.loads(bytes(file["spec"]).decode())
+        arrays = {k: torch.from_numpy(file[k]) for k in file.files if k != "spec"}
+    if spec.pop("format", None) != FORMAT:
+        raise StageError("the fitted field is of another format", where=path.name, value=spec.get("format"),
+                         limit=f"format {FORMAT}", remedy="run the fit again with this version")
+    cell = float(spec.pop("cell"))
+    spec["lo"], spec["hi"] = tuple(spec["lo"]), tuple(spec["hi"])
+    model = FaceModel(FaceSpec(**spec), arrays["geometry.values"], arrays["geometry.lo"], cell)
+    model.load_state_dict(arrays)
+    return model.to(device)
+
+
+class FittedField:
+    """`pipeline.fields.protocol.Field` over a FaceModel."""
+
+    def __init__(self, model: FaceModel) -> None:
+        self.model = model.eval()
+        self.device = model.beta.device
+
+    @property
+    def bounds(self) -> tuple[F32, F32]:
+        """Box in which the SDF is defined."""
+        lo, hi = self.model.geometry.box()
+        return lo.cpu().numpy(), hi.cpu().numpy()
+
+    @property
+    def cell(self) -> float:
+        """Edge of the finest SDF cell."""
+        return self.model.geometry.cell
+
+    @property
+    def rank(self) -> int:
+        """Number of specular bases."""
+        return self.model.spec.rank
+
+    @property
+    def light(self) -> F32:
+        """((L + 1)^2, 3) coefficients."""
+        return np.asarray(self.model.light().detach().cpu().numpy(), np.float32)
+
+    def _map(self, function: Any, *arrays: F32) -> tuple[F32, ...]:
+        out = []
+        with torch.no_grad():
+            for i in range(0, max(len(arrays[0]), 1), CHUNK):
+                part = function(*(torch.from_numpy(np.ascontiguousarray(a[i : i + CHUNK], np.float32)).to(self.device)
+                                  for a in arrays))
+                out.append([p.cpu().numpy() for p in part])
+        return tuple(np.concatenate(p) for p in zip(*out, strict=True))
+
+    def sdf_and_gradient(self, points: F32) -> tuple[F32, F32]:
+        """(N,) and (N, 3)."""
+        s, g = self._map(self.model.geometry, points)
+        return s, g
+
+    def sdf(self, points: F32) -> F32:
+        """(N,)."""
+        return self.sdf_and_gradient(points)[0]
+
+    def material(self, points: F32) -> Material:
+        """Appearance at points."""
+        albedo, rho, c, inv_kappa = self._map(self.model.spatial, points)
+        if not self.model.spec.specular:
+            rho = np.zeros_like(rho)
+        return Material(albedo, rho, c, inv_kappa)
+
+    def basis(self, wo: F32, normal: F32) -> F32:
+        """(N, k)."""
+        (b,) = self._map(lambda w, n: (self.model.basis(w, n),), wo, normal)
+        return b
+
+    def normals(self, points: F32) -> F32:
+        """(N, 3) unit, outward."""
+        (n,) = self._map(lambda p: (unit(self.model.geometry(p)[1]),), points)
+        return n
+
+
+def load_face(path: Path, device: str = "cpu") -> FittedField:
+    """The fitted face in a file, as plain arrays."""
+    return FittedField(load_model(path, device))
+
+
+def mean_radiance(light: Tensor) -> float:
+    """Mean of L over the sphere and the channels: c_00 Y_00."""
+    return float(light[0].mean() / math.sqrt(4 * math.pi))

@@ -1,0 +1,108 @@
+"""Differentiable gathers with two back ends: compiled CPU kernels where numba is installed, plain torch elsewhere.
+
+The torch path is the reference, and the only one on a GPU. `use_numba(False)` forces it everywhere (tests).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.maths.sdf import spline_sdf, spline_stencil
+from pipeline.maths.tracing import MAX_STEPS, REFINE_STEPS, sphere_trace
+
+try:
+    from pipeline.fields import kernels_numba as nb
+except ImportError:  # a bare GPU machine has torch, numpy and scipy alone
+    nb = None  # type: ignore[assignment]
+
+_enabled = True
+
+
+def use_numba(enabled: bool) -> None:
+    """Allow or forbid the compiled kernels."""
+    global _enabled
+    _enabled = enabled
+
+
+def compiled(x: Tensor) -> bool:
+    """Whether the compiled kernels serve this tensor: float32 on the CPU, numba at hand."""
+    return _enabled and nb is not None and x.device.type == "cpu" and x.dtype == torch.float32
+
+
+def _np(x: Tensor) -> Any:
+    return x.detach().contiguous().numpy()
+
+
+class SplineSdf(torch.autograd.Function):
+    """SDF and gradient of a spline grid; the gradient of the coefficients is added to `sink` (X, Y, Z).
+
+    The sink spares a dense gradient tensor a call. Positions get no gradient: samples are placed, not learnt.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, values: Tensor, sink: Tensor, lo: Tensor, cell: float
+    ) -> tuple[Tensor, Tensor]:
+        ctx.save_for_backward(x)
+        ctx.grid = (values.shape, sink, lo, cell)
+        if not compiled(x):
+            return spline_sdf(values.detach(), x, lo, cell)
+        s, g = torch.empty(len(x)), torch.empty(len(x), 3)
+        nb.spline_forward(_np(values), _np(lo), np.float32(1 / cell), _np(x), s.numpy(), g.numpy())
+        return s, g
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (x,) = ctx.saved_tensors
+        shape, sink, lo, cell = ctx.grid
+        gs, gg = grads
+        if compiled(x):
+            nb.spline_backward(sink.numpy(), _np(lo), np.float32(1 / cell), _np(x), _np(gs), _np(gg))
+        else:
+            index, w, dw = spline_stencil(x, lo, cell, shape)
+            share = gs[:, None] * w + torch.einsum("nc,nkc->nk", gg, dw)
+            sink.view(-1).index_add_(0, index.reshape(-1), share.reshape(-1))
+        return None, None, None, None, None
+
+
+def trace(
+    values: Tensor, lo: Tensor, cell: float, o: Tensor, d: Tensor, t_near: Tensor, t_far: Tensor, *, min_step: float,
+    factor: float = 1.0,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`pipeline.maths.tracing.sphere_trace` on a spline grid: t, hit, sdf there. No gradients."""
+    values, o, d = values.detach(), o.detach(), d.detach()
+    if not compiled(o):
+        with torch.no_grad():
+            return sphere_trace(lambda p: spline_sdf(values, p, lo, cell)[0], o, d, t_near, t_far,
+                                min_step=min_step, factor=factor)
+    t, s, hit = torch.empty(len(o)), torch.empty(len(o)), torch.empty(len(o), dtype=torch.bool)
+    nb.march(_np(values), _np(lo), np.float32(1 / cell), _np(o), _np(d), _np(t_near), _np(t_far), np.float32(factor),
+             np.float32(min_step), MAX_STEPS, REFINE_STEPS, t.numpy(), hit.numpy(), s.numpy())
+    return t, hit, s
+
+
+def adam_on_band(
+    values: Tensor, grad: Tensor, m: Tensor, v: Tensor, active: Tensor, step: int, lr: float,
+    betas: tuple[float, float], eps: float = 1e-12,
+) -> None:
+    """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
+
+    eps is far below any useful gradient's size: distances are in metres, so that gradients can be as small as 1e-8.
+    """
+    b1, b2 = betas
+    c1, c2 = 1 - b1**step, 1 - b2**step
+    if compiled(values):
+        f = np.float32
+        nb.band_adam(_np(values), grad.numpy(), m.numpy(), v.numpy(), active.numpy(), f(lr), f(b1), f(b2), f(eps),
+                     f(c1), f(c2))
+        return
+    flat = [x.detach().view(-1) for x in (values, grad, m, v)]
+    g = flat[1][active]
+    flat[1][active] = 0
+    flat[2][active] = mi = b1 * flat[2][active] + (1 - b1) * g
+    flat[3][active] = vi = b2 * flat[3][active] + (1 - b2) * g * g
+    flat[0][active] -= lr * (mi / c1) / (torch.sqrt(vi / c2) + eps)

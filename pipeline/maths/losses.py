@@ -1,0 +1,55 @@
+"""The terms of the fit's objective, unreduced; stages.inverse_rendering.objective weighs and sums them ([NeuFace eq. 20])."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pipeline.colour import srgb_from_linear
+
+
+def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
+    """|I - I_bar|, mean over channels: (N, 3) linear, (N, 3) encoded -> (N,). [NeuFace eq. 21]
+
+    Differs: compared as sRGB, the metric's and the eye's scale, while the model stays linear; in linear values the
+    loss would be ruled by highlights.
+    """
+    return (srgb_from_linear(predicted) - target_srgb).abs().mean(-1)
+
+
+def white_light(coefficients: Tensor) -> Tensor:
+    """|L_i - mean over RGB of L_i|, on the SH coefficients: (K, 3) -> (K,). [NeuFace eq. 22]
+
+    Differs: per coefficient and not per ray; the light does not depend on the ray, and the basis is orthonormal.
+    """
+    return (coefficients - coefficients.mean(-1, keepdim=True)).abs().mean(-1)
+
+
+def specular_energy(specular: Tensor) -> Tensor:
+    """L_s, mean over channels: (N, 3) -> (N,). [NeuFace eq. 23]; L_s >= 0 by construction."""
+    return specular.mean(-1)
+
+
+def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
+    """| |grad SDF| - 1 | or its square: (N, 3) -> (N,). The second term of [NeuFace eq. 24].
+
+    The norm is sqrt(|g|^2 + 1e-12): its derivative at 0 stays finite, and 1e-6 is far below any real gradient.
+    """
+    residual = torch.sqrt((gradient * gradient).sum(-1) + 1e-12) - 1
+    return residual * residual if squared else residual.abs()
+
+
+def displacement(d: Tensor) -> Tensor:
+    """|D(x)|: the third term of [NeuFace eq. 24]."""
+    return d.abs()
+
+
+def embedding(z: Tensor) -> Tensor:
+    """|z|^2 of the prior's embedding: the first term of [NeuFace eq. 24]."""
+    return (z * z).sum(-1)
+
+
+def normal_consistency(n: Tensor, n_near: Tensor) -> Tensor:
+    """1 - n . n' at a point and a jittered neighbour: (N, 3), (N, 3) -> (N,). Not in the paper: it stands for the
+    smoothness that the paper's MLP has by itself and a grid has not."""
+    return 1 - (n * n_near).sum(-1)

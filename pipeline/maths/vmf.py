@@ -1,0 +1,47 @@
+"""Attenuation of spherical harmonics under a von Mises-Fisher lobe.
+
+Symbols: kappa > 0 concentration; s = 1 / kappa >= 0 its inverse, which is what the field predicts (s = 0: mirror).
+A_l(s) is the factor of E over vMF(w; w_r, kappa) of Y_lm(w), relative to Y_lm(w_r). A_0 = 1, A_l falls with l and s.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+EXTRA_ORDERS = 8  # float32 error 5e-6 over all s (4 give 1.3e-5)
+
+
+def attenuation_exponential(inv_kappa: Tensor, order: int) -> Tensor:
+    """A_l = exp(-l (l + 1) s / 2): (N,) -> (N, order + 1). [NeuFace eq. 11, 27]
+
+    Error against the exact ratio: at most 0.075 (l = 1, kappa = 1.55), of order kappa^-2 for large kappa.
+    """
+    l = torch.arange(order + 1, dtype=inv_kappa.dtype, device=inv_kappa.device)  # noqa: E741
+    return torch.exp(-0.5 * l * (l + 1) * inv_kappa[:, None])
+
+
+def attenuation_exact(inv_kappa: Tensor, order: int) -> Tensor:
+    """A_l = I_{l+1/2}(kappa) / I_{1/2}(kappa): (N,) -> (N, order + 1). Domain: all s >= 0.
+
+        r_l = A_l / A_{l-1} = 1 / ((2 l + 1) s + r_{l+1}),    A_l = r_1 ... r_l
+
+    Run downward (upward it explodes), started a few orders above with the asymptotic ratio
+    r_N = 1 / (N s + sqrt(1 + N (N + 1) s^2)), which is right at both ends of s. Every term is positive and finite,
+    and so is its derivative.
+    """
+    s = inv_kappa
+    top = order + EXTRA_ORDERS
+    r = 1 / ((top + 1) * s + torch.sqrt(1 + (top + 1) * (top + 2) * s * s))
+    ratios = []
+    for l in range(top, 0, -1):  # noqa: E741
+        r = 1 / ((2 * l + 1) * s + r)
+        if l <= order:
+            ratios.append(r)
+    a = [torch.ones_like(s)]
+    for r in reversed(ratios):
+        a.append(a[-1] * r)
+    return torch.stack(a, -1)
+
+
+ATTENUATIONS = {"exponential": attenuation_exponential, "exact": attenuation_exact}
