@@ -1,0 +1,219 @@
+"""Write the demo capture: photos and cameras in FaceScape's format, with the truth beside them.
+
+Folder
+    {i}.png            8-bit sRGB, black background
+    params.json        FaceScape's keys; pixel centres at integers, so cx = (W - 1) / 2
+    truth/alpha        coverage of every view, 8 bit
+    truth/albedo       linear RGB, every fifth view (i % 5 == 2), the photo's pixels
+    truth/normal       unit normals of the world, the same views
+    truth/mesh_gt.ply  metres
+    truth/light.json   coefficients (121, 3) of the light; truth/env.exr the same as a lat-long
+    demo.json          written last: the arguments and a hash over them
+
+World: metres, +Y up, +Z out of the face. The folder appears under its name only when it is complete.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import OpenEXR
+import trimesh
+
+from pipeline.demo import head, light
+from pipeline.demo.mesh import Mesh, mesh_from_distance
+from pipeline.demo.render import Camera, Picture, Scene, render, scene_from_mesh
+from pipeline.demo.rig import rig_cameras
+
+F64 = npt.NDArray[np.float64]
+Progress = Callable[[int, int, str], None]
+
+VERSION = 1
+"""Raised whenever the same arguments give another capture."""
+
+MARKER = "demo.json"
+EXPOSURE = 0.5
+"""Scale of the studio light: it sets the photos' brightness, as a camera's exposure would."""
+
+_ENV_HEIGHT = 128
+_TRUTH_EVERY, _TRUTH_AT = 5, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Everything that decides the bytes of a capture."""
+
+    views: int
+    size: int
+    samples: int
+    mesh_step: float
+    seed: int
+    shadows: bool
+    version: int = VERSION
+
+    def digest(self) -> str:
+        """Hash of the arguments, hexadecimal."""
+        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+def write_demo_capture(
+    folder: Path,
+    *,
+    views: int = 40,
+    size: int = 384,
+    samples: int = 16,
+    mesh_step: float = 0.001,
+    seed: int = 0,
+    shadows: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Write the demo capture to `folder`, or return at once if it already holds the one asked for.
+
+    `views` photos of `size` x `size` pixels; `samples` (a power of two) light samples for each lobe in each
+    quarter pixel; `mesh_step` metres, the grid of the traced mesh; `progress(done, total, what)`.
+    A folder holding anything else is refused, not overwritten.
+    """
+    request = Request(views, size, samples, mesh_step, seed, shadows)
+    _check(request)
+    if is_complete(folder, request):
+        return
+    if folder.exists() and any(folder.iterdir()):
+        raise FileExistsError(f"{folder} exists and is not this demo capture; choose another folder or remove it")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+    try:
+        _write(partial, request, progress or (lambda done, total, what: None))
+        partial.chmod(0o755)  # mkdtemp makes it private
+        os.replace(partial, folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def is_complete(folder: Path, request: Request) -> bool:
+    """Whether `folder` holds exactly the capture of `request`."""
+    try:
+        marker = json.loads((folder / MARKER).read_text())
+    except (OSError, ValueError):
+        return False
+    return isinstance(marker, dict) and marker.get("digest") == request.digest()
+
+
+def _check(request: Request) -> None:
+    if request.views < 1 or request.size < 8:
+        raise ValueError(f"a demo capture needs a view and 8 pixels, not {request.views} and {request.size}")
+    if request.samples < 1 or request.samples & (request.samples - 1):
+        raise ValueError(f"samples must be a power of two, not {request.samples}")
+    if not 2e-4 <= request.mesh_step <= 8e-3:
+        raise ValueError(f"mesh_step must be within 0.2 and 8 mm, not {request.mesh_step * 1000:g} mm")
+
+
+def _write(folder: Path, request: Request, progress: Progress) -> None:
+    """Fill `folder`, which is empty; the marker comes last."""
+    for name in ("alpha", "albedo", "normal"):
+        (folder / "truth" / name).mkdir(parents=True)
+    cameras = rig_cameras(request.views, request.size, request.seed)
+    _write_json(folder / "params.json", facescape_params(cameras))
+    total = request.views + 1
+    progress(0, total, "sculpting the head")
+    mesh = mesh_from_distance(
+        head.signed_distance, head.distance_and_gradient, head.BOUNDS, request.mesh_step
+    )
+    _write_mesh(folder / "truth" / "mesh_gt.ply", request.mesh_step)
+    coefficients = light.studio_coefficients(EXPOSURE)
+    _write_light(folder / "truth", coefficients)
+    scene = scene_from_mesh(mesh, coefficients, request.samples, request.seed, request.shadows)
+    with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 4)) as pool:
+        jobs = [pool.submit(_write_view, folder, scene, camera, i) for i, camera in enumerate(cameras)]
+        try:
+            for i, job in enumerate(jobs):
+                progress(i + 1, total, f"photo {i + 1} of {len(jobs)}")
+                job.result()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    _write_json(folder / MARKER, {"digest": request.digest(), **asdict(request)})
+    progress(total, total, "done")
+
+
+def facescape_params(cameras: list[Camera]) -> dict[str, object]:
+    """FaceScape's flat dictionary of `cameras`."""
+    params: dict[str, object] = {}
+    for i, camera in enumerate(cameras):
+        params[f"{i}_K"] = camera.k.tolist()
+        params[f"{i}_Rt"] = camera.cam_from_world.tolist()
+        params[f"{i}_distortion"] = [0.0] * 5
+        params[f"{i}_width"] = params[f"{i}_height"] = camera.size
+        params[f"{i}_valid"] = True
+        params[f"{i}_matches"] = 1000
+        params[f"{i}_sn"] = f"DEMO{i:03d}"
+        params[f"{i}_ori"] = f"{i}.png"
+    return params
+
+
+def srgb_from_linear(linear: F64) -> npt.NDArray[np.uint8]:
+    """8-bit sRGB of linear values, clipped to [0, 1]."""
+    x = np.clip(linear, 0.0, 1.0)
+    encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1.0 / 2.4) - 0.055)
+    return np.asarray(np.rint(255.0 * encoded), dtype=np.uint8)
+
+
+def _write_view(folder: Path, scene: Scene, camera: Camera, i: int) -> None:
+    picture = render(scene, camera, i)
+    _write_png(folder / f"{i}.png", srgb_from_linear(picture.radiance)[..., ::-1])
+    _write_png(folder / "truth" / "alpha" / f"{i}.png", np.rint(255.0 * picture.alpha).astype(np.uint8))
+    if i % _TRUTH_EVERY == _TRUTH_AT:
+        _write_truth(folder / "truth", picture, i)
+
+
+def _write_truth(truth: Path, picture: Picture, i: int) -> None:
+    _write_exr(truth / "albedo" / f"{i}.exr", picture.albedo.astype(np.float16))
+    _write_exr(truth / "normal" / f"{i}.exr", picture.normal.astype(np.float16))
+
+
+def _write_light(truth: Path, coefficients: F64) -> None:
+    _write_exr(truth / "env.exr", light.lat_long(coefficients, _ENV_HEIGHT))
+    about = {
+        "basis": "real orthonormal spherical harmonics, index l (l + 1) + m, no Condon-Shortley sign",
+        "polar_axis": "+Z",
+        "world": "+Y up, +Z out of the face",
+        "degree": light.DEGREE,
+        "coefficients": coefficients.tolist(),
+    }
+    _write_json(truth / "light.json", about)
+
+
+def _write_mesh(path: Path, mesh_step: float) -> None:
+    """The true surface, meshed at 2.2 mm or the traced mesh's step if that is coarser."""
+    mesh: Mesh = mesh_from_distance(
+        head.signed_distance, head.distance_and_gradient, head.BOUNDS, max(mesh_step, 0.0022)
+    )
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
+
+
+def _write_png(path: Path, pixels: npt.NDArray[np.uint8]) -> None:
+    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels))
+    if not done:
+        raise OSError(f"could not encode {path.name}")
+    path.write_bytes(data.tobytes())
+
+
+def _write_exr(path: Path, pixels: npt.NDArray[np.float16] | npt.NDArray[np.float32]) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.ascontiguousarray(pixels)}) as file:
+        file.write(str(path))
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=1) + "\n")
