@@ -1,0 +1,151 @@
+"""What a photo says of the camera that took it: a minimal reader of TIFF tags, which EXIF is made of.
+
+Only what the pipeline uses: orientation, focal length, make, model, lens. A file with damaged or no metadata gives
+an empty `Exif`, never an error: metadata is a help, not a condition. Source: EXIF 2.32 (CIPA DC-008), TIFF 6.0.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+Tags = dict[int, tuple[float, ...] | str]
+
+MAKE, MODEL, ORIENTATION, EXIF_IFD = 0x10F, 0x110, 0x112, 0x8769
+FOCAL_MM, FOCAL_35MM, PIXEL_X, LENS = 0x920A, 0xA405, 0xA002, 0xA434
+PLANE_X_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
+FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
+_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8)}
+_MAX_TAGS, _MAX_VALUES = 1000, 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Exif:
+    """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown."""
+
+    orientation: int = 1
+    body: str = ""
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    pixels_per_mm: float | None = None
+    recorded_width: int | None = None
+
+    def focal_px(self, width: int, height: int) -> float | None:
+        """Focal length in pixels of an image of width x height, or None."""
+        if self.focal_35mm:
+            return self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+        if self.focal_mm and self.pixels_per_mm and self.recorded_width:
+            # the resolution is that of the frame as recorded; a copy scaled down since has fewer pixels a millimetre
+            return self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_width
+        return None
+
+
+def read_exif(data: bytes) -> Exif:
+    """Metadata of a JPEG, PNG (eXIf) or TIFF file, given its bytes."""
+    block = _exif_block(data)
+    if block is None:
+        return Exif()
+    tags = first_ifd(block)
+    offset = tags.get(EXIF_IFD)
+    if isinstance(offset, tuple) and offset:
+        tags = tags | _ifd(block, int(offset[0]))
+    unit = _UNIT_MM.get(int(_number(tags, PLANE_UNIT) or 2))
+    resolution = _number(tags, PLANE_X_RESOLUTION)
+    orientation = int(_number(tags, ORIENTATION) or 1)
+    width = _number(tags, PIXEL_X)
+    return Exif(
+        orientation=orientation if 1 <= orientation <= 8 else 1,
+        body=" ".join(t for t in (_text(tags, MAKE), _text(tags, MODEL), _text(tags, LENS)) if t),
+        focal_mm=_number(tags, FOCAL_MM),
+        focal_35mm=_number(tags, FOCAL_35MM),
+        pixels_per_mm=resolution / unit if resolution and unit else None,
+        recorded_width=int(width) if width else None,
+    )
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """(marker, first byte, end) of each segment of a JPEG's header, up to and with the first SOS (0xDA)."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        yield marker, at + 4, end
+        if marker == 0xDA:
+            return
+        at = end
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """(type, first byte, end) of each chunk of a PNG; `end` may lie beyond the data if the file is cut off."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        yield data[at + 4 : at + 8], at + 8, at + 8 + length
+        at += 12 + length
+
+
+def first_ifd(block: bytes) -> Tags:
+    """Tags of a TIFF block's first directory; empty if it is damaged or a BigTIFF."""
+    if block[:4] not in (b"II*\0", b"MM\0*") or len(block) < 8:
+        return {}
+    return _ifd(block, struct.unpack_from(_order(block) + "I", block, 4)[0])
+
+
+def _exif_block(data: bytes) -> bytes | None:
+    if data[:2] == b"\xff\xd8":
+        blocks = (data[a:b] for m, a, b in jpeg_segments(data) if m == 0xE1)
+        return next((b[6:] for b in blocks if b[:6] == b"Exif\0\0"), None)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return next((data[a:b] for t, a, b in png_chunks(data) if t == b"eXIf"), None)
+    return data if data[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def _order(block: bytes) -> str:
+    return "<" if block[:2] == b"II" else ">"
+
+
+def _ifd(block: bytes, offset: int) -> Tags:
+    """One directory. Entries that point outside the block are left out."""
+    order, tags = _order(block), Tags()
+    if offset + 2 > len(block):
+        return tags
+    for i in range(min(struct.unpack_from(order + "H", block, offset)[0], _MAX_TAGS)):
+        entry = offset + 2 + 12 * i
+        if entry + 12 > len(block):
+            break
+        tag, kind, count = struct.unpack_from(order + "HHI", block, entry)
+        code, size = _TYPES.get(kind, ("", 0))
+        if not size or count > _MAX_VALUES:
+            continue
+        at = entry + 8 if size * count <= 4 else struct.unpack_from(order + "I", block, entry + 8)[0]
+        if at + size * count <= len(block):
+            tags[tag] = _values(block, order, code, at, count)
+    return tags
+
+
+def _values(block: bytes, order: str, code: str, at: int, count: int) -> tuple[float, ...] | str:
+    if code == "s":
+        return block[at : at + count].split(b"\0")[0].decode("latin-1").strip()
+    raw = struct.unpack_from(order + code * count, block, at)
+    if len(code) == 1:
+        return raw
+    return tuple(n / d if d else math.nan for n, d in zip(raw[::2], raw[1::2], strict=True))
+
+
+def _number(tags: Tags, tag: int) -> float | None:
+    """A tag's first value if it is a positive finite number; cameras write 0 for unknown."""
+    value = tags.get(tag)
+    if not isinstance(value, tuple) or not value or not math.isfinite(value[0]) or value[0] <= 0:
+        return None
+    return float(value[0])
+
+
+def _text(tags: Tags, tag: int) -> str:
+    value = tags.get(tag)
+    return value if isinstance(value, str) else ""

@@ -1,0 +1,88 @@
+"""Is a picture's file whole? Decoders fill what is missing with grey or black, and then nobody notices.
+
+JPEG: the end marker after the last scan, and no decoder's grey where the data ran out. PNG: every chunk's CRC up to
+IEND. TIFF: every strip and tile inside the file. EXR: the reader itself refuses a cut-off file.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.capture.exif import first_ifd, jpeg_segments, png_chunks
+
+_STRIPS, _TILES = (273, 279), (324, 325)  # TIFF tags: offsets, byte counts
+_NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # in a scan, FF 00 is a data byte and FF D0..D7 are restarts
+GREY, GREY_ROWS, CUT = 128, 8, 8  # libjpeg's fill; 8 bytes hold at most 32 flat blocks, 8 rows of 512 px hold 64
+
+
+def fault_of(data: bytes) -> str | None:
+    """What is missing from a JPEG, PNG or TIFF file, or None if it is whole (or of another kind)."""
+    if data[:2] == b"\xff\xd8":
+        return _jpeg_fault(data)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _png_fault(data)
+    return _tiff_fault(data) if data[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def _jpeg_fault(data: bytes) -> str | None:
+    scan = next((end for marker, _, end in jpeg_segments(data) if marker == 0xDA), None)
+    if scan is None:
+        return "cut off in the header"
+    end = _end_of_image(data, scan)
+    if end is None:
+        return "cut off: the JPEG has no end marker"
+    return "the JPEG's data ends before the picture does" if _ends_in_grey(data[:end]) else None
+
+
+def _end_of_image(data: bytes, scan: int) -> int | None:
+    """Offset of the EOI marker that closes the picture, scan by scan (progressive files have several)."""
+    at = scan
+    while (found := _NEXT_MARKER.search(data, at)) is not None:
+        if data[found.start() + 1] == 0xD9:
+            return found.start()
+        at = found.start() + 2 + int.from_bytes(data[found.start() + 2 : found.start() + 4], "big")
+    return None
+
+
+def _ends_in_grey(data: bytes) -> bool:
+    """True if the last rows are the decoder's fill. `data`: the file without its EOI marker.
+
+    A photo may well end in an exact mid grey; then its last bytes encode just that, and the picture stays the same
+    without them. Where the decoder filled in, the last bytes encode something else, and cutting them changes it.
+    """
+    whole = _decode(data)
+    if whole is None or whole.shape[0] < GREY_ROWS or whole.shape[1] < 512 or not (whole[-GREY_ROWS:] == GREY).all():
+        return False
+    shorter = _decode(data[:-CUT])
+    return shorter is None or not np.array_equal(whole, shorter)
+
+
+def _decode(data: bytes) -> npt.NDArray[np.generic] | None:
+    return cv2.imdecode(np.frombuffer(data + b"\xff\xd9", np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def _png_fault(data: bytes) -> str | None:
+    for kind, start, end in png_chunks(data):
+        if end + 4 > len(data):
+            return f"cut off in its {kind.decode('latin-1')} data"
+        if zlib.crc32(data[start - 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"its {kind.decode('latin-1')} data does not match its checksum"
+        if kind == b"IEND":
+            return None
+    return "cut off: the PNG has no end chunk"
+
+
+def _tiff_fault(data: bytes) -> str | None:
+    tags = first_ifd(data)
+    for offsets, counts in (_STRIPS, _TILES):
+        at, size = tags.get(offsets, ()), tags.get(counts, ())
+        if not isinstance(at, tuple) or not isinstance(size, tuple):
+            continue
+        if any(a + n > len(data) for a, n in zip(at, size, strict=False)):
+            return "cut off: image data lies beyond the end of the file"
+    return None

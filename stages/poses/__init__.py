@@ -1,0 +1,1 @@
+"""Cameras around the subject: given ones as they are, or solved from the photos."""

@@ -1,0 +1,204 @@
+"""From the capture's world to asset coordinates: centre, axes, scale and the radius of the region of interest.
+
+Symbols: N cameras; world_from_cam (N, 4, 4) rigid, OpenCV axes; c camera centres (N, 3); a unit rays through the
+frames' centres (N, 3); roi = region of interest, the ball that the frames look at. Asset coordinates: right-handed,
++Y up, origin = centre of the region of interest, metres (nominal ones where the scale is not known).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.artifacts import Camera
+from pipeline.errors import StageError
+from pipeline.transforms import F64, matrix, rays, similarity
+
+NOMINAL_ROI = 0.18  # metres: a head with some air around it
+PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
+UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
+UP_LIMIT = np.cos(np.radians(45.0))
+POINTS_WITHIN, POINTS_MARGIN, POINTS_SHRINK = 0.95, 1.2, 0.6  # share of points, air around them, least share of frame
+MIN_POINTS = 50
+ROBUST_STEPS = 30
+
+
+@dataclass(frozen=True, slots=True)
+class Normalisation:
+    """capture_from_asset: 4x4 similarity. roi_radius: asset units, around the origin. metric: units are metres."""
+
+    capture_from_asset: F64
+    roi_radius: float
+    metric: bool
+    warnings: tuple[str, ...]
+
+
+def normalise(cameras: Sequence[Camera], points: F64 | None = None, *, given: bool) -> Normalisation:
+    """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
+
+    points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
+    Raises StageError if the cameras do not look at a common place.
+    """
+    centres, axes = viewing_rays(cameras)
+    warnings: list[str] = []
+    centre = nearest_point(centres, axes)
+    _in_front(cameras, centres, axes, centre, warnings)
+    radius = frame_radius(cameras, centres, centre)
+    if points is not None and len(points) >= MIN_POINTS:
+        centre = points_centre(points, centre, radius)
+        radius = frame_radius(cameras, centres, centre)
+        distances = np.linalg.norm(points - centre, axis=1)
+        reach = POINTS_MARGIN * float(np.quantile(distances[distances < radius], POINTS_WITHIN))
+        radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
+    poses = np.stack([matrix(c.world_from_cam) for c in cameras])
+    rotation = given_axes(poses, warnings) if given else solved_axes(poses, centre)
+    scale, metric = given_scale(radius, warnings) if given else (NOMINAL_ROI / radius, False)
+    inverse = similarity(1.0 / scale, rotation.T, centre)
+    return Normalisation(inverse, radius * scale, metric, tuple(warnings))
+
+
+def viewing_rays(cameras: Sequence[Camera]) -> tuple[F64, F64]:
+    """Camera centres (N, 3) and unit rays (N, 3) through the middle of the frames.
+
+    The frame's middle and not the principal point: a cropped frame's principal point may lie anywhere.
+    """
+    found = [
+        rays(matrix(c.K), matrix(c.world_from_cam), np.array(c.distortion), np.array([[c.width / 2, c.height / 2]]))
+        for c in cameras
+    ]
+    return np.stack([o for o, _ in found]), np.concatenate([d for _, d in found])
+
+
+def nearest_point(centres: F64, axes: F64) -> F64:
+    """The point nearest to all rays, robustly (sum of distances, by reweighted least squares).
+
+    sum_i w_i (1 - a_i a_i^T) (x - c_i) = 0, w_i = 1 / distance_i
+    Raises StageError if the rays are parallel.
+    """
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    weights = np.ones(len(centres))
+    x = np.zeros(3)
+    for _ in range(ROBUST_STEPS):
+        A = np.einsum("n,nij->ij", weights, across)
+        if np.linalg.eigvalsh(A / weights.sum())[0] < 1e-6:
+            raise StageError("the cameras look in parallel directions", where="poses", value="no point where the views "
+                             "meet", limit="views that turn around the subject", remedy="photograph the subject from "
+                             "all around, each photo aimed at the head")  # fmt: skip
+        x = np.linalg.solve(A, np.einsum("n,nij,nj->i", weights, across, centres))
+        distance = np.linalg.norm(np.einsum("nij,nj->ni", across, x - centres), axis=1)
+        weights = 1.0 / np.maximum(distance, 1e-2 * max(float(np.median(distance)), 1e-12))
+    return x
+
+
+def frame_radius(cameras: Sequence[Camera], centres: F64, centre: F64) -> float:
+    """What the frames see around `centre`: median of distance * tan(half the smaller field of view)."""
+    K = np.stack([matrix(c.K) for c in cameras])
+    tangent = np.array([min(c.width / 2 / k[0, 0], c.height / 2 / k[1, 1]) for c, k in zip(cameras, K, strict=True)])
+    return float(np.median(np.linalg.norm(centres - centre, axis=1) * tangent))
+
+
+def points_centre(points: F64, start: F64, radius: float) -> F64:
+    """Robust middle of the sparse points near where the views meet.
+
+    Points are weighted by exp(-(distance from `start` / radius)^2), so that a table or wall far off has no say, and
+    the coordinate-wise weighted median keeps strays out.
+    """
+    weights = np.exp(-(np.linalg.norm(points - start, axis=1) ** 2) / radius**2)
+    if weights.sum() < MIN_POINTS / 10:
+        return start
+    out = np.empty(3)
+    for axis in range(3):
+        order = np.argsort(points[:, axis], kind="stable")
+        cumulative = np.cumsum(weights[order])
+        out[axis] = points[order[np.searchsorted(cumulative, cumulative[-1] / 2)], axis]
+    return out
+
+
+def given_axes(poses: F64, warnings: list[str]) -> F64:
+    """(3, 3) asset_from_capture: the world's own axes if the cameras stand upright in it, else the least turn to +Y."""
+    up = robust_direction(-poses[:, :3, 1])
+    if up is None:
+        warnings.append("the cameras' up directions cancel out; the capture's own axes are kept")
+        return np.eye(3)
+    if up[1] >= UP_LIMIT:
+        return np.eye(3)
+    warnings.append(f"the cameras' mean up direction ({up[0]:.2f}, {up[1]:.2f}, {up[2]:.2f}) is far from +Y; the world "
+                    "is turned so that it is +Y")  # fmt: skip
+    return least_turn(up, np.array([0.0, 1.0, 0.0]))
+
+
+def solved_axes(poses: F64, centre: F64) -> F64:
+    """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z towards the side with the cameras.
+
+    Up is the direction that the cameras' x axes are square to (a photographer tilts a camera more than he rolls it,
+    so that the mean of the up vectors alone leans back), held near the mean of their up vectors.
+    """
+    up = robust_direction(-poses[:, :3, 1])
+    up = poses[0, :3, 1] * -1.0 if up is None else up
+    x = poses[:, :3, 0]
+    weights = np.ones(len(x))
+    start = up
+    for _ in range(ROBUST_STEPS):
+        A = np.einsum("n,ni,nj->ij", weights, x, x) / weights.sum() + 0.02 * (np.eye(3) - np.outer(start, start))
+        y = np.linalg.eigh(A)[1][:, 0]
+        up = y if y @ start > 0 else -y
+        weights = 1.0 / np.maximum(np.abs(x @ up), 0.02)
+    side = np.mean(poses[:, :3, 3] - centre, axis=0)
+    side = side - (side @ up) * up
+    if np.linalg.norm(side) < 1e-6 * np.linalg.norm(poses[:, :3, 3] - centre, axis=1).mean():
+        side = poses[0, :3, 3] - centre  # cameras evenly all around: the first one's side will do
+        side = side - (side @ up) * up
+    z = side / np.linalg.norm(side)
+    return np.stack([np.cross(up, z), up, z])
+
+
+def robust_direction(vectors: F64) -> F64 | None:
+    """Unit vector nearest to (N, 3) unit vectors (geometric median), or None if they cancel out."""
+    weights = np.ones(len(vectors))
+    mean = vectors.mean(0)
+    if np.linalg.norm(mean) < 0.1:
+        return None
+    for _ in range(ROBUST_STEPS):
+        mean = weights @ vectors / weights.sum()
+        weights = 1.0 / np.maximum(np.linalg.norm(vectors - mean, axis=1), 1e-2)
+    return np.asarray(mean / np.linalg.norm(mean), np.float64)
+
+
+def least_turn(a: F64, b: F64) -> F64:
+    """The smallest rotation that takes unit vector a to unit vector b."""
+    v, c = np.cross(a, b), float(a @ b)
+    if c < -1 + 1e-9:  # opposite: half a turn about any axis across
+        across = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
+        across /= np.linalg.norm(across)
+        return np.asarray(2 * np.outer(across, across) - np.eye(3), np.float64)
+    skew = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + c), np.float64)
+
+
+def given_scale(radius: float, warnings: list[str]) -> tuple[float, bool]:
+    """(asset units per capture unit, metric). The unit under which the region of interest has a head's size."""
+    low, high = PLAUSIBLE_ROI
+    fitting = [u for u, factor in UNITS.items() if low <= radius * factor <= high]
+    if not fitting:
+        warnings.append(f"the cameras' unit is not known (the views see {radius:.4g} units around the subject); the "
+                        f"asset is scaled to a nominal {NOMINAL_ROI} m")  # fmt: skip
+        return NOMINAL_ROI / radius, False
+    unit = min(fitting, key=lambda u: abs(np.log(radius * UNITS[u] / NOMINAL_ROI)))
+    if unit != "metres":
+        warnings.append(f"the cameras' unit is taken as {unit} (the views see {radius:.4g} units around the subject)")
+    return UNITS[unit], True
+
+
+def _in_front(cameras: Sequence[Camera], centres: F64, axes: F64, centre: F64, warnings: list[str]) -> None:
+    """Most cameras must have the common point before them; the few that have not are named."""
+    behind = np.einsum("ni,ni->n", axes, centre - centres) <= 0
+    if behind.sum() > len(cameras) / 3:
+        raise StageError("the cameras look away from each other", where="poses", value=f"{int(behind.sum())} of "
+                         f"{len(cameras)} have the point where the views meet behind them", limit="at most a third",
+                         remedy="check that Rt is world-to-camera with OpenCV axes (x right, y down, z forward), not "
+                         "its inverse and not OpenGL axes")  # fmt: skip
+    for c, wrong in zip(cameras, behind, strict=True):
+        if wrong:
+            warnings.append(f"{c.name} looks away from the point where the views meet")
