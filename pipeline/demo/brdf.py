@@ -45,7 +45,7 @@ def cube_directions(cells: int) -> F64:
         out[face, ..., axis] = 1.0 - 2.0 * (face % 2)
         out[face, ..., first] = u
         out[face, ..., second] = v
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
+    return np.asarray(out / np.linalg.norm(out, axis=-1, keepdims=True))
 
 
 def cube_table(radiance: Callable[[F64], F64], cells: int) -> F32:

@@ -32,7 +32,7 @@ import OpenEXR
 import trimesh
 
 from pipeline.demo import head, light
-from pipeline.demo.mesh import Mesh, mesh_from_distance
+from pipeline.demo.mesh import Mesh, mesh_from_distance, simplified
 from pipeline.demo.render import Camera, Picture, Scene, render, scene_from_mesh
 from pipeline.demo.rig import rig_cameras
 
@@ -43,10 +43,11 @@ VERSION = 1
 """Raised whenever the same arguments give another capture."""
 
 MARKER = "demo.json"
-EXPOSURE = 0.5
+EXPOSURE = 0.52
 """Scale of the studio light: it sets the photos' brightness, as a camera's exposure would."""
 
 _ENV_HEIGHT = 128
+_TRUTH_FACES = 50_000
 _TRUTH_EVERY, _TRUTH_AT = 5, 2
 
 
@@ -89,7 +90,7 @@ def write_demo_capture(
     if is_complete(folder, request):
         return
     if folder.exists() and any(folder.iterdir()):
-        raise FileExistsError(f"{folder} exists and is not this demo capture; choose another folder or remove it")
+        raise FileExistsError(f"{folder} holds something else than this demo capture; choose another folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
     try:
@@ -130,7 +131,7 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     mesh = mesh_from_distance(
         head.signed_distance, head.distance_and_gradient, head.BOUNDS, request.mesh_step
     )
-    _write_mesh(folder / "truth" / "mesh_gt.ply", request.mesh_step)
+    _write_mesh(folder / "truth" / "mesh_gt.ply", mesh)
     coefficients = light.studio_coefficients(EXPOSURE)
     _write_light(folder / "truth", coefficients)
     scene = scene_from_mesh(mesh, coefficients, request.samples, request.seed, request.shadows)
@@ -194,11 +195,9 @@ def _write_light(truth: Path, coefficients: F64) -> None:
     _write_json(truth / "light.json", about)
 
 
-def _write_mesh(path: Path, mesh_step: float) -> None:
-    """The true surface, meshed at 2.2 mm or the traced mesh's step if that is coarser."""
-    mesh: Mesh = mesh_from_distance(
-        head.signed_distance, head.distance_and_gradient, head.BOUNDS, max(mesh_step, 0.0022)
-    )
+def _write_mesh(path: Path, traced: Mesh) -> None:
+    """The true surface in at most some 50 000 faces, its vertices on the zero level."""
+    mesh = simplified(traced, _TRUTH_FACES, head.distance_and_gradient)
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
 
 

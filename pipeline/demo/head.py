@@ -12,6 +12,7 @@ Paired parts are built once on the folded coordinate |x|, so that the head is ex
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -49,6 +50,10 @@ _NOSE = (6.0, -20.0, 94.0, 48.0)
 _EARS = (80.0, -20.0, -16.0, 46.0)
 _LID = (32.0, -2.0, 64.0)  # centre and radii of the closed lids
 _LID_RADII = (17.0, 14.0, 14.0)
+_HELIX = spline([(9, -2, 1), (12, 12, 0.5), (8, 26, 1.5), (-4, 30, 3), (-14.5, 20, 4), (-16, 4, 4),
+                 (-12, -12, 3), (-3, -24, 1)], 2)
+_ANTIHELIX = spline([(2, 22, 2), (-6, 14, 2.6), (-9, 2, 2.8), (-6, -11, 2.6), (1, -18, 2)], 2)
+_CHEEK_FOLD = spline([(17, -40, 96), (25, -54, 94), (32, -70, 84)], 6)
 _ARCH_AXIS = 56.0  # the arch of the teeth: z of its axis, and its radius
 _ARCH_RADIUS = 38.0
 _BLOCK = 4096  # points at a time: the temporaries then stay in the processor's cache
@@ -119,23 +124,23 @@ def _skull(middle: Frame, pair: Frame) -> Distance:
     s = smooth_union(s, ellipsoid(middle, (0, 40, 26), (61, 50, 61)), 30.0)
     s = smooth_union(s, ellipsoid(middle, (0, -14, 4), (65, 52, 66)), 30.0)
     s = smooth_union(s, ellipsoid(middle, (0, -42, 30), (52, 68, 56)), 30.0)
-    s = smooth_union(s, ellipsoid(_along(pair, (50, -19, 48), yaw=0.95), (0, 0, 0), (26, 11, 12)), 24.0)
-    s = smooth_union(s, _jaw(pair), 26.0)
-    s = smooth_union(s, ellipsoid(middle, (0, -99, 73), (20, 13, 16)), 18.0)
+    s = smooth_union(s, ellipsoid(_along(pair, (46, -20, 50), yaw=0.95), (0, 0, 0), (25, 12, 11)), 30.0)
+    s = smooth_union(s, ellipsoid(pair, (40, -52, 38), (20, 32, 28)), 26.0)
+    s = smooth_union(s, _jaw(pair), 30.0)
+    s = smooth_union(s, ellipsoid(middle, (0, -97, 73), (18, 14, 16)), 20.0)
     s = smooth_union(s, ellipsoid(middle, (0, -62, 63), (34, 29, 31)), 24.0)
-    brow = ellipsoid(_along(pair, (21, 19, 79), yaw=0.25, roll=0.14), (0, 0, 0), (19, 7, 9))
-    s = smooth_union(s, brow, 15.0)
+    brow = ellipsoid(_along(pair, (21, 19, 79), yaw=0.25, roll=0.14), (0, 0, 0), (19, 6.5, 8))
+    s = smooth_union(s, brow, 18.0)
     outer_brow = ellipsoid(_along(pair, (45, 17, 65), yaw=0.85, roll=-0.18), (0, 0, 0), (16, 7, 8))
-    s = smooth_union(s, outer_brow, 15.0)
-    # Temples and the hollow of the cheek are shallow bowls.
-    s = smooth_cut(s, ellipsoid(pair, (92, 24, 46), (22, 24, 24)), 22.0)
-    return smooth_cut(s, ellipsoid(pair, (76, -62, 70), (22, 24, 24)), 26.0)
+    s = smooth_union(s, outer_brow, 18.0)
+    # The temples are shallow bowls.
+    return smooth_cut(s, ellipsoid(pair, (92, 24, 46), (22, 24, 24)), 22.0)
 
 
 def _jaw(pair: Frame) -> Distance:
-    ramus = tube(pair, [(50, -25, 2), (47, -68, 12)], (12, 13))
-    body = tube(pair, [(47, -68, 12), (14, -101, 68)], (13, 12))
-    return smooth_union(ramus, body, 14.0)
+    ramus = tube(pair, [(49, -25, 4), (44, -66, 14)], (12, 13))
+    body = tube(pair, [(44, -66, 14), (12, -98, 66)], (13, 12.5))
+    return smooth_union(ramus, body, 16.0)
 
 
 def _along(frame: Frame, centre: tuple[float, float, float], yaw: float, roll: float = 0.0) -> Frame:
@@ -145,24 +150,32 @@ def _along(frame: Frame, centre: tuple[float, float, float], yaw: float, roll: f
 
 def _neck(middle: Frame, pair: Frame) -> Distance:
     """Neck with its two oblique muscles, the throat and a hint of the trapezius."""
-    n = tube(middle, [(0, -40, -30), (0, -230, -36)], (50, 58))
+    n = tube(middle, [(0, -40, -30), (0, -230, -36)], (50, 55))
     muscle = tube(pair, [(52, -50, -24), (12, -190, 32)], (9, 9))
     n = smooth_union(n, muscle, 24.0)
     throat = tube(middle, [(0, -90, 20), (0, -200, 14)], (12, 14))
     n = smooth_union(n, throat, 24.0)
-    slope = tube(pair, [(20, -60, -56), (70, -215, -56)], (14, 24))
-    return smooth_union(n, slope, 30.0)
+    slope = tube(pair, [(20, -60, -54), (58, -215, -50)], (14, 20))
+    n = smooth_union(n, slope, 30.0)
+    return smooth_union(n, ellipsoid(middle, (0, -132, 29), (8, 12, 8)), 16.0)
 
 
 def _eyes(head: Distance, middle: Frame, pair: Frame) -> Distance:
     """Sockets, and closed lids over the eyeballs with the lid line and the upper crease."""
     head = smooth_cut(head, ellipsoid(pair, (31, 1, 97), (20, 12, 18)), 17.0)
     head = smooth_cut(head, ellipsoid(pair, (15, 2, 93), (6, 9, 10)), 10.0)
-    head = smooth_union(head, ellipsoid(pair, _LID, _LID_RADII), 9.0)
-    lid_line = _on_lid([(17, -4), (23, -7.6), (31, -9.4), (39, -8.2), (47, -4)], 0.2)
-    head = smooth_cut(head, tube(pair, lid_line, (0.8,) * len(lid_line)), 2.2)
-    crease = _on_lid([(20, 2.5), (25, 5.0), (32, 6.0), (40, 4.6), (46, 0.5)], 0.6)
-    return smooth_cut(head, tube(pair, crease, (0.8,) * len(crease)), 3.4)
+    head = smooth_union(head, ellipsoid(pair, _LID, _LID_RADII), 13.0)
+    edge, crease = _lid_curves()
+    head = smooth_cut(head, tube(pair, edge, (0.7,) * len(edge)), 2.4)
+    return smooth_cut(head, tube(pair, crease, (0.7,) * len(crease)), 4.5)
+
+
+@cache
+def _lid_curves() -> tuple[list[list[float]], list[list[float]]]:
+    """The edge of the closed upper lid, and the crease above it."""
+    edge = [(x, float(lid_line(np.asarray(x))[0])) for x in (17.0, 24.5, 32.0, 39.5, 47.0)]
+    crease = [(20.0, 2.5), (25.0, 5.0), (32.0, 6.0), (40.0, 4.6), (46.0, 0.5)]
+    return _on_lid(edge, 1.3), _on_lid(crease, 1.6)
 
 
 def _on_lid(curve: list[tuple[float, float]], above: float) -> list[list[float]]:
@@ -178,9 +191,9 @@ def _nose(head: Distance, middle: Frame, pair: Frame) -> Distance:
     """Bridge, tip, wings, septum and nostrils."""
     head = smooth_union(head, tube(middle, [(0, 12, 76), (0, -32, 93)], (8, 13)), 12.0)
     head = smooth_union(head, tube(middle, [(0, 4, 85), (0, -34, 104)], (4.5, 6)), 12.0)
-    head = smooth_union(head, ellipsoid(middle, (0, -36.5, 105), (10.5, 8.5, 10)), 9.0)
-    wing = ellipsoid(turned(pair, (12, -40, 95), rotation(yaw=-0.35)), (0, 0, 0), (6.5, 7.5, 11))
-    head = smooth_union(head, wing, 6.0)
+    head = smooth_union(head, ellipsoid(middle, (0, -36.5, 105), (10, 8.2, 9.6)), 11.0)
+    wing = ellipsoid(turned(pair, (12, -40, 95), rotation(yaw=-0.35)), (0, 0, 0), (5.8, 7, 11))
+    head = smooth_union(head, wing, 7.0)
     head = smooth_union(head, tube(middle, [(0, -42, 105), (0, -47, 94)], (4.6, 4.8)), 6.0)
     nostril = ellipsoid(turned(pair, (7.0, -46.5, 99), rotation(yaw=-0.4)), (0, 0, 0), (3.0, 4.6, 6.2))
     return smooth_cut(head, nostril, 3.0)
@@ -193,16 +206,16 @@ def _mouth(head: Distance, middle: Frame, pair: Frame) -> Distance:
     """
     arch, arch_pair = (wrapped(f, _ARCH_AXIS, _ARCH_RADIUS) for f in (middle, pair))
     head = smooth_cut(head, ellipsoid(arch, (0, -85.5, 10), (20, 5, 11)), 10.0)
-    fold = tube(pair, spline([(17, -40, 96), (25, -54, 94), (32, -70, 84)], 6), (1.2,) * 13)
+    fold = tube(pair, _CHEEK_FOLD, (1.2,) * len(_CHEEK_FOLD))
     head = smooth_cut(head, fold, 8.0)
     head = smooth_cut(head, ellipsoid(arch, (0, -54, 4.6), (3.2, 9.5, 4.4)), 4.5)
     upper = arched(arch_pair, -0.004)
-    head = smooth_union(head, ellipsoid(upper, (8, -64.6, 0.0), (18, 4.6, 5.0)), 4.0)
-    head = smooth_union(head, ellipsoid(arch, (0, -66.2, 0.6), (7, 3.8, 5.0)), 4.0)
+    head = smooth_union(head, ellipsoid(upper, (8, -64.8, -1.8), (18.5, 4.4, 4.6)), 6.0)
+    head = smooth_union(head, ellipsoid(arch, (0, -66.2, -1.0), (7, 3.6, 4.8)), 5.0)
     lower = arched(arch, 0.003)
-    head = smooth_union(head, ellipsoid(lower, (0, -74.0, -0.8), (22, 5.6, 6.4)), 4.5)
+    head = smooth_union(head, ellipsoid(lower, (0, -73.6, -2.4), (22, 5.0, 6.0)), 6.5)
     line = arched(arch, -0.002)
-    head = smooth_cut(head, ellipsoid(line, (0, -69.2, 5.0), (27, 1.1, 5.0)), 3.2)
+    head = smooth_cut(head, ellipsoid(line, (0, -69.2, 5.0), (24.5, 1.0, 5.6)), 3.2)
     return smooth_cut(head, ellipsoid(arch_pair, (28, -71, 2.0), (3, 3, 3)), 5.0)
 
 
@@ -211,23 +224,20 @@ def _ears(head: Distance, middle: Frame, pair: Frame) -> Distance:
 
     Ear frame: +x towards the face, +y up, +z away from the head.
     """
-    to_ear = rotation(pitch=0.0, roll=-0.22) @ _ear_axes(flare=0.42)
-    ear = turned(pair, (77, -20, -16), to_ear)
+    to_ear = rotation(pitch=0.0, roll=-0.22) @ _ear_axes(flare=0.38)
+    ear = turned(pair, (74, -20, -14), to_ear)
     plate = ellipsoid(ear, (0, 0, 0), (16, 29, 3.6))
-    rim = spline([(9, -2, 1), (12, 12, 0.5), (8, 26, 1.5), (-4, 30, 3), (-14.5, 20, 4), (-16, 4, 4),
-                  (-12, -12, 3), (-3, -24, 1)], 2)
-    plate = smooth_union(plate, tube(ear, rim, (2.2,) + (2.7,) * 12 + (3.0, 3.4)), 3.0)
+    plate = smooth_union(plate, tube(ear, _HELIX, (2.2, *(2.7,) * 12, 3.0, 3.4)), 3.0)
     plate = smooth_union(plate, ellipsoid(ear, (1, -27, 0.5), (7.5, 8.5, 3.6)), 4.0)
     plate = smooth_cut(plate, ellipsoid(ear, (-1, 1, 6.5), (11.5, 23, 5.5)), 3.0)
     plate = smooth_cut(plate, ellipsoid(ear, (3, -6, 4), (8, 10.5, 6.5)), 3.0)
-    inner = spline([(2, 22, 2), (-6, 14, 2.6), (-9, 2, 2.8), (-6, -11, 2.6), (1, -18, 2)], 2)
-    plate = smooth_union(plate, tube(ear, inner, (1.4,) + (2.0,) * 7 + (1.8,)), 3.0)
+    plate = smooth_union(plate, tube(ear, _ANTIHELIX, (1.4, *(2.0,) * 7, 1.8)), 3.0)
     plate = smooth_union(plate, ellipsoid(ear, (10.5, -7, 2.0), (3.4, 5.5, 3.4)), 3.0)
     return smooth_union(head, plate, 6.0)
 
 
 def _ear_axes(flare: float) -> F64:
-    """Rotation (3, 3) to the ear frame from the folded frame: x from +Z, y from +Y, z from +X, flared back."""
+    """Orthogonal (3, 3) to the ear frame from the folded frame: x from +Z, y from +Y, z from +X, flared."""
     axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     # The plate turns about the vertical so that its rear edge stands away from the skull.
     c, s = np.cos(flare), np.sin(flare)
@@ -247,9 +257,9 @@ def mouth_coordinates(points: F64) -> tuple[F64, F64, F64]:
 def lip_borders(along: F64) -> tuple[F64, F64]:
     """Heights of the upper and the lower border of the lips' red at arc length `along`, millimetres."""
     x = np.abs(along)
-    bow = 1.0 * np.exp(-((x / 3.0) ** 2))
-    upper = -64.6 + 4.6 * np.sqrt(np.maximum(1.0 - ((x - 8.0) / 19.0) ** 2, 0.0)) - 0.004 * x * x - bow
-    lower = -74.0 - 5.6 * np.sqrt(np.maximum(1.0 - (x / 26.0) ** 2, 0.0)) + 0.003 * x * x
+    bow = 1.1 * np.exp(-((x / 3.0) ** 2))
+    upper = -66.0 + 4.6 * np.sqrt(np.maximum(1.0 - ((x - 6.0) / 22.0) ** 2, 0.0)) - 0.004 * x * x - bow
+    lower = -72.5 - 5.2 * np.sqrt(np.maximum(1.0 - (x / 27.0) ** 2, 0.0)) + 0.003 * x * x
     return upper, lower
 
 

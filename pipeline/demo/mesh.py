@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import fast_simplification
 import numpy as np
 import numpy.typing as npt
 from skimage.measure import marching_cubes
@@ -46,9 +47,22 @@ def mesh_from_distance(
     volume, known = _spread(coarse, near)
     holes = np.argwhere(known)
     volume[tuple(holes.T)] = distance(bounds[0] + holes * step)
-    vertices, faces, _, _ = marching_cubes(volume, 0.0, spacing=(step, step, step), mask=known)
+    vertices, faces, _, _ = marching_cubes(  # type: ignore[no-untyped-call]
+        volume, 0.0, spacing=(step, step, step), mask=known
+    )
     points = _project(np.asarray(vertices, dtype=np.float64) + bounds[0], distance_and_gradient, step)
     return Mesh(points, _outward(points, np.asarray(faces, dtype=np.int64)))
+
+
+def simplified(
+    mesh: Mesh, faces: int, distance_and_gradient: Callable[[F64], tuple[F64, F64]], step: float = 1e-3
+) -> Mesh:
+    """At most about `faces` faces by quadric collapse, vertices then projected by up to `step` metres each."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    points, triangles = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=faces)
+    vertices = _project(np.asarray(points, dtype=np.float64), distance_and_gradient, step)
+    return Mesh(vertices, _outward(vertices, np.asarray(triangles, dtype=np.int64)))
 
 
 def _grid(origin: F64, step: float, shape: tuple[int, ...]) -> F64:

@@ -19,7 +19,13 @@ FIELD = 0.325
 """Height of the world that a picture shows at the target's distance, metres."""
 
 # Elevation in degrees, share of the views, and half the range of azimuths in degrees.
-_ROWS = ((-24.0, 0.18, 100.0), (-5.0, 0.25, 108.0), (13.0, 0.25, 108.0), (32.0, 0.17, 100.0), (54.0, 0.08, 75.0))
+_ROWS = (
+    (-24.0, 0.18, 100.0),
+    (-5.0, 0.25, 108.0),
+    (13.0, 0.25, 108.0),
+    (32.0, 0.17, 100.0),
+    (54.0, 0.08, 75.0),
+)
 _BACK = (150.0, -145.0, 179.0)  # azimuths, repeated, of the views that are left over
 
 
@@ -43,7 +49,6 @@ def _angles(views: int) -> list[tuple[float, float]]:
         counts[int(np.argmax(counts))] -= 1
     out: list[tuple[float, float]] = []
     for (elevation, _, reach), count in zip(_ROWS, counts, strict=True):
-        # Neighbouring rows are staggered by half a step, so that no two views stand in one column.
         steps = np.linspace(-reach, reach, count) if count > 1 else np.zeros(count)
         out += [(float(a), elevation) for a in steps]
     left = views - len(out)

@@ -12,16 +12,20 @@ sculpture is differentiated in one pass (forward mode) without finite difference
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.demo.compiled import compiled
+
 F64 = npt.NDArray[np.float64]
 Vector = Sequence[float]
 
 _TINY = 1e-12
+_NOTHING: F64 = np.empty((3, 0))  # stands for a gradient that was not asked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,18 +135,8 @@ def ellipsoid(frame: Frame, centre: Vector, radii: Vector) -> Distance:
 
     d = k0 (k0 - 1) / k1   with k0 = |p / r|, k1 = |p / r^2|
     """
-    p = frame.points - _column(centre)
-    r2 = _column(radii) ** 2
-    s = p / r2
-    # The centre itself has no direction; the tiny term keeps it finite (d there is about -min(r)).
-    k0 = np.sqrt(np.einsum("in,in->n", p, s) + _TINY)
-    k1 = np.sqrt(np.einsum("in,in->n", s, s) + _TINY)
-    value = k0 * (k0 - 1.0) / k1
-
-    def gradient() -> F64:
-        return np.asarray(s * ((2.0 - 1.0 / k0) / k1) - (s / r2) * (value / k1**2))
-
-    return frame.distance(value, gradient)
+    value, gradient = _ellipsoid(frame.points, _vector(centre), _vector(radii), frame.pull is not None)
+    return frame.distance(value, lambda: gradient)
 
 
 def tube(frame: Frame, knots: Sequence[Vector], radii: Vector) -> Distance:
@@ -151,21 +145,8 @@ def tube(frame: Frame, knots: Sequence[Vector], radii: Vector) -> Distance:
     d = min over pieces of |p - c(t)| - r(t), c(t) the nearest point of the piece.
     """
     ends = np.asarray(knots, dtype=np.float64)
-    best: F64 | None = None
-    grad: F64 | None = None
-    for a, b, ra, rb in zip(ends[:-1], ends[1:], radii[:-1], radii[1:], strict=True):
-        value, g = _piece(frame, a, b, float(ra), float(rb))
-        if best is None:
-            best, grad = value, g
-            continue
-        nearer = value < best
-        best = np.where(nearer, value, best)
-        if grad is not None and g is not None:
-            grad = np.where(nearer, g, grad)
-    assert best is not None, "a tube needs two knots"
-    if frame.pull is None or grad is None:
-        return Distance(best, None)
-    return Distance(best, frame.pull(grad))
+    value, gradient = _tube(frame.points, ends, _vector(radii), frame.pull is not None)
+    return frame.distance(value, lambda: gradient)
 
 
 def half_space(frame: Frame, normal: Vector, offset: float) -> Distance:
@@ -177,15 +158,10 @@ def half_space(frame: Frame, normal: Vector, offset: float) -> Distance:
 
 def smooth_union(a: Distance, b: Distance, k: float) -> Distance:
     """Cubic smooth minimum, C2: min(a, b) - k h^3 / 6 with h = max(1 - |a - b| / k, 0)."""
-    gap = a.value - b.value
-    h = np.maximum(1.0 - np.abs(gap) / k, 0.0)
-    value = np.minimum(a.value, b.value) - (k / 6.0) * h**3
     if a.gradient is None or b.gradient is None:
+        value, _ = _union(a.value, _NOTHING, b.value, _NOTHING, k)
         return Distance(value, None)
-    # d/da of the correction is half h^2 for the farther operand and takes as much from the nearer one.
-    share = 0.5 * h * h
-    of_a = np.where(gap > 0.0, share, 1.0 - share)
-    return Distance(value, b.gradient + of_a * (a.gradient - b.gradient))
+    return Distance(*_union(a.value, a.gradient, b.value, b.gradient, k))
 
 
 def smooth_cut(a: Distance, b: Distance, k: float) -> Distance:
@@ -217,21 +193,71 @@ def _catmull_rom(four: F64, t: float) -> F64:
     )
 
 
-def _piece(frame: Frame, a: F64, b: F64, ra: float, rb: float) -> tuple[F64, F64 | None]:
-    axis = b - a
-    length2 = float(axis @ axis)
-    p = frame.points - a[:, None]
-    raw = (axis @ p) / length2
-    t = np.clip(raw, 0.0, 1.0)
-    away = p - axis[:, None] * t
-    dist = np.sqrt(np.einsum("in,in->n", away, away) + _TINY)
-    value = dist - (ra + t * (rb - ra))
-    if frame.pull is None:
-        return value, None
-    # The nearest point minimises dist, so only the radius feels a change of t.
-    slope = np.where(raw == t, (rb - ra) / length2, 0.0)
-    return value, np.asarray(away / dist - axis[:, None] * slope)
+def _vector(v: Vector) -> F64:
+    return np.asarray(v, dtype=np.float64)
 
 
 def _column(v: Vector) -> F64:
-    return np.asarray(v, dtype=np.float64)[:, None]
+    return _vector(v)[:, None]
+
+
+@compiled
+def _ellipsoid(p: F64, centre: F64, radii: F64, with_gradient: bool) -> tuple[F64, F64]:
+    count = p.shape[1]
+    value, gradient = np.empty(count), np.empty((3, count if with_gradient else 0))
+    a, b, c = radii[0] ** 2, radii[1] ** 2, radii[2] ** 2
+    for n in range(count):
+        x, y, z = p[0, n] - centre[0], p[1, n] - centre[1], p[2, n] - centre[2]
+        sx, sy, sz = x / a, y / b, z / c
+        # The centre itself has no direction; the tiny term keeps it finite (d there is about -min(r)).
+        k0 = math.sqrt(x * sx + y * sy + z * sz + _TINY)
+        k1 = math.sqrt(sx * sx + sy * sy + sz * sz + _TINY)
+        d = k0 * (k0 - 1.0) / k1
+        value[n] = d
+        if with_gradient:
+            rise, fall = (2.0 - 1.0 / k0) / k1, d / (k1 * k1)
+            gradient[0, n] = sx * (rise - fall / a)
+            gradient[1, n] = sy * (rise - fall / b)
+            gradient[2, n] = sz * (rise - fall / c)
+    return value, gradient
+
+
+@compiled
+def _tube(p: F64, knots: F64, radii: F64, with_gradient: bool) -> tuple[F64, F64]:
+    count = p.shape[1]
+    value, gradient = np.full(count, np.inf), np.empty((3, count if with_gradient else 0))
+    for i in range(knots.shape[0] - 1):
+        ax, ay, az = knots[i + 1] - knots[i]
+        length2, widen = ax * ax + ay * ay + az * az, radii[i + 1] - radii[i]
+        for n in range(count):
+            x, y, z = p[0, n] - knots[i, 0], p[1, n] - knots[i, 1], p[2, n] - knots[i, 2]
+            raw = (ax * x + ay * y + az * z) / length2
+            t = min(max(raw, 0.0), 1.0)
+            x, y, z = x - t * ax, y - t * ay, z - t * az
+            dist = math.sqrt(x * x + y * y + z * z + _TINY)
+            d = dist - (radii[i] + t * widen)
+            if d < value[n]:
+                value[n] = d
+                if with_gradient:
+                    # The nearest point minimises dist, so only the radius feels a change of t.
+                    slope = widen / length2 if raw == t else 0.0
+                    gradient[0, n] = x / dist - ax * slope
+                    gradient[1, n] = y / dist - ay * slope
+                    gradient[2, n] = z / dist - az * slope
+    return value, gradient
+
+
+@compiled
+def _union(a: F64, grad_a: F64, b: F64, grad_b: F64, k: float) -> tuple[F64, F64]:
+    count = a.shape[0]
+    value, gradient = np.empty(count), np.empty(grad_a.shape)
+    for n in range(count):
+        gap = a[n] - b[n]
+        h = max(1.0 - abs(gap) / k, 0.0)
+        value[n] = min(a[n], b[n]) - (k / 6.0) * h * h * h
+        if grad_a.shape[1] > 0:
+            # d/da of the correction is half h^2 for the farther operand, and the nearer one gives as much.
+            of_a = 0.5 * h * h if gap > 0.0 else 1.0 - 0.5 * h * h
+            for i in range(3):
+                gradient[i, n] = grad_b[i, n] + of_a * (grad_a[i, n] - grad_b[i, n])
+    return value, gradient

@@ -14,6 +14,7 @@ close crop. Everything is a fixed function of the position and of the seed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,12 @@ BASE = np.array([0.60, 0.405, 0.315])  # linear RGB of bloodless, unpigmented sk
 BLOOD = np.array([0.10, 0.62, 0.56])  # absorbance at full blood
 MELANIN = np.array([0.42, 0.68, 0.95])  # absorbance at full pigment
 HAIR = np.array([0.055, 0.036, 0.026])
+
+# Height of the hairline over z, millimetres: nape, behind the ear, sideburn, temple, forehead.
+_HAIRLINE = (
+    (-110.0, -60.0, -34.0, -10.0, 4.0, 14.0, 26.0, 38.0, 48.0, 66.0, 90.0),
+    (-62.0, -60.0, -48.0, -30.0, -26.0, -6.0, 14.0, 34.0, 54.0, 65.0, 66.0),
+)
 
 F0_RANGE = (0.02, 0.06)
 ROUGHNESS_RANGE = (0.30, 0.55)
@@ -47,7 +54,8 @@ def material(points: F64, seed: int = 0) -> Material:
     p = points * 1000.0
     side = np.abs(p[:, 0])
     lips, brow, lash, crop = _lips(points), _brows(p, side, seed), _lashes(p, side), _crop(p, side, seed)
-    blood = _blood(p, side) + 1.15 * lips + 0.16 * _noise(p, 22.0, 2, seed + 1) + 0.10 * _noise(p, 3.0, 2, seed + 2)
+    flush = 0.16 * _noise(p, 22.0, 2, seed + 1) + 0.10 * _noise(p, 3.0, 2, seed + 2)
+    blood = _blood(p, side) + 0.95 * lips + flush
     melanin = 0.10 + 0.14 * _noise(p, 9.0, 3, seed + 3) + 0.75 * _freckles(p, side, seed) * (1.0 - lips)
     # Pores are small dark dots; their relief is too fine for the pictures and is left to the colour.
     pores = 0.10 * _noise(p, 0.9, 2, seed + 4) + 0.05 * _noise(p, 2.0, 1, seed + 5)
@@ -73,9 +81,10 @@ def _gloss(p: F64, side: F64, lips: F64, hair: F64, seed: int) -> tuple[F64, F64
 
 def _blood(p: F64, side: F64) -> F64:
     """How much blood shows: cheeks, nose, ears, lids and chin."""
-    blood = 0.42 * _spot(p, side, (44, -30, 62), (20, 17, 34)) + 0.40 * _spot(p, side, (0, -38, 108), (17, 12, 18))
-    blood += 0.42 * _spot(p, side, (84, -20, -18), (15, 34, 26)) + 0.16 * _spot(p, side, (0, -100, 88), (20, 12, 20))
-    return np.asarray(blood + 0.22 * _spot(p, side, (32, -4, 76), (18, 10, 14)) + 0.05)
+    cheek, nose = _spot(p, side, (44, -30, 62), (20, 17, 34)), _spot(p, side, (0, -38, 108), (17, 12, 18))
+    ear, chin = _spot(p, side, (84, -20, -18), (15, 34, 26)), _spot(p, side, (0, -100, 88), (20, 12, 20))
+    lid = _spot(p, side, (32, -4, 76), (18, 10, 14))
+    return np.asarray(0.05 + 0.42 * cheek + 0.40 * nose + 0.42 * ear + 0.16 * chin + 0.22 * lid)
 
 
 def _lips(points: F64) -> F64:
@@ -94,7 +103,8 @@ def _brows(p: F64, side: F64, seed: int) -> F64:
     inside = _step(width - np.abs(p[:, 1] - middle), -1.6, 1.2)
     inside = inside * _step(along, -0.06, 0.10) * _step(1.0 - along, 0.0, 0.15) * _step(p[:, 2], 30.0, 40.0)
     # Strands are noise stretched along the comb's direction.
-    combed = np.stack([p[:, 0] * 0.35 + p[:, 1] * 0.25 * np.sign(p[:, 0]), p[:, 1] - 0.25 * side, p[:, 2] * 0.3])
+    lean = p[:, 0] * 0.35 + p[:, 1] * 0.25 * np.sign(p[:, 0])
+    combed = np.stack([lean, p[:, 1] - 0.25 * side, p[:, 2] * 0.3])
     strands = 0.72 + 0.4 * _noise(np.ascontiguousarray(combed.T), 0.9, 2, seed + 9)
     return np.asarray(0.88 * inside * np.clip(strands, 0.0, 1.0))
 
@@ -109,13 +119,10 @@ def _lashes(p: F64, side: F64) -> F64:
 def _crop(p: F64, side: F64, seed: int) -> F64:
     """Closely cropped hair above a ragged hairline."""
     ragged = 2.5 * _noise(p, 6.0, 2, seed + 10)
-    front = 67.0 - 0.0035 * side**2
-    # Behind the temples the hairline drops in front of the ear, and runs low round the nape.
-    drop = _step(34.0 - p[:, 2], 0.0, 16.0) * 62.0 + _step(-22.0 - p[:, 2], 0.0, 18.0) * 62.0
-    above = p[:, 1] - (front - drop) + ragged
-    not_ear = 1.0 - _spot(p, side, (84, -20, -16), (14, 36, 30)) * _step(side, 70.0, 73.0)
+    above = p[:, 1] - np.interp(p[:, 2], _HAIRLINE[0], _HAIRLINE[1]) + ragged
+    not_ear = 1.0 - _step(side, 72.5, 75.5) * _step(20.0 - p[:, 1], 0.0, 5.0)
     grain = 0.72 + 0.30 * _noise(p, 0.8, 2, seed + 11) + 0.10 * _noise(p, 5.0, 1, seed + 12)
-    return np.asarray(0.78 * _step(above, -3.0, 6.0) * np.clip(not_ear, 0.0, 1.0) * np.clip(grain, 0.0, 1.0))
+    return np.asarray(0.80 * _step(above, -4.0, 9.0) * np.clip(not_ear, 0.0, 1.0) * np.clip(grain, 0.0, 1.0))
 
 
 def _beard(p: F64, side: F64) -> F64:
@@ -128,13 +135,17 @@ def _beard(p: F64, side: F64) -> F64:
 
 def _freckles(p: F64, side: F64, seed: int) -> F64:
     """Coverage of freckles, thickest across nose and cheeks."""
-    where = _spot(p, side, (30, -20, 80), (30, 16, 30)) + 0.8 * _spot(p, side, (0, -14, 96), (14, 16, 20)) + 0.12
-    return np.asarray(np.clip(where, 0.0, 1.0) * _step(_noise(p, 2.6, 1, seed + 13), 0.42, 0.62))
+    where = _spot(p, side, (30, -20, 80), (30, 16, 30)) + 0.8 * _spot(p, side, (0, -14, 96), (14, 16, 20))
+    cover = np.zeros(len(p))
+    freckled = np.flatnonzero(where > 0.05)
+    cover[freckled] = _speckles(p[freckled] / 4.0, seed + 13) * np.clip(where[freckled], 0.0, 1.0)
+    return cover
 
 
 def _spot(p: F64, side: F64, centre: tuple[float, float, float], widths: tuple[float, float, float]) -> F64:
     """Gaussian spot, one on each side of the face; millimetres."""
-    x, y, z = (side - centre[0]) / widths[0], (p[:, 1] - centre[1]) / widths[1], (p[:, 2] - centre[2]) / widths[2]
+    x, y = (side - centre[0]) / widths[0], (p[:, 1] - centre[1]) / widths[1]
+    z = (p[:, 2] - centre[2]) / widths[2]
     return np.asarray(np.exp(-(x * x + y * y + z * z)))
 
 
@@ -176,4 +187,24 @@ def _value_noise(p: F64, octaves: int, seed: int) -> F64:
                 total += share * _lattice(i + a, j + b, k + c, seed + 101 * octave)
             out[n] += weight * total
             scale, weight = scale * 2.0, weight * 0.5
+    return out
+
+
+@compiled
+def _speckles(p: F64, seed: int) -> F64:
+    """Coverage (N,) by round spots, one of random place, size and strength in each unit cell; `p` (N, 3)."""
+    out = np.zeros(p.shape[0])
+    for n in range(p.shape[0]):
+        i, j, k = int(np.floor(p[n, 0])), int(np.floor(p[n, 1])), int(np.floor(p[n, 2]))
+        for cell in range(27):
+            a, b, c = i + cell % 3 - 1, j + (cell // 3) % 3 - 1, k + cell // 9 - 1
+            strength = _lattice(a, b, c, seed)
+            if strength < 0.1:  # most cells stay empty
+                continue
+            dx = p[n, 0] - a - 0.5 - 0.45 * _lattice(a, b, c, seed + 1)
+            dy = p[n, 1] - b - 0.5 - 0.45 * _lattice(a, b, c, seed + 2)
+            dz = p[n, 2] - c - 0.5 - 0.45 * _lattice(a, b, c, seed + 3)
+            radius = 0.24 + 0.12 * _lattice(a, b, c, seed + 4)
+            t = min(max(1.6 - math.sqrt(dx * dx + dy * dy + dz * dz) / radius, 0.0), 1.0)
+            out[n] = max(out[n], (0.35 + 0.65 * strength) * t * t * (3.0 - 2.0 * t))
     return out
