@@ -41,6 +41,7 @@ class FaceSpec:
     light_start: float = 1.0
     attenuation: str = "exponential"
     basis_inputs: str = "cosine"
+    density: str = "crossing"
     specular: bool = True
     calibrated: bool = False
     levels: int = 10

@@ -33,6 +33,10 @@ class GridSdf(nn.Module):
 
     def _set(self, values: Tensor) -> None:
         self.values = nn.Parameter(values.contiguous())
+        self._clear()
+
+    def _clear(self) -> None:
+        values = self.values.detach()
         self.sink = torch.zeros_like(values)
         self.m = torch.zeros_like(values)
         self.v = torch.zeros_like(values)
@@ -70,6 +74,8 @@ class GridSdf(nn.Module):
             inner = torch.zeros_like(self.values, dtype=torch.bool)
             inner[1:-1, 1:-1, 1:-1] = True
             near = (self.values.abs() < BAND * self.cell) & inner
+            idle = ~near  # what leaves the band forgets its momentum, so that a checkpoint of the band is all there is
+            self.m[idle], self.v[idle] = 0, 0
             self.active = torch.nonzero(near.view(-1)).squeeze(-1)
 
     def step(self, lr: float) -> None:
@@ -100,6 +106,15 @@ class GridSdf(nn.Module):
         self._set(finer)
 
     # ---------------------------------------------------------------- checkpoints
+    def to_device(self, device: str) -> None:
+        """Move the optimiser's state after the module."""
+        self.sink, self.m, self.v = (x.to(device) for x in (self.sink, self.m, self.v))
+        self.active = self.active.to(device)
+
+    def restore(self, values: Tensor) -> None:
+        """Take a grid of another size (from a checkpoint); the optimiser's state starts empty."""
+        self._set(values)
+
     def optimiser_state(self) -> dict[str, Tensor | int]:
         """State of the band's optimiser, as far as it can move."""
         return {"active": self.active, "m": self.m.view(-1)[self.active], "v": self.v.view(-1)[self.active],

@@ -1,0 +1,215 @@
+"""The fit itself: start, coarse to fine, checkpoints. Arrays in, a FaceModel out; needs torch, numpy, scipy and OpenCV.
+
+A fit repeats bit by bit for one seed on one machine: every random draw comes from a generator seeded by (seed, step),
+and a checkpoint holds everything else, so that an interrupted fit goes on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline.errors import Cancelled, StageError
+from pipeline.fields.face import FaceModel, FaceSpec
+from stages.inverse_rendering.objective import objective
+from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.views import PhotoView, PixelTable
+
+OUTSIDE_SHARE = 0.25
+LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
+BAND_EVERY = 250
+CHECKPOINT_SECONDS = 20.0
+SMOOTHING = 0.98  # of the running loss and error that are shown
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the geometry begins: SDF samples (X, Y, Z) at lo + i cell, asset units."""
+
+    values: npt.NDArray[np.float32]
+    lo: npt.NDArray[np.float32]
+    cell: float
+
+
+@dataclass(frozen=True, slots=True)
+class Hooks:
+    """How the fit talks to whoever runs it."""
+
+    progress: Callable[..., None]
+    cancelled: Callable[[], bool]
+    checkpoint: Path | None = None
+
+
+@dataclass(slots=True)
+class Trainer:
+    """The state of a fit under way."""
+
+    views: list[PhotoView]
+    settings: FitSettings
+    device: str
+    model: FaceModel
+    step: int = 0
+    level: int = 0
+    loss: float = float("nan")
+    error: float = float("nan")
+    table: PixelTable | None = None
+    optimiser: torch.optim.Optimizer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.optimiser = make_optimiser(self.model, self.settings, self.device)
+
+    @property
+    def psnr(self) -> float:
+        """Running PSNR over whole subject pixels of the fitted views."""
+        return -10 * math.log10(max(self.error, 1e-10)) if math.isfinite(self.error) else float("nan")
+
+    # ---------------------------------------------------------------- schedule
+    def share(self) -> float:
+        """How far the fit is, in [0, 1)."""
+        return self.step / self.settings.steps
+
+    def enter_level(self) -> None:
+        """Refine the grid and take larger photos when their time has come."""
+        starts = LEVEL_STARTS[self.settings.levels]
+        due = sum(self.share() >= s for s in starts) - 1
+        while self.level < due:
+            self.model.geometry.refine()
+            self.level += 1
+            self.table = None
+        if self.table is None:
+            side = self.settings.image_side
+            side = max(side // 2 ** (len(starts) - 1 - self.level), min(side, 256))
+            self.table = PixelTable(self.views, side, self.device)
+
+    def set_rates(self) -> float:
+        """Learning rates and beta of this step; returns the SDF's rate in asset units.
+
+        Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
+        learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
+        """
+        s, p = self.settings, self.share()
+        decay = 0.1 ** max((p - 0.3) / 0.7, 0.0)
+        warm = min((self.step + 1) / 50, 1.0)
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["start"] * decay * warm
+        finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
+        start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
+        self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
+        return s.lr_sdf * self.model.geometry.cell * decay * warm
+
+    # ---------------------------------------------------------------- one step
+    def advance(self) -> None:
+        """Draw, evaluate, move."""
+        self.enter_level()
+        assert self.table is not None
+        rate = self.set_rates()
+        seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
+        batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
+        generator = torch.Generator().manual_seed(seed + 1)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, error = objective(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+        loss.backward()
+        self.optimiser.step()
+        self.model.geometry.step(rate)
+        self.step += 1
+        if self.step % BAND_EVERY == 0:
+            self.model.geometry.find_band()
+        self._note(float(loss.detach()), error)
+
+    def _note(self, loss: float, error: float) -> None:
+        if not math.isfinite(loss):
+            raise StageError("the fit diverged", where=f"inverse_rendering, step {self.step}", value=f"loss {loss}",
+                             limit="a finite loss", remedy="lower --set inverse_rendering.lr_sdf or lr_appearance by "
+                             "half, and check cameras and masks in the report of the stages before")
+        self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
+        if math.isfinite(error):
+            known = math.isfinite(self.error)
+            self.error = SMOOTHING * self.error + (1 - SMOOTHING) * error if known else error
+
+    # ---------------------------------------------------------------- checkpoints
+    def save(self, path: Path) -> None:
+        """Write everything that the rest of the fit depends on; the old file stays until the new one is whole."""
+        g = self.model.geometry
+        torch.save({"settings": repr(self.settings), "step": self.step, "level": self.level, "loss": self.loss,
+                    "error": self.error, "cell": g.cell, "model": self.model.state_dict(),
+                    "band": g.optimiser_state(), "optimiser": self.optimiser.state_dict()}, path.with_suffix(".new"))
+        path.with_suffix(".new").rename(path)
+
+    def load(self, path: Path) -> bool:
+        """Go on from a checkpoint. False if there is none that can be read, or it is of other settings."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception:  # noqa: BLE001  a torn or foreign file: begin anew
+            return False
+        if state["settings"] != repr(self.settings):
+            return False
+        values = state["model"]["geometry.values"]
+        g = self.model.geometry
+        g.cell = float(state["cell"])
+        g.restore(values.to(self.device))
+        self.model.load_state_dict(state["model"])
+        g.load_optimiser_state(state["band"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
+        return True
+
+
+def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torch.optim.Optimizer:
+    """Adam over everything but the SDF, which has its own in the band. The table has no momentum to spare: eps is
+    small, because most of its entries see a gradient only now and then."""
+    groups = [
+        {"params": [model.spatial.encoding.table], "start": settings.lr_appearance},
+        {"params": [*model.spatial.net.parameters(), *model.basis.parameters()],
+         "start": 0.3 * settings.lr_appearance},
+        {"params": [model.light.coefficients], "start": settings.lr_light},
+        {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
+    ]
+    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+
+def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> Trainer:
+    """A fit that has not begun: geometry from the hull, an even white light, grey skin."""
+    torch.manual_seed(settings.seed)
+    coarse_table = PixelTable(views, 256, device)
+    lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
+    spec = FaceSpec(
+        lo=tuple(map(float, lo)), hi=tuple(map(float, hi)), views=len(views), rank=settings.rank,
+        light_order=settings.light_order, light_start=coarse_table.mean_colour() / 0.4,
+        attenuation=settings.attenuation, basis_inputs=settings.basis_inputs, density=settings.density,
+        specular=settings.specular,
+        calibrated=calibrated, levels=settings.hash_levels, log2_size=settings.hash_log2_size,
+        coarse=float((hi - lo).max()) / 16, fine=settings.hash_fine, width=settings.width,
+    )
+    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(lo.astype(np.float32)), start.cell)
+    model.to(device)
+    model.geometry.to_device(device)
+    return Trainer(views, settings, device, model)
+
+
+def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
+    """Train to the last step, or raise Cancelled after writing a checkpoint."""
+    if hooks.checkpoint is not None and hooks.checkpoint.is_file():
+        trainer.load(hooks.checkpoint)
+    saved = shown = time.monotonic()
+    while trainer.step < trainer.settings.steps:
+        trainer.advance()
+        now = time.monotonic()
+        if hooks.cancelled():
+            if hooks.checkpoint is not None:
+                trainer.save(hooks.checkpoint)
+            raise Cancelled("stopped by the user; the fit goes on from its checkpoint next time")
+        if now - shown > 0.5:
+            hooks.progress(trainer.step, trainer.settings.steps, "fitting", loss=trainer.loss, psnr=trainer.psnr)
+            shown = now
+        if hooks.checkpoint is not None and now - saved > CHECKPOINT_SECONDS:
+            trainer.save(hooks.checkpoint)
+            saved = time.monotonic()
+    trainer.model.geometry.redistance()
+    return trainer.model

@@ -1,0 +1,49 @@
+"""The compound objective: the one place where terms are weighed and summed. [NeuFace eq. 20]"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pipeline.colour import srgb_from_linear
+from pipeline.fields.face import FaceModel
+from pipeline.maths import density, losses
+from pipeline.maths.sdf import unit
+from stages.inverse_rendering.render import sample_shell, shade_shell
+from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.views import WHOLE, Batch
+
+
+def objective(
+    model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator, smooth_scale: float
+) -> tuple[Tensor, float]:
+    """Loss of a batch, and its mean squared error over whole subject pixels as people see it (sRGB)."""
+    device = batch.alpha.device
+    jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)
+    shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
+    alpha = batch.alpha[shell.kept]
+    n_rays = len(batch.alpha)
+    loss = settings.mask * density.opacity_cross_entropy(shell.tau, alpha).clamp(max=20).sum() / n_rays
+    loss = loss + settings.eikonal * losses.eikonal(shell.gradient).mean()
+    pick = torch.nonzero(shell.hit & (alpha > WHOLE)).squeeze(-1)
+    if not len(pick):
+        return loss, float("nan")
+    shaded = shade_shell(model, shell, batch.rays, pick)
+    colour, target = shaded.total, batch.target[shell.kept[pick]]
+    if model.spec.calibrated:
+        colour = torch.einsum("nij,nj->ni", model.calibration()[batch.view[shell.kept[pick]]], colour)
+    loss = loss + settings.rgb * losses.rgb_l1(colour, target).sum() / n_rays
+    loss = loss + settings.white * losses.white_light(model.light()).sum()
+    loss = loss + settings.specular_energy * losses.specular_energy(shaded.specular).mean()
+    loss = loss + settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator)
+    with torch.no_grad():
+        error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
+    return loss, error
+
+
+def _smoothness(model: FaceModel, x: Tensor, generator: torch.Generator) -> Tensor:
+    """Mean normal change over a jitter of one cell."""
+    step = torch.randn(x.shape, generator=generator).to(x) * model.geometry.cell
+    _, g = model.geometry(torch.cat([x, x + step]))
+    n, near = unit(g).chunk(2)
+    return losses.normal_consistency(n, near).mean()

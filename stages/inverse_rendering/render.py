@@ -1,0 +1,98 @@
+"""Rendering a batch of rays with the model: trace, sample a thin shell, weigh, shade. [NeuFace section 4.4]
+
+Symbols: t_0 hit or closest approach; samples at t_0 +- w, w so wide that the shell crosses the soft surface at any
+angle; tau optical depth; x_s, n the point and normal averaged by the weights of [NeuFace eq. 18].
+
+Differs: shading is evaluated once a ray, at x_s, and not at every sample: over a shell of under a millimetre the
+radiance is close to linear, so that the mean of the values is the value at the mean; 10 times cheaper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pipeline.fields.face import FaceModel, Shaded
+from pipeline.maths.density import crossing_weights, laplace_density, ray_weights
+from pipeline.maths.sdf import unit
+from pipeline.maths.tracing import box_interval
+from stages.inverse_rendering.views import Rays
+
+SHELL_CELLS, SHELL_BETAS = 1.5, 4.0
+MIN_COSINE = 0.25
+REACH_BETAS = 12.0  # beyond this closest approach a ray's opacity is below e^-12 whatever its length in the shell
+
+
+@dataclass(frozen=True, slots=True)
+class Shell:
+    """Samples of M kept rays of a batch of N: kept (M,) indices, tau (M,), x (M, 3), n (M, 3), hit (M,), and the raw
+    gradient at every sample (M * S, 3) for the eikonal term."""
+
+    kept: Tensor
+    tau: Tensor
+    x: Tensor
+    n: Tensor
+    hit: Tensor
+    gradient: Tensor
+
+
+def sample_shell(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None, keep: Tensor | None) -> Shell:
+    """Trace the rays and weigh samples around the surface. `jitter` (N, S) in [0, 1), default the middle of each
+    interval. `keep`: rays that are wanted even if they pass far from the surface."""
+    geometry = model.geometry
+    near, far = box_interval(rays.o, rays.d, *geometry.box())
+    t0, hit, s0 = geometry.trace(rays.o, rays.d, near, far)
+    wanted = (far > near) & (hit | (s0 < REACH_BETAS * float(model.beta)))
+    if keep is not None:
+        wanted |= (far > near) & keep
+    kept = torch.nonzero(wanted).squeeze(-1)
+    o, d, t0, hit = rays.o[kept], rays.d[kept], t0[kept], hit[kept]
+    w = _half_width(model, o + t0[:, None] * d, d)
+    u = (torch.arange(samples, device=o.device) + (0.5 if jitter is None else jitter[kept])) / samples
+    t = t0[:, None] + w[:, None] * (2 * u - 1)
+    x = o[:, None] + t[..., None] * d[:, None]
+    s, g = geometry(x.reshape(-1, 3))
+    weights, tau = _weigh(model, s.reshape(t.shape), w, hit)
+    share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-8)
+    x_s = o + (share * t).sum(-1, keepdim=True) * d
+    n = unit((share[..., None] * g.reshape(*t.shape, 3)).sum(1))
+    return Shell(kept, tau, x_s, n, hit, g)
+
+
+def _weigh(model: FaceModel, s: Tensor, w: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (M, S) and optical depth (M,) of a shell's SDF samples."""
+    if model.spec.density == "crossing":
+        return crossing_weights(s, model.beta)
+    delta = (2 * w / s.shape[1])[:, None].expand_as(s).clone()
+    delta[:, -1] += torch.where(hit, 2 * w, torch.zeros_like(w))  # behind the shell of a hit lies the solid
+    return ray_weights(laplace_density(s, model.beta), delta)
+
+
+def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
+    """w (M,): wide enough that the SDF runs over +-(SHELL_CELLS cells, SHELL_BETAS beta) at this angle."""
+    with torch.no_grad():
+        cosine = (unit(model.geometry(x)[1]) * d).sum(-1).abs().clamp(min=MIN_COSINE)
+    return max(SHELL_CELLS * model.geometry.cell, SHELL_BETAS * float(model.beta)) / cosine
+
+
+def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Shaded:
+    """Radiance of some of a shell's rays (`pick` indexes the shell)."""
+    return model.shade(shell.x[pick], shell.n[pick], -rays.d[shell.kept[pick]])
+
+
+def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536) -> tuple[Tensor, Tensor]:
+    """Premultiplied linear colour (N, 3) and opacity (N,) of any number of rays, without gradients."""
+    colour = torch.zeros(len(rays.d), 3, device=rays.d.device)
+    opacity = torch.zeros(len(rays.d), device=rays.d.device)
+    with torch.no_grad():
+        for i in range(0, len(rays.d), chunk):
+            part = Rays(rays.o[i : i + chunk], rays.d[i : i + chunk])
+            shell = sample_shell(model, part, samples, None, None)
+            if not len(shell.kept):
+                continue
+            a = -torch.expm1(-shell.tau)
+            total = shade_shell(model, shell, part, torch.arange(len(shell.kept), device=rays.d.device)).total
+            colour[i + shell.kept], opacity[i + shell.kept] = total * a[:, None], a
+    return colour, opacity

@@ -1,0 +1,56 @@
+"""Settings of the fit, and the presets that fill them: points on the curve of speed against accuracy.
+
+Kept free of everything but the standard library, so that the fit runs on a bare machine with torch alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """Everything that the fit reads. Lengths in asset units (metres), weights as in [NeuFace eq. 20]-[NeuFace eq. 24]."""
+
+    seed: int = 0
+    # size
+    image_side: int = 512
+    steps: int = 3000
+    batch: int = 4096
+    samples: int = 10
+    grid_cells: int = 288
+    levels: int = 3
+    # model
+    rank: int = 3
+    light_order: int = 10
+    attenuation: str = "exponential"
+    basis_inputs: str = "cosine"
+    density: str = "crossing"
+    specular: bool = True
+    calibration: str = "auto"
+    hash_levels: int = 10
+    hash_log2_size: int = 17
+    hash_fine: float = 0.0008
+    width: int = 64
+    # weights
+    rgb: float = 1.0
+    mask: float = 0.1
+    white: float = 5e-3
+    specular_energy: float = 8e-3
+    eikonal: float = 0.1
+    smooth: float = 0.05
+    # learning
+    lr_sdf: float = 0.02
+    lr_appearance: float = 1e-2
+    lr_light: float = 1e-2
+    beta_end: float = 0.3
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {},
+    "studio": {"image_side": 1024, "steps": 12000, "batch": 8192, "grid_cells": 448, "hash_fine": 0.0005,
+               "hash_log2_size": 18},
+    "film": {"image_side": 2048, "steps": 30000, "batch": 16384, "grid_cells": 768, "levels": 4, "hash_fine": 0.0003,
+             "hash_log2_size": 20, "samples": 16},
+}

@@ -1,0 +1,219 @@
+"""The stage: settings from a preset, photos from the store, a fitted field and its held-out views back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from pipeline.artifacts import CameraSet, Capture, FittedFace, HeldOutView, Located, MaskSet
+from pipeline.contract import Context, Stage, StageConfig
+from pipeline.errors import StageError
+from stages.inverse_rendering.settings import PRESETS, FitSettings
+
+if TYPE_CHECKING:
+    from pipeline.fields.face import FaceModel
+    from stages.inverse_rendering.views import PhotoView
+
+MIN_VIEWS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Photos, cameras, masks."""
+
+    capture: Located[Capture]
+    poses: Located[CameraSet]
+    masks: Located[MaskSet]
+
+
+class Config(StageConfig):
+    """A preset, and any of its settings changed. The filled-in settings are what the key sees."""
+
+    preset: str = Field("draft", description="point on the curve of speed against accuracy")
+    seed: int = Field(0, ge=0, description="seed of every random draw")
+    image_side: int = Field(description="longest side of the photos in the fit's last phase, pixels", ge=32, le=16384)
+    steps: int = Field(description="optimisation steps", ge=1, le=10_000_000)
+    batch: int = Field(description="rays a step", ge=16, le=1_048_576)
+    samples: int = Field(description="samples a ray in the shell around the surface", ge=4, le=128)
+    grid_cells: int = Field(description="cells of the final SDF grid along the subject's longest side", ge=16, le=2048)
+    levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
+    rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
+    light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
+    attenuation: Literal["exponential", "exact"] = Field(description="of the light under the lobe [NeuFace eq. 11]")
+    basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
+    density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
+    specular: bool = Field(description="model a specular term at all")
+    calibration: Literal["auto", "on", "off"] = Field(description="per-image colour matrices [NeuFace eq. 19]; auto: "
+                                                      "where the capture has more than one kind of camera")
+    hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
+    hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
+    hash_fine: float = Field(description="finest cell of the appearance encoding, asset units", gt=0, le=0.1)
+    width: int = Field(description="width of the appearance networks", ge=8, le=512)
+    rgb: float = Field(description="lambda 1 [NeuFace eq. 21]", ge=0)
+    mask: float = Field(description="weight of the opacity's cross-entropy against the masks", ge=0)
+    white: float = Field(description="lambda 2 [NeuFace eq. 22]", ge=0)
+    specular_energy: float = Field(description="lambda 3 [NeuFace eq. 23]", ge=0)
+    eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
+    smooth: float = Field(description="weight of the normals' consistency", ge=0)
+    lr_sdf: float = Field(description="learning rate of the SDF, cells a step", gt=0, le=1)
+    lr_appearance: float = Field(description="learning rate of the hash table; networks take 0.3 of it", gt=0, le=1)
+    lr_light: float = Field(description="learning rate of the light's coefficients", gt=0, le=1)
+    beta_end: float = Field(description="final width of the soft surface, finest cells", gt=0, le=10)
+
+    @field_validator("preset")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in PRESETS:
+            raise ValueError(f"unknown preset {name!r}; choose one of {', '.join(PRESETS)}")
+        return name
+
+    @model_validator(mode="before")
+    @classmethod
+    def _filled(cls, data: Any) -> Any:
+        given = dict(data) if isinstance(data, dict) else {}
+        preset = PRESETS.get(str(given.get("preset", "draft")), {})
+        return {**asdict(FitSettings()), **preset, **given}
+
+    def settings(self) -> FitSettings:
+        """What the fit reads."""
+        return FitSettings(**{f.name: getattr(self, f.name) for f in fields(FitSettings)})
+
+
+def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
+    """Fit the field and predict the held-out views."""
+    from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
+    from stages.inverse_rendering.start import hull_start
+
+    settings = config.settings()
+    dropped = set(inputs.masks.artifact.dropped)
+    held = {v.index for v in inputs.capture.artifact.views if v.holdout}
+    usable = [c.index for c in inputs.poses.artifact.cameras if c.index not in held and c.index not in dropped]
+    if len(usable) < MIN_VIEWS:
+        raise StageError("too few views are left to fit", where="inverse_rendering", value=len(usable),
+                         limit=f"at least {MIN_VIEWS}", remedy="add photos, or hold fewer back with --holdout")
+    context.progress(0, settings.steps, "reading photos")
+    views = read_views(inputs, usable, settings.image_side)
+    cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
+    context.progress(0, settings.steps, "visual hull")
+    start = hull_start(cameras, [v.alpha for v in views], inputs.poses.artifact.roi_radius, settings.grid_cells,
+                       settings.levels)
+    trainer = new_trainer(views, start, settings, calibrated(inputs, usable, config), context.device)
+    model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
+    model.save(context.workdir / "field.npz")
+    write_light(model, context)
+    held_out = predict_held_out(model, inputs, config, context)
+    return FittedFace(
+        field=context.file("field.npz"), light=context.file("light.json"), rank=settings.rank,
+        light_order=settings.light_order, fitted_views=tuple(usable), held_out=held_out, steps=trainer.step,
+        loss=round(trainer.loss, 8), psnr=round(trainer.psnr, 4), beta=float(model.beta), cell=model.geometry.cell,
+        model=model_facts(config, model),
+    )
+
+
+def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
+    """Whether per-image colour matrices are fitted."""
+    if config.calibration != "auto":
+        return config.calibration == "on"
+    return len({v.camera_group for v in inputs.capture.artifact.views if v.index in set(usable)}) > 1
+
+
+def read_views(inputs: Inputs, indices: list[int], side: int) -> list[PhotoView]:
+    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`."""
+    import numpy as np
+
+    from pipeline import transforms
+    from pipeline.images import read_alpha, read_linear
+    from stages.inverse_rendering.views import PhotoView
+
+    cameras = {c.index: c for c in inputs.poses.artifact.cameras}
+    masks = {m.index: m for m in inputs.masks.artifact.masks}
+    photos = {v.index: v for v in inputs.capture.artifact.views}
+    views = []
+    for i in indices:
+        c = cameras[i]
+        views.append(PhotoView(
+            i, read_linear(inputs.capture.path(photos[i].image)), read_alpha(inputs.masks.path(masks[i].mask)),
+            transforms.matrix(c.K), transforms.matrix(c.world_from_cam), np.array(c.distortion)))
+    return [shrunk(v, side) for v in views]
+
+
+def shrunk(view: PhotoView, side: int) -> PhotoView:
+    """The view at the smallest whole-block size that still has `side` pixels, so that large photos fit in memory.
+
+    Lens positions are kept exact: intrinsics scale with the image, distortion does not change.
+    """
+    from dataclasses import replace
+
+    from pipeline.images import shrink
+    from stages.inverse_rendering.views import factor_for
+
+    f = factor_for(view.size, max(side, 1024))
+    if f == 1:
+        return view
+    K = view.K.copy()
+    K[:2] /= f
+    return replace(view, rgb=shrink(view.rgb, f), alpha=shrink(view.alpha, f), K=K)
+
+
+def write_light(model: FaceModel, context: Context) -> None:
+    """light.json: raw coefficients and the conventions that they need."""
+    import json
+
+    rows = model.light().detach().cpu().double().numpy().round(7).tolist()
+    (context.workdir / "light.json").write_text(json.dumps({
+        "order": model.spec.light_order, "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
+        "frame": "asset coordinates, +Y up, direction towards the light", "colour": "linear Rec.709 radiance",
+        "coefficients": rows}, indent=1))
+
+
+def predict_held_out(model: FaceModel, inputs: Inputs, config: Config, context: Context) -> tuple[HeldOutView, ...]:
+    """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
+    from pipeline.images import write_exr, write_png_from_linear
+    from stages.inverse_rendering.predict import predict_view
+    from stages.inverse_rendering.views import factor_for
+
+    held = {v.index: v for v in inputs.capture.artifact.views if v.holdout}
+    known = [c for c in inputs.poses.artifact.cameras if c.index in held]
+    out = []
+    for n, c in enumerate(known):
+        context.check()
+        context.progress(n, len(known), "held-out views")
+        factor = factor_for((c.width, c.height), config.image_side)
+        view = camera_only(c)
+        rgba = predict_view(model, view, factor, config.samples, context.device)
+        exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
+        write_exr(context.workdir / exr, rgba)
+        write_png_from_linear(context.workdir / png, rgba[..., :3])
+        out.append(HeldOutView(index=c.index, exr=context.file(exr), png=context.file(png), scale=factor))
+    return tuple(out)
+
+
+def camera_only(c: Any) -> PhotoView:
+    """A camera as a view without a photo: what a prediction may see of a held-out view."""
+    import numpy as np
+
+    from pipeline import transforms
+    from stages.inverse_rendering.views import PhotoView
+
+    empty = np.broadcast_to(np.zeros((), np.float32), (c.height, c.width, 3))
+    return PhotoView(c.index, empty, empty[..., 0], transforms.matrix(c.K), transforms.matrix(c.world_from_cam),
+                     np.array(c.distortion))
+
+
+def model_facts(config: Config, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
+    """What was modelled and what was left out, for the report."""
+    return {
+        "specular": {"modelled": config.specular, "why": "setting"},
+        "light": {"order": config.light_order, "why": "setting"},
+        "rank": {"k": config.rank, "why": "setting"},
+        "calibration": {"modelled": model.spec.calibrated, "why": "more than one kind of camera" if
+                        config.calibration == "auto" and model.spec.calibrated else "one kind of camera" if
+                        config.calibration == "auto" else "setting"},
+        "geometry": {"prior": "visual hull", "cell_mm": round(model.geometry.cell * 1e3, 4), "why": "no licensed prior"},
+        "density": {"kind": config.density, "why": "setting"},
+    }
+
+
+STAGE = Stage(name="inverse_rendering", version=1, inputs=Inputs, config=Config, output=FittedFace, run=run)

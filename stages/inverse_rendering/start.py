@@ -1,0 +1,30 @@
+"""The geometry's start: the visual hull of the masks as a signed distance on the coarsest grid."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import Camera
+from pipeline.errors import StageError
+from pipeline.hull import hull_bounds, hull_sdf, visual_hull
+from stages.inverse_rendering.fit import Start
+
+F32 = npt.NDArray[np.float32]
+MARGIN_CELLS = 4  # room for the band and the spline's border around the hull
+
+
+def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int) -> Start:
+    """SDF samples of the hull, at a spacing that `levels` - 1 halvings bring to 1 / `cells` of the hull's longest side.
+
+    Raises StageError if the masks leave nothing.
+    """
+    lo, hi = hull_bounds(cameras, alphas, roi_radius)
+    cell = float((hi - lo).max()) / cells * 2 ** (levels - 1)
+    lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
+    hull = visual_hull(cameras, alphas, lo, hi, cell)
+    if not hull.occupied.any():
+        raise StageError("the masks have no common body", where="inverse_rendering", value="an empty visual hull",
+                         limit="at least one voxel inside every view's silhouette", remedy="look at the masks and the "
+                         "cameras: one of them is wrong, or views show different subjects")
+    return Start(hull_sdf(hull).astype(np.float32), (hull.lo + 0.5 * cell).astype(np.float32), cell)

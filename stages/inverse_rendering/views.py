@@ -1,0 +1,138 @@
+"""Photos as tables of rays: which pixels take part, where they look, what they should show.
+
+Symbols: a view's pixel at image position uv looks along R (x, y, 1), with (x, y) its exactly undistorted position on
+the z = 1 plane. Photos are never resampled to remove distortion; a smaller size is a mean over whole blocks of pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from pipeline import transforms
+from pipeline.colour import srgb_from_linear
+from pipeline.images import shrink
+
+F32, F64 = npt.NDArray[np.float32], npt.NDArray[np.float64]
+NEAR_BAND = 0.05  # background pixels within this share of the image side of the subject are worth rays
+FAR_EVERY = 16  # of the background beyond, one pixel in so many keeps stray matter away
+WHOLE = 0.99  # alpha from which a pixel shows the subject alone
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoView:
+    """A photo with its camera: rgb (H, W, 3) linear, alpha (H, W) in [0, 1], at the photo's size."""
+
+    index: int
+    rgb: F32
+    alpha: F32
+    K: F64
+    world_from_cam: F64
+    distortion: F64
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.rgb.shape[1], self.rgb.shape[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """N rays: origins and unit directions (N, 3)."""
+
+    o: Tensor
+    d: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Rays with what the photos show there: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit."""
+
+    rays: Rays
+    target: Tensor
+    alpha: Tensor
+    view: Tensor
+
+
+def factor_for(size: tuple[int, int], side: int) -> int:
+    """The smallest block that brings the longest side to `side` or below, and divides the photo exactly."""
+    for f in range(1, max(size) + 1):
+        if max(size) <= side * f and size[0] % f == 0 and size[1] % f == 0:
+            return f
+    return 1
+
+
+def normalised_positions(view: PhotoView, factor: int) -> F32:
+    """(H, W, 2) of (x, y) on the z = 1 plane, for blocks of factor x factor pixels."""
+    w, h = view.size
+    uv = transforms.pixel_centres(w, h, factor)
+    xy = np.linalg.solve(view.K[:2, :2], (uv - view.K[:2, 2]).T).T
+    return transforms.undistort(xy, view.distortion).astype(np.float32).reshape(h // factor, w // factor, 2)
+
+
+class PixelTable:
+    """The pixels of all fitted views at one resolution, ready to be drawn from."""
+
+    def __init__(self, views: list[PhotoView], side: int, device: str) -> None:
+        parts: list[tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]] = []
+        for n, view in enumerate(views):
+            parts.append(_pixels_of(view, n, factor_for(view.size, side)))
+        xy, target, alpha, which, kind = (np.concatenate(p) for p in zip(*parts, strict=True))
+        self.xy, self.target = torch.from_numpy(xy).to(device), torch.from_numpy(target).to(device)
+        self.alpha, self.view = torch.from_numpy(alpha).to(device), torch.from_numpy(which).to(device)
+        self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
+        self.outside = torch.from_numpy(np.flatnonzero(kind == 0)).to(device)
+        self.R = torch.from_numpy(np.stack([v.world_from_cam[:3, :3] for v in views]).astype(np.float32)).to(device)
+        self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
+
+    def mean_colour(self) -> float:
+        """Mean linear radiance of the subject over all photos."""
+        s = self.target[self.inside[:: max(len(self.inside) // 100_000, 1)]].float()
+        return float((((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean())
+
+    def draw(self, n: int, outside_share: float, seed: int) -> Batch:
+        """A random batch that depends on the seed alone."""
+        generator = torch.Generator().manual_seed(seed)
+        n_out = int(n * outside_share) if len(self.outside) else 0
+        picks = []
+        for pool, k in ((self.inside, n - n_out), (self.outside, n_out)):
+            if k:
+                picks.append(pool[torch.randint(len(pool), (k,), generator=generator).to(pool.device)])
+        i = torch.cat(picks)
+        view = self.view[i].long()
+        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view)
+
+    def _rays(self, xy: Tensor, view: Tensor) -> Rays:
+        local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
+        d = torch.einsum("nij,nj->ni", self.R[view], local)
+        return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True))
+
+
+def _pixels_of(
+    view: PhotoView, n: int, factor: int
+) -> tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]:
+    """Candidate pixels of one view: (x, y), encoded target, alpha, view number, 1 inside or 0 outside."""
+    alpha = shrink(view.alpha, factor)
+    encoded = srgb_from_linear(shrink(view.rgb, factor)).astype(np.float16)
+    xy = normalised_positions(view, factor)
+    reach = 2 * max(int(max(alpha.shape) * NEAR_BAND), 2) + 1
+    near = cv2.dilate((alpha > 0.01).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+    inside = alpha > 0.5
+    far = np.zeros_like(near)
+    far.reshape(-1)[n % FAR_EVERY :: FAR_EVERY] = True
+    take = inside | near | far
+    return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
+
+
+def image_rays(view: PhotoView, factor: int, device: str) -> Rays:
+    """Rays of every block of a view, row by row."""
+    xy = torch.from_numpy(normalised_positions(view, factor).reshape(-1, 2)).to(device)
+    R = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32)).to(device)
+    d = torch.cat([xy, torch.ones_like(xy[:, :1])], -1) @ R.T
+    o = torch.from_numpy(view.world_from_cam[:3, 3].astype(np.float32)).to(device).expand_as(d)
+    return Rays(o, d / d.norm(dim=-1, keepdim=True))
