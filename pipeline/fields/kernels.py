@@ -91,6 +91,9 @@ def adam_on_band(
 ) -> None:
     """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
 
+    Coefficients that no ray touched are left alone, momentum and all: a batch sees a few per cent of the band, and
+    moving the rest by old gradients costs most of the time and adds noise.
+
     eps is far below any useful gradient's size: distances are in metres, so that gradients can be as small as 1e-8.
     """
     b1, b2 = betas
@@ -101,6 +104,7 @@ def adam_on_band(
                      f(c1), f(c2))
         return
     flat = [x.detach().view(-1) for x in (values, grad, m, v)]
+    active = active[flat[1][active] != 0]
     g = flat[1][active]
     flat[1][active] = 0
     flat[2][active] = mi = b1 * flat[2][active] + (1 - b1) * g

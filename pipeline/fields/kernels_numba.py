@@ -174,11 +174,13 @@ def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, ref
 
 @njit(parallel=True, fastmath=FAST, cache=True)
 def band_adam(values, grad, m, v, active, lr, b1, b2, eps, c1, c2):
-    """One Adam step on the active coefficients (flat indices), which also clears their gradient."""
+    """One Adam step on the active coefficients (flat indices) that have a gradient, which it clears."""
     p, g0, m0, v0 = values.reshape(-1), grad.reshape(-1), m.reshape(-1), v.reshape(-1)
     for q in prange(active.shape[0]):
         i = active[q]
         g = g0[i]
+        if g == ZERO:
+            continue
         g0[i] = ZERO
         m0[i] = b1 * m0[i] + (ONE - b1) * g
         v0[i] = b2 * v0[i] + (ONE - b2) * g * g

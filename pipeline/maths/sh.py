@@ -13,6 +13,11 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+try:
+    from pipeline.maths import sh_compiled as compiled
+except ImportError:  # a bare GPU machine has torch alone
+    compiled = None  # type: ignore[assignment]
+
 ORDER = 10  # [NeuFace eq. 2]
 
 
@@ -108,12 +113,8 @@ def clamped_cosine(order: int = ORDER) -> Tensor:
 
 
 def irradiance(c: Tensor, n: Tensor) -> Tensor:
-    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16]; may be slightly negative.
-
-    Odd bands above 1 carry nothing, so the basis is needed only to the last even order.
-    """
-    order = order_of(c)
-    return sh_basis(n, order) @ (clamped_cosine(order).to(c)[:, None] * c)
+    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16]; may be slightly negative."""
+    return band_radiance(clamped_cosine(order_of(c)).to(c)[:, None] * c, n).sum(1)
 
 
 def radiance(c: Tensor, d: Tensor) -> Tensor:
@@ -122,8 +123,17 @@ def radiance(c: Tensor, d: Tensor) -> Tensor:
 
 
 def band_radiance(c: Tensor, d: Tensor) -> Tensor:
-    """Each band's share of L(d): (N, L + 1, 3). One matrix product for all bands."""
+    """Each band's share of L(d): (N, L + 1, 3). Compiled for float32 on the CPU where numba is installed; else one
+    matrix product for all bands."""
     order = order_of(c)
+    if compiled is not None and d.dtype == c.dtype == torch.float32 and d.device.type == "cpu":
+        out: Tensor = compiled.BandRadiance.apply(c, d, order)  # type: ignore[no-untyped-call]
+        return out
+    return band_radiance_reference(c, d, order)
+
+
+def band_radiance_reference(c: Tensor, d: Tensor, order: int) -> Tensor:
+    """`band_radiance` in plain torch."""
     spread = (c[:, None, :] * band_selector(order).to(c)[:, :, None]).reshape(c.shape[0], -1)
     return (sh_basis(d, order) @ spread).reshape(d.shape[0], order + 1, 3)
 
