@@ -1,0 +1,121 @@
+"""The captured light: spherical harmonics to and from a lat-long picture, and as a file.
+
+Lat-long (USD's dome): rows from +Y (top) to -Y; the image's centre looks along +Z, its left edge is longitude +pi,
+and columns grow towards -X. Longitude 0 is +Z and grows towards +X.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline.errors import StageError
+from pipeline.maths import sh
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+
+CONVENTION = (
+    "Radiance L(d) = sum over l = 0..order, m = -l..l of coefficients[l * (l + 1) + m] * Y_lm(d), linear Rec.709, one "
+    "column a colour. Y_lm are the real, orthonormal spherical harmonics without the Condon-Shortley phase "
+    "(Y_00 = 0.28209, Y_1m = 0.48860 * (y, z, x)), with the polar axis along z of the asset coordinates (right-handed, "
+    "Y up, metres). d is a unit vector from the surface towards the light. The raw sum may be slightly negative; "
+    "environment.exr is its positive part, scaled per colour to the same total."
+)
+
+
+def latlong_directions(width: int, height: int) -> F64:
+    """(height, width, 3) unit directions through the pixel centres."""
+    longitude = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)
+    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    ring = np.cos(latitude)[:, None]
+    return np.stack(
+        [
+            ring * np.sin(longitude),
+            np.broadcast_to(np.sin(latitude)[:, None], (height, width)),
+            ring * np.cos(longitude),
+        ],
+        -1,
+    )
+
+
+def latlong_weights(width: int, height: int) -> F64:
+    """(height, 1) solid angle of one pixel in each row; over all pixels they sum to 4 pi."""
+    edge = np.sin(np.pi * (0.5 - np.arange(height + 1) / height))
+    weights: F64 = ((edge[:-1] - edge[1:]) * 2 * np.pi / width)[:, None]
+    return weights
+
+
+def environment(light: F32, width: int) -> F32:
+    """(width / 2, width, 3) picture of the light: negative lobes cut off, total energy kept per colour."""
+    height = width // 2
+    directions = torch.from_numpy(latlong_directions(width, height).reshape(-1, 3))
+    raw = sh.radiance(torch.from_numpy(np.asarray(light, np.float64)), directions).numpy().reshape(height, width, 3)
+    weights = latlong_weights(width, height)[..., None]
+    image = raw.clip(min=0)
+    wanted, found = ((x * weights).sum((0, 1)) for x in (raw, image))
+    return np.asarray(image * (wanted.clip(min=0) / np.where(found > 0, found, 1)), np.float32)
+
+
+def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:
+    """((order + 1)^2, 3) coefficients of a lat-long picture (H, W, 3), by summing over its pixels."""
+    height, width = image.shape[:2]
+    directions = latlong_directions(width, height)
+    weights = latlong_weights(width, height)
+    out = np.zeros((sh.count(order), 3))
+    for row in range(height):
+        basis = sh.sh_basis(torch.from_numpy(directions[row]), order).numpy()
+        out += weights[row] * basis.T @ image[row].astype(np.float64)
+    return out.astype(np.float32)
+
+
+def light_json(light: F32, attenuation: str) -> str:
+    """The raw coefficients with what they mean."""
+    rows = [[float(f"{x:.9g}") for x in row] for row in np.asarray(light, np.float64)]
+    content = {
+        "order": int(np.sqrt(len(light))) - 1,
+        "convention": CONVENTION,
+        "attenuation": attenuation,
+        "colour_space": "linear Rec.709",
+        "coefficients": rows,
+    }
+    return json.dumps(content, indent=1) + "\n"
+
+
+def read_light(path: Path) -> F32:
+    """((L + 1)^2, 3) from light.json, or from the fit's .npz or .npy file."""
+    try:
+        found: Any
+        if path.suffix == ".json":
+            found = json.loads(path.read_text())["coefficients"]
+        else:
+            stored = np.load(path, allow_pickle=False)
+            found = (
+                stored if isinstance(stored, np.ndarray) else stored["light" if "light" in stored else stored.files[0]]
+            )
+        light = np.asarray(found, np.float32)
+    except (OSError, ValueError, KeyError, IndexError) as e:
+        raise _bad_light(path, e) from e
+    if (
+        light.ndim != 2
+        or light.shape[1] != 3
+        or int(np.sqrt(len(light))) ** 2 != len(light)
+        or not np.isfinite(light).all()
+    ):
+        raise _bad_light(path, f"array of {light.shape}, {int((~np.isfinite(light)).sum())} not finite")
+    return light
+
+
+def _bad_light(path: Path, value: object) -> StageError:
+    return StageError(
+        "the captured light can't be used",
+        where=path.name,
+        value=value,
+        limit="(order + 1)^2 rows of three finite coefficients",
+        remedy="run the inverse_rendering stage again",
+    )

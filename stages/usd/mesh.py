@@ -1,0 +1,158 @@
+"""The asset's mesh in memory, and texture coordinates for its proxy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.errors import StageError
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I32 = npt.NDArray[np.int32]
+
+CANDIDATES = 12  # nearest triangles among which the exact nearest point is looked for
+
+
+@dataclass(frozen=True, slots=True)
+class UvSurface:
+    """Triangles with texture coordinates. vertices, normals (V, 3); faces, uv_faces (F, 3); uvs (U, 2), v up."""
+
+    vertices: F32
+    normals: F32
+    faces: I32
+    uvs: F32
+    uv_faces: I32
+
+
+def read_mesh(path: Path, *, with_uvs: bool = True) -> UvSurface:
+    """A mesh npz. Without uvs (a proxy) these arrays are empty. StageError where arrays do not fit each other."""
+    with np.load(path, allow_pickle=False) as f:
+        stored = {k: f[k] for k in f.files}
+    if not with_uvs:
+        stored |= {"uvs": np.zeros((0, 2)), "uv_faces": np.zeros((0, 3))}
+    missing = {"vertices", "normals", "faces", "uvs", "uv_faces"} - stored.keys()
+    if missing:
+        raise _bad_mesh(path, f"no array {', '.join(sorted(missing))}")
+    mesh = UvSurface(
+        np.asarray(stored["vertices"], np.float32),
+        np.asarray(stored["normals"], np.float32),
+        np.asarray(stored["faces"], np.int32),
+        np.asarray(stored["uvs"], np.float32),
+        np.asarray(stored["uv_faces"], np.int32),
+    )
+    fault = _fault(mesh, with_uvs)
+    if fault:
+        raise _bad_mesh(path, fault)
+    return mesh
+
+
+def _fault(mesh: UvSurface, with_uvs: bool) -> str:
+    if not len(mesh.faces):
+        return "no triangles"
+    if mesh.vertices.shape != mesh.normals.shape or not all(
+        np.isfinite(a).all() for a in (mesh.vertices, mesh.normals, mesh.uvs)
+    ):
+        return "values that are not finite, or not one normal a vertex"
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        return f"vertex index {mesh.faces.max()} of {len(mesh.vertices)}"
+    if with_uvs and (
+        mesh.uv_faces.shape != mesh.faces.shape or mesh.uv_faces.min() < 0 or mesh.uv_faces.max() >= len(mesh.uvs)
+    ):
+        return f"{mesh.uv_faces.shape} texture indices for {mesh.faces.shape} vertex indices, {len(mesh.uvs)} uvs"
+    return ""
+
+
+def _bad_mesh(path: Path, value: str) -> StageError:
+    return StageError(
+        "the mesh can't be exported",
+        where=path.name,
+        value=value,
+        limit="finite vertices, normals, uvs and indices within them",
+        remedy="run the uv stage again",
+    )
+
+
+def charts_of(uv_faces: I32, count: int) -> I32:
+    """(F,) chart number of each triangle: triangles that share a texture vertex are in one chart."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = uv_faces[:, [0, 1]].ravel(), uv_faces[:, [1, 2]].ravel()
+    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
+    labels = connected_components(graph, directed=False)[1]
+    return np.asarray(labels[uv_faces[:, 0]], np.int32)
+
+
+def with_uvs_from(proxy: UvSurface, full: UvSurface) -> UvSurface:
+    """The proxy with texture coordinates of the full mesh, so that one material serves both.
+
+    Each proxy triangle takes the chart that lies nearest to its centroid, and each of its corners the texture
+    coordinate of that chart's nearest point. At a chart's edge corners are therefore drawn onto the edge: never into
+    a neighbour's texels. Nearest is measured in space and in the texture together (against where the centroid's
+    triangle, continued as a plane, would put the corner), because a chart may wind around and meet itself at a seam.
+    """
+    from scipy.spatial import cKDTree
+
+    chart = charts_of(full.uv_faces, len(full.uvs))
+    corners, t = full.vertices[full.faces].astype(np.float64), full.uvs[full.uv_faces].astype(np.float64)
+    ends = proxy.vertices[proxy.faces].astype(np.float64)
+    hit, weights = _nearest(ends.mean(1), corners, cKDTree(corners.mean(1)).query(ends.mean(1), CANDIDATES)[1])
+    scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres a unit of texture
+    expected = _continued(ends, corners[hit], t[hit], weights)
+    places = np.concatenate([corners.mean(1), scale * t.mean(1)], 1)
+    wanted = np.concatenate([ends, scale * expected], -1)
+    uvs = np.zeros((len(ends), 3, 2))
+    for number in np.unique(chart[hit]):
+        rows, inside = np.flatnonzero(chart[hit] == number), np.flatnonzero(chart == number)
+        query = wanted[rows].reshape(-1, 5)
+        near = cKDTree(places[inside]).query(query, min(CANDIDATES, len(inside)))[1].reshape(len(query), -1)
+        face, weights = _nearest(query[:, :3], corners[inside], near)
+        uvs[rows] = (t[inside[face]] * weights[..., None]).sum(1).reshape(-1, 3, 2)
+    values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
+    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
+
+
+def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
+    """(N, 3, 2): where each triangle's affine map from space to texture puts three points (N, 3, 3)."""
+    edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
+    on = (corners * weights[..., None]).sum(1)
+    start = (t * weights[..., None]).sum(1)
+    return np.asarray(start[:, None] + (points - on[:, None]) @ np.linalg.pinv(edges) @ along)
+
+
+def _areas(triangles: F64) -> F64:
+    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    product = np.cross(a, b) if triangles.shape[2] == 3 else (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])[:, None]
+    return np.asarray(np.linalg.norm(product, axis=1) / 2)
+
+
+def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.int64], F64]:
+    """Of the candidate triangles (N, K) the nearest (N,), and the barycentric weights (N, 3) of its nearest point."""
+    import trimesh
+
+    best = np.full(len(points), np.inf)
+    face, on = np.zeros(len(points), np.int64), np.zeros_like(points)
+    for column in candidates.T:
+        near = trimesh.triangles.closest_point(corners[column], points)  # type: ignore[no-untyped-call]
+        distance = np.linalg.norm(near - points, axis=1)
+        closer = distance < best - 1e-12
+        best[closer], face[closer], on[closer] = distance[closer], column[closer], near[closer]
+    weights = trimesh.triangles.points_to_barycentric(corners[face], on)  # type: ignore[no-untyped-call]
+    return face, np.nan_to_num(weights).clip(0, 1)
+
+
+def uv_fault(mesh: UvSurface, limit: float = 0.005) -> str:
+    """Why a proxy's texture coordinates would mislead a client, or "": mirrored or empty triangles (by area)."""
+    t = mesh.uvs[mesh.uv_faces].astype(np.float64)
+    a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    signed = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    x = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
+    empty, mirrored = (float(area[m].sum() / area.sum()) for m in (np.abs(signed) < 1e-10, signed < 0))
+    if empty > limit:
+        return f"{empty:.1%} of the proxy's surface has no area in the texture"
+    return f"{mirrored:.1%} of the proxy's surface is mirrored in the texture" if mirrored > 4 * limit else ""

@@ -1,0 +1,104 @@
+"""Stage usd: mesh, maps, light and cameras become an asset that other programs open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import Field
+
+from pipeline.artifacts import (
+    CameraSet,
+    Capture,
+    FileRef,
+    FittedFace,
+    HeldOutView,
+    Located,
+    TextureSet,
+    UsdAsset,
+    UvMesh,
+)
+from pipeline.contract import Context, Stage, StageConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """What is exported."""
+
+    uv: Located[UvMesh]
+    bake: Located[TextureSet]
+    inverse_rendering: Located[FittedFace]
+    poses: Located[CameraSet]
+    capture: Located[Capture]
+
+
+class Config(StageConfig):
+    """Settings of the export."""
+
+    name: str = Field("head", description="name of the asset: prim, file and prefix of the textures")
+    asset_version: str = Field("1.0.0", description="assetInfo:version of the component")
+    usdz: bool = Field(True, description="also write a preview package NAME.usdz")
+    proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
+    environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
+    render_views: bool = Field(True, description="render the held-out views from the exported files")
+    samples: int = Field(2, ge=1, le=8, description="rays along each side of a pixel of these renders")
+    preview_size: int = Field(512, ge=64, le=4096, description="pixels of the preview pictures' side")
+
+
+def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
+    """Write asset/, check it, then render from what was written."""
+    from stages.usd.export import export
+    from stages.usd.naming import check_name
+    from stages.usd.previews import render_held_out, render_previews
+    from stages.usd.validate import checks_run, require_valid
+
+    name = check_name(config.name)
+    total = 4
+    context.progress(0, total, "writing the component")
+    written, notes = export(
+        inputs.uv,
+        inputs.bake,
+        inputs.inverse_rendering,
+        inputs.poses,
+        inputs.capture,
+        config,
+        context.workdir / "asset",
+        context.check,
+    )
+    warnings = list(notes)
+    context.progress(1, total, "checking it")
+    for file in [f for f in written if f.parent == context.workdir / "asset" and f.name in _roots(name)]:
+        context.check()
+        warnings += [
+            f"{file.name}: {f.check}: {f.message} {f.where}".strip()
+            for f in require_valid(file)
+            if f.level == "warning"
+        ]
+    context.progress(2, total, "rendering previews")
+    root = context.workdir / "asset" / f"{name}.usd"
+    written += render_previews(root, config.preview_size, context.workdir / "previews", context.check)
+    context.progress(3, total, "rendering held-out views from the asset")
+    views: tuple[HeldOutView, ...] = ()
+    if config.render_views:
+        views = render_held_out(root, inputs.poses.artifact, inputs.inverse_rendering.artifact, config.samples, context)
+    context.progress(total, total, "done", checks=checks_run(), warnings=len(warnings))
+    files = tuple(_refs(context, sorted(written)))
+    return UsdAsset(
+        name=name,
+        root=f"asset/{name}.usd",
+        files=files,
+        views=views,
+        checks=checks_run(),
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+
+
+def _roots(name: str) -> tuple[str, ...]:
+    return (f"{name}.usd", "lookdev.usda", f"{name}.usdz")
+
+
+def _refs(context: Context, files: list[Path]) -> list[FileRef]:
+    return [context.file(f) for f in files]
+
+
+STAGE = Stage(name="usd", version=1, inputs=Inputs, config=Config, output=UsdAsset, run=run)

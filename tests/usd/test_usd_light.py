@@ -1,0 +1,96 @@
+"""The environment picture shows the light in the right places and keeps its energy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import sph_harm_y
+from support.synthetic_asset import smooth_light
+
+from pipeline.errors import StageError
+from stages.usd.light import (
+    environment,
+    latlong_directions,
+    latlong_weights,
+    light_from_environment,
+    light_json,
+    read_light,
+)
+
+AXES = {  # direction: (column, row) of the pixel just right of and below it, as shares of the picture
+    (0, 1, 0): (0.5, 0.0),
+    (0, -1, 0): (0.5, 1.0),
+    (0, 0, 1): (0.5, 0.5),
+    (1, 0, 0): (0.25, 0.5),
+    (-1, 0, 0): (0.75, 0.5),
+    (0, 0, -1): (0.0, 0.5),
+}
+
+
+def radiance(light: np.ndarray, direction: tuple[int, int, int]) -> np.ndarray:
+    """The series by scipy's complex harmonics (which have the Condon-Shortley phase)."""
+    theta, phi = np.arccos(direction[2]), np.arctan2(direction[1], direction[0])
+    total = np.zeros(3)
+    for l in range(11):  # noqa: E741
+        for m in range(-l, l + 1):
+            y = sph_harm_y(l, abs(m), theta, phi) * (-1) ** m
+            real = y.real if m == 0 else np.sqrt(2) * (y.real if m > 0 else y.imag)
+            total += light[l * (l + 1) + m] * real
+    return total
+
+
+@pytest.mark.parametrize("direction", AXES)
+def test_axes_are_where_usd_looks_for_them(direction: tuple[int, int, int]) -> None:
+    light = smooth_light()
+    image = environment(light, 512)
+    column, row = AXES[direction]
+    found = image[min(int(row * 256), 255), min(int(column * 512), 511)]
+    np.testing.assert_allclose(found, radiance(light, direction), rtol=0.01)
+
+
+def test_columns_grow_towards_minus_x_and_rows_down() -> None:
+    directions = latlong_directions(64, 32)
+    assert directions[16, 40, 0] < directions[16, 36, 0] < 0  # right of the centre: -X
+    assert directions[0, 0, 1] > 0.99 > -0.99 > directions[-1, 0, 1]
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)
+    assert (latlong_weights(64, 32) * np.ones((32, 64))).sum() == pytest.approx(4 * np.pi)
+
+
+def test_clamped_picture_keeps_the_energy() -> None:
+    light = np.zeros((121, 3), np.float32)
+    light[0] = [1, 2, 0.5]
+    light[3] = [2, 2, 2]  # along x: negative on the other side
+    image = environment(light, 256)
+    assert image.min() == 0
+    total = (image * latlong_weights(256, 128)[..., None]).sum((0, 1))
+    np.testing.assert_allclose(total, light[0] * np.sqrt(4 * np.pi), rtol=1e-4)
+
+
+def test_dark_light_gives_a_black_picture() -> None:
+    assert environment(np.zeros((121, 3), np.float32), 64).max() == 0
+
+
+def test_a_picture_gives_its_coefficients_back() -> None:
+    light = smooth_light()
+    np.testing.assert_allclose(light_from_environment(environment(light, 256)), light, atol=2e-3)
+
+
+def test_light_files_round_trip(tmp_path: Path) -> None:
+    light = smooth_light()
+    (tmp_path / "light.json").write_text(light_json(light, "exact"))
+    np.save(tmp_path / "light.npy", light)
+    np.savez(tmp_path / "light.npz", light=light)
+    for name in ("light.json", "light.npy", "light.npz"):
+        np.testing.assert_allclose(read_light(tmp_path / name), light, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "name, content", [("light.json", b"{"), ("light.json", b"{}"), ("light.npz", b"PK"), ("light.npz", None)]
+)
+def test_unreadable_lights(tmp_path: Path, name: str, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(StageError, match="light can't be used"):
+        read_light(tmp_path / name)

@@ -1,0 +1,263 @@
+"""The exported files: structure, determinism, what the stage refuses."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
+from support.synthetic_asset import SyntheticInputs, ball, texture_arrays, write_inputs
+
+from pipeline.contract import Context
+from pipeline.errors import StageError, UsageError
+from pipeline.images import read_encoded, read_exr
+from pipeline.transforms import inverse_rigid, matrix, project
+from stages.usd.component import ior_from_f0
+from stages.usd.naming import check_name, name_from
+from stages.usd.stage import STAGE, Config, Inputs
+
+
+def run(inputs: SyntheticInputs, folder: Path, **config: object):
+    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+    small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
+    return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))
+
+
+def test_files_are_those_of_the_interface(exported) -> None:
+    folder, asset = exported
+    listed = {f.path for f in asset.files}
+    assert {
+        "asset/head.usd",
+        "asset/payload.usdc",
+        "asset/lookdev.usda",
+        "asset/head.usdz",
+        "asset/environment.exr",
+        "asset/light.json",
+        "asset/textures/head_albedo.exr",
+        "asset/textures/head_albedo.png",
+        "asset/textures/head_specular_coefficients.exr",
+        "asset/textures/head_basis_lut.exr",
+    } <= listed
+    on_disk = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+    views = {f.path for v in asset.views for f in (v.exr, v.png)}
+    assert on_disk == listed | views
+    assert asset.root == "asset/head.usd"
+    assert asset.warnings == ()
+
+
+def test_component_structure(exported) -> None:
+    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
+    prim = stage.GetDefaultPrim()
+    assert prim.GetPath() == "/head"
+    assert Usd.ModelAPI(prim).GetKind() == "component"
+    assert Usd.ModelAPI(prim).GetAssetName() == "head"
+    assert [str(p) for p in prim.GetInherits().GetAllDirectInherits()] == ["/_class_head"]
+    render, proxy = (UsdGeom.Mesh.Get(stage, f"/head/geo/{n}") for n in ("render", "proxy"))
+    assert render.GetPurposeAttr().Get() == "render"
+    assert proxy.GetPurposeAttr().Get() == "proxy"
+    assert render.GetProxyPrimRel().GetTargets() == [proxy.GetPath()]
+    assert render.GetSubdivisionSchemeAttr().Get() == "none"
+    assert render.GetDoubleSidedAttr().Get() is False
+    st = UsdGeom.PrimvarsAPI(render).GetPrimvar("st")
+    assert (st.GetTypeName(), st.GetInterpolation(), st.IsIndexed()) == ("texCoord2f[]", "faceVarying", True)
+    material = UsdShade.MaterialBindingAPI(render).ComputeBoundMaterial()[0]
+    surface = UsdShade.Shader(material.ComputeSurfaceSource()[0])
+    assert surface.GetInput("useSpecularWorkflow").Get() == 0
+    assert surface.GetInput("ior").Get() == pytest.approx(1.402, abs=2e-3)  # of the synthetic mean F0 of 0.028
+
+
+def test_mesh_survives_the_round_trip(exported, inputs: SyntheticInputs) -> None:
+    from stages.usd.exported import read_usd_mesh
+
+    found, wanted = read_usd_mesh(exported[0] / "asset/head.usd"), ball()
+    np.testing.assert_array_equal(found.vertices[found.faces], wanted["vertices"][wanted["faces"]])
+    np.testing.assert_array_equal(found.uvs[found.uv_faces], wanted["uvs"][wanted["uv_faces"]])
+    np.testing.assert_allclose(found.normals[found.faces], wanted["normals"][wanted["faces"]], atol=1e-6)
+
+
+def test_every_layer_has_units_and_axis(exported) -> None:
+    from pxr import Sdf
+
+    for name in ("head.usd", "payload.usdc", "lookdev.usda"):
+        layer = Sdf.Layer.FindOrOpen(str(exported[0] / "asset" / name))
+        assert layer.pseudoRoot.GetInfo("metersPerUnit") == 1, name
+        assert layer.pseudoRoot.GetInfo("upAxis") == "Y", name
+
+
+def test_proxy_takes_the_texture_of_what_it_stands_for(exported) -> None:
+    """At each proxy corner the texture coordinate is that of the full mesh's nearest vertex, within its spacing."""
+    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
+    proxy = UsdGeom.Mesh.Get(stage, "/head/geo/proxy")
+    points = np.array(proxy.GetPointsAttr().Get())[np.array(proxy.GetFaceVertexIndicesAttr().Get())]
+    st = np.array(UsdGeom.PrimvarsAPI(proxy).GetPrimvar("st").ComputeFlattened())
+    mid = np.abs(points[:, 1]) < 0.1  # away from the poles, where u is not defined
+    u = 0.02 + 0.96 * ((np.arctan2(points[mid, 0], points[mid, 2]) / (2 * np.pi) + 0.5) % 1)
+    seam = np.abs(np.abs(u - 0.5) - 0.48) < 0.02
+    assert np.abs(st[mid, 0] - u)[~seam].max() < 0.01
+    assert (np.minimum(st[mid, 0], 1 - st[mid, 0])[seam] < 0.045).all()
+    corners = st.reshape(-1, 3, 2)
+    assert np.ptp(corners[..., 0], axis=1).max() < 0.1  # no triangle runs from one edge of the chart to the other
+
+
+def test_lookdev_adds_light_and_cameras_only(exported) -> None:
+    folder = exported[0] / "asset"
+    stage, plain = Usd.Stage.Open(str(folder / "lookdev.usda")), Usd.Stage.Open(str(folder / "head.usd"))
+    dome = UsdLux.DomeLight.Get(stage, "/head/lookdev/captured_light")
+    assert dome.GetTextureFileAttr().Get().resolvedPath == str(folder / "environment.exr")
+    assert not any("Light" in p.GetTypeName() or p.IsA(UsdGeom.Camera) for p in plain.Traverse())
+    assert stage.GetDefaultPrim().GetPath() == "/head"
+    assert [p.GetName() for p in stage.GetPseudoRoot().GetChildren() if not p.IsAbstract()] == ["head"]
+
+
+def test_cameras_see_points_where_the_photos_do(exported, inputs: SyntheticInputs) -> None:
+    """USD's own frustum mathematics against the pipeline's projection (less the distortion, which USD can't hold)."""
+    stage = Usd.Stage.Open(str(exported[0] / "asset/lookdev.usda"))
+    points = np.random.default_rng(3).uniform(-0.15, 0.15, (50, 3))
+    for camera in inputs.poses.artifact.cameras:
+        usd = UsdGeom.Camera.Get(stage, f"/head/lookdev/cameras/view_{camera.index}").GetCamera(Usd.TimeCode.Default())
+        view_projection = usd.frustum.ComputeViewMatrix() * usd.frustum.ComputeProjectionMatrix()
+        ndc = np.array([view_projection.Transform(Gf.Vec3d(*p.tolist())) for p in points])
+        found = np.stack([(ndc[:, 0] + 1) / 2 * camera.width, (1 - ndc[:, 1]) / 2 * camera.height], -1)
+        wanted, depth = project(matrix(camera.K), inverse_rigid(matrix(camera.world_from_cam)), np.zeros(5), points)
+        assert np.abs(found - wanted).max() < 0.01
+        near, far = usd.clippingRange.min, usd.clippingRange.max
+        assert near < depth.min() < depth.max() < far
+
+
+def test_two_exports_have_the_same_bytes(inputs: SyntheticInputs, tmp_path: Path, monkeypatch) -> None:
+    """In other folders, and years apart by the clock."""
+    import time
+
+    first = run(inputs, tmp_path / "a" / "work")
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + 1e8)
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    second = run(inputs, tmp_path / "b/other/work")
+    assert first.digest() == second.digest()
+    assert {f.path: f.sha256 for f in first.files} == {f.path: f.sha256 for f in second.files}
+
+
+def test_package_is_aligned_png_only_and_opens(exported) -> None:
+    path = exported[0] / "asset/head.usdz"
+    with zipfile.ZipFile(path) as z:
+        names = z.namelist()
+        assert names[0] == "head.usdc"
+        assert {Path(n).suffix for n in names[1:]} == {".png"}
+        assert all(i.compress_type == zipfile.ZIP_STORED and i.date_time == (1980, 1, 1, 0, 0, 0) for i in z.infolist())
+    stage = Usd.Stage.Open(str(path))
+    assert [p.GetName() for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)] == ["render"]
+    texture = UsdShade.Shader.Get(stage, "/head/mtl/captured/albedo").GetInput("file").Get()
+    assert texture.resolvedPath.endswith("head.usdz[textures/head_albedo.png]")
+
+
+@pytest.mark.parametrize("length", range(1, 70))
+def test_package_aligns_names_of_any_length(tmp_path: Path, length: int) -> None:
+    from stages.usd.package import write_package
+
+    path = tmp_path / "x.usdz"
+    write_package(path, [("a" * length, b"12345"), ("b", b"6" * length)])
+    content = path.read_bytes()
+    with zipfile.ZipFile(path) as z:
+        assert z.testzip() is None
+        for info in z.infolist():
+            extra = int.from_bytes(content[info.header_offset + 28 : info.header_offset + 30], "little")
+            start = info.header_offset + 30 + len(info.filename) + extra
+            assert start % 64 == 0
+            assert content[start : start + info.file_size] == z.read(info)
+
+
+def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
+    """A viewer that shows proxies would otherwise show nothing."""
+    run(write_inputs(tmp_path / "in", proxy=False, held_out=()), tmp_path / "work", usdz=False)
+    stage = Usd.Stage.Open(str(tmp_path / "work/asset/head.usd"))
+    assert UsdGeom.Mesh.Get(stage, "/head/geo/render").ComputePurpose() == "default"
+    assert not stage.GetPrimAtPath("/head/geo/proxy")
+    assert not (tmp_path / "work/asset/head.usdz").exists()
+    assert not (tmp_path / "work/asset_views").exists()
+
+
+def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
+    asset = run(write_inputs(tmp_path / "in", scale=2), tmp_path / "work")
+    assert [(v.index, v.scale) for v in asset.views] == [(3, 2), (9, 2)]
+    image, names = read_exr(tmp_path / "work" / asset.views[0].exr.path)
+    assert image.shape == (60, 48, 4)
+    assert names == ("R", "G", "B", "A")
+    png = read_encoded(tmp_path / "work" / asset.views[0].png.path)
+    assert png.shape == (60, 48, 4)
+
+
+def test_name_goes_into_prim_files_and_textures(inputs: SyntheticInputs, tmp_path: Path) -> None:
+    asset = run(inputs, tmp_path / "work", name="anna_02", render_views=False)
+    assert asset.root == "asset/anna_02.usd"
+    assert (tmp_path / "work/asset/textures/anna_02_albedo.png").is_file()
+    assert Usd.Stage.Open(str(tmp_path / "work/asset/anna_02.usd")).GetDefaultPrim().GetName() == "anna_02"
+
+
+@pytest.mark.parametrize("name", ["", "2head", "my head", "a/b", "tête", "payload", "lookdev2", "Light", "x" * 65])
+def test_bad_names_are_refused_and_mended(inputs: SyntheticInputs, tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="name"):
+        run(inputs, tmp_path / "work", name=name)
+    assert check_name(name_from(name)) == name_from(name)
+
+
+def test_missing_maps_are_named(tmp_path: Path) -> None:
+    arrays = texture_arrays()
+    del arrays["inv_kappa"]
+    with pytest.raises(StageError, match="maps are missing"):
+        run(write_inputs(tmp_path / "in", arrays=arrays), tmp_path / "work")
+
+
+@pytest.mark.parametrize("key, value", [("faces", -1), ("faces", 10**6), ("uv_faces", 10**6), ("vertices", np.nan)])
+def test_broken_meshes_are_refused(tmp_path: Path, key: str, value: float) -> None:
+    mesh = ball()
+    mesh[key][5, 1] = value
+    with pytest.raises(StageError, match="mesh can't be exported"):
+        run(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
+
+
+def test_mesh_without_uvs_is_refused(tmp_path: Path) -> None:
+    mesh = ball()
+    del mesh["uvs"]
+    with pytest.raises(StageError, match="no array uvs"):
+        run(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
+
+
+@pytest.mark.parametrize("light", [np.zeros((120, 3)), np.zeros((121, 4)), np.full((121, 3), np.nan)])
+def test_broken_lights_are_refused(tmp_path: Path, light: np.ndarray) -> None:
+    with pytest.raises(StageError, match="light can't be used"):
+        run(write_inputs(tmp_path / "in", light=light.astype(np.float32)), tmp_path / "work")
+
+
+def test_a_cancelled_export_stops(inputs: SyntheticInputs, tmp_path: Path) -> None:
+    from pipeline.errors import Cancelled
+
+    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+    context = Context(tmp_path / "w", tmp_path / "s", cancelled=lambda: True)
+    with pytest.raises(Cancelled):
+        STAGE.run(Inputs(**named), Config(), context)
+
+
+def test_light_json_explains_itself(exported) -> None:
+    content = json.loads((exported[0] / "asset/light.json").read_text())
+    assert np.array(content["coefficients"]).shape == (121, 3)
+    assert content["order"] == 10
+    assert "l * (l + 1) + m" in content["convention"]
+
+
+def test_no_machine_path_in_any_layer(exported) -> None:
+    for path in (exported[0] / "asset").rglob("*"):
+        if path.is_file():
+            assert str(exported[0].parent).encode() not in path.read_bytes(), path.name
+
+
+@pytest.mark.parametrize("f0, ior", [(0.04, 1.5), (0.028, 1.402)])
+def test_ior(f0: float, ior: float) -> None:
+    assert ior_from_f0(f0) == pytest.approx(ior, abs=1e-3)
+    assert ((ior - 1) / (ior + 1)) ** 2 == pytest.approx(f0, abs=1e-4)
+
+
+def test_ior_of_implausible_reflectance_stays_finite() -> None:
+    assert 1 < ior_from_f0(-1.0) < ior_from_f0(5.0) < 3
