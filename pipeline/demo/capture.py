@@ -32,7 +32,7 @@ import OpenEXR
 import trimesh
 
 from pipeline.demo import head, light
-from pipeline.demo.mesh import Mesh, mesh_from_distance, simplified
+from pipeline.demo.mesh import Mesh, mesh_from_distance
 from pipeline.demo.render import Camera, Picture, Scene, render, scene_from_mesh
 from pipeline.demo.rig import rig_cameras
 
@@ -47,7 +47,7 @@ EXPOSURE = 0.52
 """Scale of the studio light: it sets the photos' brightness, as a camera's exposure would."""
 
 _ENV_HEIGHT = 128
-_TRUTH_FACES = 50_000
+_TRUTH_STEP = 0.0027  # metres; gives some 60 000 faces
 _TRUTH_EVERY, _TRUTH_AT = 5, 2
 
 
@@ -128,10 +128,9 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     _write_json(folder / "params.json", facescape_params(cameras))
     total = request.views + 1
     progress(0, total, "sculpting the head")
-    mesh = mesh_from_distance(
-        head.signed_distance, head.distance_and_gradient, head.BOUNDS, request.mesh_step
-    )
-    _write_mesh(folder / "truth" / "mesh_gt.ply", mesh)
+    mesh = _head_mesh(request.mesh_step)
+    coarser = max(request.mesh_step, _TRUTH_STEP)
+    _write_mesh(folder / "truth" / "mesh_gt.ply", mesh if coarser == request.mesh_step else _head_mesh(coarser))
     coefficients = light.studio_coefficients(EXPOSURE)
     _write_light(folder / "truth", coefficients)
     scene = scene_from_mesh(mesh, coefficients, request.samples, request.seed, request.shadows)
@@ -146,6 +145,10 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
             raise
     _write_json(folder / MARKER, {"digest": request.digest(), **asdict(request)})
     progress(total, total, "done")
+
+
+def _head_mesh(step: float) -> Mesh:
+    return mesh_from_distance(head.signed_distance, head.distance_and_gradient, head.BOUNDS, step)
 
 
 def facescape_params(cameras: list[Camera]) -> dict[str, object]:
@@ -195,9 +198,7 @@ def _write_light(truth: Path, coefficients: F64) -> None:
     _write_json(truth / "light.json", about)
 
 
-def _write_mesh(path: Path, traced: Mesh) -> None:
-    """The true surface in at most some 50 000 faces, its vertices on the zero level."""
-    mesh = simplified(traced, _TRUTH_FACES, head.distance_and_gradient)
+def _write_mesh(path: Path, mesh: Mesh) -> None:
     trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(path)
 
 

@@ -35,8 +35,8 @@ from pipeline.demo.shapes import (
     wrapped,
 )
 
-BOUNDS: F64 = np.array([[-0.105, -0.180, -0.125], [0.105, 0.135, 0.135]])
-"""Corners (2, 3) of a box that holds the whole head, metres."""
+BOUNDS: F64 = np.array([[-0.1043, -0.1807, -0.1249], [0.1057, 0.1349, 0.1353]])
+"""Corners (2, 3) of a box that holds the whole head, metres; odd, so that no grid node meets a flat face."""
 
 NECK_CUT = -0.168
 """Height of the plane that ends the neck, metres."""
@@ -44,15 +44,17 @@ NECK_CUT = -0.168
 _MM = 1000.0
 _FOLD_MM = 1.0
 _WIDEST_JOINT = 17.0  # of the joints made inside _within
-_EYES = (31.0, 0.0, 80.0, 34.0)  # balls x, y, z, radius that hold the features of the face, millimetres
-_MOUTH = (12.0, -72.0, 90.0, 40.0)
+_EYES = (31.0, 0.0, 80.0, 38.0)  # balls x, y, z, radius that hold the features of the face, millimetres
+_MOUTH = (12.0, -72.0, 90.0, 42.0)
 _NOSE = (6.0, -20.0, 94.0, 48.0)
-_EARS = (80.0, -20.0, -16.0, 46.0)
+_EARS = (78.0, -20.0, -15.0, 48.0)
 _LID = (32.0, -2.0, 64.0)  # centre and radii of the closed lids
 _LID_RADII = (17.0, 14.0, 14.0)
-_HELIX = spline([(9, -2, 1), (12, 12, 0.5), (8, 26, 1.5), (-4, 30, 3), (-14.5, 20, 4), (-16, 4, 4),
-                 (-12, -12, 3), (-3, -24, 1)], 2)
-_ANTIHELIX = spline([(2, 22, 2), (-6, 14, 2.6), (-9, 2, 2.8), (-6, -11, 2.6), (1, -18, 2)], 2)
+# Curves of the ear, in its own frame: x, y, z and the tube's radius.
+_HELIX = spline([(9, -2, 0.5, 2.2), (12, 12, 0, 2.5), (8, 26, 0.8, 2.7), (-4, 30, 1.6, 2.7), (-14, 20, 2.2, 2.7),
+                 (-15.6, 4, 2.2, 2.7), (-12, -12, 1.8, 2.8), (-3, -24, 0.5, 3.2)], 5)
+_ANTIHELIX = spline([(2, 22, 1.4, 1.4), (-6, 14, 2.0, 2.0), (-8.6, 2, 2.2, 2.0), (-6, -11, 2.2, 2.0),
+                     (1, -18, 1.6, 1.8)], 5)
 _CHEEK_FOLD = spline([(17, -40, 96), (25, -54, 94), (32, -70, 84)], 6)
 _ARCH_AXIS = 56.0  # the arch of the teeth: z of its axis, and its radius
 _ARCH_RADIUS = 38.0
@@ -215,7 +217,7 @@ def _mouth(head: Distance, middle: Frame, pair: Frame) -> Distance:
     lower = arched(arch, 0.003)
     head = smooth_union(head, ellipsoid(lower, (0, -73.6, -2.4), (22, 5.0, 6.0)), 6.5)
     line = arched(arch, -0.002)
-    head = smooth_cut(head, ellipsoid(line, (0, -69.2, 5.0), (24.5, 1.0, 5.6)), 3.2)
+    head = smooth_cut(head, tube(line, [(-23.5, -69.2, 2.0), (23.5, -69.2, 2.0)], (1.0, 1.0)), 3.2)
     return smooth_cut(head, ellipsoid(arch_pair, (28, -71, 2.0), (3, 3, 3)), 5.0)
 
 
@@ -226,14 +228,21 @@ def _ears(head: Distance, middle: Frame, pair: Frame) -> Distance:
     """
     to_ear = rotation(pitch=0.0, roll=-0.22) @ _ear_axes(flare=0.38)
     ear = turned(pair, (74, -20, -14), to_ear)
-    plate = ellipsoid(ear, (0, 0, 0), (16, 29, 3.6))
-    plate = smooth_union(plate, tube(ear, _HELIX, (2.2, *(2.7,) * 12, 3.0, 3.4)), 3.0)
+    plate = ellipsoid(ear, (0, 0, 0), (17, 30, 4.6))
+    # The root fills the gap behind the bowl, so that the ear encloses no tunnel.
+    plate = smooth_union(plate, ellipsoid(ear, (2, -2, -8), (9, 17, 10)), 5.0)
+    plate = smooth_union(plate, _curve(ear, _HELIX), 3.0)
     plate = smooth_union(plate, ellipsoid(ear, (1, -27, 0.5), (7.5, 8.5, 3.6)), 4.0)
-    plate = smooth_cut(plate, ellipsoid(ear, (-1, 1, 6.5), (11.5, 23, 5.5)), 3.0)
+    plate = smooth_cut(plate, ellipsoid(ear, (-1, 1, 6.8), (11.5, 23, 5.0)), 3.0)
     plate = smooth_cut(plate, ellipsoid(ear, (3, -6, 4), (8, 10.5, 6.5)), 3.0)
-    plate = smooth_union(plate, tube(ear, _ANTIHELIX, (1.4, *(2.0,) * 7, 1.8)), 3.0)
+    plate = smooth_union(plate, _curve(ear, _ANTIHELIX), 3.0)
     plate = smooth_union(plate, ellipsoid(ear, (10.5, -7, 2.0), (3.4, 5.5, 3.4)), 3.0)
     return smooth_union(head, plate, 6.0)
+
+
+def _curve(frame: Frame, curve: list[list[float]]) -> Distance:
+    """Tube along rows of x, y, z, radius."""
+    return tube(frame, [row[:3] for row in curve], [row[3] for row in curve])
 
 
 def _ear_axes(flare: float) -> F64:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import eval_legendre, sph_harm_y_all
+from scipy.special import eval_legendre, sph_legendre_p_all
 
 F64 = npt.NDArray[np.float64]
 
@@ -58,18 +58,19 @@ _SAMPLES = 24  # points along each side of a soft box
 def real_basis(directions: F64) -> F64:
     """Real orthonormal harmonics (N, 121) at unit `directions` (N, 3)."""
     x, y, z = directions.T
-    polar, azimuth = np.arccos(np.clip(z, -1.0, 1.0)), np.arctan2(y, x)
-    complex_ = sph_harm_y_all(DEGREE, DEGREE, polar, azimuth)
-    basis = np.empty((len(directions), COEFFICIENTS))
-    for degree in range(DEGREE + 1):
-        centre = degree * (degree + 1)
-        basis[:, centre] = complex_[degree, 0].real
-        for order in range(1, degree + 1):
-            # scipy carries the Condon-Shortley sign; this basis does not.
-            value = np.sqrt(2.0) * (-1.0) ** order * complex_[degree, order]
-            basis[:, centre + order] = value.real
-            basis[:, centre - order] = value.imag
-    return basis
+    azimuth = np.arctan2(y, x)
+    legendre = np.asarray(sph_legendre_p_all(DEGREE, DEGREE, np.arccos(np.clip(z, -1.0, 1.0))))
+    legendre = legendre.reshape(DEGREE + 1, 2 * DEGREE + 1, len(directions))
+    basis = np.empty((COEFFICIENTS, len(directions)))
+    for order in range(DEGREE + 1):
+        # scipy carries the Condon-Shortley sign; this basis does not.
+        scale = 1.0 if order == 0 else np.sqrt(2.0) * (-1.0) ** order
+        cosine, sine = scale * np.cos(order * azimuth), scale * np.sin(order * azimuth)
+        for degree in range(order, DEGREE + 1):
+            centre = degree * (degree + 1)
+            basis[centre - order] = legendre[degree, order] * sine
+            basis[centre + order] = legendre[degree, order] * cosine
+    return np.ascontiguousarray(basis.T)
 
 
 def kernel_bands() -> F64:

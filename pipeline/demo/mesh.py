@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import fast_simplification
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from skimage.measure import marching_cubes
 
 F64 = npt.NDArray[np.float64]
@@ -51,18 +52,7 @@ def mesh_from_distance(
         volume, 0.0, spacing=(step, step, step), mask=known
     )
     points = _project(np.asarray(vertices, dtype=np.float64) + bounds[0], distance_and_gradient, step)
-    return Mesh(points, _outward(points, np.asarray(faces, dtype=np.int64)))
-
-
-def simplified(
-    mesh: Mesh, faces: int, distance_and_gradient: Callable[[F64], tuple[F64, F64]], step: float = 1e-3
-) -> Mesh:
-    """At most about `faces` faces by quadric collapse, vertices then projected by up to `step` metres each."""
-    if len(mesh.faces) <= faces:
-        return mesh
-    points, triangles = fast_simplification.simplify(mesh.vertices, mesh.faces, target_count=faces)
-    vertices = _project(np.asarray(points, dtype=np.float64), distance_and_gradient, step)
-    return Mesh(vertices, _outward(vertices, np.asarray(triangles, dtype=np.int64)))
+    return _largest(points, _outward(points, np.asarray(faces, dtype=np.int64)))
 
 
 def _grid(origin: F64, step: float, shape: tuple[int, ...]) -> F64:
@@ -102,6 +92,17 @@ def _project(points: F64, distance_and_gradient: Callable[[F64], tuple[F64, F64]
         length2 = np.maximum(np.einsum("ni,ni->n", gradient, gradient), 1e-6)
         points = points - gradient * np.clip(value / length2, -step, step)[:, None]
     return points
+
+
+def _largest(vertices: F64, faces: Faces) -> Mesh:
+    """The piece with most vertices: a coarse grid may break crumbs off a crease finer than itself."""
+    count = len(vertices)
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    graph = coo_array((np.ones(len(edges), dtype=np.int8), edges.T), shape=(count, count))
+    _, piece = connected_components(graph, directed=False)
+    kept = piece == np.argmax(np.bincount(piece))
+    renumbered = np.cumsum(kept) - 1
+    return Mesh(vertices[kept], renumbered[faces[kept[faces[:, 0]]]])
 
 
 def _outward(vertices: F64, faces: Faces) -> Faces:

@@ -20,11 +20,11 @@ FIELD = 0.325
 
 # Elevation in degrees, share of the views, and half the range of azimuths in degrees.
 _ROWS = (
-    (-24.0, 0.18, 100.0),
-    (-5.0, 0.25, 108.0),
-    (13.0, 0.25, 108.0),
-    (32.0, 0.17, 100.0),
-    (54.0, 0.08, 75.0),
+    (-24.0, 0.18, 112.0),
+    (-5.0, 0.25, 120.0),
+    (13.0, 0.25, 120.0),
+    (32.0, 0.17, 112.0),
+    (54.0, 0.08, 90.0),
 )
 _BACK = (150.0, -145.0, 179.0)  # azimuths, repeated, of the views that are left over
 
@@ -49,7 +49,8 @@ def _angles(views: int) -> list[tuple[float, float]]:
         counts[int(np.argmax(counts))] -= 1
     out: list[tuple[float, float]] = []
     for (elevation, _, reach), count in zip(_ROWS, counts, strict=True):
-        steps = np.linspace(-reach, reach, count) if count > 1 else np.zeros(count)
+        # Middles of equal parts: even two views of a row then stand in front, not at its two ends.
+        steps = ((np.arange(count) + 0.5) / max(count, 1) * 2.0 - 1.0) * reach
         out += [(float(a), elevation) for a in steps]
     left = views - len(out)
     return out + [(_BACK[i % len(_BACK)], 8.0 + 22.0 * (i % 2)) for i in range(left)]
