@@ -26,6 +26,7 @@ class HashEncoding(nn.Module):
     offset: Tensor
     size: Tensor
     hashed: Tensor
+    window: Tensor
     lo: Tensor
     inv: Tensor
 
@@ -40,6 +41,7 @@ class HashEncoding(nn.Module):
         self.register_buffer("offset", torch.tensor(np.cumsum([0, *rows[:-1]]), dtype=torch.int64))
         self.register_buffer("size", torch.tensor(sizes, dtype=torch.int64))
         self.register_buffer("hashed", torch.tensor([s[0] * s[1] * s[2] > 2**log2_size for s in sizes]))
+        self.register_buffer("window", torch.ones(FEATURES * levels))
         self.register_buffer("lo", lo.float().clone())
         self.register_buffer("inv", torch.tensor([1 / h for h in cells], dtype=torch.float32))
         self.table = nn.Parameter(torch.empty(sum(rows), FEATURES).uniform_(-1e-4, 1e-4))
@@ -52,7 +54,13 @@ class HashEncoding(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Features at x, differentiable in the table and in x."""
         out: Tensor = _Hash.apply(x, self.table, self) if kernels.compiled(x) else self.reference(x)  # type: ignore[no-untyped-call]
-        return out
+        return out * self.window
+
+    def open_levels(self, share: float) -> None:
+        """Let the coarsest `share` of the levels through, the last of them in part; finer ones give 0."""
+        count = len(self.offset)
+        level = torch.arange(count, device=self.window.device).repeat_interleave(FEATURES)
+        self.window.copy_((share * count - level).clamp(0, 1))
 
     def reference(self, x: Tensor) -> Tensor:
         """The same in plain torch, differentiated by autograd."""

@@ -153,15 +153,19 @@ def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, ref
                 t1 = min(t + max(factor * s, min_step), t_far[n])
                 s1 = _value(values, lo, inv, o[n, 0] + t1 * d[n, 0], o[n, 1] + t1 * d[n, 1], o[n, 2] + t1 * d[n, 2])
                 if s1 <= 0:
-                    t0, s0 = t, s
+                    t0, s0, last = t, s, 0
                     for _ in range(refine_steps):
                         best_t = t0 + (t1 - t0) * (s0 / max(s0 - s1, np.float32(1e-12)))
                         best_s = _value(values, lo, inv, o[n, 0] + best_t * d[n, 0], o[n, 1] + best_t * d[n, 1],
                                         o[n, 2] + best_t * d[n, 2])
+                        if abs(best_s) < np.float32(1e-3) * min_step:
+                            break
                         if best_s > 0:
-                            t0, s0 = best_t, best_s
+                            t0, s0, s1 = best_t, best_s, HALF * s1 if last == 1 else s1
+                            last = 1
                         else:
-                            t1, s1 = best_t, best_s
+                            t1, s1, s0 = best_t, best_s, HALF * s0 if last == -1 else s0
+                            last = -1
                     found = True
                     break
                 if s1 < best_s:

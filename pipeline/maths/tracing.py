@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-MAX_STEPS, REFINE_STEPS = 200, 4
+MAX_STEPS, REFINE_STEPS = 200, 6
 
 
 def box_interval(o: Tensor, d: Tensor, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,12 +62,16 @@ def sphere_trace(
 def _secant(
     sdf: Callable[[Tensor], Tensor], o: Tensor, d: Tensor, t0: Tensor, s0: Tensor, t1: Tensor, s1: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Root between t0 (outside) and t1 (inside) by regula falsi."""
+    """Root between t0 (outside) and t1 (inside) by the Illinois rule: regula falsi that halves the value at an end
+    which stays twice running, so that it can't creep in from one side."""
     t, s = t1, s1
+    last = torch.zeros_like(s)
     for _ in range(REFINE_STEPS):
         t = t0 + (t1 - t0) * (s0 / (s0 - s1).clamp(min=1e-12))
         s = sdf(o + t[:, None] * d)
         outside = s > 0
-        t0, s0 = torch.where(outside, t, t0), torch.where(outside, s, s0)
-        t1, s1 = torch.where(outside, t1, t), torch.where(outside, s1, s)
+        again = torch.sign(s) == last
+        last = torch.sign(s)
+        t0, s0 = torch.where(outside, t, t0), torch.where(outside, s, torch.where(again, 0.5 * s0, s0))
+        t1, s1 = torch.where(outside, t1, t), torch.where(outside, torch.where(again, 0.5 * s1, s1), s)
     return t, s

@@ -89,7 +89,7 @@ class Trainer:
             self.table = PixelTable(self.views, side, self.device)
 
     def set_rates(self) -> float:
-        """Learning rates and beta of this step; returns the SDF's rate in asset units.
+        """Learning rates, beta and open encoding levels of this step; returns the SDF's rate in asset units.
 
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
@@ -102,6 +102,8 @@ class Trainer:
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
+        opened = min(p / s.open_until, 1.0)
+        self.model.spatial.encoding.open_levels(s.open_from + (1 - s.open_from) * opened)
         return s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step

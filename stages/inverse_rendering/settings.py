@@ -32,6 +32,8 @@ class FitSettings:
     hash_levels: int = 10
     hash_log2_size: int = 17
     hash_fine: float = 0.0008
+    open_from: float = 0.4
+    open_until: float = 0.5
     width: int = 64
     # weights
     rgb: float = 1.0

@@ -50,6 +50,8 @@ class Config(StageConfig):
     hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
     hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
     hash_fine: float = Field(description="finest cell of the appearance encoding, asset units", gt=0, le=0.1)
+    open_from: float = Field(description="share of the encoding's levels, coarse first, open at the start", ge=0, le=1)
+    open_until: float = Field(description="share of the steps after which all levels are open", gt=0, le=1)
     width: int = Field(description="width of the appearance networks", ge=8, le=512)
     rgb: float = Field(description="lambda 1 [NeuFace eq. 21]", ge=0)
     mask: float = Field(description="weight of the opacity's cross-entropy against the masks", ge=0)

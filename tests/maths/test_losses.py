@@ -1,0 +1,39 @@
+"""Loss terms: values by hand, and gradients where they could break."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pipeline.colour import linear_from_srgb
+from pipeline.maths import losses
+
+
+def test_rgb_is_zero_for_the_right_colour_and_keeps_its_gradient_above_one() -> None:
+    target = torch.tensor([[0.2, 0.5, 1.0]])
+    assert float(losses.rgb_l1(linear_from_srgb(target), target)) == pytest.approx(0, abs=1e-6)
+    x = torch.tensor([[0.0, 2.0, -0.1]], requires_grad=True)
+    losses.rgb_l1(x, target).sum().backward()
+    assert torch.isfinite(x.grad).all() and (x.grad != 0).all()
+
+
+def test_white_light_counts_colour_alone() -> None:
+    assert losses.white_light(torch.tensor([[2.0, 2, 2]])).item() == 0
+    assert losses.white_light(torch.tensor([[3.0, 0, 0]])).item() == pytest.approx(4 / 3)
+
+
+@pytest.mark.parametrize("squared", [True, False])
+def test_eikonal(squared: bool) -> None:
+    g = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 3, 0]], requires_grad=True)
+    found = losses.eikonal(g, squared)
+    assert found.tolist() == pytest.approx([1, 0, 4 if squared else 2], abs=1e-5)
+    found.sum().backward()
+    assert torch.isfinite(g.grad).all()
+
+
+def test_the_other_terms() -> None:
+    assert losses.displacement(torch.tensor([-2.0, 1.0])).tolist() == [2, 1]
+    assert losses.embedding(torch.tensor([[3.0, 4.0]])).item() == 25
+    assert losses.specular_energy(torch.tensor([[0.0, 0.3, 0.6]])).item() == pytest.approx(0.3)
+    n = torch.tensor([[0.0, 0, 1]])
+    assert losses.normal_consistency(n, n).item() == 0 and losses.normal_consistency(n, -n).item() == 2
