@@ -144,7 +144,13 @@ def execute(
 
 
 def _run(
-    stage: Stage[I, C, O], inputs: I, config: C, store: Store, k: str, device: str, progress: Progress,
+    stage: Stage[I, C, O],
+    inputs: I,
+    config: C,
+    store: Store,
+    k: str,
+    device: str,
+    progress: Progress,
     cancelled: Callable[[], bool],
 ) -> Done[O]:
     partial, scratch = store.begin(stage.name, k), store.scratch(stage.name, k)
@@ -155,8 +161,11 @@ def _run(
         context.check()
         artifact = stage.run(inputs, config, context)
         run: dict[str, Any] = {
-            "seconds": round(time.perf_counter() - start, 3), "peak_memory_mb": peak_memory_mb(), "device": device,
-            "config": config.model_dump(mode="json"), "versions": versions(),
+            "seconds": round(time.perf_counter() - start, 3),
+            "peak_memory_mb": peak_memory_mb(),
+            "device": device,
+            "config": config.model_dump(mode="json"),
+            "versions": versions(),
         }
         located = store.finish(stage.name, k, partial, artifact, run)
     except BaseException:

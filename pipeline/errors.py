@@ -68,5 +68,10 @@ def stage_error_from_os_error(error: OSError, where: Path | str) -> StageError |
     if found is None:
         return None
     what, remedy = found
-    return StageError(what, where=error.filename or where, value=error.strerror or error, limit="a writable folder "
-                      "with enough free space", remedy=remedy)
+    return StageError(
+        what,
+        where=error.filename or where,
+        value=error.strerror or error,
+        limit="a writable folder with enough free space",
+        remedy=remedy,
+    )

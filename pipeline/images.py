@@ -1,4 +1,4 @@
-"""Reading and writing pictures. Arrays are RGB(A), row 0 on top; what is linear and what is encoded is said per function."""
+"""Reading and writing pictures. Arrays are RGB(A), row 0 on top; each function says what is linear."""
 
 from __future__ import annotations
 
@@ -23,12 +23,21 @@ def read_encoded(path: Path) -> npt.NDArray[np.generic]:
     size = path.stat().st_size if path.is_file() else 0
     image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if size else None
     if image is None:
-        raise StageError("the image can't be decoded", where=path.name, value=f"{size} bytes, not a readable image",
-                         limit="a complete JPEG, PNG, TIFF or EXR file", remedy="copy the file again from the camera, "
-                         "or take it out of the folder")
+        raise StageError(
+            "the image can't be decoded",
+            where=path.name,
+            value=f"{size} bytes, not a readable image",
+            limit="a complete JPEG, PNG, TIFF or EXR file",
+            remedy="copy the file again from the camera, or take it out of the folder",
+        )
     if image.shape[0] * image.shape[1] > MAX_PIXELS:
-        raise StageError("the image is too large", where=path.name, value=f"{image.shape[1]} x {image.shape[0]}",
-                         limit=f"{MAX_PIXELS / 1e6:.0f} megapixels", remedy="scale it down")
+        raise StageError(
+            "the image is too large",
+            where=path.name,
+            value=f"{image.shape[1]} x {image.shape[0]}",
+            limit=f"{MAX_PIXELS / 1e6:.0f} megapixels",
+            remedy="scale it down",
+        )
     if image.ndim == 2:
         image = image[..., None]
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
@@ -84,8 +93,9 @@ def write_exr(path: Path, image: F32, channels: tuple[str, ...] | None = None, *
 
     data = np.atleast_3d(np.asarray(image, np.float16 if half else np.float32))
     count = data.shape[2]
-    names = channels or {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(count, tuple(
-        f"c{i}" for i in range(count)))
+    names = channels or {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(
+        count, tuple(f"c{i}" for i in range(count))
+    )
     if len(names) != count:
         raise ValueError(f"{len(names)} channel names for {count} channels")
     planes = {n: np.ascontiguousarray(data[..., i]) for i, n in enumerate(names)}

@@ -2,8 +2,8 @@
 
 Layout: `<root>/<stage>/<key>/` is finished and holds `manifest.json`, the artifact's files and `run.json`;
 `<key>.partial-*` is being written; `<key>.scratch/` holds checkpoints of work under way; `.locks/<stage>-<key>` is
-held while one process works on the key. Only a rename turns a partial folder into a finished one, so that a process killed at
-any moment leaves nothing that could be taken for finished.
+held while one process works on the key. Only a rename turns a partial folder into a finished one, so that a process
+killed at any moment leaves nothing that could be taken for finished.
 """
 
 from __future__ import annotations
@@ -95,6 +95,13 @@ class Store:
         partial = self.root / stage / f"{key}.partial-{uuid.uuid4().hex[:8]}"
         partial.mkdir(parents=True)
         return partial
+
+    def forget(self, stage: str, key: str) -> None:
+        """Take out what is stored under a key, finished or not, so that it is made anew."""
+        with self.lock(stage, key):
+            for folder in (self.folder(stage, key), self.scratch(stage, key)):
+                if folder.is_dir():
+                    shutil.rmtree(folder)
 
     def finish(self, stage: str, key: str, partial: Path, artifact: A, run: dict[str, object]) -> Located[A]:
         """Seal a partial folder: every named file there and on disk, then one rename."""

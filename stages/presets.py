@@ -1,0 +1,196 @@
+"""Every stage's settings from a preset, a file and single values: the one place where they are put together.
+
+Order, the later one wins: the stages' own defaults, the preset, the options that concern several stages (holdout,
+name, seed), the file, the single values.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from pipeline.contract import Stage, StageConfig
+from pipeline.errors import UsageError
+
+Settings = Mapping[str, Mapping[str, Any]]
+
+# Speed against accuracy. draft: look at it in minutes. studio: the default. film: hours. paper: the paper's own
+# formulas and schedule, for comparison.
+PRESETS: dict[str, dict[str, dict[str, Any]]] = {
+    "draft": {
+        "inverse_rendering": {"preset": "draft"},
+        "surface": {"resolution": 192},
+        "uv": {"target_faces": 20_000},
+        "bake": {"size": 1024},
+    },
+    "studio": {
+        "inverse_rendering": {"preset": "studio"},
+        "surface": {"resolution": 320},
+        "uv": {"target_faces": 40_000},
+        "bake": {"size": 2048},
+    },
+    "film": {
+        "inverse_rendering": {"preset": "film"},
+        "surface": {"resolution": 512},
+        "uv": {"target_faces": 60_000},
+        "bake": {"size": 4096},
+    },
+    "paper": {
+        "inverse_rendering": {"preset": "paper"},
+        "surface": {"resolution": 512},
+        "uv": {"target_faces": 60_000},
+        "bake": {"size": 2048},
+    },
+}
+DEFAULT_PRESET = "studio"
+
+
+def configs_for(
+    preset: str,
+    sets: Settings,
+    config_file: Settings | None = None,
+    *,
+    holdout: str | None = None,
+    name: str | None = None,
+    seed: int | None = None,
+    registry: Iterable[Stage[Any, Any, Any]] | None = None,
+) -> dict[str, StageConfig]:
+    """The checked settings of every stage, by the stage's name.
+
+    Raises:
+        UsageError: an unknown preset, stage or key, or a value outside its limits; says which and what is possible.
+    """
+    stages = {s.name: s for s in (_registry() if registry is None else registry)}
+    known(preset, PRESETS, what="unknown preset", where="--preset")
+    merged: dict[str, dict[str, Any]] = {n: {} for n in stages}
+    for source in (PRESETS[preset], _shared(stages, holdout, name, seed)):
+        for stage, own in source.items():
+            if stage in merged:
+                merged[stage].update(own)
+    for origin, settings in (("--config", config_file or {}), ("--set", sets)):
+        for stage, values in settings.items():
+            known(stage, stages, what="unknown stage", where=f"{origin} {stage}")
+            if not isinstance(values, Mapping):
+                raise UsageError(
+                    "settings of a stage must be a table",
+                    where=f"{origin} {stage}",
+                    value=repr(values),
+                    limit="key = value under the stage's name",
+                    remedy=f"write [{stage}] above its keys",
+                )
+            for key in values:
+                known(
+                    key,
+                    stages[stage].config.model_fields,
+                    what=f"unknown setting of {stage}",
+                    where=f"{origin} {stage}.{key}",
+                )
+            merged[stage].update(values)
+    return {name: _checked(stages[name], values) for name, values in merged.items()}
+
+
+def _registry() -> tuple[Stage[Any, Any, Any], ...]:
+    from stages import REGISTRY
+
+    return REGISTRY
+
+
+def _shared(
+    stages: Mapping[str, Stage[Any, Any, Any]], holdout: str | None, name: str | None, seed: int | None
+) -> dict[str, dict[str, Any]]:
+    """Options that belong to whichever stage has a setting of that name."""
+    given = {"holdout": holdout, "name": name, "seed": seed}
+    found: dict[str, dict[str, Any]] = {}
+    for stage in stages.values():
+        for key, value in given.items():
+            if value is not None and key in stage.config.model_fields:
+                found.setdefault(stage.name, {})[key] = value
+    return found
+
+
+def _checked(stage: Stage[Any, Any, Any], values: Mapping[str, Any]) -> StageConfig:
+    try:
+        config: StageConfig = stage.config(**values)
+    except ValidationError as e:
+        first = e.errors()[0]
+        key = ".".join(str(part) for part in (stage.name, *first["loc"]))
+        field = stage.config.model_fields.get(str(first["loc"][0])) if first["loc"] else None
+        about = f" ({field.description})" if field and field.description else ""
+        raise UsageError(
+            "a setting is outside its limits",
+            where=key,
+            value=repr(first["input"]),
+            limit=first["msg"],
+            remedy=f"change {key}{about}",
+        ) from e
+    return config
+
+
+def known(word: str, choices: Iterable[str], *, what: str, where: str) -> None:
+    """Pass, if `word` is one of `choices`; else a UsageError that lists them and guesses which was meant."""
+    listed = list(choices)
+    if word in listed:
+        return
+    near = difflib.get_close_matches(word, listed, n=1)
+    guess = f"did you mean {near[0]}?" if near else "use one of these names"
+    raise UsageError(what, where=where, value=word, limit="one of: " + ", ".join(listed), remedy=guess)
+
+
+# ------------------------------------------------------------------ what users write
+def parse_sets(pairs: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """`stage.key=value` strings. A value in brackets, or null, is read as JSON; all else by the setting's own type."""
+    found: dict[str, dict[str, Any]] = {}
+    for pair in pairs:
+        path, equals, text = pair.partition("=")
+        stage, dot, key = path.strip().partition(".")
+        if not (equals and dot and stage and key):
+            raise UsageError(
+                "a single setting can't be read",
+                where="--set",
+                value=pair,
+                limit="stage.key=value",
+                remedy="for example --set bake.size=2048",
+            )
+        found.setdefault(stage, {})[key] = _value(text.strip())
+    return found
+
+
+def _value(text: str) -> Any:
+    if text == "null" or text[:1] in ("[", "{"):
+        try:
+            return json.loads(text)
+        except ValueError:
+            return text
+    return text
+
+
+def read_config_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Settings from a .toml or .json file: one table for each stage.
+
+    Raises:
+        UsageError: the file is missing, of another kind, or can't be parsed.
+    """
+    kinds = {".toml": tomllib.loads, ".json": json.loads}
+    try:
+        read: Any = kinds[path.suffix.lower()](path.read_text(encoding="utf-8"))
+    except KeyError:
+        fault = f"a {path.suffix or 'nameless'} file"
+    except (OSError, ValueError) as e:
+        fault = str(e)
+    else:
+        if isinstance(read, dict):
+            return read
+        fault = f"a {type(read).__name__} at the top"
+    raise UsageError(
+        "the settings file can't be read",
+        where=f"--config {path}",
+        value=fault,
+        limit="a .toml or .json file with one table for each stage",
+        remedy="for example a file s.toml that holds [bake] and under it size = 2048",
+    )

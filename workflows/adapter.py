@@ -1,0 +1,132 @@
+"""The one seam between stages and Prefect.
+
+Each stage becomes a task without Prefect's caching, result storage or retries: the store is the only cache, manifests
+and folders are all that is passed, and a stage that failed on bad input would only fail again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+from uuid import UUID
+
+from prefect import task
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    update_progress_artifact,
+)
+from prefect.cache_policies import NO_CACHE
+from prefect.logging import get_run_logger
+from prefect.settings import get_current_settings
+
+from pipeline.contract import Done, Stage, StageConfig, execute
+from workflows.plan import Plan
+from workflows.runner import RunStage
+from workflows.session import current
+
+PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
+
+
+def on_a_server() -> bool:
+    """Whether somebody can look at artifacts: a server that was named, not the throw-away one of a single run."""
+    return get_current_settings().api.url is not None
+
+
+def as_tasks(plan: Plan) -> RunStage:
+    """Run each stage of the plan as a Prefect task."""
+
+    def run_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> Done[Any]:
+        as_task = task(
+            name=stage.name,
+            task_run_name=stage.name,
+            description=(stage.run.__doc__ or "").strip(),
+            version=str(stage.version),
+            retries=0,
+            cache_policy=NO_CACHE,
+            persist_result=False,
+        )
+        run: Callable[[_Sealed], Done[Any]] = as_task(_execute)
+        return run(_Sealed(stage, inputs, config, plan))
+
+    return run_stage
+
+
+class _Sealed:
+    """A task's parameters as one object: Prefect would otherwise walk through every manifest in search of futures."""
+
+    def __init__(self, stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig, plan: Plan) -> None:
+        self.stage, self.inputs, self.config, self.plan = stage, inputs, config, plan
+
+    def __repr__(self) -> str:
+        return f"{self.stage.name} v{self.stage.version}, {self.config!r}"
+
+
+def _execute(work: _Sealed) -> Done[Any]:
+    watch, log = current(), get_run_logger()
+    shown = _Published(work.stage.name) if on_a_server() else None
+
+    def progress(done: int, total: int, message: str = "", **figures: float) -> None:
+        watch.observer.progress(done, total, message, **figures)
+        if shown is not None:
+            shown(done, total, message, figures)
+
+    plan = work.plan
+    done = execute(
+        work.stage,
+        work.inputs,
+        work.config,
+        plan.store,
+        device=plan.device,
+        progress=progress,
+        cancelled=watch.stop.is_set,
+    )
+    log.info("%s: %s, %s", done.stage, "reused" if done.reused else f"{done.run['seconds']} s", done.key[:12])
+    for warning in getattr(done.located.artifact, "warnings", ()):
+        log.warning("%s: %s", done.stage, warning)
+    if shown is not None:
+        shown.close("reused from the store" if done.reused else f"done in {done.run['seconds']} s")
+    return done
+
+
+class _Published:
+    """A stage's progress artifact, updated every few seconds."""
+
+    def __init__(self, stage: str) -> None:
+        self.key = f"progress-{stage.replace('_', '-')}"
+        self.artifact: UUID | None = None
+        self.last = 0.0
+
+    def __call__(self, done: int, total: int, message: str, figures: dict[str, float]) -> None:
+        if time.monotonic() - self.last >= PUBLISH_EVERY:
+            text = " ".join([message, *(f"{k} {v:.4g}" for k, v in figures.items())])
+            self._put(min(100.0 * done / max(total, 1), 100.0), text.strip())
+
+    def close(self, text: str) -> None:
+        """The last word on this stage."""
+        self._put(100.0, text)
+
+    def _put(self, percent: float, text: str) -> None:
+        self.last = time.monotonic()
+        if self.artifact is None:
+            self.artifact = cast(UUID, create_progress_artifact(percent, key=self.key, description=text))
+        else:
+            update_progress_artifact(self.artifact, percent, description=text)
+
+
+def publish_result(out: Path, record: dict[str, Any]) -> None:
+    """Show a finished run in Prefect: a table of its stages and a link to the report."""
+    if not on_a_server():
+        return
+    lines = ["| stage | seconds | key |", "|---|---|---|"]
+    for name, s in record["stages"].items():
+        lines.append(f"| {name} | {'reused' if s['reused'] else s['seconds']} | `{s['key'][:12]}` |")
+    warnings = [f"- {name}: {w}" for name, s in record["stages"].items() for w in s["warnings"]]
+    text = "\n".join([f"# {out.name}", f"`{out.resolve()}`", "", *lines, "", *warnings])
+    create_markdown_artifact(text, key="run", description="stages of this run")
+    page = out.resolve() / "report" / "index.html"
+    if page.is_file():
+        create_link_artifact(page.as_uri(), link_text="report", key="report", description="figures and pictures")

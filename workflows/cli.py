@@ -1,0 +1,125 @@
+"""The command line `neuface`.
+
+Exit codes: 0 done, 1 failed, 2 wrong usage, 130 stopped by the user with finished stages kept.
+"""
+
+import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from pipeline.errors import NeufaceError, stage_error_from_os_error
+from workflows import commands
+from workflows.console import Console
+
+EXAMPLES = """examples:
+  neuface demo                                        a made-up head, start to end, checked against the truth
+  neuface run photos/ --out runs/anna                 photos of a head -> asset and report
+  neuface run photos/ --out runs/anna --preset draft --holdout every:5:2 --set bake.size=2048
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    p = argparse.ArgumentParser(
+        prog="neuface",
+        description="Photos of a head in, a relightable USD asset out.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--verbose", action="store_true", help="also log what the stages say, and show tracebacks")
+    commands_of = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _run_options(commands_of.add_parser("run", help="one capture -> asset and report"))
+    demo = commands_of.add_parser("demo", help="the built-in demo capture -> asset, report, figures against the truth")
+    demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
+    demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
+    demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
+    demo.add_argument("--preset", default="draft", help="speed against accuracy (%(default)s)")
+    _where(demo)
+    demo.set_defaults(run=commands.demo_command)
+    validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
+    validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
+    validate.set_defaults(run=commands.validate_command)
+    for name, text, run in (
+        ("report", "(re)build the report of a run", commands.report_command),
+        ("view", "open the report of a run in a browser", commands.view_command),
+    ):
+        sub = commands_of.add_parser(name, help=text)
+        sub.add_argument("folder", metavar="DIR", help="the --out of that run")
+        sub.set_defaults(run=run)
+    doctor = commands_of.add_parser("doctor", help="is this machine ready?")
+    doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
+    doctor.set_defaults(run=commands.doctor_command)
+    return p
+
+
+def _run_options(run: argparse.ArgumentParser) -> None:
+    run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
+    run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
+    run.add_argument(
+        "--preset", default="studio", help="speed against accuracy: draft, studio, film or paper (%(default)s)"
+    )
+    run.add_argument(
+        "--holdout",
+        metavar="RULE",
+        help="views kept from the fit and used for the metrics: every:5:2 "
+        "(index %% 5 == 2) or names:a.jpg,b.jpg; default none",
+    )
+    run.add_argument("--name", help="name of the asset")
+    run.add_argument("--seed", type=int, default=0, help="of every random draw (%(default)s)")
+    run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
+    run.add_argument("--until", metavar="S", help="stop after this stage")
+    run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")
+    run.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
+    run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
+    _where(run)
+    run.set_defaults(run=commands.run_command)
+
+
+def _where(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--device", default="auto", help="auto, cpu or cuda (%(default)s)")
+    sub.add_argument(
+        "--store",
+        metavar="DIR",
+        default=os.environ.get("NEUFACE_STORE"),
+        help="folder of finished stages ($NEUFACE_STORE, else DIR/.store)",
+    )
+
+
+class _at_least:  # noqa: N801  (used like a function)
+    """An integer with a lower limit, as argparse wants it."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+
+    def __call__(self, text: str) -> int:
+        if not text.isdecimal() or int(text) < self.limit:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {self.limit}")
+        return int(text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; errors that a user can meet are printed without a traceback."""
+    options = parser().parse_args(arguments)
+    level = logging.INFO if options.verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
+    console = Console()
+    try:
+        code: int = options.run(options, console)
+    except Exception as e:
+        console.close()
+        known = (
+            e if isinstance(e, NeufaceError) else stage_error_from_os_error(e, "") if isinstance(e, OSError) else None
+        )
+        if known is None or options.verbose:
+            raise
+        print(f"error: {known}", file=sys.stderr)
+        code = known.exit_code
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

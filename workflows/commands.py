@@ -1,0 +1,246 @@
+"""What each command of `neuface` does, given its parsed options. Prefect is imported only where a flow runs."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import dataclasses
+import json
+import logging
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import Cancelled, NeufaceError, StageError
+from workflows import environment, folders
+from workflows.console import Console
+from workflows.interrupt import interruptible
+from workflows.plan import RunRequest, make_plan, preview
+from workflows.session import Session, session
+
+# The demo: enough views and pixels to recognise the face, few enough for minutes on two cores.
+DEMO_VIEWS, DEMO_SIZE, DEMO_HOLDOUT = 40, 384, "every:5:2"
+
+
+def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, Any]:
+    """Plan, then run through the Prefect flow. Hands back what run.json holds.
+
+    Raises:
+        StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C.
+    """
+    plan = make_plan(request)
+    if dry:
+        for step in preview(plan):
+            print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
+        return {}
+    made = folders.missing(plan.out) + folders.missing(plan.store.root)
+    with folders.writable(plan.out, plan.store.root):
+        # Prefect stops its server when Python exits and writes to its home until then: look again after that.
+        atexit.register(folders.sweep, made, plan.store.root)
+        environment.settle(plan.store.root, plan.out)
+        watch = Session(console, plan=plan)
+        with session(watch), interruptible(watch.stop, _end_server, console.note):
+            return _through_prefect(request)
+
+
+def _through_prefect(request: RunRequest) -> dict[str, Any]:
+    from prefect.client.orchestration import get_client
+
+    from workflows.flows import capture_to_asset
+
+    for name in ("prefect.flow_runs", "prefect.task_runs", "prefect.engine"):
+        logging.getLogger(name).addFilter(_not_ours)
+    with get_client(sync_client=True):  # starts the server while SIGINT is blocked, so that Ctrl-C does not reach it
+        parameters = request.model_dump()
+        record: dict[str, Any] = capture_to_asset(**{**parameters, "sets": list(request.sets)})
+    return record
+
+
+def _not_ours(record: logging.LogRecord) -> bool:
+    """Keep Prefect from printing tracebacks of errors that the user is told about in plain words."""
+    return not (record.exc_info and isinstance(record.exc_info[1], NeufaceError))
+
+
+def _end_server() -> None:
+    from prefect.server.api.server import SubprocessASGIServer
+
+    process = SubprocessASGIServer().server_process
+    if process is not None:
+        process.terminate()
+
+
+# ------------------------------------------------------------------ commands
+def run_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface run"""
+    request = request_from(options)
+    try:
+        record = run(request, console, options.dry_run)
+    except Cancelled:
+        console.close()
+        console.note("stopped; the same command goes on where this one left off")
+        raise
+    if record:
+        _tell(record, Path(options.out))
+    return 0
+
+
+def demo_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface demo"""
+    from pipeline.demo.capture import write_demo_capture
+
+    out, capture = Path(options.out), Path(options.out) / "capture"
+    request = RunRequest(
+        capture=str(capture),
+        out=str(out),
+        preset=options.preset,
+        holdout=DEMO_HOLDOUT,
+        name="demo_head",
+        device=options.device,
+        store=options.store,
+    )
+    with folders.writable(out, request.store_path):
+        console.started("demo photos", 0, 0)
+        try:
+            write_demo_capture(
+                capture,
+                views=options.views,
+                size=options.size,
+                progress=lambda done, total, what: console.progress(done, total, what),
+            )
+        except FileExistsError as e:
+            raise StageError(
+                "the folder for the demo's photos holds something else",
+                where=capture,
+                value=e,
+                limit="this demo's capture, or nothing",
+                remedy="choose another folder with --out",
+            ) from e
+        console.close()
+        record = run(request, console)
+    _tell(record, out)
+    _against_truth(out, capture, record, request)
+    return 0
+
+
+def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest) -> None:
+    from pipeline.artifacts import Capture
+    from pipeline.store import Store
+    from workflows.truth import measure
+
+    found = Store(request.store_path).load("capture", record["stages"]["capture"]["key"], Capture)
+    if found is None:
+        return
+    figures = measure(out, capture, found.artifact)
+    (out / "truth.json").write_text(json.dumps(dataclasses.asdict(figures), indent=1))
+    print("against the truth that the demo knows:")
+    for line in figures.lines():
+        print(f"  {line}")
+
+
+def validate_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface validate"""
+    from stages.usd.validate import checks_run, validate
+
+    found = validate(Path(options.asset))
+    for finding in found:
+        if finding.level != "info" or options.verbose:
+            print(finding)
+    faults = sum(f.level == "error" for f in found)
+    print(
+        f"{options.asset}: {checks_run()} checks, {faults} faults, {sum(f.level == 'warning' for f in found)} warnings"
+    )
+    return 1 if faults else 0
+
+
+def report_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface report"""
+    out = Path(options.folder)
+    record = read_record(out)
+    request = RunRequest(
+        **{**record["request"], "out": str(out), "store": record["store"], "from_stage": "report", "until": None}
+    )
+    _tell(run(request, console), out)
+    return 0
+
+
+def view_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface view"""
+    page = (Path(options.folder) / "report" / "index.html").resolve()
+    if not page.is_file():
+        raise StageError(
+            "there is no report",
+            where=page,
+            value="no such file",
+            limit="a finished run",
+            remedy=f"make it with: neuface report {options.folder}",
+        )
+    print(page)
+    webbrowser.open(page.as_uri())
+    return 0
+
+
+def doctor_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface doctor"""
+    from workflows.doctor import examine
+
+    found = examine(Path(options.out))
+    print("\n".join(str(f) for f in found))
+    return 1 if any(f.level == "fault" for f in found) else 0
+
+
+# ------------------------------------------------------------------ helpers
+def request_from(options: argparse.Namespace) -> RunRequest:
+    """The request that the options of `neuface run` make."""
+    from stages.presets import read_config_file
+
+    config = read_config_file(Path(options.config)) if options.config else {}
+    return RunRequest(
+        capture=options.capture,
+        out=options.out,
+        preset=options.preset,
+        holdout=options.holdout,
+        name=options.name,
+        seed=options.seed,
+        device=options.device,
+        until=options.until,
+        from_stage=options.from_stage,
+        sets=tuple(options.set),
+        config=config,
+        store=options.store,
+    )
+
+
+def read_record(out: Path) -> dict[str, Any]:
+    """run.json of a folder that a run left.
+
+    Raises:
+        StageError: it is not there, or is not what a run writes.
+    """
+    path = out / "run.json"
+    try:
+        record = json.loads(path.read_text())
+        if not {"request", "store", "stages"} <= record.keys():
+            raise ValueError("it lacks request, store or stages")
+    except (OSError, ValueError, AttributeError) as e:
+        raise StageError(
+            "this folder holds no finished run",
+            where=path,
+            value=e,
+            limit="the run.json of a run",
+            remedy="name the folder that was given as --out",
+        ) from e
+    found: dict[str, Any] = record
+    return found
+
+
+def _tell(record: dict[str, Any], out: Path) -> None:
+    """On stdout, what a script would want to know."""
+    if "asset" in record:
+        print(f"asset  {out / record['asset']}")
+    page = out / "report" / "index.html"
+    if "report" in record["stages"] and page.is_file():
+        print(f"report {page}")
+    reused = sum(s["reused"] for s in record["stages"].values())
+    print(f"run    {out / 'run.json'} ({len(record['stages'])} stages, {reused} reused)")
+    sys.stdout.flush()

@@ -1,0 +1,132 @@
+"""Is this machine ready? Each line is a fact and, where something is missing, how to get it."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+# import name -> distribution, and what it is for
+NEEDED = {
+    "numpy": ("numpy", "arrays"),
+    "scipy": ("scipy", "numerics"),
+    "torch": ("torch", "the fit"),
+    "cv2": ("opencv-contrib-python-headless", "photos, masks"),
+    "skimage": ("scikit-image", "metrics"),
+    "OpenEXR": ("OpenEXR", "linear pictures"),
+    "numba": ("numba", "the demo's renderer, baking"),
+    "pycolmap": ("pycolmap", "cameras of photos that have none"),
+    "trimesh": ("trimesh", "meshes"),
+    "embreex": ("embreex", "rays against meshes"),
+    "pymeshlab": ("pymeshlab", "mesh repair"),
+    "fast_simplification": ("fast-simplification", "mesh decimation"),
+    "xatlas": ("xatlas", "UV charts"),
+    "pxr": ("usd-core", "the asset"),
+    "prefect": ("prefect", "runs"),
+    "fastapi": ("fastapi", "Prefect's server"),
+    "jinja2": ("jinja2", "the report"),
+    "tqdm": ("tqdm", "progress bars"),
+}
+OPTIONAL = {"flip_evaluator": ("flip-evaluator", "the FLIP metric in the report")}
+SERVER_BREAKS = (0, 158)  # fastapi from here on: Prefect 3.8's server does not start
+MEMORY_GB, DISK_GB = 6.0, 5.0  # a studio fit of 60 photos peaks below this; its store and the set-up's caches
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line. level: "ok", "note" or "fault"."""
+
+    level: str
+    what: str
+    found: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        mark = {"ok": "ok   ", "note": "note ", "fault": "FAULT"}[self.level]
+        return f"{mark} {self.what}: {self.found}" + (f"\n      {self.remedy}" if self.remedy else "")
+
+
+def examine(folder: Path) -> list[Finding]:
+    """Everything that `neuface doctor` looks at; `folder` is where results would go."""
+    return [_python(), *_packages(), *_hardware(folder), _threads()]
+
+
+def _python() -> Finding:
+    right = sys.version_info[:2] in ((3, 11), (3, 12))
+    return Finding(
+        "ok" if right else "fault",
+        "Python",
+        platform.python_version(),
+        "" if right else "install Python 3.11, then `make setup`",
+    )
+
+
+def _packages() -> Iterator[Finding]:
+    for table, level in ((NEEDED, "fault"), (OPTIONAL, "note")):
+        for module, (distribution, purpose) in table.items():
+            try:
+                importlib.import_module(module)
+                version = importlib.metadata.version(distribution)
+            except (ImportError, OSError) as e:  # OSError: a shared library that does not load
+                yield Finding(
+                    level, distribution, f"can't be used ({e})", f"for {purpose}: pip install -r requirements.lock"
+                )
+                continue
+            if module == "fastapi" and tuple(int(p) for p in version.split(".")[:2]) >= SERVER_BREAKS:
+                yield Finding(
+                    "fault",
+                    distribution,
+                    version,
+                    "Prefect's server does not start with it: pip install -r requirements.lock",
+                )
+                continue
+            yield Finding("ok", distribution, version)
+
+
+def _hardware(folder: Path) -> Iterator[Finding]:
+    yield Finding("ok", "cores", str(len(os.sched_getaffinity(0))))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    yield Finding(
+        "ok" if memory >= MEMORY_GB else "note",
+        "memory",
+        f"{memory:.1f} GB",
+        "" if memory >= MEMORY_GB else "use --preset draft",
+    )
+    near = next(p for p in (folder.resolve(), *folder.resolve().parents) if p.exists())
+    free = shutil.disk_usage(near).free / 1e9
+    yield Finding(
+        "ok" if free >= DISK_GB else "note",
+        f"free disk at {near}",
+        f"{free:.1f} GB",
+        "" if free >= DISK_GB else "choose another disk with --out or --store",
+    )
+    if not os.access(near, os.W_OK):
+        yield Finding("fault", f"folder {near}", "can't be written", "choose another with --out")
+    yield _device()
+
+
+def _device() -> Finding:
+    try:
+        import torch
+    except (ImportError, OSError):
+        return Finding("fault", "device", "torch can't be loaded", "pip install -r requirements.lock")
+    if torch.cuda.is_available():
+        return Finding("ok", "device", f"cuda, {torch.cuda.get_device_name(0)}")
+    return Finding("note", "device", "cpu", "the fit is several times faster on a CUDA device; a CPU does as well")
+
+
+def _threads() -> Finding:
+    policy = os.environ.get("OMP_WAIT_POLICY", "")
+    passive = policy.upper() == "PASSIVE" or os.environ.get("GOMP_SPINCOUNT") == "0"
+    return Finding(
+        "ok" if passive else "note",
+        "idle threads",
+        policy or "spinning",
+        "" if passive else "unset OMP_WAIT_POLICY, or everything beside the fit slows down",
+    )

@@ -1,0 +1,30 @@
+"""Prefect's settings for a run on this machine alone. They must be in the environment before Prefect is imported."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+# Offline and quiet. Whoever sets one of these decides it; these are only defaults.
+OFFLINE = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "90",
+    "PREFECT_LOGGING_LEVEL": "WARNING",
+    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
+    "PREFECT_CLI_PROMPT": "false",
+}
+
+
+def settle(store: Path, out: Path) -> None:
+    """Prepare the environment for `neuface run`: a throw-away server unless PREFECT_API_URL names one.
+
+    The server's home lies in the store, one for each `out`: two runs on one SQLite file lock each other out.
+    """
+    for name, value in OFFLINE.items():
+        os.environ.setdefault(name, value)
+    if "PREFECT_API_URL" not in os.environ:
+        own = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
+        os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve()))

@@ -1,0 +1,73 @@
+"""The folders that a run writes to: checked before any work, and left as they were if nothing came of it."""
+
+from __future__ import annotations
+
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipeline.errors import StageError, stage_error_from_os_error
+
+OWN = (".locks", ".prefect")  # in the store, but nobody's result
+
+
+@contextmanager
+def writable(out: Path, store: Path) -> Iterator[None]:
+    """Make both folders and see that files can be written there; on failure take away what holds no result.
+
+    Raises:
+        StageError: one of them is a file, or can't be written.
+    """
+    made = missing(out) + missing(store)
+    try:
+        for folder in (out, store):
+            _probe(folder)
+        yield
+    except BaseException:
+        sweep(made, store)
+        raise
+
+
+def missing(folder: Path) -> list[Path]:
+    """The folder and its parents that are not there yet, the innermost first."""
+    chain = [folder, *folder.parents]
+    return [p for p in chain if not p.exists() and not p.is_symlink()]
+
+
+def _probe(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".probe-{uuid.uuid4().hex[:8]}"
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except FileExistsError as e:
+        raise StageError(
+            "a file is where a folder is needed",
+            where=folder,
+            value="a file",
+            limit="a folder, or nothing",
+            remedy="remove that file or choose another folder",
+        ) from e
+    except OSError as e:
+        raise stage_error_from_os_error(e, folder) or e from e
+
+
+def sweep(made: list[Path], store: Path) -> None:
+    """Remove the folders that this run made, unless the store holds something finished or worth resuming."""
+    if store.is_dir() and any(_results(store)):
+        return
+    if store in made:
+        shutil.rmtree(store, ignore_errors=True)
+    for folder in made:
+        try:
+            folder.rmdir()
+        except OSError:
+            continue  # gone already, or something else lies in it
+
+
+def _results(store: Path) -> Iterator[Path]:
+    for stage in store.iterdir():
+        if stage.name not in OWN and stage.is_dir():
+            yield from (p for p in stage.iterdir() if ".partial-" not in p.name)

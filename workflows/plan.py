@@ -1,0 +1,169 @@
+"""What a run will do: checked before anything is written. The same request makes the same plan everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+import stages
+from pipeline.artifacts import Artifact, Located
+from pipeline.contract import Stage, StageConfig, inputs_from, key
+from pipeline.errors import StageError, UsageError
+from pipeline.store import MANIFEST, Store
+from stages.presets import DEFAULT_PRESET, configs_for, known, parse_sets
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class RunRequest(BaseModel):
+    """A run as the user asks for it: plain data, the same from the command line and from a deployment."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    capture: str
+    out: str
+    preset: str = DEFAULT_PRESET
+    holdout: str | None = None
+    name: str | None = None
+    seed: int = 0
+    device: str = "auto"
+    until: str | None = None
+    from_stage: str | None = None
+    sets: tuple[str, ...] = ()
+    config: dict[str, dict[str, Any]] = {}
+    store: str | None = None
+
+    @property
+    def store_path(self) -> Path:
+        """Where finished artifacts are kept."""
+        return Path(self.store) if self.store else Path(self.out) / ".store"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The stages to run, in order, with their settings. `anew`: those that run even if the store has them."""
+
+    request: RunRequest
+    source: Located[Any]
+    out: Path
+    store: Store
+    stages: tuple[Stage[Any, Any, Any], ...]
+    configs: dict[str, StageConfig]
+    device: str
+    anew: frozenset[str]
+
+
+def make_plan(request: RunRequest) -> Plan:
+    """Check a request and read what the capture's folder holds. Nothing is written.
+
+    Raises:
+        UsageError: unknown names, or settings outside their limits.
+        StageError: the capture can't be used, or the device is not there.
+    """
+    from stages.capture.scan import scan_capture
+
+    chosen, anew = _choose(request.until, request.from_stage)
+    configs = configs_for(
+        request.preset,
+        parse_sets(request.sets),
+        request.config,
+        holdout=request.holdout,
+        name=request.name,
+        seed=request.seed,
+        registry=stages.REGISTRY,
+    )
+    known(request.device, DEVICES, what="unknown device", where="--device")
+    _names_a_folder(request.out, "--out")
+    capture, out = Path(request.capture), Path(request.out)
+    source = scan_capture(capture)
+    if out.resolve() == capture.resolve():
+        raise UsageError(
+            "the results would land among the photos",
+            where="--out",
+            value=out,
+            limit="another folder than the capture's",
+            remedy=f"for example --out {out / 'asset_run'}",
+        )
+    needs_torch = any(s.name == "inverse_rendering" for s in chosen)
+    return Plan(
+        request,
+        source,
+        out,
+        Store(request.store_path),
+        chosen,
+        configs,
+        device_for(request.device) if needs_torch else "cpu",
+        anew,
+    )
+
+
+def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
+    names = [s.name for s in stages.REGISTRY]
+    for option, value in (("--until", until), ("--from-stage", from_stage)):
+        if value is not None:
+            known(value, names, what="unknown stage", where=option)
+    last = names.index(until) if until else len(names) - 1
+    first = names.index(from_stage) if from_stage else len(names)
+    if from_stage and first > last:
+        raise UsageError(
+            "nothing would run",
+            where="--from-stage and --until",
+            value=f"{from_stage} after {until}",
+            limit="a first stage that is not after the last",
+            remedy="swap them, or leave one out",
+        )
+    return tuple(stages.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
+
+
+def _names_a_folder(text: str, option: str) -> None:
+    if not text.strip():
+        raise UsageError("no folder is named", where=option, value=repr(text), limit="a path", remedy="name a folder")
+
+
+def device_for(wanted: str) -> str:
+    """The device that "auto" means here, or the wanted one if it is there."""
+    if wanted == "cpu":
+        return "cpu"
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
+        raise StageError(
+            "there is no CUDA device that torch can use",
+            where="--device",
+            value="cuda",
+            limit=f"a build of torch with CUDA and a GPU (this is torch {torch.__version__})",
+            remedy="run with --device cpu, or install a CUDA build of torch",
+        )
+    return "cpu"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What would happen to one stage: "reused", "made", or "made anew". `key` is None where it can't be known yet."""
+
+    stage: str
+    key: str | None
+    action: str
+
+
+def preview(plan: Plan) -> list[Step]:
+    """What `run` would do, from the manifests in the store; nothing is run, hashed or written."""
+    finished: dict[str, Located[Artifact]] = {stages.SOURCE: plan.source}
+    steps: list[Step] = []
+    for stage in plan.stages:
+        if not all(f in finished for f in stage.inputs.__dataclass_fields__):
+            steps.append(Step(stage.name, None, "made"))
+            continue
+        k = key(stage, inputs_from(stage, finished), plan.configs[stage.name])
+        manifest = plan.store.folder(stage.name, k) / MANIFEST
+        if stage.name in plan.anew or not manifest.is_file():
+            steps.append(Step(stage.name, k, "made anew" if manifest.is_file() else "made"))
+            continue
+        finished[stage.name] = Located(stage.output.model_validate_json(manifest.read_bytes()), manifest.parent)
+        steps.append(Step(stage.name, k, "reused"))
+    return steps

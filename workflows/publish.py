@@ -1,0 +1,147 @@
+"""From the store into the folder that the user named. Nothing half-written is ever seen under its final name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import uuid
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.artifacts import FileRef, Located
+from pipeline.contract import Done, versions
+from pipeline.errors import stage_error_from_os_error
+from pipeline.store import sync, write_synced
+from workflows.plan import Plan
+
+Copies = dict[str, Path]  # path below the published folder -> file in the store
+
+
+def publish(plan: Plan, done: Iterable[Done[Any]]) -> dict[str, Any]:
+    """Copy asset/ and report/ to `plan.out` and write run.json beside them. Hands back what run.json holds.
+
+    Raises:
+        StageError: the disk is full or can't be written; what was there before is still there.
+    """
+    stages = {d.stage: d for d in done}
+    record = run_record(plan, stages)
+    try:
+        for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
+            if copies:
+                _replace_folder(plan.out / name, copies, record["timing"])
+        partial = plan.out / f".run.json.partial-{uuid.uuid4().hex[:8]}"
+        write_synced(partial, json.dumps(record, indent=1))
+        partial.replace(plan.out / "run.json")
+    except OSError as e:
+        raise stage_error_from_os_error(e, plan.out) or e from e
+    return record
+
+
+def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
+    """asset/: everything that lies beside the file to open."""
+    if "usd" not in stages:
+        return {}
+    usd: Located[Any] = stages["usd"].located
+    top = usd.artifact.root.rpartition("/")[0]
+    inside = f"{top}/" if top else ""
+    return {f.path.removeprefix(inside): usd.path(f) for f in usd.artifact.files if f.path.startswith(inside)}
+
+
+def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
+    """report/: the page and its figures, and the held-out views of the model and of the exported asset."""
+    copies: Copies = {}
+    if "report" in stages:
+        copies |= {f.path: stages["report"].located.path(f) for f in stages["report"].located.artifact.files}
+    for stage, field, folder in (("inverse_rendering", "held_out", "views"), ("usd", "views", "asset_views")):
+        if stage not in stages:
+            continue
+        located = stages[stage].located
+        for view in getattr(located.artifact, field):
+            copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
+            copies[f"{folder}/{view.index}.png"] = located.path(view.png)
+    return copies
+
+
+def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
+    """What run.json holds. Figures that may differ from run to run live here, not in any manifest."""
+    taken = {n: float(d.run.get("seconds", 0.0)) for n, d in stages.items()}
+    record: dict[str, Any] = {
+        "stages": {
+            n: {
+                "key": d.key,
+                "reused": d.reused,
+                "seconds": taken[n],
+                "peak_memory_mb": d.run.get("peak_memory_mb"),
+                "device": d.run.get("device"),
+                "warnings": list(getattr(d.located.artifact, "warnings", ())),
+            }
+            for n, d in stages.items()
+        },
+        "timing": {**taken, "total": round(sum(taken.values()), 3)},
+        "request": plan.request.model_dump(mode="json"),
+        "store": str(plan.store.root.resolve()),
+        "device": plan.device,
+        "seed": plan.request.seed,
+        "versions": versions(),
+    }
+    if "poses" in stages:
+        record["capture_from_asset"] = stages["poses"].located.artifact.capture_from_asset
+    if "usd" in stages:
+        record["asset"] = f"asset/{Path(stages['usd'].located.artifact.root).name}"
+        record["asset_hash"] = asset_hash(stages["usd"].located.artifact.files)
+    return record
+
+
+def asset_hash(files: Iterable[FileRef]) -> str:
+    """sha256 over the sorted (path, sha256) of the asset's files: equal hashes mean equal bytes."""
+    pairs = sorted((f.path, f.sha256) for f in files)
+    return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
+
+
+def _replace_folder(final: Path, copies: Copies, timing: Mapping[str, float]) -> None:
+    """Copy into a sibling, then swap it for what was there."""
+    partial = final.with_name(f".{final.name}.partial-{uuid.uuid4().hex[:8]}")
+    try:
+        for path, source in copies.items():
+            target = partial / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if final.name == "report" and path in ("index.html", "metrics.json"):
+                target.write_bytes(_with_timing(path, source.read_bytes(), timing))
+            else:
+                shutil.copyfile(source, target)
+            sync(target)
+        sync(partial)
+        swap(partial, final)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def swap(new: Path, final: Path) -> None:
+    """Put `new` under the name `final`; what was there goes only when the new one stands."""
+    old = final.with_name(f".{final.name}.old-{uuid.uuid4().hex[:8]}")
+    if final.exists() or final.is_symlink():
+        final.rename(old)
+    try:
+        new.rename(final)
+    except OSError:
+        if old.exists():
+            old.rename(final)
+        raise
+    if old.is_dir() and not old.is_symlink():
+        shutil.rmtree(old)
+    else:
+        old.unlink(missing_ok=True)
+
+
+def _with_timing(path: str, content: bytes, timing: Mapping[str, float]) -> bytes:
+    """The report with the seconds of this run: manifests are the same on every machine, times are not."""
+    if path == "metrics.json":
+        return json.dumps({**json.loads(content), "timing": dict(timing)}, indent=1).encode()
+    try:
+        from stages.report.page import with_timing
+    except ImportError:
+        return content
+    return str(with_timing(content.decode(), dict(timing))).encode()

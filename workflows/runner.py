@@ -1,0 +1,57 @@
+"""The run itself: stage after stage, each with the artifacts of those before it. Knows nothing of Prefect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import stages
+from pipeline.artifacts import Artifact, Located
+from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
+from pipeline.errors import Cancelled
+from workflows.plan import Plan
+from workflows.session import current
+
+RunStage = Callable[[Stage[Any, Any, Any], Any, StageConfig], Done[Any]]
+
+
+def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
+    """Run the plan's stages in order and hand back what was done, first to last.
+
+    Raises:
+        StageError: from the first stage that can't go on; those before it stay in the store.
+        Cancelled: the user stopped the run.
+    """
+    watch = current()
+    finished: dict[str, Located[Artifact]] = {stages.SOURCE: plan.source}
+    done: list[Done[Any]] = []
+    for number, stage in enumerate(plan.stages, 1):
+        if watch.stop.is_set():
+            raise Cancelled("stopped by the user; finished stages are kept")
+        watch.observer.started(stage.name, number, len(plan.stages))
+        inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
+        if stage.name in plan.anew:
+            plan.store.forget(stage.name, key(stage, inputs, config))
+        result = run_stage(stage, inputs, config)
+        watch.observer.finished(result)
+        finished[stage.name] = result.located
+        done.append(result)
+    return done
+
+
+def run_here(plan: Plan) -> RunStage:
+    """Run a stage by a plain call, as tests and debuggers want it."""
+
+    def run_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> Done[Any]:
+        watch = current()
+        return execute(
+            stage,
+            inputs,
+            config,
+            plan.store,
+            device=plan.device,
+            progress=watch.observer.progress,
+            cancelled=watch.stop.is_set,
+        )
+
+    return run_stage

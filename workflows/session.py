@@ -1,0 +1,68 @@
+"""Who watches a run, and who may stop it. Flow parameters have to be plain data, so this travels beside them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from pipeline.contract import Done
+
+
+class Observer(Protocol):
+    """Told what a run does."""
+
+    def started(self, stage: str, number: int, of: int) -> None:
+        """A stage begins; `number` counts from 1."""
+        ...
+
+    def progress(self, done: int, total: int, message: str = "", **figures: float) -> None:
+        """How far the stage is."""
+        ...
+
+    def finished(self, done: Done[Any]) -> None:
+        """The stage is done, or its result was found."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Something worth a line."""
+        ...
+
+
+class Silent:
+    """An observer that shows nothing."""
+
+    def started(self, stage: str, number: int, of: int) -> None: ...
+    def progress(self, done: int, total: int, message: str = "", **figures: float) -> None: ...
+    def finished(self, done: Done[Any]) -> None: ...
+    def note(self, text: str) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One run's watcher and its stop flag. `plan`: the one that was already made for these parameters, if any."""
+
+    observer: Observer = field(default_factory=Silent)
+    stop: threading.Event = field(default_factory=threading.Event)
+    plan: Any = None
+
+
+_SESSION: ContextVar[Session | None] = ContextVar("neuface_session", default=None)
+
+
+def current() -> Session:
+    """The session around this code, or one that is silent and never stopped."""
+    return _SESSION.get() or Session()
+
+
+@contextmanager
+def session(value: Session) -> Iterator[Session]:
+    """Make `value` the current session."""
+    token = _SESSION.set(value)
+    try:
+        yield value
+    finally:
+        _SESSION.reset(token)
