@@ -137,11 +137,11 @@ def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> 
     best = np.full(len(points), np.inf)
     face, on = np.zeros(len(points), np.int64), np.zeros_like(points)
     for column in candidates.T:
-        near = trimesh.triangles.closest_point(corners[column], points)  # type: ignore[no-untyped-call]
+        near = trimesh.triangles.closest_point(corners[column], points)
         distance = np.linalg.norm(near - points, axis=1)
         closer = distance < best - 1e-12
         best[closer], face[closer], on[closer] = distance[closer], column[closer], near[closer]
-    weights = trimesh.triangles.points_to_barycentric(corners[face], on)  # type: ignore[no-untyped-call]
+    weights = trimesh.triangles.points_to_barycentric(corners[face], on)
     return face, np.nan_to_num(weights).clip(0, 1)
 
 

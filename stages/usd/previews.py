@@ -17,6 +17,7 @@ from stages.usd.exported import load_exported
 from stages.usd.render import Renderer, View, orbit_view
 
 F32 = npt.NDArray[np.float32]
+FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side
 SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
 GREY_LIGHT = np.array([[3.2, 3.2, 3.2], [1.6, 1.6, 1.6], [1.9, 1.9, 1.9], [0.9, 0.9, 0.9]], np.float32)
 """A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape alone."""
@@ -36,22 +37,43 @@ def view_of(camera: Camera) -> View:
 def render_held_out(
     root: Path, cameras: CameraSet, face: FittedFace, samples: int, context: Context
 ) -> tuple[HeldOutView, ...]:
-    """asset_views/I.exr and .png for each view that the fit predicted, at the same scale."""
+    """asset_views/I.exr and .png for each view that the fit predicted, at the same scale.
+
+    With no held-out view, of a few fitted ones instead, so that there is something to look at.
+    """
     by_index = {c.index: c for c in cameras.cameras}
-    wanted = [v for v in face.held_out if v.index in by_index]
+    wanted = [(v.index, v.scale) for v in face.held_out if v.index in by_index]
+    wanted = wanted or [(i, factor_for(by_index[i])) for i in spread(face.fitted_views, FITTED_SHOWN) if i in by_index]
     if not wanted:
         return ()
     renderer = Renderer(load_exported(root))
     out = []
-    for number, view in enumerate(wanted):
+    for number, (index, scale) in enumerate(wanted):
         context.check()
-        context.progress(number, len(wanted), f"asset view {view.index}")
-        rgba = renderer.render(view_of(by_index[view.index]), factor=view.scale, samples=samples)
-        exr, png = (context.workdir / f"asset_views/{view.index}.{e}" for e in ("exr", "png"))
+        context.progress(number, len(wanted), f"asset view {index}")
+        rgba = renderer.render(view_of(by_index[index]), factor=scale, samples=samples)
+        exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
         write_exr(exr, rgba)
         write_rgba_png(png, rgba)
-        out.append(HeldOutView(index=view.index, exr=context.file(exr), png=context.file(png), scale=view.scale))
+        out.append(HeldOutView(index=index, exr=context.file(exr), png=context.file(png), scale=scale))
     return tuple(out)
+
+
+def spread(items: tuple[int, ...], count: int) -> list[int]:
+    """At most `count` of the items, evenly spread."""
+    picks = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[i] for i in picks]
+
+
+def factor_for(camera: Camera) -> int:
+    """The smallest block of photo pixels that divides the photo and brings its longest side to FITTED_SIDE."""
+    longest = max(camera.width, camera.height)
+    fits = [
+        f
+        for f in range(1, longest + 1)
+        if camera.width % f == 0 and camera.height % f == 0 and longest <= f * FITTED_SIDE
+    ]
+    return fits[0] if fits and min(camera.width, camera.height) // fits[0] >= 64 else 1
 
 
 def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
-from support.synthetic_asset import SyntheticInputs, ball, texture_arrays, write_inputs
+from support.synthetic_asset import SyntheticInputs, ball, cameras, texture_arrays, write_inputs
 
 from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
@@ -176,7 +176,6 @@ def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
     assert UsdGeom.Mesh.Get(stage, "/head/geo/render").ComputePurpose() == "default"
     assert not stage.GetPrimAtPath("/head/geo/proxy")
     assert not (tmp_path / "work/asset/head.usdz").exists()
-    assert not (tmp_path / "work/asset_views").exists()
 
 
 def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
@@ -187,6 +186,21 @@ def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
     assert names == ("R", "G", "B", "A")
     png = read_encoded(tmp_path / "work" / asset.views[0].png.path)
     assert png.shape == (60, 48, 4)
+
+
+def test_without_held_out_views_a_few_fitted_ones_are_rendered(tmp_path: Path) -> None:
+    asset = run(write_inputs(tmp_path / "in", held_out=()), tmp_path / "work")
+    assert [(v.index, v.scale) for v in asset.views] == [(0, 1), (6, 1), (12, 1)]
+
+
+def test_large_fitted_views_are_rendered_smaller() -> None:
+    from stages.usd.previews import factor_for, spread
+
+    camera = cameras(1, 2000, 3000).cameras[0]
+    assert factor_for(camera) == 5
+    assert factor_for(cameras(1, 1999, 3001).cameras[0]) == 1  # nothing divides both
+    assert spread((4,), 3) == [4]
+    assert spread((), 3) == []
 
 
 def test_name_goes_into_prim_files_and_textures(inputs: SyntheticInputs, tmp_path: Path) -> None:

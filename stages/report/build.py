@@ -1,0 +1,136 @@
+"""Puts scores and pictures together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.images import read_encoded, read_exr
+from stages.report.compare import JudgedView
+from stages.report.gather import Results
+from stages.report.metrics import Scores, encoded, mean_scores
+from stages.report.page import Picture, Pictures, ViewRow, render_page
+from stages.report.pictures import (
+    ERROR_RANGE,
+    data_uri,
+    error_map,
+    light_picture,
+    map_picture,
+    scale_bar,
+    to_bytes,
+)
+
+SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
+ENVIRONMENT = "asset/environment.exr"
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedRow:
+    """A view's scores and the pictures of it: the images themselves are let go."""
+
+    index: int
+    held_out: bool
+    model: Scores | None
+    asset: Scores | None
+    row: ViewRow
+
+
+def build_rows(view: JudgedView, side: int) -> JudgedRow:
+    """photo | model | asset | error of the asset (of the model where there is no asset render)."""
+    pictures = [Picture(data_uri(to_bytes(encoded(view.photo)), side), "photo")]
+    for image, scores, what in ((view.model, view.model_scores, "model"), (view.asset, view.asset_scores, "asset")):
+        if image is not None:
+            note = f", {scores.psnr:.1f} dB" if scores else ""
+            pictures.append(Picture(data_uri(to_bytes(encoded(image[..., :3])), side), f"{what}{note}"))
+    last = view.asset if view.asset is not None else view.model
+    if last is not None:
+        what = "asset" if view.asset is not None else "model"
+        heat = data_uri(error_map(last, view.photo, view.mask), side)
+        pictures.append(Picture(heat, f"error of the {what}"))
+    note = "held out" if view.held_out else "took part in the fit"
+    return JudgedRow(
+        view.index,
+        view.held_out,
+        view.model_scores,
+        view.asset_scores,
+        ViewRow(f"View {view.index}", f"{view.name}, {note}", pictures),
+    )
+
+
+def summary(rows: list[JudgedRow]) -> dict[str, Any]:
+    """metrics.json's `holdout`: means over views, the worst view, and every view's scores."""
+    model, asset = [r.model for r in rows if r.model], [r.asset for r in rows if r.asset]
+    held_out = bool(rows) and all(r.held_out for r in rows)
+    out: dict[str, Any] = {"views": len(rows), "held_out": held_out, **mean_scores(model)}
+    out |= {f"asset_{k}": v for k, v in mean_scores(asset).items()}
+    scored = [(s.psnr, r.index) for r in rows if (s := r.asset or r.model)]
+    out["worst_view"] = min(scored)[1] if scored else None
+    out["per_view"] = {str(r.index): _both(r) for r in rows}
+    return out
+
+
+def _both(row: JudgedRow) -> dict[str, float | None]:
+    model = row.model.json() if row.model else {}
+    return model | ({f"asset_{k}": v for k, v in row.asset.json().items()} if row.asset else {})
+
+
+def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, side: int) -> str:
+    """The page with its pictures."""
+    return render_page(
+        metrics,
+        Pictures(
+            views=[x.row for x in rows],
+            sides=_sides(r, side),
+            maps=_maps(r, side // 2),
+            light=_light(r, side),
+            scale=data_uri(scale_bar(), 256, lossless=True),
+            scale_top=ERROR_RANGE,
+        ),
+    )
+
+
+def _sides(r: Results, side: int) -> list[Picture]:
+    """The previews that came with the asset, shape and look next to each other."""
+    found = {
+        f.path.removeprefix("previews/").removesuffix(".png"): f
+        for f in r.usd.artifact.files
+        if f.path.startswith("previews/")
+    }
+    order = [n for s in ("left", "front", "right") for n in (s, f"shape_{s}") if n in found]
+    return [
+        Picture(
+            data_uri(_over_grey(read_encoded(r.usd.path(found[n]))), side),
+            n.replace("shape_", "shape from the ") if "shape" in n else f"{n}, captured light",
+        )
+        for n in order
+    ]
+
+
+def _over_grey(image: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """RGB of an 8-bit RGBA picture over mid grey, which suits light and dark pages."""
+    if image.shape[2] < 4:
+        return np.asarray(image, np.uint8)
+    alpha = image[..., 3:].astype(np.float32) / 255
+    return np.asarray(image[..., :3] * alpha + 90 * (1 - alpha), np.uint8)
+
+
+def _maps(r: Results, side: int) -> list[Picture]:
+    out = []
+    for name, texture in sorted(r.bake.artifact.maps.items()):
+        if name not in SKIPPED_MAPS and "exr" in texture.files:
+            values = read_exr(r.bake.path(texture.files["exr"]))[0]
+            step = max(1, values.shape[0] // (2 * side))
+            picture = map_picture(values[::step, ::step], texture.space)
+            out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}"))
+    return out
+
+
+def _light(r: Results, side: int) -> Picture | None:
+    files = [f for f in r.usd.artifact.files if f.path == ENVIRONMENT]
+    if not files:
+        return None
+    caption = "captured light (lat-long; centre: in front of the face)"
+    return Picture(data_uri(light_picture(read_exr(r.usd.path(files[0]))[0][..., :3]), side), caption)

@@ -1,0 +1,64 @@
+"""The views that are judged: their photos, masks, predictions and asset renders, one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import HeldOutView, Located
+from pipeline.images import read_alpha, read_exr, read_linear, shrink
+from stages.report.gather import Results
+from stages.report.metrics import Scores, score
+
+F32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class JudgedView:
+    """One view. photo (H, W, 3), mask (H, W), renders (H, W, 4); scores are None where there is no render."""
+
+    index: int
+    name: str
+    held_out: bool
+    photo: F32
+    mask: F32
+    model: F32 | None
+    asset: F32 | None
+    model_scores: Scores | None
+    asset_scores: Scores | None
+
+
+def judged_views(r: Results) -> Iterator[JudgedView]:
+    """Views with a render from the model or from the asset and with a mask, in the order of their index."""
+    predicted = {v.index: v for v in r.inverse_rendering.artifact.held_out}
+    rendered = {v.index: v for v in r.usd.artifact.views}
+    masks = {m.index: m for m in r.masks.artifact.masks}
+    for view in sorted(r.capture.artifact.views, key=lambda v: v.index):
+        i = view.index
+        if i not in predicted.keys() | rendered.keys() or i not in masks:
+            continue
+        factor = (predicted.get(i) or rendered[i]).scale
+        photo = shrink(read_linear(r.capture.path(view.image)), factor)
+        mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor)
+        model, asset = _read(r.inverse_rendering, predicted.get(i)), _read(r.usd, rendered.get(i))
+        scores = [score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset)]
+        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1])
+
+
+def unjudged(r: Results) -> list[str]:
+    """Why a held-out view is missing from the scores."""
+    predicted, masks = ({v.index for v in a} for a in (r.inverse_rendering.artifact.held_out, r.masks.artifact.masks))
+    out = []
+    for view in r.capture.artifact.views:
+        if view.holdout and view.index not in predicted:
+            out.append(f"report: held-out view {view.index} was not predicted (it has no camera)")
+        elif view.holdout and view.index not in masks:
+            out.append(f"report: held-out view {view.index} has no mask and was not scored")
+    return out
+
+
+def _read(at: Located, view: HeldOutView | None) -> F32 | None:  # type: ignore[type-arg]
+    return None if view is None else read_exr(at.path(view.exr))[0][..., :4]

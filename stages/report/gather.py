@@ -1,0 +1,115 @@
+"""Figures of all stages in one plain dictionary: what metrics.json holds."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from pipeline.artifacts import (
+    CameraSet,
+    Capture,
+    FittedFace,
+    Located,
+    MaskSet,
+    Surface,
+    TextureSet,
+    UsdAsset,
+    UvMesh,
+)
+
+
+class Results(Protocol):
+    """The artifacts that the report is about."""
+
+    @property
+    def capture(self) -> Located[Capture]: ...
+    @property
+    def poses(self) -> Located[CameraSet]: ...
+    @property
+    def masks(self) -> Located[MaskSet]: ...
+    @property
+    def inverse_rendering(self) -> Located[FittedFace]: ...
+    @property
+    def surface(self) -> Located[Surface]: ...
+    @property
+    def uv(self) -> Located[UvMesh]: ...
+    @property
+    def bake(self) -> Located[TextureSet]: ...
+    @property
+    def usd(self) -> Located[UsdAsset]: ...
+
+
+def figures(r: Results) -> dict[str, Any]:
+    """Everything but the views' scores and the timing."""
+    face, surface, uv = r.inverse_rendering.artifact, r.surface.artifact, r.uv.artifact
+    bake, usd = r.bake.artifact, r.usd.artifact
+    cameras = r.poses.artifact
+    return {
+        "model": {k: dict(v) for k, v in face.model.items()},
+        "fit": {
+            "steps": face.steps,
+            "loss": face.loss,
+            "psnr_fitted_views": face.psnr,
+            "views": len(face.fitted_views),
+            "rank": face.rank,
+            "light_order": face.light_order,
+            "beta": face.beta,
+            "cell": face.cell,
+        },
+        "cameras": {
+            "source": cameras.source,
+            "metric": cameras.metric,
+            "registered": len(cameras.cameras),
+            "unregistered": len(cameras.unregistered),
+            "reprojection_error_px": cameras.reprojection_error_px,
+        },
+        "surface": {
+            "vertices": surface.vertices,
+            "faces": surface.faces,
+            "watertight": surface.watertight,
+            "components": surface.components,
+            "removed_components": surface.removed_components,
+        },
+        "uv": {
+            "vertices": uv.vertices,
+            "faces": uv.faces,
+            "charts": uv.charts,
+            "utilisation": uv.utilisation,
+            "stretch": uv.stretch,
+            "overlap": uv.overlap,
+            "deviation_mm": uv.deviation_mm,
+        },
+        "maps": {
+            "size": bake.size,
+            "covered_share": bake.coverage,
+            **{
+                n: {"channels": m.channels, "minimum": m.minimum, "mean": m.mean, "maximum": m.maximum}
+                for n, m in sorted(bake.maps.items())
+            },
+        },
+        "asset": {
+            "name": usd.name,
+            "root": usd.root.rpartition("/")[2],
+            "checks": usd.checks,
+            "megabytes": round(sum(f.size for f in usd.files if f.path.startswith("asset/")) / 1e6, 2),
+        },
+        "warnings": warnings(r),
+    }
+
+
+def warnings(r: Results) -> list[str]:
+    """What every stage had to say, in their order, and what they left out."""
+    out = [f"capture: {w}" for w in r.capture.artifact.warnings]
+    out += [f"capture: left out: {x}" for x in r.capture.artifact.left_out]
+    out += [f"poses: {w}" for w in r.poses.artifact.warnings]
+    if not r.poses.artifact.metric:
+        out.append("poses: the scale is unknown; the asset's size is nominal")
+    if r.poses.artifact.unregistered:
+        out.append(f"poses: no camera was found for {', '.join(r.poses.artifact.unregistered)}")
+    out += [f"masks: {w}" for w in r.masks.artifact.warnings]
+    if r.masks.artifact.dropped:
+        out.append(
+            f"masks: views not fitted because their mask disagrees: {', '.join(map(str, r.masks.artifact.dropped))}"
+        )
+    for name in ("inverse_rendering", "surface", "uv", "bake", "usd"):
+        out += [f"{name}: {w}" for w in getattr(r, name).artifact.warnings]
+    return list(dict.fromkeys(out))

@@ -1,0 +1,106 @@
+"""How close a rendered view is to its photo.
+
+Symbols: rendered (H, W, 4) linear RGBA, colour premultiplied (the photo's pixel value over black); photo (H, W, 3)
+linear; mask (H, W) in [0, 1], the photo's subject. All comparisons are on sRGB-encoded values clipped to [0, 1], as
+people see them. "Full" images are weighted by their own alpha first, so that what lies behind the subject is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.colour import srgb_from_linear
+
+F32 = npt.NDArray[np.float32]
+EQUAL = 100.0  # dB that stand for equal images, whose ratio would be infinite
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """psnr (dB, subject's pixels only), psnr_full (dB), ssim (-1..1), flip (0..1, 0 = equal), mask_iou (0..1)."""
+
+    psnr: float
+    psnr_full: float
+    ssim: float
+    flip: float | None
+    mask_iou: float
+
+    def json(self) -> dict[str, float | None]:
+        """Rounded to what is meaningful; what is not finite becomes None, which JSON has."""
+        return {k: None if v is None or not np.isfinite(v) else round(v, 5) for k, v in asdict(self).items()}
+
+
+def score(rendered: F32, photo: F32, mask: F32) -> Scores:
+    """All metrics of one view. ValueError if the sizes differ or the mask is empty."""
+    if rendered.shape[:2] != photo.shape[:2] or mask.shape != photo.shape[:2]:
+        raise ValueError(f"sizes differ: rendered {rendered.shape}, photo {photo.shape}, mask {mask.shape}")
+    if not (mask > 0.5).any():
+        raise ValueError("the mask is empty")
+    shown, truth = encoded(rendered[..., :3] * rendered[..., 3:]), encoded(photo * mask[..., None])
+    return Scores(
+        psnr_fg(rendered[..., :3], photo, mask),
+        psnr(shown, truth),
+        ssim(shown, truth),
+        flip(truth, shown),
+        iou(rendered[..., 3], mask),
+    )
+
+
+def encoded(linear: F32) -> F32:
+    """sRGB-encoded values of linear ones, clipped to [0, 1]."""
+    return np.asarray(srgb_from_linear(np.asarray(linear, np.float32).clip(0, 1)), np.float32)
+
+
+def psnr(a: F32, b: F32) -> float:
+    """-10 log10 of the mean squared difference of two encoded images, in dB; at most 100."""
+    error = float(np.mean((a.astype(np.float64) - b) ** 2))
+    return min(EQUAL, -10 * float(np.log10(max(error, 1e-10))))
+
+
+def psnr_fg(rendered: F32, photo: F32, mask: F32) -> float:
+    """PSNR over the pixels with mask > 0.5, of linear images. The background can't flatter it."""
+    inside = mask > 0.5
+    return psnr(encoded(rendered[inside]), encoded(photo[inside]))
+
+
+def ssim(a: F32, b: F32) -> float:
+    """Structural similarity of two encoded images (H, W, 3), Gaussian window of sigma 1.5. [Wang et al. 2004]
+
+    Images smaller than the window (11 pixels) can't be compared so: NaN.
+    """
+    from skimage import metrics
+
+    if min(a.shape[:2]) < 11:
+        return float("nan")
+    compare: Any = metrics.structural_similarity
+    return float(
+        compare(a, b, channel_axis=2, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False)
+    )
+
+
+def flip(reference: F32, test: F32) -> float | None:
+    """Mean FLIP of two encoded images [Andersson et al. 2020]; None where flip-evaluator is not installed."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError:
+        return None
+    return float(evaluate(np.ascontiguousarray(reference), np.ascontiguousarray(test), "LDR", True, False)[0].mean())
+
+
+def iou(alpha: F32, mask: F32) -> float:
+    """Overlap of two silhouettes at one half: intersection over union."""
+    a, b = alpha > 0.5, mask > 0.5
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def mean_scores(scores: list[Scores]) -> dict[str, float | None]:
+    """The mean of each metric over views; None where no view has it."""
+    out: dict[str, float | None] = {}
+    for name in Scores.__dataclass_fields__:
+        values = [v for s in scores if (v := getattr(s, name)) is not None and np.isfinite(v)]
+        out[name] = round(float(np.mean(values)), 5) if values else None
+    return out

@@ -1,0 +1,124 @@
+"""One self-contained HTML page: no scripts that run, nothing fetched from anywhere."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined, Template
+from markupsafe import Markup, escape
+
+ISLAND = re.compile(r'(<script type="application/json" id="timing">).*?(</script>)', re.S)
+TABLE = re.compile(r"(<!-- timing -->).*?(<!-- /timing -->)", re.S)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A data URI and the words below it."""
+
+    uri: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """photo | model | asset | error of one view. `note` says in words how good it is."""
+
+    title: str
+    note: str
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What the page shows besides figures. `scale`: the heat map's legend, from 0 to `scale_top`."""
+
+    views: Sequence[ViewRow] = ()
+    sides: Sequence[Picture] = ()
+    maps: Sequence[Picture] = ()
+    light: Picture | None = None
+    scale: str = ""
+    scale_top: float = 0.0
+
+
+def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:
+    """The page from metrics.json's content and its pictures. The same input gives the same bytes."""
+    return _template().render(m=metrics, p=pictures, headline=headline(metrics), sections=sections(metrics))
+
+
+def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """(value, what it is, what it means) of the figures that matter most."""
+    h, kind = metrics["holdout"], "held-out photos" if metrics["holdout"]["held_out"] else "FITTED photos"
+    out = []
+    for prefix, what in (("", "model"), ("asset_", "exported asset")):
+        if h.get(f"{prefix}psnr") is not None:
+            out.append((f"{h[f'{prefix}psnr']:.1f} dB", f"PSNR, {what}", f"subject's pixels of {h['views']} {kind}"))
+    for key, what, meaning in (
+        ("asset_ssim", "SSIM, exported asset", "1 is equal"),
+        ("asset_flip", "FLIP, exported asset", "0 is equal, as an eye sees it"),
+    ):
+        if h.get(key) is not None:
+            out.append((f"{h[key]:.3f}", what, meaning))
+    out.append((f"{metrics['uv']['faces']:,}", "triangles", f"{metrics['uv']['charts']} charts"))
+    out.append(
+        (f"{metrics['maps']['size']}²", "texels", f"{100 * metrics['maps']['covered_share']:.0f} % of them used")
+    )
+    return out
+
+
+def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Tables of figures: (title, rows of name and value)."""
+    out = []
+    for key, title in (
+        ("fit", "Fit"),
+        ("cameras", "Cameras"),
+        ("surface", "Surface"),
+        ("uv", "Mesh and charts"),
+        ("asset", "Asset"),
+    ):
+        out.append((title, [(_words(k), _value(v)) for k, v in metrics[key].items()]))
+    rows = [
+        (n, f"{_value(m['mean'])}  ({_value(m['minimum'])} to {_value(m['maximum'])}), {m['channels']} channel(s)")
+        for n, m in metrics["maps"].items()
+        if isinstance(m, Mapping)
+    ]
+    return [*out, ("Maps: mean (range)", rows)]
+
+
+def with_timing(html: str, timing: Mapping[str, float]) -> str:
+    """The page with the seconds of a run: as a table, and as JSON for programs. May be applied again."""
+    island = json.dumps(dict(timing)).replace("<", "\\u003c")
+    rows = "".join(f"<tr><th>{escape(_words(k))}</th><td>{v:.1f} s</td></tr>" for k, v in timing.items())
+    table = f"<h3>Time</h3><table>{rows}</table>" if rows else ""
+    html = ISLAND.sub(lambda m: m[1] + island + m[2], html, count=1)
+    return TABLE.sub(lambda m: m[1] + table + m[2], html, count=1)
+
+
+@lru_cache(maxsize=1)
+def _template() -> Template:
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["words"] = _words
+    environment.filters["value"] = _value
+    environment.filters["island"] = lambda x: Markup(json.dumps(x).replace("<", "\\u003c"))
+    source = files("stages.report").joinpath("templates/page.html.j2").read_text(encoding="utf-8")
+    return environment.from_string(source)
+
+
+def _words(key: object) -> str:
+    return str(key).replace("_", " ")
+
+
+def _value(value: object) -> str:
+    """A figure as people read it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

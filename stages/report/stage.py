@@ -1,0 +1,67 @@
+"""Stage report: every other stage's result becomes metrics.json and one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from pipeline.artifacts import (
+    CameraSet,
+    Capture,
+    FittedFace,
+    Located,
+    MaskSet,
+    Report,
+    Surface,
+    TextureSet,
+    UsdAsset,
+    UvMesh,
+)
+from pipeline.contract import Context, Stage, StageConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Everything that was made."""
+
+    capture: Located[Capture]
+    poses: Located[CameraSet]
+    masks: Located[MaskSet]
+    inverse_rendering: Located[FittedFace]
+    surface: Located[Surface]
+    uv: Located[UvMesh]
+    bake: Located[TextureSet]
+    usd: Located[UsdAsset]
+
+
+class Config(StageConfig):
+    """Settings of the page; the metrics do not depend on them."""
+
+    picture_side: int = Field(360, ge=64, le=2048, description="largest side of a picture on the page, pixels")
+    views_shown: int = Field(8, ge=0, le=200, description="views shown as pictures; the table lists all")
+
+
+def run(inputs: Inputs, config: Config, context: Context) -> Report:
+    """Score the views, gather the figures, write metrics.json and index.html."""
+    import json
+
+    from stages.report.build import build_page, build_rows, summary
+    from stages.report.compare import judged_views, unjudged
+    from stages.report.gather import figures
+
+    rows, total = [], max(1, len(inputs.usd.artifact.views), len(inputs.inverse_rendering.artifact.held_out))
+    for number, view in enumerate(judged_views(inputs)):
+        context.check()
+        rows.append(build_rows(view, config.picture_side))
+        context.progress(number + 1, total + 1, f"view {view.index}")
+    metrics = {"holdout": summary(rows), "timing": {}, **figures(inputs)}
+    metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
+    (context.workdir / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+    page = build_page(metrics, rows[: config.views_shown], inputs, config.picture_side)
+    (context.workdir / "index.html").write_text(page, encoding="utf-8")
+    context.progress(total + 1, total + 1, "done")
+    return Report(files=(context.file("index.html"), context.file("metrics.json")), warnings=tuple(unjudged(inputs)))
+
+
+STAGE = Stage(name="report", version=1, inputs=Inputs, config=Config, output=Report, run=run)

@@ -1,0 +1,207 @@
+"""The page is one sound HTML file that needs nothing else, and the figures are those of the artifacts."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.synthetic_results import SyntheticResults, write_results
+
+from pipeline.artifacts import Located
+from pipeline.contract import Context
+from pipeline.errors import Cancelled
+from stages.report.page import with_timing
+from stages.report.pictures import ERROR_RANGE, data_uri, error_map, heat, map_picture
+from stages.report.stage import STAGE, Config, Inputs
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+
+
+def run(results: SyntheticResults, folder: Path, **context: object) -> tuple[dict, str]:
+    folder.mkdir(parents=True)
+    named = {n: getattr(results, n) for n in Inputs.__slots__}
+    artifact = STAGE.run(Inputs(**named), Config(), Context(folder, folder / "scratch", **context))
+    assert [f.path for f in artifact.files] == ["index.html", "metrics.json"]
+    return json.loads((folder / "metrics.json").read_text()), (folder / "index.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> SyntheticResults:
+    return write_results(tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="module")
+def made(results: SyntheticResults, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, str]:
+    return run(results, tmp_path_factory.mktemp("report") / "work")
+
+
+class Page(HTMLParser):
+    """Collects what the page refers to and whether its tags close in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.wrong: list[str] = []
+        self.links: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        self.links += [v or "" for k, v in attrs if k in ("src", "href", "action", "data", "srcset", "poster")]
+        self.wrong += [f"{tag} {k}" for k, _ in attrs if k.startswith("on")]
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
+
+
+def test_page_parses_and_refers_to_nothing_outside(made: tuple[dict, str]) -> None:
+    page = Page(made[1])
+    assert page.wrong == []
+    assert page.open == []
+    assert page.links
+    assert all(x.startswith("data:image/") for x in page.links)
+    assert not re.search(r"(https?:)?//[a-z]|@import|url\(", re.sub(r"data:image/[^\"]+", "", made[1]))
+    assert "default-src 'none'" in made[1]
+
+
+def test_every_picture_decodes(made: tuple[dict, str]) -> None:
+    for uri in Page(made[1]).links:
+        content = base64.b64decode(uri.partition("base64,")[2], validate=True)
+        assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is not None
+
+
+def test_metrics_have_the_keys_that_others_read(made: tuple[dict, str]) -> None:
+    metrics = made[0]
+    assert {"views", "psnr", "ssim", "flip", "per_view", "asset_psnr", "asset_ssim", "asset_flip"} <= metrics[
+        "holdout"
+    ].keys()
+    assert {"vertices", "faces", "watertight", "components"} <= metrics["surface"].keys()
+    assert {"charts", "utilisation", "stretch"} <= metrics["uv"].keys()
+    assert metrics["holdout"]["views"] == 2
+    assert set(metrics["holdout"]["per_view"]) == {"3", "9"}
+    assert metrics["model"]["specular"]["modelled"] is True
+    assert metrics["warnings"] == ["surface: two floating pieces were removed"]
+    assert metrics["timing"] == {}
+
+
+def test_scores_are_right(made: tuple[dict, str]) -> None:
+    """The photo is 0.6 to 1 of (0.4, 0.25, 0.2) in the disc; the asset shows (0.3, 0.2, 0.15) exactly there."""
+    h = made[0]["holdout"]
+    assert h["asset_mask_iou"] == 1
+    assert 30 < h["asset_psnr"] < 35
+    assert h["psnr"] < 15  # the model's stand-in is a grey card
+    assert h["asset_psnr"] == pytest.approx(np.mean([v["asset_psnr"] for v in h["per_view"].values()]))
+
+
+def test_warnings_come_before_figures(made: tuple[dict, str]) -> None:
+    page = made[1]
+    assert page.index("two floating pieces") < page.index("PSNR, model") < page.index("View 3")
+
+
+def test_same_results_same_bytes(results: SyntheticResults, made: tuple[dict, str], tmp_path: Path) -> None:
+    assert run(results, tmp_path / "again")[1] == made[1]
+
+
+def test_timing_is_filled_in_from_outside(made: tuple[dict, str]) -> None:
+    page = with_timing(made[1], {"capture": 1.25, "</script><b>": 2.0})
+    again = with_timing(page, {"capture": 7.0, "total": 7.0})
+    island = re.search(r'id="timing">(.*?)</script>', again, re.S)
+    assert island is not None
+    assert json.loads(island[1]) == {"capture": 7.0, "total": 7.0}
+    assert "7.0 s" in again
+    assert "1.2 s" not in again
+    assert Page(page).wrong == []
+    assert with_timing(made[1], {}) == made[1]
+
+
+def test_no_held_out_view_is_said_clearly(tmp_path: Path) -> None:
+    metrics, page = run(write_results(tmp_path / "in", held_out=(), asset_views=(0, 6)), tmp_path / "work")
+    assert metrics["holdout"]["held_out"] is False
+    assert metrics["holdout"]["views"] == 2
+    assert metrics["holdout"]["psnr"] is None
+    assert metrics["holdout"]["asset_psnr"] > 30
+    assert "No photo was held back." in page
+    assert "FITTED photos" in page
+    assert "Held-out views" not in page
+
+
+def test_no_view_at_all(tmp_path: Path) -> None:
+    metrics, page = run(write_results(tmp_path / "in", held_out=(), asset_views=()), tmp_path / "work")
+    assert metrics["holdout"]["views"] == 0
+    assert metrics["holdout"]["worst_view"] is None
+    assert Page(page).wrong == []
+
+
+def test_views_rendered_smaller_are_compared_with_the_shrunk_photo(tmp_path: Path) -> None:
+    metrics, _ = run(write_results(tmp_path / "in", scale=2), tmp_path / "work")
+    assert 30 < metrics["holdout"]["asset_psnr"] < 36
+
+
+def test_a_held_out_view_without_mask_is_reported(results: SyntheticResults, tmp_path: Path) -> None:
+    masks = results.masks.artifact
+    fewer = masks.model_copy(update={"masks": tuple(m for m in masks.masks if m.index != 3)})
+    changed = replace(results, masks=Located(fewer, results.masks.folder))
+    metrics, _ = run(changed, tmp_path / "work")
+    assert metrics["holdout"]["views"] == 1
+    assert any("view 3 has no mask" in w for w in metrics["warnings"])
+
+
+def test_what_stages_left_out_becomes_a_warning(results: SyntheticResults, tmp_path: Path) -> None:
+    poses = results.poses.artifact.model_copy(update={"metric": False, "unregistered": ("x.jpg",)})
+    capture = results.capture.artifact.model_copy(update={"left_out": ("y.jpg: blurred <b>",)})
+    changed = replace(
+        results, poses=Located(poses, results.poses.folder), capture=Located(capture, results.capture.folder)
+    )
+    metrics, page = run(changed, tmp_path / "work")
+    text = " ".join(metrics["warnings"])
+    assert "x.jpg" in text
+    assert "scale is unknown" in text
+    assert "y.jpg: blurred <b>" in "".join(Page(page).words)  # escaped, not markup
+
+
+def test_a_cancelled_report_stops(results: SyntheticResults, tmp_path: Path) -> None:
+    with pytest.raises(Cancelled):
+        run(results, tmp_path / "work", cancelled=lambda: True)
+
+
+def test_error_map_is_dark_where_equal_and_bright_where_not() -> None:
+    photo = np.full((8, 8, 3), 0.2, np.float32)
+    mask = np.ones((8, 8), np.float32)
+    render = np.concatenate([photo, mask[..., None]], -1)
+    render[:, 4:, :3] = 1.0
+    found = error_map(render, photo, mask).astype(int).sum(-1)
+    assert (found[:, :4] < 20).all()
+    assert (found[:, 4:] > 550).all()
+    assert (np.diff(heat(np.linspace(0, 1, 64, dtype=np.float32)[None]).astype(int).sum(-1)[0]) >= -2).all()
+    assert 0 < ERROR_RANGE < 1
+
+
+def test_map_pictures() -> None:
+    ramp = np.linspace(3, 5, 101, dtype=np.float32)[None, :, None]
+    stretched = map_picture(ramp, "raw")[0, :, 0]
+    assert stretched[0] == 0
+    assert stretched[-1] == 255
+    assert (map_picture(np.full((2, 2, 1), 0.2, np.float32), "raw") == 51).all()
+    assert (map_picture(np.full((2, 2, 1), 40.0, np.float32), "raw") == 128).all()
+    assert (map_picture(np.full((2, 2, 3), [-0.5, 0, 1], np.float32), "raw")[0, 0] == [64, 128, 255]).all()
+
+
+@pytest.mark.parametrize("shape", [(3, 500, 3), (500, 3, 4), (1, 1, 3)])
+def test_pictures_are_never_larger_than_asked(shape: tuple[int, int, int]) -> None:
+    uri = data_uri(np.zeros(shape, np.uint8), 100)
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert max(image.shape[:2]) <= 100
+    assert image.shape[2] == shape[2]
