@@ -1,0 +1,189 @@
+"""Triangle meshes as plain arrays: files, normals and the checks that say whether a mesh is a closed surface.
+
+Symbols: V vertices (V, 3), F faces (F, 3) vertex indices, counter-clockwise seen from outside. Lengths are in the
+caller's unit. Nothing here changes a mesh; that is the work of the stages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Faces = npt.NDArray[np.int32]
+Mask = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """vertices (V, 3) float32, normals (V, 3) float32 unit, faces (F, 3) int32."""
+
+    vertices: F32
+    normals: F32
+    faces: Faces
+
+
+@dataclass(frozen=True, slots=True)
+class Charts:
+    """Texture coordinates: uvs (U, 2) float32, origin bottom left; faces (F, 3) int32 into uvs, rows as the mesh's."""
+
+    uvs: F32
+    faces: Faces
+
+
+@dataclass(frozen=True, slots=True)
+class Topology:
+    """How a mesh hangs together. `watertight`: every edge has two faces that run along it in opposite directions."""
+
+    watertight: bool
+    boundary_edges: int
+    crowded_edges: int
+    pinched_vertices: int
+    components: int
+    euler: int
+
+    @property
+    def manifold(self) -> bool:
+        """Closed, and every vertex has one fan of faces."""
+        return self.watertight and self.pinched_vertices == 0
+
+
+def save(path: Path, mesh: Mesh, charts: Charts | None = None) -> None:
+    """Write the npz of the Surface and UvMesh artifacts."""
+    arrays = {"vertices": mesh.vertices, "normals": mesh.normals, "faces": mesh.faces}
+    if charts is not None:
+        arrays |= {"uvs": charts.uvs, "uv_faces": charts.faces}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+
+
+def load(path: Path) -> Mesh:
+    """The mesh of an npz written by `save`."""
+    with np.load(path, allow_pickle=False) as z:
+        return Mesh(z["vertices"], z["normals"], z["faces"])
+
+
+def load_charts(path: Path) -> Charts:
+    """The texture coordinates of an npz written by `save`. Raises KeyError if it holds none."""
+    with np.load(path, allow_pickle=False) as z:
+        return Charts(z["uvs"], z["uv_faces"])
+
+
+def area_vectors(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
+    """(F, 3): along each face's normal, as long as its area."""
+    a, b, c = np.asarray(vertices, np.float64)[faces].transpose(1, 0, 2)
+    out: F64 = 0.5 * np.cross(b - a, c - a)
+    return out
+
+
+def areas(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
+    """(F,) face areas."""
+    out: F64 = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    return out
+
+
+def volume(vertices: npt.NDArray[np.floating], faces: Faces) -> float:
+    """Signed volume of a closed mesh: positive when its faces look outward."""
+    a = np.asarray(vertices, np.float64)[faces[:, 0]]
+    return float((a * area_vectors(vertices, faces)).sum() / 3)
+
+
+def vertex_normals(vertices: npt.NDArray[np.floating], faces: Faces) -> F32:
+    """(V, 3) unit normals, faces weighted by area. A vertex without faces gets +y."""
+    weighted = area_vectors(vertices, faces)
+    out = np.stack([np.bincount(faces.ravel(), np.repeat(weighted[:, i], 3), len(vertices)) for i in range(3)], 1)
+    return unit(np.asarray(out, np.float64)).astype(np.float32)
+
+
+def unit(v: npt.NDArray[np.floating]) -> F64:
+    """(N, 3) vectors at length one; zero vectors become +y, because a normal must have a direction."""
+    w = np.asarray(v, np.float64)
+    length = np.linalg.norm(w, axis=1)
+    out: F64 = np.where((length > 1e-30)[:, None], w / np.maximum(length, 1e-30)[:, None], [0.0, 1.0, 0.0])
+    return out
+
+
+def edges(faces: Faces) -> Indices:
+    """(3 F, 2) directed edges, in the order of the faces' sides 0-1, 1-2, 2-0 (all first sides first)."""
+    f = np.asarray(faces, np.int64)
+    return np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+
+
+def edge_lengths(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
+    """(3 F,) lengths of `edges`."""
+    v = np.asarray(vertices, np.float64)
+    e = edges(faces)
+    out: F64 = np.linalg.norm(v[e[:, 1]] - v[e[:, 0]], axis=1)
+    return out
+
+
+def component_of_face(faces: Faces, count: int) -> Indices:
+    """(F,) label of each face's component; faces belong together when they share a vertex. `count`: vertices."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    e = edges(faces)
+    graph = coo_array((np.ones(len(e), np.int8), (e[:, 0], e[:, 1])), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    return np.asarray(label[np.asarray(faces)[:, 0]], np.int64)
+
+
+def topology(faces: Faces, count: int) -> Topology:
+    """Check a mesh of `count` vertices. Empty meshes are neither watertight nor manifold."""
+    if len(faces) == 0:
+        return Topology(False, 0, 0, 0, 0, 0)
+    e = edges(faces)
+    code = np.minimum(e[:, 0], e[:, 1]) * count + np.maximum(e[:, 0], e[:, 1])
+    order = np.argsort(code, kind="stable")
+    first = np.flatnonzero(np.diff(code[order], prepend=-1))
+    uses = np.diff(first, append=len(code))
+    turns = np.add.reduceat(np.where(e[order, 0] < e[order, 1], 1, -1), first)  # 0 where directions are opposite
+    boundary, crowded = int((uses == 1).sum()), int(((uses > 2) | ((uses == 2) & (turns != 0))).sum())
+    used = np.bincount(faces.ravel(), minlength=count) > 0
+    labels = np.bincount(component_of_face(faces, count))
+    return Topology(
+        watertight=crowded == 0 and boundary == 0,
+        boundary_edges=boundary,
+        crowded_edges=crowded,
+        pinched_vertices=len(_pinched(faces, count, order, np.diff(code[order]) == 0)),
+        components=int((labels > 0).sum()),
+        euler=int(used.sum()) - len(first) + len(faces),
+    )
+
+
+def _pinched(faces: Faces, count: int, order: Indices, same: Mask) -> Indices:
+    """Vertices whose faces form more than one fan (two cones that touch at their tips).
+
+    Corners of faces are joined across shared edges; a vertex with one fan has all its corners in one group.
+    order: of `edges`, so that equal undirected edges are neighbours; same: (3 F - 1,) whether the next one is equal.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    f = np.asarray(faces, np.int64)
+    size = len(f)
+    corner = np.arange(3 * size).reshape(size, 3)
+    start, end = edges(faces).T
+    at_start = np.concatenate([corner[:, i] for i in range(3)])
+    at_end = np.concatenate([corner[:, (i + 1) % 3] for i in range(3)])
+    at_low, at_high = np.where(start < end, at_start, at_end), np.where(start < end, at_end, at_start)
+    a, b = order[:-1][same], order[1:][same]
+    rows = np.concatenate([at_low[a], at_high[a]])
+    columns = np.concatenate([at_low[b], at_high[b]])
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(3 * size, 3 * size))
+    fans, fan = connected_components(graph, directed=False)
+    vertex = np.empty(fans, np.int64)
+    vertex[fan] = f.ravel()
+    return np.flatnonzero(np.bincount(vertex, minlength=count) > 1)
+
+
+def compact(vertices: npt.NDArray[np.floating], faces: Faces) -> tuple[npt.NDArray[np.floating], Faces, Indices]:
+    """Drop vertices that no face uses. Returns vertices, faces and (V',) which old vertex each new one was."""
+    used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
+    new = np.cumsum(used) - 1
+    return vertices[used], new[faces].astype(np.int32), np.flatnonzero(used)

@@ -1,0 +1,1 @@
+"""Bake stage: the fitted material as texture maps on the UV mesh."""

@@ -1,0 +1,1 @@
+"""Surface stage: the zero set of the fitted SDF as one closed triangle mesh."""

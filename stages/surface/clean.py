@@ -1,0 +1,104 @@
+"""From a marched mesh to a closed, outward surface on the zero set.
+
+Symbols: h lattice cell; d SDF; g its gradient. A vertex lies either on the zero set of the SDF or on the cap, the
+plane where the field's box cuts the solid; each is moved along its own gradient only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.fields.protocol import Field
+from pipeline.meshes import F32, F64, Faces, Mask
+from stages.surface.extract import QUERY, Lattice, box_distance
+
+NEWTON_STEPS = 3
+REACH = 0.5  # of h: a vertex of the right cell is never further away than that
+THIN = 1e-4  # of h^2: a face with less area counts as degenerate
+RELAX_STEPS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Landed:
+    """Vertices on the surface (V, 3), their outward unit normals (V, 3), and which lie on the cap (V,)."""
+
+    vertices: F64
+    normals: F32
+    capped: Mask
+
+
+def largest_component(vertices: F64, faces: Faces) -> tuple[F64, Faces, int, float]:
+    """Keep the component with the largest area. Also how many were dropped, and the second's area over the first's.
+
+    Components are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but
+    only pieces outside compete for the second place.
+    """
+    label = meshes.component_of_face(faces, len(vertices))
+    vectors = meshes.area_vectors(vertices, faces)
+    area = np.bincount(label, np.linalg.norm(vectors, axis=1))
+    solid = np.bincount(label, (vertices[faces[:, 0]] * vectors).sum(1)) > 0
+    first = int(area.argmax())
+    v, f, _ = meshes.compact(vertices, faces[label == first])
+    others = np.where(solid, area, 0.0)
+    others[first] = 0.0
+    return np.asarray(v, np.float64), f, int((area > 0).sum()) - 1, float(others.max() / area[first])
+
+
+def land(field: Field, grid: Lattice, start: F64, steps: int = NEWTON_STEPS) -> Landed:
+    """Newton's method along the gradient, clamped to REACH * h from where the vertex started.
+
+    x <- x - d g / |g|^2
+    """
+    x = start.copy()
+    value, gradient, capped = _solid(field, grid, x)
+    for _ in range(steps):
+        square = (gradient * gradient).sum(1)
+        x = x - (value / np.maximum(square, 1e-6))[:, None] * gradient
+        moved = x - start
+        length = np.linalg.norm(moved, axis=1)
+        x = start + moved * np.minimum(1, REACH * grid.h / np.maximum(length, 1e-30))[:, None]
+        value, gradient, capped = _solid(field, grid, x)
+    return Landed(x, meshes.unit(gradient).astype(np.float32), capped)
+
+
+def spread_degenerate(field: Field, grid: Lattice, landed: Landed, faces: Faces) -> Landed:
+    """Move the corners of faces without area towards the middle of their neighbours, and land them again.
+
+    Deleting such faces would open the mesh or pinch it; moving corners along the surface keeps its topology.
+    """
+    x = landed.vertices.copy()
+    e = meshes.edges(faces)
+    degree = np.bincount(e[:, 0], minlength=len(x))
+    for _ in range(RELAX_STEPS):
+        thin = meshes.areas(x.astype(np.float32), faces) < THIN * grid.h**2
+        if not thin.any():
+            return landed
+        corners = np.unique(faces[thin])
+        sums = np.stack([np.bincount(e[:, 0], x[e[:, 1], i], len(x)) for i in range(3)], 1)
+        middle = sums[corners] / degree[corners, None]
+        again = land(field, grid, 0.5 * (x[corners] + middle), 2)
+        x[corners] = again.vertices
+        normals, capped = landed.normals.copy(), landed.capped.copy()
+        normals[corners], capped[corners] = again.normals, again.capped
+        landed = Landed(x.copy(), normals, capped)
+    return landed
+
+
+def outward(vertices: F64, faces: Faces) -> Faces:
+    """Faces whose normals leave the solid: turned over if the mesh encloses a negative volume."""
+    return faces if meshes.volume(vertices, faces) >= 0 else np.ascontiguousarray(faces[:, ::-1])
+
+
+def _solid(field: Field, grid: Lattice, points: F64) -> tuple[F64, F64, Mask]:
+    """max(sdf, box) with its gradient, and where the box is the larger."""
+    value, gradient = np.empty(len(points)), np.empty((len(points), 3))
+    for start in range(0, len(points), QUERY):
+        part = slice(start, start + QUERY)
+        inside = np.clip(points[part], grid.lower, grid.upper).astype(np.float32)
+        value[part], gradient[part] = field.sdf_and_gradient(inside)
+    wall, wall_gradient = box_distance(points, grid)
+    capped = wall > value
+    return np.where(capped, wall, value), np.where(capped[:, None], wall_gradient, gradient), capped

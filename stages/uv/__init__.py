@@ -1,0 +1,1 @@
+"""UV stage: a decimated mesh with texture coordinates, and a proxy."""

@@ -1,0 +1,161 @@
+"""The mesher against shapes whose surface is a formula."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from pipeline import meshes
+from pipeline.errors import StageError
+from stages.surface import clean, extract
+from stages.surface.build import Built, build
+from tests.support.analytic_fields import AnalyticField, Distance, bumpy_head, ellipsoid, sphere, union
+
+
+def quiet(done: int, total: int) -> None:
+    """No progress shown."""
+
+
+def built(distance: Distance, resolution: int = 48, half: tuple[float, float, float] = (0.12, 0.13, 0.12)) -> Built:
+    return build(AnalyticField(distance, half), resolution, quiet)
+
+
+def edge_uses(faces: np.ndarray) -> dict[tuple[int, int], int]:
+    """Plain count of directed edges, an oracle apart from pipeline.meshes."""
+    uses: dict[tuple[int, int], int] = {}
+    for a, b, c in faces.tolist():
+        for edge in ((a, b), (b, c), (c, a)):
+            uses[edge] = uses.get(edge, 0) + 1
+    return uses
+
+
+def test_sphere_is_exact_closed_and_outward() -> None:
+    got = built(sphere(0.1))
+    radius = np.linalg.norm(got.mesh.vertices.astype(np.float64), axis=1)
+    assert np.abs(radius - 0.1).max() < 0.01 * got.cell
+    uses = edge_uses(got.mesh.faces)
+    assert all(n == 1 and uses.get((b, a)) == 1 for (a, b), n in uses.items())
+    assert len(got.mesh.vertices) - len(uses) // 2 + len(got.mesh.faces) == 2
+    assert meshes.volume(got.mesh.vertices, got.mesh.faces) == pytest.approx(4 / 3 * np.pi * 0.1**3, rel=4e-3)
+    assert np.abs(got.mesh.normals - got.mesh.vertices / 0.1).max() < 1e-4
+    assert got.topology.manifold and got.topology.euler == 2 and got.warnings == ()
+    assert got.cell == pytest.approx(0.26 / 48)
+
+
+def test_faces_look_along_the_field_gradient() -> None:
+    got = built(bumpy_head(), 64)
+    face_normals = meshes.unit(meshes.area_vectors(got.mesh.vertices, got.mesh.faces))
+    vertex_mean = meshes.unit(got.mesh.normals[got.mesh.faces].mean(1))
+    assert np.mean((face_normals * vertex_mean).sum(1) > 0.5) > 0.99
+
+
+def test_neck_is_capped_flat_inside_the_box() -> None:
+    field = AnalyticField(bumpy_head())
+    got = build(field, 64, quiet)
+    floor = -0.13 + extract.INSET * got.cell
+    on_floor = np.abs(got.mesh.vertices[:, 1] - floor) < 1e-6
+    assert got.topology.manifold and got.topology.euler == 2
+    assert on_floor.sum() > 100 and got.mesh.vertices[:, 1].min() > floor - 1e-6
+    cap = on_floor[got.mesh.faces].all(1)
+    area = meshes.areas(got.mesh.vertices, got.mesh.faces)[cap].sum()
+    assert np.pi * (0.05 - got.cell) ** 2 < area < np.pi * 0.053**2  # the faces on the rim are not counted
+    assert np.allclose(got.mesh.normals[on_floor].mean(0), [0, -1, 0], atol=0.02)
+    free = ~on_floor
+    assert np.abs(field.distance(got.mesh.vertices[free].astype(np.float64))[0]).max() < 0.01 * got.cell
+
+
+def test_no_face_without_area() -> None:
+    got = built(sphere(0.1), 26, (0.13, 0.13, 0.13))  # lattice nodes fall exactly on the sphere
+    assert meshes.areas(got.mesh.vertices, got.mesh.faces).min() > 0.9 * clean.THIN * got.cell**2
+
+
+def test_specks_and_cavities_go() -> None:
+    specks = union(sphere(0.08), sphere(0.006, (0.1, 0.1, 0.1)), sphere(0.005, (-0.1, 0.11, 0.1)))
+
+    def with_cavity(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, gradient = specks(p)
+        hole, inward = sphere(0.02)(p)
+        cut = -hole > value
+        return np.where(cut, -hole, value), np.where(cut[:, None], -inward, gradient)
+
+    got = built(with_cavity, 64)
+    assert got.removed == 3 and got.topology.components == 1
+    assert np.abs(np.linalg.norm(got.mesh.vertices, axis=1) - 0.08).max() < 1e-4
+    assert got.warnings == ()
+
+
+def test_large_second_piece_is_reported() -> None:
+    got = built(union(sphere(0.07, (0, -0.03, 0)), sphere(0.03, (0.0, 0.09, 0))))
+    assert got.removed == 1 and "second piece" in got.warnings[0]
+
+
+def test_slabs_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = built(bumpy_head(), 64)
+    monkeypatch.setattr(extract, "SLAB_NODES", 1)
+    sliced = built(bumpy_head(), 64)
+    assert sliced.topology == whole.topology
+    distance, _ = cKDTree(whole.mesh.vertices).query(sliced.mesh.vertices)
+    assert distance.max() < 1e-6 and len(whole.mesh.vertices) == len(sliced.mesh.vertices)
+
+
+def test_twice_gives_the_same_bytes() -> None:
+    a, b = built(bumpy_head(), 40), built(bumpy_head(), 40)
+    for name in ("vertices", "normals", "faces"):
+        assert getattr(a.mesh, name).tobytes() == getattr(b.mesh, name).tobytes()
+
+
+def test_only_near_blocks_are_evaluated() -> None:
+    field = AnalyticField(sphere(0.1))
+    build(field, 128, quiet)
+    assert field.evaluations < 0.45 * 128**3
+
+
+@pytest.mark.parametrize("steepness", [0.2, 4.0, 30.0])
+def test_fields_that_are_no_distances(steepness: float) -> None:
+    """A slope far from one hides the surface from the near-block test; the walls that this makes are noticed."""
+
+    def scaled(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, gradient = sphere(0.1, (0.003, 0.001, 0.002))(p)
+        return steepness * value, steepness * gradient
+
+    got = built(scaled, 64)
+    radius = np.linalg.norm(got.mesh.vertices - np.array([0.003, 0.001, 0.002]), axis=1)
+    assert got.topology.manifold and np.abs(radius - 0.1).max() < 0.01 * got.cell
+
+
+def test_small_ball_between_coarse_nodes_is_found() -> None:
+    got = built(sphere(0.004, (0.0113, 0.0071, 0.0029)), 64)
+    assert got.topology.euler == 2
+
+
+@pytest.mark.parametrize("shift", [0.5, -0.5])
+def test_no_surface(shift: float) -> None:
+    def constant(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(len(p), shift), np.tile([0.0, 1.0, 0.0], (len(p), 1))
+
+    with pytest.raises(StageError, match="no surface" if shift > 0 else "fills its box"):
+        built(constant)
+
+
+def test_nan_is_refused() -> None:
+    def broken(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, gradient = sphere(0.1)(p)
+        return np.where(p[:, 0] > 0.05, np.nan, value), gradient
+
+    with pytest.raises(StageError, match="not finite"):
+        built(broken)
+
+
+def test_flat_box_is_refused() -> None:
+    with pytest.raises(StageError, match="no volume"):
+        built(sphere(0.1), 32, (0.1, 0.0, 0.1))
+
+
+def test_newton_stays_within_half_a_cell() -> None:
+    field = AnalyticField(ellipsoid())
+    grid = extract.lattice(field, 64)
+    rng = np.random.default_rng(0)
+    start = rng.uniform(-0.1, 0.1, (500, 3))
+    landed = clean.land(field, grid, start)
+    assert np.linalg.norm(landed.vertices - start, axis=1).max() <= clean.REACH * grid.h * 1.001
