@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.synthetic_asset import RADIUS, ball, smooth_light, texture_arrays, write_inputs
 
+from pipeline.transforms import inverse_rigid, project
 from stages.usd.exported import ExportedAsset
 from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
 from stages.usd.render import Renderer, View, bilinear, lookup, orbit_view, tangents
@@ -123,6 +124,41 @@ def test_flat_normal_map_changes_nothing_and_a_tilted_one_turns_the_right_way() 
     image = Renderer(asset(light=light, normal=tilted)).render(orbit_view(RADIUS, 0.0, SIZE), samples=1)
     middle = image[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1, 0].mean()
     assert middle == pytest.approx(0.4 * (1 + 2 / 3 * 0.9 * np.sin(0.3)), abs=2e-3)  # u grows towards +x there
+
+
+def test_a_normal_map_tilted_along_v_looks_up() -> None:
+    """Green is +y: towards growing v, which is up on this ball."""
+    light = np.zeros((121, 3), np.float32)
+    light[0], light[1] = np.sqrt(4 * np.pi), 0.9 / np.sqrt(3 / (4 * np.pi))  # grows along +y
+    tilted = np.broadcast_to(np.float32([0, np.sin(0.3), np.cos(0.3)]), (8, 8, 3))
+    for azimuth in (0.0, 2.0, 4.5):
+        image = Renderer(asset(light=light, normal=tilted)).render(orbit_view(RADIUS, azimuth, SIZE), samples=1)
+        middle = image[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1, 0].mean()
+        assert middle == pytest.approx(0.4 * (1 + 2 / 3 * 0.9 * np.sin(0.3)), abs=2e-3)
+
+
+def test_silhouette_lies_where_the_distorted_camera_projects_it() -> None:
+    """An off-centre ball seen through a strong lens: its outline's mean is that of its projected contour."""
+    view = orbit_view(RADIUS, 0.0, 200, centre=np.array([0.06, 0.04, 0.0]))
+    K = view.K.copy()
+    K[0, 0] *= 0.6
+    K[1, 1] *= 0.5
+    bent = View(K, view.world_from_cam, 200, 200, np.array([-0.4, 0.1, 0.02, -0.03, 0.0]))
+    alpha = Renderer(asset()).render(bent, samples=2)[..., 3]
+    row, column = np.mgrid[:200, :200] + 0.5
+    found = np.array([(alpha * column).sum(), (alpha * row).sum()]) / alpha.sum()
+    eye = view.world_from_cam[:3, 3]  # the contour: a circle around the axis from the eye to the ball
+    distance = np.linalg.norm(eye)
+    axis, turn = -eye / distance, np.linspace(0, 2 * np.pi, 4000, endpoint=False)
+    side = np.cross(axis, [0, 1, 0]) / np.linalg.norm(np.cross(axis, [0, 1, 0]))
+    across = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
+    near = RADIUS**2 / distance
+    contour = -axis * near + across * np.sqrt(RADIUS**2 - near**2)
+    uv = project(K, inverse_rigid(view.world_from_cam), bent.distortion, contour)[0]
+    x, y = uv.T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    wanted = [((a + np.roll(a, -1)) * cross).sum() / (3 * cross.sum()) for a in (x, y)]  # a polygon's centroid
+    assert np.abs(found - wanted).max() < 0.02
 
 
 def test_tangent_follows_u() -> None:

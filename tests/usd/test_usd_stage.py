@@ -140,6 +140,39 @@ def test_two_exports_have_the_same_bytes(inputs: SyntheticInputs, tmp_path: Path
     assert {f.path: f.sha256 for f in first.files} == {f.path: f.sha256 for f in second.files}
 
 
+@pytest.mark.slow
+def test_another_process_writes_the_same_bytes(exported, inputs: SyntheticInputs, tmp_path: Path) -> None:
+    """Hash seeds, thread schedules and import orders differ between processes."""
+    import os
+    import pickle
+    import subprocess
+    import sys
+
+    (tmp_path / "inputs.pkl").write_bytes(pickle.dumps(inputs))
+    tests = Path(__file__).resolve().parents[1]
+    code = """
+import pickle, sys
+from pathlib import Path
+sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
+from pipeline.contract import Context
+from stages.usd.stage import STAGE, Config, Inputs
+made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
+named = {n: getattr(made, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+work = Path(sys.argv[2]) / "work"
+asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), Context(work, work / "scratch"))
+print(asset.digest())
+"""
+    environment = os.environ | {"PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tests), str(tmp_path)],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout.split()[-1] == exported[1].digest()
+
+
 def test_package_is_aligned_png_only_and_opens(exported) -> None:
     path = exported[0] / "asset/head.usdz"
     with zipfile.ZipFile(path) as z:
