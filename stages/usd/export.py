@@ -104,7 +104,7 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
     if uv.artifact.proxy is None:
         return None, []
     proxy = with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh)
-    fault = uv_fault(proxy)
+    fault = uv_fault(proxy, mesh)
     return (None, [f"the proxy mesh was left out: {fault}"]) if fault else (proxy, [])
 
 

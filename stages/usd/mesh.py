@@ -145,14 +145,23 @@ def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> 
     return face, np.nan_to_num(weights).clip(0, 1)
 
 
-def uv_fault(mesh: UvSurface, limit: float = 0.005) -> str:
-    """Why a proxy's texture coordinates would mislead a client, or "": mirrored or empty triangles (by area)."""
+def uv_fault(proxy: UvSurface, full: UvSurface, limit: float = 0.005) -> str:
+    """Why a proxy's texture coordinates would mislead a client, or "".
+
+    Triangles without area, or more mirrored ones than the full mesh has (an atlas may mirror whole charts).
+    """
+    empty, mirrored = _shares(proxy)
+    if empty > limit:
+        return f"{empty:.1%} of the proxy's surface has no area in the texture"
+    wrong = abs(mirrored - _shares(full)[1])
+    return f"{wrong:.1%} of the proxy's surface is mirrored in the texture" if wrong > 10 * limit else ""
+
+
+def _shares(mesh: UvSurface) -> tuple[float, float]:
+    """Shares of a mesh's area whose triangles are empty, and are mirrored, in the texture."""
     t = mesh.uvs[mesh.uv_faces].astype(np.float64)
     a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     signed = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    x = mesh.vertices[mesh.faces].astype(np.float64)
-    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
-    empty, mirrored = (float(area[m].sum() / area.sum()) for m in (np.abs(signed) < 1e-10, signed < 0))
-    if empty > limit:
-        return f"{empty:.1%} of the proxy's surface has no area in the texture"
-    return f"{mirrored:.1%} of the proxy's surface is mirrored in the texture" if mirrored > 4 * limit else ""
+    area = _areas(mesh.vertices[mesh.faces].astype(np.float64))
+    empty, mirrored = (float(area[m].sum() / max(area.sum(), 1e-30)) for m in (np.abs(signed) < 1e-10, signed < 0))
+    return empty, mirrored

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from support.synthetic_asset import RADIUS, ball, smooth_light, texture_arrays, write_inputs
@@ -14,13 +16,19 @@ from stages.usd.render import Renderer, View, bilinear, lookup, orbit_view, tang
 SIZE = 64
 
 
+@lru_cache(maxsize=1)
+def fine_ball() -> UvSurface:
+    """Fine enough that interpolated normals are the sphere's to 1e-4."""
+    mesh = ball(192, 96, height=1.0)
+    return UvSurface(*(mesh[k] for k in ("vertices", "normals", "faces", "uvs", "uv_faces")))
+
+
 def asset(**changes: object) -> ExportedAsset:
     """A fine sphere, grey, without specular reflection, under a constant light of radiance 1."""
-    mesh = ball(192, 96, height=1.0)
     light = np.zeros((121, 3), np.float32)
     light[0] = np.sqrt(4 * np.pi)
     parts: dict[str, object] = {
-        "mesh": UvSurface(*(mesh[k] for k in ("vertices", "normals", "faces", "uvs", "uv_faces"))),
+        "mesh": fine_ball(),
         "albedo": np.full((8, 8, 3), 0.4, np.float32),
         "coefficients": np.zeros((8, 8, 1), np.float32),
         "inv_kappa": np.full((8, 8, 1), 1e-6, np.float32),
@@ -225,8 +233,10 @@ def test_a_proxy_that_can_not_be_textured_is_reported(tmp_path) -> None:
     full = read_mesh(inputs.uv.path(inputs.uv.artifact.mesh))
     proxy = read_mesh(inputs.uv.path(inputs.uv.artifact.proxy), with_uvs=False)
     good = with_uvs_from(proxy, full)
-    assert uv_fault(good) == ""
+    assert uv_fault(good, full) == ""
     mirrored = UvSurface(good.vertices, good.normals, good.faces, good.uvs, good.uv_faces[:, ::-1].copy())
-    assert "mirrored" in uv_fault(mirrored)
+    flipped = UvSurface(full.vertices, full.normals, full.faces, full.uvs * [-1, 1] + [1, 0], full.uv_faces)
+    assert uv_fault(with_uvs_from(proxy, flipped), flipped) == ""  # an atlas that mirrors the chart is no fault
+    assert "mirrored" in uv_fault(mirrored, full)
     empty = UvSurface(good.vertices, good.normals, good.faces, good.uvs * 0, good.uv_faces)
-    assert "no area" in uv_fault(empty)
+    assert "no area" in uv_fault(empty, full)
