@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
+from typing import Any
 
-os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")
+import cv2
+import numpy as np
+import numpy.typing as npt
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import numpy.typing as npt  # noqa: E402
-
-from pipeline.colour import linear_from_srgb, srgb_from_linear  # noqa: E402
-from pipeline.errors import StageError  # noqa: E402
+from pipeline.colour import linear_from_srgb, srgb_from_linear
+from pipeline.errors import StageError
 
 F32 = npt.NDArray[np.float32]
 MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
 
 
-def read_encoded(path: Path) -> npt.NDArray[np.generic]:
+def read_encoded(path: Path) -> npt.NDArray[Any]:
     """(H, W, C) as stored, RGB order. Raises StageError if the file is empty, corrupt or absurdly large."""
     size = path.stat().st_size if path.is_file() else 0
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if size else None
+    image = _decoded(path) if size else None
     if image is None:
         raise StageError(
             "the image can't be decoded",
@@ -44,6 +42,19 @@ def read_encoded(path: Path) -> npt.NDArray[np.generic]:
     return np.ascontiguousarray(image[..., order])
 
 
+def _decoded(path: Path) -> npt.NDArray[Any] | None:
+    """(H, W) or (H, W, C) in OpenCV's order, or None. Its wheel is built without OpenEXR: those are read here."""
+    if path.suffix.lower() != ".exr":
+        return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        planes, names = read_exr(path)
+    except (RuntimeError, OSError, ValueError):  # what OpenEXR raises for damaged files
+        return None
+    colour = [n for n in "BGRA" if n in names]
+    wanted = colour if len(colour) >= 3 else list(names[:1])
+    return planes[..., [names.index(n) for n in wanted]]
+
+
 def read_linear(path: Path) -> F32:
     """(H, W, 3) linear Rec.709 float32. Integer files are taken as sRGB, float files as linear."""
     image = read_encoded(path)
@@ -63,7 +74,7 @@ def read_alpha(path: Path) -> F32:
     return (plane.astype(np.float32) / peak).clip(0, 1)
 
 
-def write_png(path: Path, image: npt.NDArray[np.generic], bits: int = 8) -> None:
+def write_png(path: Path, image: npt.NDArray[Any], bits: int = 8) -> None:
     """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] as they are (no transfer curve)."""
     peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     data = np.asarray(image, np.float64)
@@ -79,7 +90,7 @@ def write_png_from_linear(path: Path, image: F32) -> None:
     write_png(path, srgb_from_linear(np.asarray(image, np.float32).clip(0, 1)))
 
 
-def _encode(path: Path, kind: str, data: npt.NDArray[np.generic]) -> None:
+def _encode(path: Path, kind: str, data: npt.NDArray[Any]) -> None:
     ok, buffer = cv2.imencode(kind, data)
     if not ok:
         raise RuntimeError(f"{path.name}: {kind} can't hold an array of {data.shape} {data.dtype}")

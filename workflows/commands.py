@@ -12,7 +12,7 @@ import webbrowser
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import Cancelled, NeufaceError, StageError
+from pipeline.errors import Cancelled, StageError
 from workflows import environment, folders
 from workflows.console import Console
 from workflows.interrupt import interruptible
@@ -46,20 +46,17 @@ def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, A
 
 def _through_prefect(request: RunRequest) -> dict[str, Any]:
     from prefect.client.orchestration import get_client
+    from prefect.settings import get_current_settings
 
     from workflows.flows import capture_to_asset
 
-    for name in ("prefect.flow_runs", "prefect.task_runs", "prefect.engine"):
-        logging.getLogger(name).addFilter(_not_ours)
+    if get_current_settings().api.url is None:  # nobody reads Prefect's log of this run: the console tells it all
+        for name in ("prefect.flow_runs", "prefect.task_runs"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
     with get_client(sync_client=True):  # starts the server while SIGINT is blocked, so that Ctrl-C does not reach it
         parameters = request.model_dump()
         record: dict[str, Any] = capture_to_asset(**{**parameters, "sets": list(request.sets)})
     return record
-
-
-def _not_ours(record: logging.LogRecord) -> bool:
-    """Keep Prefect from printing tracebacks of errors that the user is told about in plain words."""
-    return not (record.exc_info and isinstance(record.exc_info[1], NeufaceError))
 
 
 def _end_server() -> None:

@@ -11,7 +11,7 @@ OFFLINE = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
-    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "90",
+    "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "180",
     "PREFECT_LOGGING_LEVEL": "WARNING",
     "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
     "PREFECT_CLI_PROMPT": "false",
@@ -27,4 +27,5 @@ def settle(store: Path, out: Path) -> None:
         os.environ.setdefault(name, value)
     if "PREFECT_API_URL" not in os.environ:
         own = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
-        os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve()))
+        home = Path(os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve())))
+        home.mkdir(parents=True, exist_ok=True)  # Prefect makes the last folder only

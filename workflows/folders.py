@@ -51,7 +51,14 @@ def _probe(folder: Path) -> None:
             remedy="remove that file or choose another folder",
         ) from e
     except OSError as e:
-        raise stage_error_from_os_error(e, folder) or e from e
+        known = stage_error_from_os_error(e, folder)
+        raise known or StageError(
+            "the folder can't be written",
+            where=folder,
+            value=e.strerror,
+            limit="a folder that files can be made in",
+            remedy="choose another with --out or --store",
+        ) from e
 
 
 def sweep(made: list[Path], store: Path) -> None:

@@ -140,8 +140,6 @@ def _with_timing(path: str, content: bytes, timing: Mapping[str, float]) -> byte
     """The report with the seconds of this run: manifests are the same on every machine, times are not."""
     if path == "metrics.json":
         return json.dumps({**json.loads(content), "timing": dict(timing)}, indent=1).encode()
-    try:
-        from stages.report.page import with_timing
-    except ImportError:
-        return content
-    return str(with_timing(content.decode(), dict(timing))).encode()
+    from stages.report.page import with_timing
+
+    return with_timing(content.decode(), timing).encode()

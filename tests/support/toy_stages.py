@@ -54,12 +54,12 @@ class Config(StageConfig):
     plus: int = Field(0, ge=0, le=1000, description="what is added")
     seed: int = 0
     holdout: str = "none"
+    fault: str = ""
 
 
 class SlowConfig(Config):
     steps: int = Field(1, ge=1, description="files that are written one after the other")
     pause: float = Field(0.0, ge=0, description="seconds between them")
-    fault: str = ""
 
 
 def source(folder: Path) -> Located[Folder]:
@@ -74,6 +74,8 @@ def _write(context: Context, total: int) -> Number:
 
 def run_first(inputs: FirstInputs, config: Config, context: Context) -> Number:
     """Sum of the files' sizes."""
+    if config.fault:
+        raise StageError("the first toy is broken", where="part 1", value=3, limit="4", remedy="mend it")
     return _write(context, sum(f.size for f in inputs.source.artifact.files) + config.plus)
 
 

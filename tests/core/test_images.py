@@ -1,0 +1,145 @@
+"""Pictures to files and back: bit depth, channels, order, and files that are not pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from pipeline import images
+from pipeline.colour import linear_from_srgb
+from pipeline.errors import StageError
+
+
+def codes(bits: int, channels: int) -> np.ndarray:
+    peak = 2**bits - 1
+    return np.random.default_rng(0).integers(0, peak + 1, (7, 5, channels)) / peak
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_png_round_trip_is_exact(tmp_path: Path, bits: int, channels: int) -> None:
+    data = codes(bits, channels)
+    images.write_png(tmp_path / "a.png", data, bits)
+    back = images.read_encoded(tmp_path / "a.png")
+    assert back.dtype == (np.uint8 if bits == 8 else np.uint16)
+    assert np.array_equal(back / (2**bits - 1), data)
+
+
+def test_png_is_rgb_in_the_file(tmp_path: Path) -> None:
+    """Seen by another reader: a red pixel is red."""
+    images.write_png(tmp_path / "a.png", np.array([[[1.0, 0.5, 0.0]]]))
+    from PIL import Image
+
+    assert Image.open(tmp_path / "a.png").convert("RGB").getpixel((0, 0)) == (255, 128, 0)
+
+
+def test_png_clamps_and_rounds(tmp_path: Path) -> None:
+    images.write_png(tmp_path / "a.png", np.array([[-1.0, 2.0, np.nan, 0.4999 / 255, 0.5001 / 255]]))
+    assert images.read_encoded(tmp_path / "a.png")[0, :, 0].tolist() == [0, 255, 0, 0, 1]
+
+
+def test_read_linear_decodes_integers_and_leaves_floats(tmp_path: Path) -> None:
+    data = codes(8, 3)
+    images.write_png(tmp_path / "a.png", data)
+    assert np.abs(images.read_linear(tmp_path / "a.png") - linear_from_srgb(data)).max() < 1e-7
+    images.write_exr(tmp_path / "a.exr", data.astype(np.float32) * 4)
+    assert np.abs(images.read_linear(tmp_path / "a.exr") - data * 4).max() < 1e-6
+
+
+def test_read_linear_of_grey_and_alpha(tmp_path: Path) -> None:
+    images.write_png(tmp_path / "g.png", codes(8, 1))
+    assert images.read_linear(tmp_path / "g.png").shape == (7, 5, 3)
+    images.write_png(tmp_path / "a.png", codes(8, 4))
+    assert images.read_linear(tmp_path / "a.png").shape == (7, 5, 3)
+
+
+def test_write_png_from_linear_is_srgb(tmp_path: Path) -> None:
+    images.write_png_from_linear(tmp_path / "a.png", np.full((1, 1, 3), 0.21404114, np.float32))
+    assert images.read_encoded(tmp_path / "a.png").ravel().tolist() == [128] * 3  # half grey
+
+
+def test_read_alpha(tmp_path: Path) -> None:
+    rgba = codes(8, 4)
+    images.write_png(tmp_path / "a.png", rgba)
+    assert np.allclose(images.read_alpha(tmp_path / "a.png"), rgba[..., 3])
+    images.write_png(tmp_path / "m.png", codes(16, 1), 16)
+    assert np.allclose(images.read_alpha(tmp_path / "m.png"), codes(16, 1)[..., 0])
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4, 6])
+def test_exr_round_trip(tmp_path: Path, channels: int) -> None:
+    data = np.random.default_rng(1).normal(0, 100, (6, 9, channels)).astype(np.float32)
+    data[0, 0] = 1e30
+    images.write_exr(tmp_path / "sub" / "a.exr", data)
+    back, names = images.read_exr(tmp_path / "sub" / "a.exr")
+    assert np.array_equal(back, data)
+    assert names == {1: ("Y",), 3: tuple("RGB"), 4: tuple("RGBA")}.get(channels, tuple(f"c{i}" for i in range(6)))
+
+
+def test_half_exr_is_close(tmp_path: Path) -> None:
+    data = np.random.default_rng(2).uniform(0, 4, (6, 9, 3)).astype(np.float32)
+    images.write_exr(tmp_path / "a.exr", data, half=True)
+    back, _ = images.read_exr(tmp_path / "a.exr")
+    assert 0 < np.abs(back - data).max() < 4 * 2**-11
+
+
+def test_exr_is_what_another_reader_finds(tmp_path: Path) -> None:
+    data = np.random.default_rng(3).uniform(0, 1, (4, 3, 3)).astype(np.float32)
+    images.write_exr(tmp_path / "a.exr", data)
+    channels = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
+    assert all(np.array_equal(channels[n].pixels, data[..., i]) for i, n in enumerate("RGB"))
+
+
+def test_an_exr_photo_with_more_channels_gives_its_colour(tmp_path: Path) -> None:
+    data = np.random.default_rng(4).uniform(0, 1, (4, 3, 5)).astype(np.float32)
+    images.write_exr(tmp_path / "a.exr", data, ("R", "G", "B", "A", "depth"))
+    assert np.array_equal(images.read_encoded(tmp_path / "a.exr"), data[..., :4])
+    images.write_exr(tmp_path / "b.exr", data, ("Z", "depth", "id", "x", "y"))
+    assert images.read_encoded(tmp_path / "b.exr").shape == (4, 3, 1)
+
+
+def test_wrong_number_of_channel_names(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="2 channel names for 3"):
+        images.write_exr(tmp_path / "a.exr", np.zeros((2, 2, 3), np.float32), ("a", "b"))
+
+
+def cut_off(path: Path) -> None:
+    if path.suffix == ".png":
+        images.write_png(path, codes(8, 3))
+    else:
+        images.write_exr(path, codes(8, 3).astype(np.float32))
+    path.write_bytes(path.read_bytes()[:30])
+
+
+@pytest.mark.parametrize("fault", ["missing", "empty", "text", "cut"])
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_files_that_are_no_pictures(tmp_path: Path, fault: str, kind: str) -> None:
+    path = tmp_path / f"photo.{kind}"
+    if fault == "empty":
+        path.write_bytes(b"")
+    elif fault == "text":
+        path.write_text("not a picture")
+    elif fault == "cut":
+        cut_off(path)
+    with pytest.raises(StageError, match="can't be decoded") as e:
+        images.read_encoded(path)
+    assert e.value.where == path.name
+
+
+def test_a_picture_that_is_far_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(images, "MAX_PIXELS", 34)
+    images.write_png(tmp_path / "a.png", codes(8, 3))
+    with pytest.raises(StageError, match="too large"):
+        images.read_encoded(tmp_path / "a.png")
+
+
+def test_shrink_is_the_mean_over_blocks() -> None:
+    data = np.arange(24, dtype=np.float32).reshape(4, 6)
+    assert images.shrink(data, 2).tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
+    assert np.allclose(images.shrink(np.stack([data, 2 * data], -1), 2)[..., 1], 2 * images.shrink(data, 2))
+    assert images.shrink(data, 1) is data
+    with pytest.raises(ValueError, match="not a multiple of 4"):
+        images.shrink(data, 4)

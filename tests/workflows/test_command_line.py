@@ -1,0 +1,179 @@
+"""`neuface` as a user has it: exit codes, messages, stopping, resuming. Runs go through the Prefect flow."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from workflows.cli import main, parser
+
+TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
+
+
+def start(environment: dict[str, str], *arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(TOY), *map(str, arguments)],
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+
+def neuface(environment: dict[str, str], *arguments: object) -> tuple[int, str, str]:
+    child = start(environment, *arguments)
+    out, err = child.communicate(timeout=120)
+    return child.returncode, out, err
+
+
+# ------------------------------------------------------------------ usage
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["fly"], ["run"], ["run", "x"], ["run", "x", "--out"], ["run", "x", "--out", "y", "--seed", "a"],
+     ["demo", "--views", "3"]],
+)  # fmt: skip
+def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as e:
+        main(arguments)
+    assert e.value.code == 2
+    assert "usage: neuface" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("toys")
+@pytest.mark.parametrize(
+    "options",
+    [["--preset", "besst"], ["--until", "frist"], ["--set", "first.puls=1"], ["--config", "gone.toml"],
+     ["--device", "tpu"], ["--set", "first.plus=-1"]],
+)  # fmt: skip
+def test_unknown_words_are_exit_code_2_and_leave_nothing(
+    photos: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(photos), "--out", str(photos.parent / "out"), *options]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert "what to do:" in err
+    assert "Traceback" not in err
+    assert [p.name for p in photos.parent.iterdir()] == ["photos"]
+
+
+def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("run", "demo", "validate", "report", "view", "doctor"):
+        with pytest.raises(SystemExit) as e:
+            parser().parse_args([command, "--help"])
+        assert e.value.code == 0
+        assert "usage" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("toys")
+def test_dry_run_writes_nothing(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(photos), "--out", str(photos.parent / "out"), "--dry-run"]) == 0
+    assert [line.split()[:2] for line in capsys.readouterr().out.splitlines()] == [
+        ["first", "made"], ["second", "made"], ["third", "made"]]  # fmt: skip
+    assert not (photos.parent / "out").exists()
+
+
+def test_commands_on_folders_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["report", str(tmp_path)], ["view", str(tmp_path)], ["validate", str(tmp_path / "a.usd")]):
+        assert main(arguments) == 1
+        assert capsys.readouterr().err.startswith("error: ")
+    (tmp_path / "run.json").write_text("[]")
+    assert main(["report", str(tmp_path)]) == 1
+
+
+def test_a_capture_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(tmp_path / "gone"), "--out", str(tmp_path / "out")]) == 1
+    assert str(tmp_path / "gone") in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+# ------------------------------------------------------------------ runs
+@pytest.mark.slow
+def test_run_reuse_fail_and_tidy(photos: Path, child_environment: dict[str, str]) -> None:
+    out = photos.parent / "out"
+    code, stdout, err = neuface(child_environment, "run", photos, "--out", out)
+    assert code == 0, err
+    assert "Traceback" not in err
+    assert "3 stages, 0 reused" in stdout
+    record = json.loads((out / "run.json").read_text())
+    assert list(record["stages"]) == ["first", "second", "third"]
+    assert all({"key", "reused", "seconds", "peak_memory_mb"} <= s.keys() for s in record["stages"].values())
+    code, stdout, err = neuface(child_environment, "run", photos, "--out", out, "--set", "third.plus=1")
+    assert code == 0, err
+    assert "3 stages, 2 reused" in stdout
+    code, stdout, err = neuface(child_environment, "run", photos, "--out", out, "--set", "second.fault=stage")
+    assert code == 1
+    for part in ("the toy is broken", "part 7", "found: 3", "limit: 4", "mend it"):
+        assert part in err
+    assert "Traceback" not in err
+    assert err.count("the toy is broken") == 1  # once, not again from Prefect's own log
+    assert list(json.loads((out / "run.json").read_text())["stages"]) == ["first", "second", "third"]
+
+
+@pytest.mark.slow
+def test_a_first_stage_that_fails_leaves_no_folder(photos: Path, child_environment: dict[str, str]) -> None:
+    out = photos.parent / "new" / "out"
+    code, _, err = neuface(child_environment, "run", photos, "--out", out, "--set", "first.fault=stage")
+    assert code == 1
+    assert "the first toy is broken" in err
+    assert [p.name for p in photos.parent.iterdir()] == ["photos"]
+
+
+@pytest.mark.slow
+def test_a_bug_shows_its_traceback_and_fails(photos: Path, child_environment: dict[str, str]) -> None:
+    code, _, err = neuface(child_environment, "run", photos, "--out", photos.parent / "out", "--set",
+                           "second.fault=bug")  # fmt: skip
+    assert code == 1
+    assert "ZeroDivisionError: a bug of the stage" in err
+
+
+def wait_until_written(out: Path, part: str, child: subprocess.Popen[str], seconds: float = 90) -> None:
+    """Wait until the slow toy has written a file, so that a signal meets it in mid-stage."""
+    end = time.monotonic() + seconds
+    while not list((out / ".store").glob(f"second/*.partial-*/{part}")):
+        assert time.monotonic() < end
+        assert child.poll() is None, child.communicate()
+        time.sleep(0.02)
+
+
+SLOW = ("--set", "second.steps=100", "--set", "second.pause=0.1")
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_is_finished_and_the_run_goes_on(photos: Path, child_environment: dict[str, str]) -> None:
+    out = photos.parent / "out"
+    child = start(child_environment, "run", photos, "--out", out, *SLOW)
+    wait_until_written(out, "part3.bin", child)
+    os.killpg(child.pid, signal.SIGINT)  # as a terminal does: Prefect's server gets it too
+    _, err = child.communicate(timeout=60)
+    assert child.returncode == 130, err
+    assert "stopping at the next checkpoint" in err
+    assert "goes on where this one left off" in err
+    assert "Traceback" not in err
+    assert len([p for p in (out / ".store/first").iterdir() if "." not in p.name]) == 1
+    assert not list((out / ".store").glob("second/*.partial-*"))
+    checkpoint = next((out / ".store").glob("second/*.scratch/step.txt"))
+    assert int(checkpoint.read_text()) >= 3
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_stops_at_once(photos: Path, child_environment: dict[str, str]) -> None:
+    out = photos.parent / "out"
+    child = start(child_environment, "run", photos, "--out", out, "--set", "second.steps=2", "--set",
+                  "second.pause=120")  # fmt: skip
+    wait_until_written(out, "part0.bin", child)
+    child.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert child.poll() is None  # the stage is deep in something that does not look up
+    began = time.monotonic()
+    child.send_signal(signal.SIGINT)
+    child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert time.monotonic() - began < 10
