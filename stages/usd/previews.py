@@ -19,7 +19,7 @@ from stages.usd.render import Renderer, View, orbit_view
 F32 = npt.NDArray[np.float32]
 FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side
 SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
-GREY_LIGHT = np.array([[3.2, 3.2, 3.2], [1.6, 1.6, 1.6], [1.9, 1.9, 1.9], [0.9, 0.9, 0.9]], np.float32)
+GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
 """A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape alone."""
 
 
