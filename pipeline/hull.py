@@ -4,7 +4,7 @@ Symbols
     alpha     (H, W) in [0, 1], 1 = subject; a pixel belongs to the subject where alpha >= 0.5
     level(p)  the (max_outside + 1)-largest, over the views that see p, of d_i(project_i(p)) * depth_z / focal:
               how far p lies outside view i's silhouette (negative: inside), in asset units
-    d_i       signed distance to the contour in view i, pixels, from the soft alpha (sub-pixel)
+    d_i       signed distance to the contour in view i, pixels (pipeline.silhouettes)
 
 `level` is 1-Lipschitz up to perspective, which lets coarse cells be settled as a whole, and its zero set is the hull
 to a fraction of a voxel. A view in whose frame a point does not fall has no opinion about that point.
@@ -24,7 +24,8 @@ from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
-from pipeline.transforms import inverse_rigid, matrix, project, undistort
+from pipeline.silhouettes import Silhouette, lens_radius, outside, silhouette
+from pipeline.transforms import inverse_rigid, matrix, project
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -63,20 +64,6 @@ class Hull:
         return out
 
 
-@dataclass(frozen=True, slots=True)
-class _Silhouette:
-    """A view made ready for lookups. distance: (h, w) signed pixels of the photo, on a grid of size / (sx, sy)."""
-
-    K: F64
-    cam_from_world: F64
-    distortion: F64
-    focal: float
-    width: int
-    height: int
-    radius: float  # on the z = 1 plane; beyond it the lens polynomial may fold back into the frame
-    distance: F32
-
-
 # ------------------------------------------------------------------ the hull
 def visual_hull(
     cameras: Sequence[Camera],
@@ -87,6 +74,7 @@ def visual_hull(
     *,
     min_views: int = 3,
     max_outside: int = 0,
+    outside_share: float = 1.0,
 ) -> Hull:
     """Carve the box [lo, hi] with silhouettes.
 
@@ -96,13 +84,15 @@ def visual_hull(
         cell: voxel edge, asset units.
         min_views: voxels that fewer views see are empty.
         max_outside: how many views may call a voxel background before it is carved (0: the plain hull).
+        outside_share: nor may more than this share of the views that see it, so that corners of space in which few
+            views meet are not kept by lenience.
 
     Raises:
         StageError: no views, an empty box, or too many voxels.
     """
     lo, hi = np.asarray(lo, np.float64), np.asarray(hi, np.float64)
     shape = _grid_shape(lo, hi, cell, len(cameras), len(alphas))
-    views = [_silhouette(c, a, 0.5 * (lo + hi), cell) for c, a in zip(cameras, alphas, strict=True)]
+    views = [silhouette(c, a, 0.5 * (lo + hi), cell) for c, a in zip(cameras, alphas, strict=True)]
     band = BAND_CELLS * cell
     coarsest = 4 if min(shape) >= 16 else 1
     level: F32 = np.zeros(tuple(-(-n // coarsest) for n in shape), np.float32)
@@ -114,7 +104,7 @@ def visual_hull(
         points = lo + (index + 0.5) * (cell * factor)
         # 1.2: depth varies inside a coarse cell and lenses stretch, so the Lipschitz constant is a little above 1
         reach = 0.0 if factor == 1 else 1.2 * np.sqrt(3) / 2 * cell * factor
-        found, count, settled = _consult(views, points, reach, band, min_views, max_outside)
+        found, count, settled = _consult(views, points, reach, band, (min_views, max_outside, outside_share))
         at = tuple(index.T)
         level[at], seen[at], open_[at] = found, count, ~settled
         if factor == 1:
@@ -162,13 +152,10 @@ def _doubled(array: npt.NDArray[S], shape: tuple[int, ...]) -> npt.NDArray[S]:
 
 
 def _consult(
-    views: list[_Silhouette], points: F64, reach: float, band: float, min_views: int, max_outside: int
+    views: list[Silhouette], points: F64, reach: float, band: float, rule: tuple[int, int, float]
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
     """Level (N,) clamped to the band, views that saw it (N,), and whether it holds for everything within `reach`."""
-    parts = [
-        _consult_chunk(views, points[i : i + CHUNK], reach, band, min_views, max_outside)
-        for i in range(0, len(points), CHUNK)
-    ]
+    parts = [_consult_chunk(views, points[i : i + CHUNK], reach, band, rule) for i in range(0, len(points), CHUNK)]
     if not parts:
         return np.zeros(0, np.float32), np.zeros(0, np.int16), np.zeros(0, bool)
     level, seen, settled = (np.concatenate(p) for p in zip(*parts, strict=True))
@@ -176,8 +163,9 @@ def _consult(
 
 
 def _consult_chunk(
-    views: list[_Silhouette], points: F64, reach: float, band: float, min_views: int, max_outside: int
+    views: list[Silhouette], points: F64, reach: float, band: float, rule: tuple[int, int, float]
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
+    min_views, max_outside, share = rule
     n, far = len(points), reach + band
     # largest levels first, over the views that see the whole neighbourhood and over those that may see some of it
     sure = np.full((max_outside + 1, n), -np.inf, np.float32)
@@ -185,7 +173,7 @@ def _consult_chunk(
     seen, glimpsed = np.zeros(n, np.int16), np.zeros(n, np.int16)
     live = np.arange(n)
     for i, view in enumerate(views):
-        value, whole, part = _outside(view, points[live], reach)
+        value, whole, part = outside(view, points[live], reach)
         seen[live] += whole
         glimpsed[live] += part
         _insert(sure, live, np.where(whole, value, -np.inf))
@@ -193,11 +181,13 @@ def _consult_chunk(
             _insert(maybe, live, np.where(part, value, -np.inf))
         if i % 4 == 3:  # carved for good: no other view can bring it back
             live = live[sure[-1, live] <= far]
-    carved = sure[-1] > far
+    lenient, column = np.minimum(max_outside, (share * seen).astype(np.intp)), np.arange(n)
+    level = sure[lenient, column]
+    carved = sure[np.minimum(max_outside, (share * glimpsed).astype(np.intp)), column] > far
     unseen = (glimpsed < min_views) & ~carved
-    inside = (maybe[-1] < -far) & (seen >= min_views)
-    level = np.where(unseen, band, sure[-1].clip(-band, band)).astype(np.float32)
-    return level, seen, carved | unseen | inside
+    inside = (maybe[lenient, column] < -far) & (seen >= min_views)
+    clamped = np.where(unseen, band, level.clip(-band, band)).astype(np.float32)
+    return clamped, seen, carved | unseen | inside
 
 
 def _insert(top: F32, at: npt.NDArray[np.intp], value: npt.NDArray[np.floating]) -> None:
@@ -207,93 +197,6 @@ def _insert(top: F32, at: npt.NDArray[np.intp], value: npt.NDArray[np.floating])
         old = row[at]
         row[at] = np.maximum(old, value)
         value = np.minimum(old, value)
-
-
-# ------------------------------------------------------------------ one view
-def _silhouette(camera: Camera, alpha: F32, about: F64, cell: float) -> _Silhouette:
-    """Signed distances of one view, on a grid no finer than the voxels can use (a third of their footprint)."""
-    import cv2
-
-    K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
-    cam_from_world = inverse_rigid(matrix(camera.world_from_cam))
-    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
-    depth = max(float((cam_from_world[:3, :3] @ about + cam_from_world[:3, 3])[2]), 1e-6)
-    footprint = cell * focal / depth * alpha.shape[1] / camera.width
-    factor = max(1.0, min(footprint / 3, max(alpha.shape) / 128))
-    size = (max(2, round(alpha.shape[1] / factor)), max(2, round(alpha.shape[0] / factor)))
-    small = np.asarray(alpha, np.float32)
-    if size != alpha.shape[::-1]:
-        small = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_AREA), np.float32)
-    scale = np.sqrt(camera.width * camera.height / (size[0] * size[1]))
-    return _Silhouette(
-        K,
-        cam_from_world,
-        d,
-        focal,
-        camera.width,
-        camera.height,
-        _lens_radius(camera),
-        signed_pixels(small) * np.float32(scale),
-    )
-
-
-def _lens_radius(camera: Camera) -> float:
-    """Radius on the z = 1 plane that holds the whole frame, with a little room."""
-    K, w, h = matrix(camera.K), camera.width, camera.height
-    edge = np.array([(x, y) for x in (0, w / 2, w) for y in (0, h / 2, h)], np.float64)
-    flat = np.asarray(np.linalg.solve(K[:2, :2], (edge - K[:2, 2]).T).T, np.float64)
-    xy = undistort(flat, np.array(camera.distortion, np.float64))
-    return 1.1 * float(np.linalg.norm(xy, axis=1).max())
-
-
-def signed_pixels(alpha: F32) -> F32:
-    """(H, W) distance to the contour alpha = 0.5 in pixels, negative inside the subject.
-
-    From the nearest pixel on the other side, moved by that pixel's own alpha: one of 0.9 has the contour 0.4 pixels
-    beyond its centre. Without any pixel on the other side the distance is the image's diagonal.
-    """
-    import cv2
-
-    inside = alpha >= 0.5
-    diagonal = float(np.hypot(*alpha.shape))
-    if inside.all() or not inside.any():
-        return np.full(alpha.shape, -diagonal if inside.all() else diagonal, np.float32)
-    sides = []
-    for other in (inside, ~inside):
-        distance, label = cv2.distanceTransformWithLabels(
-            np.where(other, 0, 1).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        alpha_of = np.zeros(int(label.max()) + 1, np.float32)
-        alpha_of[label[other]] = alpha[other]
-        sides.append(distance - np.abs(alpha_of[label] - 0.5))
-    return np.asarray(np.where(inside, -np.maximum(sides[1], 0), np.maximum(sides[0], 0)), np.float32)
-
-
-def _outside(view: _Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Bool]:
-    """How far points are outside the silhouette (N,), asset units; sees all within reach?; sees any of it?"""
-    uv, z = project(view.K, view.cam_from_world, view.distortion, points)
-    front = z > 1e-9
-    uv = np.where(front[:, None], uv, -1e9)
-    z = np.where(front, z, 1.0)
-    if np.any(view.distortion):
-        flat = points @ view.cam_from_world[:2, :3].T + view.cam_from_world[:2, 3]
-        front &= np.hypot(flat[:, 0], flat[:, 1]) < view.radius * z + reach
-    margin = reach * view.focal / z
-    left = np.minimum(uv, np.array([view.width, view.height]) - uv).min(1)  # distance to the nearest edge of the frame
-    value = _lookup(view.distance, uv / (view.width, view.height)) * (z / view.focal)
-    return value.astype(np.float32), front & (left >= margin), front & (left > -margin if reach else left >= 0)
-
-
-def _lookup(image: F32, at: F64) -> F32:
-    """Bilinear values of (H, W) at (N, 2) positions in [0, 1] across and down, clamped to the outermost pixels."""
-    h, w = image.shape
-    x = (at[:, 0] * w - 0.5).clip(0, w - 1.001)
-    y = (at[:, 1] * h - 0.5).clip(0, h - 1.001)
-    c, r = x.astype(np.int32), y.astype(np.int32)
-    fx, fy = (x - c).astype(np.float32), (y - r).astype(np.float32)
-    flat, k = image.ravel(), r * w + c
-    top = flat[k] * (1 - fx) + flat[k + 1] * fx
-    return np.asarray(top * (1 - fy) + (flat[k + w] * (1 - fx) + flat[k + w + 1] * fx) * fy, np.float32)
 
 
 # ------------------------------------------------------------------ what is done with a hull
@@ -346,22 +249,35 @@ def largest_piece(occupied: Bool) -> Bool:
 def hull_sdf(hull: Hull) -> F32:
     """(X, Y, Z) signed distance at voxel centres, asset units, negative inside.
 
-    Near the surface it is `level` (sub-voxel); farther away the distance to the nearest voxel of that band plus the
-    level there. An empty hull is positive everywhere (the grid's diagonal), a full one negative.
+    The distance to where the surface crosses the nearest voxel that it crosses; near the surface `level` where it is
+    smaller, because it knows the surface between those points. An empty hull is positive everywhere (the grid's
+    diagonal), a full one negative.
     """
     inside = hull.level <= 0
     diagonal = float(np.linalg.norm(hull.hi - hull.lo))
     if inside.all() or not inside.any():
         return np.full(inside.shape, -diagonal if inside.all() else diagonal, np.float32)
-    out = np.zeros(inside.shape, np.float32)
-    for side, sign in ((~inside, 1.0), (inside, -1.0)):
-        edge = side & ndimage.binary_dilation(~side)  # voxels with a face on the surface
-        far, nearest = ndimage.distance_transform_edt(~edge, sampling=hull.cell, return_indices=True)
-        # a band clamped by a cut through unseen space says nothing about the surface: half a cell is the best guess
-        near = np.abs(hull.level[tuple(nearest)])
-        near = np.where(near < 1.5 * hull.cell, near, 0.5 * hull.cell)
-        out[side] = sign * (far + near)[side]
-    return out
+    crossing = _mean_crossings(hull)  # (X, Y, Z, 3), NaN where the surface does not pass
+    nearest = ndimage.distance_transform_edt(np.isnan(crossing[..., 0]), return_distances=False, return_indices=True)
+    centres = hull.centres(np.ones(inside.shape, bool)).reshape(*inside.shape, 3)
+    distance = np.linalg.norm(crossing[tuple(nearest)] - centres, axis=-1)
+    size = np.abs(hull.level)
+    size = np.where(size < 0.95 * BAND_CELLS * hull.cell, np.minimum(size, distance), distance)
+    return np.asarray(np.where(inside, -size, size), np.float32)
+
+
+def _mean_crossings(hull: Hull) -> F64:
+    """(X, Y, Z, 3) mean of the surface points in each voxel, NaN where there are none."""
+    points = surface_points(hull)
+    shape = hull.level.shape
+    index = np.minimum(((points - hull.lo) / hull.cell).astype(np.intp), np.array(shape) - 1)
+    flat = np.ravel_multi_index(tuple(index.T), shape)
+    total = int(np.prod(shape))
+    count = np.bincount(flat, minlength=total)
+    sums = np.stack([np.bincount(flat, points[:, k], minlength=total) for k in range(3)], -1)
+    out = np.full((total, 3), np.nan)
+    out[count > 0] = sums[count > 0] / count[count > 0, None]
+    return out.reshape(*shape, 3)
 
 
 def surface_points(hull: Hull) -> F64:
@@ -394,7 +310,7 @@ def render_silhouette(hull: Hull, camera: Camera, height: int, width: int) -> F3
     good = z > 1e-9
     if np.any(d):
         flat = points @ cam_from_world[:2, :3].T + cam_from_world[:2, 3]
-        good &= np.hypot(flat[:, 0], flat[:, 1]) < _lens_radius(camera) * np.where(good, z, 0)
+        good &= np.hypot(flat[:, 0], flat[:, 1]) < lens_radius(camera) * np.where(good, z, 0)
     if not good.any():
         return np.zeros((height, width), np.float32)
     footprint = hull.cell * np.sqrt(K[0, 0] * K[1, 1]) / float(np.median(z[good]))

@@ -1,0 +1,140 @@
+"""Silhouettes as signed distances: how far a point in space lies outside what one view shows of the subject.
+
+A pixel belongs to the subject where alpha >= 0.5; the contour is placed to a fraction of a pixel by the soft alpha.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+from pipeline.artifacts import Camera
+from pipeline.transforms import inverse_rigid, matrix, project, undistort
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+
+BLUR = 0.7  # pixels, against the staircase of hard masks
+SPREAD = float(np.sqrt(BLUR**2 + 1 / 12))  # of an edge seen through the blur and a pixel's square
+NEAR = 1.2  # pixels from the contour up to which the blurred alpha tells the distance
+
+
+@dataclass(frozen=True, slots=True)
+class Silhouette:
+    """A view made ready for lookups. distance: (h, w) signed pixels of the photo, on a grid of size / (sx, sy)."""
+
+    K: F64
+    cam_from_world: F64
+    distortion: F64
+    focal: float
+    width: int
+    height: int
+    radius: float  # on the z = 1 plane; beyond it the lens polynomial may fold back into the frame
+    distance: F32
+
+
+def silhouette(camera: Camera, alpha: F32, about: F64, cell: float) -> Silhouette:
+    """Signed distances of one view, on a grid no finer than the voxels can use (a third of their footprint)."""
+    import cv2
+
+    K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
+    cam_from_world = inverse_rigid(matrix(camera.world_from_cam))
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    depth = max(float((cam_from_world[:3, :3] @ about + cam_from_world[:3, 3])[2]), 1e-6)
+    footprint = cell * focal / depth * alpha.shape[1] / camera.width
+    factor = max(1.0, min(footprint / 3, max(alpha.shape) / 128))
+    size = (max(2, round(alpha.shape[1] / factor)), max(2, round(alpha.shape[0] / factor)))
+    small = np.asarray(alpha, np.float32)
+    if size != alpha.shape[::-1]:
+        small = np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_AREA), np.float32)
+    scale = np.sqrt(camera.width * camera.height / (size[0] * size[1]))
+    return Silhouette(
+        K,
+        cam_from_world,
+        d,
+        focal,
+        camera.width,
+        camera.height,
+        lens_radius(camera),
+        signed_pixels(small) * np.float32(scale),
+    )
+
+
+def lens_radius(camera: Camera) -> float:
+    """Radius on the z = 1 plane that holds the whole frame, with a little room."""
+    K, w, h = matrix(camera.K), camera.width, camera.height
+    edge = np.array([(x, y) for x in (0, w / 2, w) for y in (0, h / 2, h)], np.float64)
+    flat = np.asarray(np.linalg.solve(K[:2, :2], (edge - K[:2, 2]).T).T, np.float64)
+    xy = undistort(flat, np.array(camera.distortion, np.float64))
+    return 1.1 * float(np.linalg.norm(xy, axis=1).max())
+
+
+def signed_pixels(alpha: F32) -> F32:
+    """(H, W) distance to the subject's contour in pixels, negative inside.
+
+    Near the contour from the blurred alpha: a straight edge seen through a pixel's square (variance 1/12 across any
+    direction) and a Gaussian is close to a normal distribution's integral, whose inverse is the distance. Farther away
+    the distance to the nearest pixel on the other side, less that pixel's own. Where the blur would move a pixel to
+    the other side (thin parts) its distance is 0. Without any pixel on the other side: the image's diagonal.
+    """
+    import cv2
+
+    inside = alpha >= 0.5
+    diagonal = float(np.hypot(*alpha.shape))
+    if inside.all() or not inside.any():
+        return np.full(alpha.shape, -diagonal if inside.all() else diagonal, np.float32)
+    blurred = np.asarray(cv2.GaussianBlur(alpha, (0, 0), BLUR, borderType=cv2.BORDER_REPLICATE), np.float32)
+    clear = special.ndtr(-NEAR / SPREAD)
+    near = (blurred > clear) & (blurred < 1 - clear)
+    out = np.zeros(alpha.shape, np.float32)
+    out[near] = -SPREAD * special.ndtri(blurred[near].astype(np.float64))
+    out = np.where(inside, np.minimum(out, 0), np.maximum(out, 0)).astype(np.float32)
+    beyond = np.abs(out).clip(0, 0.7)
+    for side, sign in ((inside, -1), (~inside, 1)):
+        # two pixels about equally near may lie differently far behind the contour: the median mends single ones
+        far = np.asarray(cv2.medianBlur(_to_other_side(beyond, ~side), 3), np.float32)
+        out = np.where(side & ~near, sign * far, out)
+    return out
+
+
+def _to_other_side(beyond: F32, other: Bool) -> F32:
+    """Distance (H, W) to the nearest pixel of `other`, less how far that pixel is behind the contour; >= 0."""
+    import cv2
+
+    distance, label = cv2.distanceTransformWithLabels(
+        np.where(other, 0, 1).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[other]] = beyond[other]
+    return np.asarray(np.maximum(distance - of_label[label], 0), np.float32)
+
+
+def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Bool]:
+    """How far points are outside the silhouette (N,), asset units; sees all within reach?; sees any of it?"""
+    uv, z = project(view.K, view.cam_from_world, view.distortion, points)
+    front = z > 1e-9
+    uv = np.where(front[:, None], uv, -1e9)
+    z = np.where(front, z, 1.0)
+    if np.any(view.distortion):
+        flat = points @ view.cam_from_world[:2, :3].T + view.cam_from_world[:2, 3]
+        front &= np.hypot(flat[:, 0], flat[:, 1]) < view.radius * z + reach
+    margin = reach * view.focal / z
+    left = np.minimum(uv, np.array([view.width, view.height]) - uv).min(1)  # distance to the nearest edge of the frame
+    value = _lookup(view.distance, uv / (view.width, view.height)) * (z / view.focal)
+    return value.astype(np.float32), front & (left >= margin), front & (left > -margin if reach else left >= 0)
+
+
+def _lookup(image: F32, at: F64) -> F32:
+    """Bilinear values of (H, W) at (N, 2) positions in [0, 1] across and down, clamped to the outermost pixels."""
+    h, w = image.shape
+    x = (at[:, 0] * w - 0.5).clip(0, w - 1.001)
+    y = (at[:, 1] * h - 0.5).clip(0, h - 1.001)
+    c, r = x.astype(np.int32), y.astype(np.int32)
+    fx, fy = (x - c).astype(np.float32), (y - r).astype(np.float32)
+    flat, k = image.ravel(), r * w + c
+    top = flat[k] * (1 - fx) + flat[k + 1] * fx
+    return np.asarray(top * (1 - fy) + (flat[k + w] * (1 - fx) + flat[k + w + 1] * fx) * fy, np.float32)
