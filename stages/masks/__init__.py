@@ -1,0 +1,1 @@
+"""masks: photos and cameras in, one soft mask of the subject per view out."""

@@ -1,0 +1,117 @@
+"""Do the masks of all views show one and the same body? Each is held against the hull that all of them carve.
+
+A hull that lets a few views be wrong is built from the voting views. Where a mask and the hull's silhouette differ by
+more than the hull's own coarseness, the mask is wrong (or the camera is).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.artifacts import Camera
+from pipeline.hull import render_silhouette, visual_hull
+from stages.masks.region import F32, Bool, dilated, eroded, region
+
+CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
+POSSIBLE = 1.4  # radii within which 'no part of the subject can be there' is believed
+MARGIN = 1.0  # cells by which the hull may be off
+WRONG_SHARE = 0.1  # of the views that see a voxel may be wrong about it
+SPREADS = 6.0  # robust standard deviations below the median that make an outlier
+
+
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """What the views together say about one view, (h, w) at the size of its small alpha.
+
+    silhouette: where the hull is. possible: where the subject may be, space that few views see included. iou: of the
+    view's mask and the silhouette within the region of interest, None if that is not in the picture.
+    """
+
+    silhouette: Bool
+    possible: Bool
+    here: Bool
+    margin: int
+    iou: float | None
+
+
+def tolerated(votes: int) -> int:
+    """How many of the voting views may be wrong about a voxel."""
+    return 0 if votes < 5 else max(1, votes // 40)
+
+
+def opinions(
+    cameras: Sequence[Camera], alphas: Sequence[F32], votes: Sequence[bool], roi_radius: float, cells: int
+) -> list[Opinion]:
+    """One opinion per view. alphas: (h, w) each, small. votes: which views carve (held-out and dropped ones don't)."""
+    voters = [(c, a) for c, a, v in zip(cameras, alphas, votes, strict=True) if v]
+    lenient, edge = tolerated(len(voters)), CUBE * roi_radius
+    cell = 2 * edge / cells
+    sure, possible = (
+        visual_hull([c for c, _ in voters], [a for _, a in voters], [-edge] * 3, [edge] * 3, cell,
+                    min_views=least, max_outside=lenient, outside_share=WRONG_SHARE)
+        for least in (min(3, len(voters)), 0)
+    )  # fmt: skip
+    out = []
+    for camera, alpha in zip(cameras, alphas, strict=True):
+        h, w = alpha.shape
+        disc = region(camera, roi_radius)
+        if disc is None:
+            nowhere = np.zeros((h, w), bool)
+            out.append(Opinion(nowhere, ~nowhere, nowhere, 1, None))
+            continue
+        disc = disc.scaled(w / camera.width)
+        silhouette = render_silhouette(sure, camera, h, w) >= 0.5
+        may = (render_silhouette(possible, camera, h, w) >= 0.5) | ~disc.covers(h, w, POSSIBLE)
+        here = disc.covers(h, w)
+        margin = max(1, round(MARGIN * disc.radius * cell / roi_radius))
+        out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here)))
+    return out
+
+
+def _iou(a: Bool, b: Bool, where: Bool) -> float | None:
+    union = int(((a | b) & where).sum())
+    return float((a & b & where).sum() / union) if union else None
+
+
+def contradiction(inside: Bool, opinion: Opinion) -> float:
+    """Share of the mask's area that the hull contradicts beyond its coarseness: missing, or where nothing can be."""
+    missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here
+    extra = inside & ~dilated(opinion.possible, opinion.margin)
+    extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
+    return float(missing.sum() + extra.sum()) / max(1, int(inside.sum()))
+
+
+def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:
+    """What grabCut may decide when a mask is mended: the hull's word where it is clear, else the mask's own."""
+    out = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    near = dilated(inside, opinion.margin) & ~eroded(inside, opinion.margin)
+    out[eroded(inside, opinion.margin)] = cv2.GC_FGD
+    out[~inside & ~near] = cv2.GC_BGD
+    clear = eroded(opinion.silhouette, opinion.margin)
+    empty = ~dilated(opinion.silhouette, opinion.margin)
+    here = opinion.here
+    out[here & ~clear & ~empty] = np.where(opinion.silhouette, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
+    agreed = here & ~clear & ~empty & near  # both leave it open: the view's own contour is the better first guess
+    out[agreed] = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[agreed]
+    out[here & clear] = cv2.GC_FGD
+    out[here & empty] = cv2.GC_BGD
+    out[~dilated(opinion.possible, opinion.margin)] = cv2.GC_BGD
+    return out
+
+
+def outliers(ious: Sequence[float | None], least: float, deviation: float) -> list[bool]:
+    """Which views disagree with the rest: below `least`, or below the median by `deviation` and by SPREADS sigma.
+
+    If the median itself is below `least` no view is an outlier: then cameras or all masks are at fault.
+    """
+    known = np.array([v for v in ious if v is not None])
+    if not len(known) or np.median(known) < least:
+        return [False] * len(ious)
+    middle = float(np.median(known))
+    spread = 1.4826 * float(np.median(np.abs(known - middle)))
+    limit = max(least, middle - max(deviation, SPREADS * spread))
+    return [v is not None and v < limit for v in ious]

@@ -1,0 +1,223 @@
+"""Masks for all views of a capture: make them, hold them against each other, mend or drop what does not fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Located, MaskSet, ViewMask
+from pipeline.contract import Context
+from pipeline.errors import StageError
+from pipeline.images import read_alpha, read_encoded, write_png
+from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
+from stages.masks.cut_out import cut
+from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
+from stages.masks.sources import Method, Plan, View, mask, plan, to_full_size
+
+LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
+SMALL = 512  # longest edge of the masks that are held against each other
+CONTRADICTED = 0.02  # share of a mask's area from which it is cut out anew
+FEWEST = 3  # views that must remain
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """See stages.masks.stage.Config."""
+
+    method: Method
+    threshold: float
+    working_size: int
+    hull_cells: int
+    min_agreement: float
+    max_deviation: float
+    mend: bool
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Masked:
+    """A view's mask: small (h, w) in memory, the full one in a file."""
+
+    view: View
+    camera: Camera
+    small: F32
+    source: str
+    coverage: float
+    iou: float | None = None
+
+    @property
+    def useless(self) -> bool:
+        """Whether it shows nothing, or everything."""
+        return not LIMITS[0] <= self.coverage <= LIMITS[1]
+
+
+def segment(capture: Located[Capture], poses: CameraSet, settings: Settings, context: Context) -> MaskSet:
+    """Masks of all registered views; see stages.masks.stage.run."""
+    pairs = _views(capture, poses)
+    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed)
+    context.log.info("masks: %s", how.method)
+    masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
+    warnings: list[str] = []
+    voting = [not m.view.holdout and not m.useless for m in masked]
+    _enough(sum(voting), len(masked), warnings)
+    found = _opinions(masked, voting, poses, settings)
+    masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
+    if settings.mend:
+        bad = _outliers(masked, settings)
+        mended = _each(lambda t: _mend(t[0], t[1], t[2], settings, context),
+                       list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
+        if any(a is not b for a, b in zip(mended, masked, strict=True)):
+            voting = [not m.view.holdout and not m.useless for m in mended]
+            found = _opinions(mended, voting, poses, settings)
+            mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
+        masked = mended
+    dropped = _dropped(masked, settings, warnings)
+    return MaskSet(masks=tuple(_manifest(m, context) for m in masked), dropped=tuple(dropped), warnings=tuple(warnings))
+
+
+def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
+    by_index = {v.index: v for v in capture.artifact.views}
+    out = []
+    for camera in poses.cameras:
+        v = by_index[camera.index]
+        disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
+        out.append((View(v.index, v.name, disc, v.holdout, _reader(capture, v), _mask_reader(capture, v)), camera))
+    return out
+
+
+def _reader(capture: Located[Capture], view: CaptureView) -> Callable[[], U8]:
+    return lambda: eight_bit(read_encoded(capture.path(view.image)))
+
+
+def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F32] | None:
+    if view.mask is None:
+        return None
+    path = capture.path(view.mask)
+
+    def read() -> F32:
+        alpha = read_alpha(path)
+        if alpha.shape != (view.height, view.width):
+            raise StageError("the mask is not of the photo's size", where=f"view {view.index} ({view.name})",
+                             value=f"{alpha.shape[1]} x {alpha.shape[0]}", limit=f"{view.width} x {view.height}",
+                             remedy="give a mask of the photo's own size")  # fmt: skip
+        return alpha
+
+    return read
+
+
+def _each(work: Callable[[T], R], items: list[T], context: Context, message: str) -> list[R]:
+    """`work` on every item, a few at a time, results in order; OpenCV lets other threads run while it works."""
+    out: list[R] = []
+    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+    try:
+        for done, result in enumerate(pool.map(work, items)):
+            context.check()
+            context.progress(done + 1, len(items), message)
+            out.append(result)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return out
+
+
+def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Context) -> Masked:
+    use = view if settings.method in ("auto", "given") else replace(view, given=None)
+    alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
+    made = _keep(use, camera, alpha, source, context)
+    if made.useless and source == "given":
+        raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
+                         where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
+                         limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
+                         "background black), or remove it so that one is computed")  # fmt: skip
+    return made
+
+
+def _keep(view: View, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:
+    write_png(_path(view.index, context), alpha)
+    w, h = working_size(alpha.shape[1], alpha.shape[0], SMALL)
+    return Masked(view, camera, np.asarray(resized(alpha, w, h), np.float32), source, float(alpha.mean()))
+
+
+def _path(index: int, context: Context) -> Path:
+    return context.workdir / "masks" / f"{index}.png"
+
+
+def _opinions(masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings) -> list[Opinion]:
+    return opinions([m.camera for m in masked], [m.small for m in masked], voting, poses.roi_radius,
+                    settings.hull_cells)  # fmt: skip
+
+
+def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
+    """Of the fitted views; held-out ones are measured and left alone."""
+    ious = [None if m.view.holdout or m.useless else m.iou for m in masked]
+    found = outliers(ious, settings.min_agreement, settings.max_deviation)
+    return [f or (m.useless and not m.view.holdout) for f, m in zip(found, masked, strict=True)]
+
+
+def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context: Context) -> Masked:
+    """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
+    inside = made.small >= 0.5
+    if made.source == "given" or made.view.holdout:
+        return made
+    doubtful = made.source in ("person", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
+    if not (bad or doubtful):
+        return made
+    image = made.view.read()
+    w, h = working_size(image.shape[1], image.shape[0], settings.working_size)
+    opinion_here = _at_size(opinion, w, h)
+    prior = np.asarray(resized(made.small, w, h)) >= 0.5
+    new = cut(np.asarray(resized(image, w, h), np.uint8), trimap(prior, opinion_here), settings.seed)
+    before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
+    if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
+        return made
+    return _keep(made.view, made.camera, to_full_size(image, new), f"{made.source}+hull", context)
+
+
+def _at_size(o: Opinion, width: int, height: int) -> Opinion:
+    factor = width / o.silhouette.shape[1]
+
+    def scaled(a: np.typing.NDArray[np.bool_]) -> np.typing.NDArray[np.bool_]:
+        return np.asarray(cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) >= 0.5
+
+    return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), max(1, round(o.margin * factor)), o.iou)
+
+
+def _dropped(masked: list[Masked], settings: Settings, warnings: list[str]) -> list[int]:
+    known = [m.iou for m in masked if m.iou is not None and not m.view.holdout]
+    middle = float(np.median(known)) if known else 0.0
+    if middle < settings.min_agreement:
+        warnings.append(f"masks and cameras agree poorly: median IoU with the visual hull {middle:.2f}, expected at "
+                        f"least {settings.min_agreement:.2f}; look at the masks and the poses")  # fmt: skip
+    out = []
+    for m, bad in zip(masked, _outliers(masked, settings), strict=True):
+        name = f"view {m.view.index} ({m.view.name})"
+        if bad:
+            out.append(m.view.index)
+            why = "shows nothing or everything" if m.useless else f"has IoU {m.iou:.2f} with the other views' hull"
+            warnings.append(f"{name} is not fitted: its mask {why} (median {middle:.2f})")
+        elif m.view.holdout and (m.useless or (m.iou is not None and m.iou < settings.min_agreement)):
+            warnings.append(f"{name} is held out and its mask is doubtful: IoU {m.iou or 0:.2f} with the fitted views' "
+                            f"hull (median {middle:.2f})")  # fmt: skip
+    _enough(sum(not m.view.holdout for m in masked) - len(out), len(masked), warnings)
+    return out
+
+
+def _enough(left: int, views: int, warnings: list[str]) -> None:
+    if left < FEWEST:
+        raise StageError("too few views have a mask that fits the others", where="masks",
+                         value=f"{left} of {views}; {'; '.join(warnings) or 'no usable masks'}",
+                         limit=f"at least {FEWEST} views to fit", remedy="look at the photos named; give masks, or "
+                         "choose another masks.method")  # fmt: skip
+
+
+def _manifest(m: Masked, context: Context) -> ViewMask:
+    return ViewMask(index=m.view.index, mask=context.file(_path(m.view.index, context)), source=m.source,
+                    coverage=round(m.coverage, 6), hull_iou=None if m.iou is None else round(m.iou, 4))  # fmt: skip

@@ -1,0 +1,108 @@
+"""People against any background: a small network says where, grabCut and the edge's colours say exactly where.
+
+The network (models/NOTICE) takes 256 x 256 RGB in [0, 1], channels first, and gives the probability of 'person' after
+its own sigmoid. It was trained on upright people, so the crop around the subject is turned by the camera's roll.
+"""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stages.masks.cut_out import cut
+from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, working_size
+from stages.masks.soften import largest_parts
+
+MODEL = Path(__file__).parent / "models" / "selfie_segmentation.tflite"
+SIDE = 256  # the network's input
+CROP = 1.6  # half-edge of the crop in radii of the region of interest
+UNSURE = 2.5  # network pixels on both sides of its contour that grabCut decides
+MIN_PART = 0.3  # of the largest piece: smaller ones are mistakes of the network
+_local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
+
+
+def _net() -> Any:
+    if not hasattr(_local, "net"):
+        _local.net = cv2.dnn.readNetFromTFLite(str(MODEL))
+    return _local.net
+
+
+def probability(square: U8) -> F32:
+    """(256, 256) probability of 'person' in a (256, 256, 3) 8-bit RGB picture."""
+    blob = np.ascontiguousarray(square.transpose(2, 0, 1)[None].astype(np.float32) / 255)
+    net = _net()
+    net.setInput(blob)
+    return np.array(net.forward(), np.float32).reshape(SIDE, SIDE)
+
+
+def person_probability(image: U8, disc: Disc) -> tuple[F32, float]:
+    """Probability (H, W) of 'person', and the size in pixels of what the network took for one pixel.
+
+    The whole photo is looked at, and a crop around the subject where that shows it larger; the crop's word counts
+    where it reaches.
+    """
+    h, w = image.shape[:2]
+    half = min(CROP * disc.radius, max(h, w) / 2)
+    whole, scale = _through(image, Disc(w / 2, h / 2, 0, 0), max(h, w) / 2)
+    if half > 0.7 * max(h, w) / 2 and abs(disc.roll) < 0.35:
+        return whole, scale
+    crop, scale = _through(image, Disc(disc.x, disc.y, 0, disc.roll), half)
+    return np.asarray(np.where(np.isnan(crop), whole, crop), np.float32), scale
+
+
+def _through(image: U8, centre: Disc, half: float) -> tuple[F32, float]:
+    """Run a square of half-edge `half` around a point, turned by its roll. Where the square does not reach: NaN if the
+    square is a crop."""
+    h, w = image.shape[:2]
+    scale = 2 * half / SIDE
+    c, s = np.cos(centre.roll) * scale, np.sin(centre.roll) * scale
+    # photo position = centre + turn @ (net position - middle); both in OpenCV's pixel-centre coordinates
+    turn = np.array([[c, -s], [s, c]])
+    shift = np.array([centre.x - 0.5, centre.y - 0.5]) - turn @ np.array([SIDE / 2 - 0.5] * 2)
+    photo_from_net = np.concatenate([turn, shift[:, None]], 1)
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.4 * scale) if scale > 1.3 else image  # against aliasing
+    square = cv2.warpAffine(blurred, photo_from_net, (SIDE, SIDE), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                            borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    found = probability(np.asarray(square, np.uint8))
+    out = cv2.warpAffine(found, photo_from_net, (w, h), flags=cv2.INTER_LINEAR, borderValue=float("nan"))
+    if centre.roll == 0 and half >= max(h, w) / 2:
+        out = np.nan_to_num(np.asarray(cv2.warpAffine(found, photo_from_net, (w, h), flags=cv2.INTER_LINEAR,
+                                                      borderMode=cv2.BORDER_REPLICATE)))  # fmt: skip
+    return np.asarray(out, np.float32), scale
+
+
+def person_mask(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> Bool:
+    """Hard mask of the person in the region of interest, at the working size. image: (H, W, 3) 8-bit sRGB."""
+    w, h = working_size(image.shape[1], image.shape[0], longest)
+    small = np.asarray(resized(image, w, h), np.uint8)
+    disc = disc.scaled(w / image.shape[1])
+    found, scale = person_probability(small, disc)
+    inside = of_subject(found >= threshold, disc)
+    if not inside.any():
+        return inside
+    radius = max(2, round(UNSURE * scale))
+    trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap[eroded(inside, radius)] = cv2.GC_FGD
+    trimap[~dilated(inside, radius)] = cv2.GC_BGD
+    return of_subject(cut(small, trimap, seed), disc)
+
+
+def of_subject(inside: Bool, disc: Disc) -> Bool:
+    """The pieces of a mask that matter: large ones that reach into the region of interest, holes filled where small."""
+    label = np.asarray(cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)[1])
+    core = np.unique(label[disc.covers(inside.shape[0], inside.shape[1], 0.7)])
+    kept = largest_parts(np.isin(label, core[core > 0]), MIN_PART)
+    filled = ~largest_parts_over(~kept, 0.002 * inside.size)
+    return np.asarray(filled, bool)
+
+
+def largest_parts_over(inside: Bool, area: float) -> Bool:
+    """Pieces of a mask of at least `area` pixels."""
+    _, label, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)
+    big = stats[:, cv2.CC_STAT_AREA] >= area
+    big[0] = False
+    return np.asarray(big[label])

@@ -1,0 +1,68 @@
+"""Soft edges: how much of an edge pixel is subject, from the colours on both sides of the edge.
+
+    c = alpha F + (1 - alpha) B        linear light, F and B the mean colours just inside and just outside
+
+solved for alpha by least squares. Where F and B can't be told apart the blurred hard edge stands in.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.masks.region import F32, LINEAR, U8, Bool, eroded
+
+CONTRAST = 0.03  # difference of F and B, linear, at which colour and blurred edge count alike
+NOISE = 8.0  # weight of the colours' own variance against their difference
+SNAP = 0.04  # alphas this close to 0 or 1 are noise
+
+
+def soft_edge(image: U8, inside: Bool, radius: int) -> F32:
+    """Alpha (H, W) of a hard mask whose contour is right to `radius` pixels. image: (H, W, 3) 8-bit sRGB."""
+    alpha = inside.astype(np.float32)
+    inner, outer = eroded(inside, radius), eroded(~inside, radius)
+    band = ~(inner | outer)
+    if not band.any():
+        return alpha
+    rows, columns = np.flatnonzero(band.any(1)), np.flatnonzero(band.any(0))
+    room = 3 * radius + 2
+    window = (slice(max(rows[0] - room, 0), rows[-1] + room + 1),
+              slice(max(columns[0] - room, 0), columns[-1] + room + 1))  # fmt: skip
+    alpha[window] = _solve(LINEAR[image[window]], inside[window], inner[window], outer[window], radius)
+    return alpha
+
+
+def _solve(colour: F32, inside: Bool, inner: Bool, outer: Bool, radius: int) -> F32:
+    foreground, noise_f, has_f = _near(colour, inner, 2 * radius + 1)
+    background, noise_b, has_b = _near(colour, outer, 2 * radius + 1)
+    difference = foreground - background
+    square = (difference**2).sum(-1)
+    by_colour = ((colour - background) * difference).sum(-1) / np.maximum(square, 1e-6)
+    doubt = CONTRAST**2 + NOISE * (noise_f + noise_b)
+    trust = np.where(has_f & has_b, square / (square + doubt), 0.0)
+    blurred = np.asarray(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.7), np.float32)
+    alpha = trust * by_colour.clip(0, 1) + (1 - trust) * blurred
+    alpha = np.where(alpha < SNAP, 0, np.where(alpha > 1 - SNAP, 1, alpha))
+    return np.asarray(np.where(inner, 1, np.where(outer, 0, alpha)), np.float32)
+
+
+def _near(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
+    """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` within `reach`, and whether there are any."""
+    size = (2 * reach + 1, 2 * reach + 1)
+    weight = where.astype(np.float32)
+    square = (colour**2).sum(-1)
+    stack = np.dstack([weight, square * weight, colour * weight[..., None]])
+    total = np.asarray(cv2.boxFilter(stack, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32)
+    count = np.maximum(total[..., 0], 1)
+    mean = np.asarray(total[..., 2:] / count[..., None], np.float32)
+    return mean, np.asarray(np.maximum(total[..., 1] / count - (mean**2).sum(-1), 0), np.float32), total[..., 0] > 0.5
+
+
+def largest_parts(inside: Bool, share: float) -> Bool:
+    """Pieces of a mask that are at least `share` of its largest piece."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=8)
+    if count <= 2:
+        return inside
+    area = stats[:, cv2.CC_STAT_AREA].astype(np.float64)
+    area[0] = 0
+    return np.asarray((area >= share * area.max())[label])

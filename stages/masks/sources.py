@@ -1,0 +1,101 @@
+"""The ways to a mask, and which of them a capture takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.errors import StageError, UsageError
+from stages.masks.cut_out import cut_by_region
+from stages.masks.key_out import Background, border_colours, find_background, key_out
+from stages.masks.region import F32, U8, Bool, Disc, resized
+from stages.masks.segment_person import person_mask
+from stages.masks.soften import soft_edge
+
+Method = Literal["auto", "given", "key", "person", "grabcut"]
+LOOKED_AT = 12  # views from which the kind of background and subject is judged
+PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
+SOFT = 2  # pixels of the working size to which a cut-out contour is right
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W)."""
+
+    index: int
+    name: str
+    disc: Disc
+    holdout: bool
+    read: Callable[[], U8]
+    given: Callable[[], F32] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How views without a mask of their own are masked."""
+
+    method: Literal["given", "key", "person", "grabcut"]
+    background: Background | None = None
+
+
+def plan(views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int) -> Plan:
+    """Choose the way from a few of the views that are fitted.
+
+    Raises:
+        StageError: masks or a uniform background were asked for and are not there.
+    """
+    bare = [v for v in views if v.given is None] if method in ("auto", "given") else list(views)
+    if method == "given" and bare:
+        raise UsageError("views without a mask", where="masks.method=given", value=", ".join(v.name for v in bare[:5]),
+                         limit="a mask for every view", remedy="add the masks, or use masks.method=auto")  # fmt: skip
+    if not bare:
+        return Plan("given")
+    fitted = [v for v in bare if not v.holdout] or bare
+    some = fitted[:: -(-len(fitted) // LOOKED_AT)]
+    images = [v.read() for v in some]
+    if method in ("auto", "key"):
+        background = find_background([border_colours(i) for i in images])
+        if background is not None:
+            return Plan("key", background)
+        if method == "key":
+            raise StageError("the background is not of one colour", where="masks.method=key",
+                             value="the photos' borders differ in colour", limit="one colour around the subject, the "
+                             "same in all photos", remedy="use masks.method=auto, or give masks")  # fmt: skip
+    if method in ("person", "grabcut"):
+        return Plan(method)
+    shares = [_person_share(i, v.disc, threshold, min(working_size, 320), seed)
+              for i, v in zip(images[::2], some[::2], strict=True)]  # fmt: skip
+    return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
+
+
+def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> float:
+    inside = person_mask(image, disc, threshold, longest, seed)
+    middle = disc.scaled(inside.shape[1] / image.shape[1]).covers(inside.shape[0], inside.shape[1], 0.5)
+    return float(inside[middle].mean()) if middle.any() else 0.0
+
+
+def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:
+    """Alpha (H, W) at the photo's size and where it is from. A given mask is handed on as it is.
+
+    Raises:
+        StageError: a given mask of the wrong size.
+    """
+    if view.given is not None:
+        return view.given(), "given"
+    image = view.read()
+    if how.method == "key" and how.background is not None:
+        return key_out(image, how.background), "key"
+    if how.method == "person":
+        return to_full_size(image, person_mask(image, view.disc, threshold, working_size, seed)), "person"
+    return to_full_size(image, cut_by_region(image, view.disc, working_size, seed)), "grabcut"
+
+
+def to_full_size(image: U8, inside: Bool) -> F32:
+    """Alpha (H, W) of a photo from a hard mask of a smaller size: smooth contour, then the colours of its edge."""
+    h, w = image.shape[:2]
+    factor = w / inside.shape[1]
+    hard = inside if factor == 1 else np.asarray(resized(inside.astype(np.float32), w, h), np.float32) >= 0.5
+    return soft_edge(image, hard, max(2, min(12, round(SOFT * factor))))

@@ -1,0 +1,65 @@
+"""masks: photos and cameras in, one soft mask per registered view out, checked against each other in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from pydantic import Field
+
+from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
+from pipeline.contract import Context, Stage, StageConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The checked photos and their cameras."""
+
+    capture: Located[Capture]
+    poses: Located[CameraSet]
+
+
+class Config(StageConfig):
+    """Settings of the masks stage."""
+
+    method: Literal["auto", "given", "key", "person", "grabcut"] = Field(
+        "auto",
+        description="given: the capture's masks; key: uniform background; person: learned segmentation of people; "
+        "grabcut: colour statistics around the region of interest; auto: the first of these that works",
+    )
+    threshold: float = Field(0.5, gt=0, lt=1, description="probability from which a pixel counts as a person")
+    working_size: int = Field(640, ge=128, le=2048, description="longest edge at which people and objects are cut out")
+    hull_cells: int = Field(64, ge=16, le=256, description="voxels along each edge of the consistency check")
+    min_agreement: float = Field(
+        0.8, ge=0, le=1, description="least IoU of a mask and the hull of all masks, in the region of interest"
+    )
+    max_deviation: float = Field(
+        0.05, gt=0, le=1, description="IoU below the median from which a mask may be an outlier"
+    )
+    mend: bool = Field(True, description="cut a computed mask out anew where the other views contradict it")
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
+
+
+def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
+    """Masks of all registered views.
+
+    Raises:
+        StageError: a mask that is missing, empty, full or of the wrong size; no uniform background where one was
+            asked for; too few views left that agree.
+    """
+    from stages.masks.segment import Settings, segment
+
+    settings = Settings(
+        method=config.method,
+        threshold=config.threshold,
+        working_size=config.working_size,
+        hull_cells=config.hull_cells,
+        min_agreement=config.min_agreement,
+        max_deviation=config.max_deviation,
+        mend=config.mend,
+        seed=config.seed,
+    )
+    return segment(inputs.capture, inputs.poses.artifact, settings, context)
+
+
+STAGE = Stage(name="masks", version=1, inputs=Inputs, config=Config, output=MaskSet, run=run)
