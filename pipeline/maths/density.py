@@ -56,13 +56,19 @@ def crossing_weights(s: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
     return shared, -torch.log(t[:, -1])
 
 
+OPAQUE = 3.5  # optical depth from which a ray counts as covered: opacity 0.97
+
+
 def opacity_cross_entropy(tau: Tensor, alpha: Tensor) -> Tensor:
     """Binary cross-entropy of opacity 1 - e^-tau against alpha in [0, 1], unreduced.
 
-        alpha * -log(1 - e^-tau) + (1 - alpha) * tau
+        alpha * -log(1 - e^-tau) + (1 - alpha) * tau,    the first term 0 from tau = OPAQUE on
 
     Written in tau: -log(1 - opacity) is tau itself, so that the gradient doesn't vanish where opacity saturates.
-    tau is kept above 1e-4, where the first term's derivative 1 / tau would otherwise grow without bound.
+    tau is kept above 1e-4, where the first term's derivative 1 / tau would otherwise grow without bound. The cut at
+    OPAQUE: samples end a little behind the surface, so that tau is capped there; every ray through the solid would
+    go on asking for more and, being far more than those at the silhouette, swell the surface.
     """
     t = tau.clamp(min=1e-4)
-    return -alpha * torch.log(-torch.expm1(-t)) + (1 - alpha) * tau
+    covered = torch.where(tau < OPAQUE, -torch.log(-torch.expm1(-t)), torch.zeros_like(t))
+    return alpha * covered + (1 - alpha) * tau

@@ -13,7 +13,7 @@ EXTRA_ORDERS = 8  # float32 error 5e-6 over all s (4 give 1.3e-5)
 
 
 def attenuation_exponential(inv_kappa: Tensor, order: int) -> Tensor:
-    """A_l = exp(-l (l + 1) s / 2): (N,) -> (N, order + 1). [NeuFace eq. 11, 27]
+    """A_l = exp(-l (l + 1) s / 2): (N,) -> (N, order + 1). [NeuFace eq. 11], [NeuFace eq. 27]
 
     Error against the exact ratio: at most 0.075 (l = 1, kappa = 1.55), of order kappa^-2 for large kappa.
     """

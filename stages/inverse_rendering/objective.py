@@ -23,7 +23,8 @@ def objective(
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
     alpha = batch.alpha[shell.kept]
     n_rays = len(batch.alpha)
-    loss = settings.mask * density.opacity_cross_entropy(shell.tau, alpha).clamp(max=20).sum() / n_rays
+    silhouette = density.opacity_cross_entropy(shell.tau, alpha).clamp(max=20) * batch.share[shell.kept]
+    loss = settings.mask * silhouette.sum() / n_rays
     loss = loss + settings.eikonal * losses.eikonal(shell.gradient).mean()
     pick = torch.nonzero(shell.hit & (alpha > WHOLE)).squeeze(-1)
     if not len(pick):

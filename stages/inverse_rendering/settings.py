@@ -43,7 +43,7 @@ class FitSettings:
     eikonal: float = 0.1
     smooth: float = 0.05
     # learning
-    lr_sdf: float = 0.02
+    lr_sdf: float = 0.1
     lr_appearance: float = 1e-2
     lr_light: float = 1e-2
     beta_end: float = 0.3

@@ -207,7 +207,7 @@ def camera_only(c: Any) -> PhotoView:
 def model_facts(config: Config, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
     """What was modelled and what was left out, for the report."""
     return {
-        "specular": {"modelled": config.specular, "why": "setting"},
+        "specular": {"modelled": config.specular, "attenuation": config.attenuation, "why": "setting"},
         "light": {"order": config.light_order, "why": "setting"},
         "rank": {"k": config.rank, "why": "setting"},
         "calibration": {"modelled": model.spec.calibrated, "why": "more than one kind of camera" if

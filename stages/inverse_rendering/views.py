@@ -51,12 +51,17 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Rays with what the photos show there: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit."""
+    """Rays with what the photos show there: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit.
+
+    share: (N,) what a ray stands for in the mask's term, mean 1: inverse to how likely its pixel was to be drawn.
+    Without it the side that is drawn more often would push the silhouette, by beta ln(ratio).
+    """
 
     rays: Rays
     target: Tensor
     alpha: Tensor
     view: Tensor
+    share: Tensor
 
 
 def factor_for(size: tuple[int, int], side: int) -> int:
@@ -99,13 +104,14 @@ class PixelTable:
         """A random batch that depends on the seed alone."""
         generator = torch.Generator().manual_seed(seed)
         n_out = int(n * outside_share) if len(self.outside) else 0
-        picks = []
+        picks, shares = [], []
         for pool, k in ((self.inside, n - n_out), (self.outside, n_out)):
             if k:
                 picks.append(pool[torch.randint(len(pool), (k,), generator=generator).to(pool.device)])
-        i = torch.cat(picks)
+                shares.append(torch.full((k,), len(pool) / k, device=pool.device))
+        i, share = torch.cat(picks), torch.cat(shares)
         view = self.view[i].long()
-        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view)
+        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share / share.mean())
 
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)

@@ -86,7 +86,7 @@ def test_crossing_is_finite_deep_inside_and_far_outside() -> None:
 
 
 def test_cross_entropy_matches_the_textbook_form() -> None:
-    tau = torch.tensor([0.01, 0.3, 2.0, 8.0], dtype=torch.float64)
+    tau = torch.tensor([0.01, 0.3, 2.0, 3.4], dtype=torch.float64)
     alpha = torch.tensor([0.0, 0.25, 0.5, 1.0], dtype=torch.float64)
     expected = torch.nn.functional.binary_cross_entropy(-torch.expm1(-tau), alpha, reduction="none")
     assert torch.allclose(density.opacity_cross_entropy(tau, alpha), expected, atol=1e-12)
@@ -98,3 +98,9 @@ def test_cross_entropy_keeps_its_gradient_where_opacity_saturates() -> None:
     loss.sum().backward()
     assert torch.isfinite(loss).all() and torch.isfinite(tau.grad).all()
     assert (tau.grad[2:] == 1).all()
+
+
+def test_a_covered_ray_asks_for_nothing() -> None:
+    tau = torch.tensor([3.6, 50.0], requires_grad=True)
+    density.opacity_cross_entropy(tau, torch.ones(2)).sum().backward()
+    assert (tau.grad == 0).all()

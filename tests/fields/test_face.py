@@ -1,0 +1,135 @@
+"""The model as a whole: files, shading, the parts' starting values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.errors import StageError
+from pipeline.fields.appearance import IntegratedBasis
+from pipeline.fields.calibration import Calibration
+from pipeline.fields.face import FaceModel, FaceSpec, FittedField, load_face, load_model
+from pipeline.fields.geometry import largest_solid
+from pipeline.maths import brdf
+
+LO, CELL = torch.tensor([-0.2, -0.2, -0.2]), 0.02
+
+
+def ball_model(seed: int = 0, **changes: object) -> FaceModel:
+    torch.manual_seed(seed)
+    i = torch.stack(torch.meshgrid(*[torch.arange(21)] * 3, indexing="ij"), -1)
+    spec = FaceSpec(lo=(-0.2,) * 3, hi=(0.2,) * 3, views=4, levels=4, log2_size=10, fine=0.01, **changes)  # type: ignore[arg-type]
+    return FaceModel(spec, (LO + CELL * i).norm(dim=-1) - 0.1, LO, CELL)
+
+
+def sphere_points(n: int) -> torch.Tensor:
+    g = torch.Generator().manual_seed(0)
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1)
+
+
+def test_shading_is_the_sum_of_the_two_closed_forms() -> None:
+    model = ball_model()
+    with torch.no_grad():
+        model.light.coefficients.normal_(std=0.1)
+        model.light.coefficients[0] = 4.0
+    n = sphere_points(50)
+    wo = torch.nn.functional.normalize(n + 0.5 * sphere_points(50).flip(0), dim=-1)
+    found = model.shade(0.1 * n, n, wo)
+    a, rho, c, s = model.spatial(0.1 * n)
+    cb = (c * model.basis(wo, n)).sum(-1)
+    diffuse = brdf.diffuse(a, n, model.light())
+    specular = brdf.specular(rho, cb, brdf.light_integral(brdf.reflect(wo, n), s, model.light()))
+    assert torch.allclose(found.total, diffuse + specular) and torch.allclose(found.specular, specular)
+    assert (found.specular > 0).any()
+
+
+def test_without_specular_nothing_depends_on_the_view() -> None:
+    model = ball_model(specular=False)
+    n = sphere_points(10)
+    assert torch.equal(model.shade(0.1 * n, n, n).total, model.shade(0.1 * n, n, n.flip(0)).total)
+
+
+def test_basis_is_positive_and_sees_what_it_should() -> None:
+    n, wo = sphere_points(100), sphere_points(100).flip(0)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    for cosine_only in (True, False):
+        torch.manual_seed(0)
+        basis = IntegratedBasis(3, 16, 2, cosine_only)
+        b, turned = basis(wo, n), basis(wo @ turn.T, n @ turn.T)
+        assert b.min() >= 0 and b.shape == (100, 3)
+        assert torch.allclose(b, turned, atol=1e-5) == cosine_only
+
+
+def test_calibration_starts_at_the_identity_and_keeps_its_mean() -> None:
+    torch.manual_seed(0)
+    c = Calibration(5)
+    assert torch.equal(c(), torch.eye(3).expand(5, 3, 3))
+    with torch.no_grad():
+        for p in c.parameters():
+            p.normal_()
+    assert torch.allclose(c().mean(0), torch.eye(3), atol=1e-4) and (c() - torch.eye(3)).abs().max() > 0.1
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_file_round_trip(tmp_path: Path, refined: bool) -> None:
+    model = ball_model(calibrated=True, attenuation="exact")
+    if refined:
+        model.geometry.refine()
+    model.save(tmp_path / "field.npz")
+    again = load_model(tmp_path / "field.npz")
+    assert again.spec == model.spec and again.geometry.cell == model.geometry.cell
+    for (name, a), (_, b) in zip(model.state_dict().items(), again.state_dict().items(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_same_model_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.npz", "b.npz"):
+        ball_model().save(tmp_path / name)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_foreign_format_is_refused(tmp_path: Path) -> None:
+    ball_model().save(tmp_path / "field.npz")
+    with np.load(tmp_path / "field.npz") as f:
+        arrays = dict(f)
+    arrays["spec"] = np.frombuffer(bytes(arrays["spec"]).replace(b'"format": 1', b'"format": 9'), np.uint8)
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(StageError, match="format"):
+        load_face(tmp_path / "other.npz")
+
+
+def test_fitted_field_answers_in_arrays() -> None:
+    field = FittedField(ball_model())
+    p = (0.1 * sphere_points(300)).numpy()
+    s, g = field.sdf_and_gradient(p)
+    assert np.abs(s).max() < 0.003 and np.allclose(g, p / 0.1, atol=0.05)
+    m = field.material(p)
+    assert m.albedo.shape == (300, 3) and m.coefficients.shape == (300, 3) and (m.inv_kappa > 0).all()
+    assert field.basis(p / 0.1, p / 0.1).shape == (300, 3) and field.light.shape == (121, 3)
+    lo, hi = field.bounds
+    assert (lo < -0.1).all() and (hi > 0.1).all() and field.cell == CELL
+    assert FittedField(ball_model(specular=False)).material(p).rho.max() == 0
+
+
+def test_refining_keeps_the_surface_and_cleans_the_volume() -> None:
+    model = ball_model()
+    with torch.no_grad():
+        model.geometry.values[1:4, 1:4, 1:4] = -0.02  # a speck away from the ball
+        model.geometry.values[9:12, 9:12, 9:12] = 0.02  # a hollow in its middle
+    p = 0.1 * sphere_points(200)
+    before = model.geometry(p)[0]
+    model.geometry.refine()
+    assert torch.allclose(model.geometry(p)[0], before, atol=1e-5)
+    s, _ = model.geometry(torch.tensor([[-0.16, -0.16, -0.16], [0.0, 0, 0]]))
+    assert s[0] > 0.05 and s[1] < -0.05
+
+
+def test_largest_solid() -> None:
+    v = np.zeros((12, 12, 12), bool)
+    v[2:8, 2:8, 2:8], v[10, 10, 10], v[4, 4, 4] = True, True, False
+    out = largest_solid(v)
+    assert out[4, 4, 4] and not out[10, 10, 10] and out.sum() == 6**3
+    assert not largest_solid(np.zeros((3, 3, 3), bool)).any()
