@@ -1,0 +1,72 @@
+"""The whole way from the dense mesh to a textured one and its proxy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pipeline import meshes
+from pipeline.errors import StageError
+from pipeline.meshes import Charts, Mesh
+from stages.uv import decimate
+from stages.uv.measure import Quality, measure
+from stages.uv.unwrap import Options, unwrap
+
+MOST_OVERLAP, MOST_FLIPPED, MOST_EMPTY, MOST_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
+MANY_CRUMBS = 50
+
+Step = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Built:
+    """The textured mesh, its charts, the proxy, the charts' figures, and the mean distance to the dense mesh (m)."""
+
+    mesh: Mesh
+    charts: Charts
+    proxy: Mesh
+    quality: Quality
+    deviation: float
+    warnings: tuple[str, ...]
+
+
+def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, step: Step) -> Built:
+    """Decimate, unwrap and measure.
+
+    Raises:
+        StageError: an open mesh, or one that can't be decimated or unwrapped.
+    """
+    found = meshes.topology(dense.faces, len(dense.vertices))
+    if not found.manifold:
+        raise StageError(
+            "the mesh is not a closed manifold",
+            where="surface",
+            value=found,
+            limit="every edge with two faces",
+            remedy="run the surface stage again",
+        )
+    step(0, 4, "decimating")
+    mesh = decimate.decimated(dense, target_faces)
+    proxy = decimate.decimated(mesh, proxy_faces)
+    step(1, 4, "unwrapping")
+    charts = unwrap(mesh, options)
+    step(2, 4, "measuring charts")
+    quality = measure(mesh, charts)
+    step(3, 4, "measuring the decimation")
+    deviation = decimate.deviation(dense, mesh)
+    against = decimate.flipped_share(dense, mesh)
+    step(4, 4, "done")
+    return Built(mesh, charts, proxy, quality, deviation, _warnings(quality, against))
+
+
+def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
+    checks = (
+        (quality.overlap, MOST_OVERLAP, "of the covered texels lie under two faces"),
+        (quality.flipped, MOST_FLIPPED, "of the surface is mirrored in its chart"),
+        (quality.empty, MOST_EMPTY, "of the surface has no area in texture space"),
+        (against, MOST_AGAINST, "of the decimated surface looks against the dense mesh"),
+    )
+    out = [f"{value:.2%} {what}" for value, limit, what in checks if value > limit]
+    if quality.crumbs > MANY_CRUMBS:
+        out.append(f"{quality.crumbs} of {quality.charts} charts are crumbs: the surface is rough")
+    return tuple(out)

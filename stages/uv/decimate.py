@@ -1,0 +1,187 @@
+"""Fewer triangles: quadric decimation (fast-simplification, MIT), with the faults that it leaves mended.
+
+Symbols: a crowded edge has more than two faces. Collapsing can pinch off a bubble, a closed scrap that hangs on a
+ring of crowded edges; cutting the mesh along those edges and keeping the largest part takes it away.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline import meshes
+from pipeline.errors import StageError
+from pipeline.meshes import F64, Faces, Indices, Mesh
+
+AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a closed manifold of the wanted size
+LOOP = 8  # edges of the largest hole that is closed
+ROUNDS = 4  # of taking bubbles away
+UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
+SAMPLE_SEED = 0
+NEAR = 12  # triangles that a sample is measured against
+NEARLY = 1.05  # of the target: near enough to stop trying
+
+
+def decimated(dense: Mesh, target: int) -> Mesh:
+    """A closed manifold with about `target` triangles and smooth normals. A mesh that is small enough is kept.
+
+    Normals are those of the nearest dense vertex: they come from the field's gradient and know more than the faces.
+
+    Raises:
+        StageError: no setting gives a closed manifold.
+    """
+    if len(dense.faces) <= target:
+        return dense
+    scale, origin = _scale(dense)
+    points = (dense.vertices.astype(np.float64) - origin) * scale
+    best: tuple[F64, Faces] | None = None
+    for aggressiveness in AGGRESSIVENESS:
+        vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
+        vertices, faces = without_bubbles(vertices, faces)
+        if not meshes.topology(faces, len(vertices)).manifold:
+            continue
+        if best is None or len(faces) < len(best[1]):
+            best = vertices, faces
+        if len(faces) <= NEARLY * target:
+            break
+    if best is not None:
+        v = (best[0] / scale + origin).astype(np.float32)
+        return Mesh(v, normals_from(dense, v, best[1]), best[1])
+    raise StageError(
+        "the mesh can't be decimated",
+        where="uv.target_faces",
+        value=f"{len(dense.faces)} to {target} faces breaks the surface",
+        limit="a closed manifold",
+        remedy="choose more target_faces, or another surface.resolution",
+    )
+
+
+def _scale(dense: Mesh) -> tuple[float, F64]:
+    low, high = dense.vertices.min(0).astype(np.float64), dense.vertices.max(0).astype(np.float64)
+    return UNIT / max(float((high - low).max()), 1e-30), low
+
+
+def _simplified(points: F64, faces: Faces, target: int, aggressiveness: float) -> tuple[F64, Faces]:
+    import fast_simplification
+
+    v, f = fast_simplification.simplify(points, faces, target_count=target, agg=aggressiveness)
+    return np.asarray(v, np.float64), np.asarray(f, np.int32)
+
+
+def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
+    """Cut along crowded edges and keep the part with the most faces, until no edge is crowded."""
+    for _ in range(ROUNDS):
+        label = _parts(faces, len(vertices))
+        if label is None:
+            break
+        faces = filled(faces[label == np.bincount(label).argmax()])
+    v, f, _ = meshes.compact(vertices, faces)
+    return np.asarray(v, np.float64), f
+
+
+def filled(faces: Faces) -> Faces:
+    """Close the small holes, of up to LOOP edges, with fans of faces: a ring that held a bubble may be a face itself."""
+    e = meshes.edges(faces)
+    count = int(faces.max()) + 1
+    open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
+    after = {int(b): int(a) for a, b in open_edges}  # a hole runs against its neighbours' edges
+    added = []
+    while after:
+        start, at = next(iter(after.items()))
+        loop = [start]
+        del after[start]
+        while at in after and len(loop) <= LOOP:
+            loop.append(at)
+            at = after.pop(at)
+        if at == start and 3 <= len(loop) <= LOOP:
+            added += [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
+    return np.concatenate([faces, np.array(added, np.int32)]) if added else faces
+
+
+def _parts(faces: Faces, count: int) -> Indices | None:
+    """(F,) which part each face is in when the mesh is cut along crowded edges; None if there are none."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    e = meshes.edges(faces)
+    code = np.minimum(e[:, 0], e[:, 1]) * count + np.maximum(e[:, 0], e[:, 1])
+    order = np.argsort(code, kind="stable")
+    first = np.flatnonzero(np.diff(code[order], prepend=-1))
+    uses = np.diff(first, append=len(code))
+    if not (uses > 2).any():
+        return None
+    pair = first[uses == 2]
+    a, b = order[pair] % len(faces), order[pair + 1] % len(faces)
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(len(faces), len(faces)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -> npt.NDArray[np.float32]:
+    """(V, 3) unit normals of the nearest dense vertex; the faces' own where the two disagree by over 60 degrees."""
+    from scipy.spatial import cKDTree
+
+    _, nearest = cKDTree(dense.vertices).query(vertices, workers=1)
+    own = meshes.vertex_normals(vertices, faces)
+    found = dense.normals[nearest]
+    agree = (own * found).sum(1) > 0.5
+    return np.where(agree[:, None], found, own).astype(np.float32)
+
+
+def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> float:
+    """Mean distance between two surfaces, sampled by area both ways, in the meshes' unit.
+
+    The distance is exact to the NEAR faces with the nearest centres, so it can only be too large.
+    """
+    return 0.5 * (_one_way(a, b, samples) + _one_way(b, a, samples))
+
+
+def _one_way(start: Mesh, goal: Mesh, samples: int) -> float:
+    from scipy.spatial import cKDTree
+
+    points = sampled(start, samples)
+    corners = goal.vertices.astype(np.float64)[goal.faces]
+    _, near = cKDTree(corners.mean(1)).query(points, k=min(NEAR, len(corners)))
+    near = np.asarray(near).reshape(len(points), -1)
+    best = np.full(len(points), np.inf)
+    for column in near.T:
+        best = np.minimum(best, distance_to_triangles(points, corners[column]))
+    return float(best.mean())
+
+
+def distance_to_triangles(p: F64, corners: F64) -> F64:
+    """(N,) distance from each point (N, 3) to its own triangle (N, 3, 3): to its plane if above it, else its sides."""
+    a, b, c = corners.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    square = np.maximum((normal * normal).sum(1), 1e-300)
+    inside = np.ones(len(p), np.bool_)
+    best = np.full(len(p), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        side, offset = end - start, p - start
+        inside &= (np.cross(side, offset) * normal).sum(1) >= 0
+        t = ((offset * side).sum(1) / np.maximum((side * side).sum(1), 1e-300)).clip(0, 1)
+        best = np.minimum(best, np.linalg.norm(offset - t[:, None] * side, axis=1))
+    plane = np.abs(((p - a) * normal).sum(1)) / np.sqrt(square)
+    return np.where(inside, plane, best)
+
+
+def sampled(mesh: Mesh, count: int) -> F64:
+    """(count, 3) points on the mesh, uniform by area, the same each time."""
+    rng = np.random.default_rng(SAMPLE_SEED)
+    area = meshes.areas(mesh.vertices, mesh.faces)
+    face = np.searchsorted(np.cumsum(area) / area.sum(), rng.random(count)).clip(0, len(area) - 1)
+    r, s = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
+    a, b, c = mesh.vertices.astype(np.float64)[mesh.faces[face]].transpose(1, 0, 2)
+    out: F64 = (1 - r) * a + r * (1 - s) * b + r * s * c
+    return out
+
+
+def flipped_share(dense: Mesh, mesh: Mesh) -> float:
+    """Share of the area whose faces look against the nearest dense normal."""
+    from scipy.spatial import cKDTree
+
+    centre = mesh.vertices[mesh.faces].mean(1)
+    _, nearest = cKDTree(dense.vertices).query(centre)
+    vectors = meshes.area_vectors(mesh.vertices, mesh.faces)
+    against = (vectors * dense.normals[nearest]).sum(1) < 0
+    area = np.linalg.norm(vectors, axis=1)
+    return float(area[against].sum() / area.sum())

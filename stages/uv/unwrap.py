@@ -1,0 +1,153 @@
+"""Charts: cut and flatten with xatlas (MIT), turn mirrored charts over, pack.
+
+The mesh is cut and flattened with its bumps smoothed away, in the same connectivity: noise in the surface would
+otherwise break the charts into hundreds of crumbs. What that costs is in the measured stretch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.errors import StageError
+from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
+
+UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
+SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
+PACK_MARGIN = 1.3  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """texture_size and padding in texels; max_cost and iterations as in xatlas."""
+
+    texture_size: int = 1024
+    padding: int = 4
+    max_cost: float = 12.0
+    iterations: int = 1
+
+
+def unwrap(mesh: Mesh, options: Options) -> Charts:
+    """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding.
+
+    Raises:
+        StageError: xatlas gives up, or leaves faces without a chart.
+    """
+    uvs, faces = _cut(mesh, options)
+    upright = turned_over(uvs, faces)
+    return _packed(spread(upright, faces), faces, options)
+
+
+def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
+    """Uniform Laplacian smoothing that diffuses over about `length` (same unit as the vertices)."""
+    from scipy.sparse import coo_array, diags_array
+
+    e = meshes.edges(faces)
+    adjacent = coo_array((np.ones(len(e)), (e[:, 0], e[:, 1])), shape=(len(vertices), len(vertices))).tocsr()
+    mean = diags_array(1 / np.maximum(adjacent.sum(1), 1)) @ adjacent
+    edge = float(np.median(meshes.edge_lengths(vertices, faces)))
+    v = vertices
+    for _ in range(int(np.ceil((length / edge) ** 2))):  # a random walk of n steps goes sqrt(n) edges far
+        v = 0.5 * (v + mean @ v)
+    return v
+
+
+def _cut(mesh: Mesh, options: Options) -> tuple[F64, Faces]:
+    """uvs (U, 2) in a common scale, one vertex for each place in each chart, and faces (F, 3)."""
+    import xatlas
+
+    span = float(np.ptp(mesh.vertices, axis=0).max())
+    points = mesh.vertices.astype(np.float64) * (UNIT / span)
+    points = smoothed(points, mesh.faces, SMOOTH_SHARE * UNIT)
+    atlas = xatlas.Atlas()
+    charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts.max_cost, charts.max_iterations = options.max_cost, options.iterations
+    pack.resolution, pack.padding, pack.bilinear = 256, 0, False  # thrown away: the charts are packed again
+    normals = meshes.vertex_normals(points, mesh.faces)
+    try:
+        atlas.add_mesh(points.astype(np.float32), mesh.faces.astype(np.uint32), normals)
+        atlas.generate(charts, pack)
+        _, faces, uvs = atlas[0]
+    except (RuntimeError, ValueError, IndexError) as e:
+        raise _failed(str(e)) from e
+    texels: F64 = np.asarray(uvs, np.float64) * np.array([atlas.width, atlas.height], np.float64)
+    return texels, _whole(faces, len(mesh.faces))
+
+
+def _whole(faces: object, expected: int) -> Faces:
+    out = np.asarray(faces, np.int64).reshape(-1, 3).astype(np.int32)
+    if len(out) != expected:
+        raise _failed(f"{len(out)} of {expected} faces came back")
+    return out
+
+
+def _failed(reason: str) -> StageError:
+    return StageError(
+        "the mesh can't be unwrapped",
+        where="uv",
+        value=reason,
+        limit="a chart for every face",
+        remedy="change uv.target_faces or uv.max_cost a little",
+    )
+
+
+def chart_of_face(faces: Faces, count: int) -> Indices:
+    """(F,) chart of each face, numbered from 0; charts are what hangs together in texture space."""
+    label = meshes.component_of_face(faces, count)
+    return np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1), np.int64)
+
+
+def signed_areas(uvs: F64, faces: Faces) -> F64:
+    """(F,) signed areas, positive counter-clockwise (u right, v up)."""
+    a, b, c = uvs[faces].transpose(1, 0, 2)
+    out: F64 = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    return out
+
+
+def turned_over(uvs: F64, faces: Faces) -> F64:
+    """Charts with negative area mirrored in u. Charts may overlap afterwards."""
+    chart = chart_of_face(faces, len(uvs))
+    mirrored = np.bincount(chart, signed_areas(uvs, faces)) < 0
+    flip = np.zeros(len(uvs), np.bool_)
+    flip[faces[mirrored[chart]].ravel()] = True
+    return np.where(flip[:, None], uvs * [-1, 1], uvs)
+
+
+def spread(uvs: F64, faces: Faces) -> F64:
+    """Charts side by side, so that none touches another before they are packed."""
+    chart = chart_of_face(faces, len(uvs))
+    of_vertex = np.zeros(len(uvs), np.int64)
+    of_vertex[faces.ravel()] = np.repeat(chart, 3)
+    count = int(chart.max()) + 1
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    np.minimum.at(low, of_vertex, uvs)
+    np.maximum.at(high, of_vertex, uvs)
+    width = high[:, 0] - low[:, 0]
+    gap = float(width.max())
+    start = np.concatenate([[0.0], np.cumsum(width + 0.01 * gap)[:-1]])
+    return uvs - low[of_vertex] + np.stack([start[of_vertex], np.zeros(len(uvs))], 1)
+
+
+def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
+    """The charts in one square, at one scale, as xatlas places and turns them."""
+    import xatlas
+
+    atlas = xatlas.Atlas()
+    pack = xatlas.PackOptions()
+    pack.resolution = options.texture_size
+    pack.padding = int(np.ceil(options.padding * PACK_MARGIN))
+    pack.bilinear, pack.bruteForce = True, False
+    pack.rotate_charts = False  # xatlas turns a chart by swapping its axes, which mirrors it
+    try:
+        atlas.add_uv_mesh(uvs.astype(np.float32), faces.astype(np.uint32))
+        atlas.generate(xatlas.ChartOptions(), pack)
+        _, packed_faces, packed = atlas[0]
+    except (RuntimeError, ValueError, IndexError) as e:
+        raise _failed(str(e)) from e
+    whole = _whole(packed_faces, len(faces))
+    square: F32 = (packed * np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)).astype(np.float32)
+    if np.median(signed_areas(square.astype(np.float64), whole)) < 0:
+        square[:, 1] = square[:, 1].max() - square[:, 1] + square[:, 1].min()
+    return Charts(square.clip(0, 1), whole)

@@ -1,0 +1,189 @@
+"""Decimation, charts and their figures, against plain loops and formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline import meshes, raster
+from pipeline.errors import StageError
+from pipeline.meshes import Charts, Mesh
+from stages.surface.build import build as surface_build
+from stages.uv import decimate, unwrap
+from stages.uv.build import Built, build
+from stages.uv.measure import measure, stretch
+from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
+
+
+def quiet(done: int, total: int, message: str = "") -> None:
+    """No progress shown."""
+
+
+@pytest.fixture(scope="module")
+def dense() -> Mesh:
+    return surface_build(AnalyticField(bumpy_head(0.001, 60.0)), 80, quiet).mesh
+
+
+@pytest.fixture(scope="module")
+def built(dense: Mesh) -> Built:
+    return build(dense, 5000, 1000, unwrap.Options(512, 4), quiet)
+
+
+def painted(charts: Charts, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Another rasteriser: scan lines, one triangle after the other. Counts and the last face, row 0 at v = 0."""
+    count, owner = np.zeros((size, size), int), np.full((size, size), -1)
+    for face, corner in enumerate(charts.uvs.astype(np.float64)[charts.faces] * size):
+        low, high = np.floor(corner.min(0)).astype(int), np.ceil(corner.max(0)).astype(int)
+        (x0, y0), (x1, y1), (x2, y2) = corner
+        det = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
+        if det == 0:
+            continue
+        y, x = np.mgrid[max(low[1], 0) : min(high[1], size), max(low[0], 0) : min(high[0], size)] + 0.5
+        s = ((x - x0) * (y2 - y0) - (x2 - x0) * (y - y0)) / det
+        t = ((x1 - x0) * (y - y0) - (x - x0) * (y1 - y0)) / det
+        inside = (s > 1e-4) & (t > 1e-4) & (s + t < 1 - 1e-4)
+        row, column = (y[inside] - 0.5).astype(int), (x[inside] - 0.5).astype(int)
+        count[row, column] += 1
+        owner[row, column] = face
+    return count, owner
+
+
+def test_mesh_is_closed_and_near_the_target(dense: Mesh, built: Built) -> None:
+    assert 0.9 * 5000 < len(built.mesh.faces) <= 1.05 * 5000 and len(built.proxy.faces) <= 1.2 * 1000
+    for mesh in (built.mesh, built.proxy):
+        assert meshes.topology(mesh.faces, len(mesh.vertices)).manifold
+        assert meshes.volume(mesh.vertices, mesh.faces) == pytest.approx(
+            meshes.volume(dense.vertices, dense.faces), rel=0.02
+        )
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
+    assert built.deviation < 2e-4 and built.warnings == ()
+
+
+def test_charts_hold_every_face_once(built: Built) -> None:
+    charts = built.charts
+    assert charts.uvs.min() >= 0 and charts.uvs.max() <= 1 and charts.uvs.dtype == np.float32
+    assert charts.faces.shape == built.mesh.faces.shape and np.isfinite(charts.uvs).all()
+    position_of = {}  # a texture vertex belongs to one place of the mesh
+    for uv, vertex in zip(charts.faces.ravel().tolist(), built.mesh.faces.ravel().tolist(), strict=True):
+        assert position_of.setdefault(uv, vertex) == vertex
+
+
+def test_no_overlap_and_no_flip_by_another_rasteriser(built: Built) -> None:
+    count, _ = painted(built.charts, 700)
+    assert count.max() == 1
+    uv = built.charts.uvs.astype(np.float64)[built.charts.faces]
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    weight = meshes.areas(built.mesh.vertices, built.mesh.faces)
+    assert weight[area <= 0].sum() < 0.005 * weight.sum()
+    assert built.quality.utilisation == pytest.approx(area.sum(), abs=0.01)
+    assert built.quality.utilisation > 0.45 and built.quality.overlap == 0 and built.quality.flipped < 1e-3
+
+
+def test_charts_keep_their_distance(built: Built) -> None:
+    """No texel of one chart is within `padding` texels of another chart."""
+    from scipy.ndimage import distance_transform_edt
+
+    _, owner = painted(built.charts, 512)
+    chart = unwrap.chart_of_face(built.charts.faces, len(built.charts.uvs))
+    label = np.where(owner >= 0, chart[owner], -1)
+    biggest = np.argsort(-np.bincount(label[label >= 0]))[:4]
+    for which in biggest:
+        away = distance_transform_edt(label != which)
+        assert away[(label >= 0) & (label != which)].min() >= 4
+
+
+def test_few_charts_and_little_stretch(built: Built) -> None:
+    assert built.quality.charts < 60 and built.quality.stretch < 1.35 and built.quality.empty < 0.005
+
+
+def test_twice_gives_the_same(dense: Mesh, built: Built) -> None:
+    again = build(dense, 5000, 1000, unwrap.Options(512, 4), quiet)
+    assert again.charts.uvs.tobytes() == built.charts.uvs.tobytes()
+    assert again.mesh.vertices.tobytes() == built.mesh.vertices.tobytes() and again.quality == built.quality
+
+
+def test_smooth_mesh_with_more_faces_wanted_is_kept(dense: Mesh) -> None:
+    assert decimate.decimated(dense, len(dense.faces) + 1) is dense
+
+
+def test_open_mesh_is_refused(dense: Mesh) -> None:
+    with pytest.raises(StageError, match="closed manifold"):
+        build(Mesh(dense.vertices, dense.normals, dense.faces[:-1]), 5000, 1000, unwrap.Options(), quiet)
+
+
+def test_bubble_is_cut_off() -> None:
+    """A tetrahedron without one face, hung on the three edges of a face of a large mesh, is taken away again."""
+    mesh = surface_build(AnalyticField(sphere()), 16, quiet).mesh
+    a, b, c = mesh.faces[0].tolist()
+    tip = len(mesh.vertices)
+    bubble = np.array([[a, c, b], [a, b, tip], [b, c, tip], [c, a, tip]], np.int32)
+    vertices = np.concatenate([mesh.vertices, [[0, 0.2, 0]]])
+    faces = np.concatenate([mesh.faces, bubble])
+    assert meshes.topology(faces, len(vertices)).crowded_edges == 3
+    kept_vertices, kept = decimate.without_bubbles(vertices, faces)
+    assert meshes.topology(kept, len(kept_vertices)).manifold and len(kept) == len(mesh.faces)
+
+
+def test_deviation_of_shifted_spheres() -> None:
+    """A sphere moved by e is away by e |cos| / 1 in the mean: half of e."""
+    mesh = surface_build(AnalyticField(sphere()), 40, quiet).mesh
+    moved = Mesh(mesh.vertices + np.array([0, 0.002, 0], np.float32), mesh.normals, mesh.faces)
+    assert decimate.deviation(mesh, moved) == pytest.approx(0.001, rel=0.05)
+    assert decimate.deviation(mesh, mesh) < 1e-7
+    assert decimate.flipped_share(mesh, Mesh(mesh.vertices, mesh.normals, mesh.faces[:, ::-1].copy())) == 1
+
+
+def test_distance_to_triangle_zones() -> None:
+    triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
+    points = np.array([[0.2, 0.2, 0.5], [-3, -4, 0], [0.5, -2, 0], [2, 0, 0], [1, 1, 0], [0.1, 0.1, 0]], float)
+    expected = [0.5, 5, 2, 1, np.sqrt(0.5), 0]
+    got = decimate.distance_to_triangles(points, np.repeat(triangle[None], len(points), 0))
+    assert np.allclose(got, expected)
+
+
+def square_mesh() -> tuple[Mesh, Charts]:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    uvs = np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.6], [0.1, 0.6]], np.float32)
+    return Mesh(vertices, np.tile(np.float32([0, 0, 1]), (4, 1)), faces), Charts(uvs, faces.copy())
+
+
+def test_stretch_of_known_maps() -> None:
+    mesh, charts = square_mesh()
+    assert stretch(mesh, charts) == pytest.approx(1, abs=1e-6)
+    wide = Charts(charts.uvs * np.float32([1, 0.25]), charts.faces)
+    # singular values 2 and 1/2 after the areas are made equal: sqrt((4 + 1/4) / 2)
+    assert stretch(mesh, wide) == pytest.approx(np.sqrt(2.125), rel=1e-5)
+
+
+def test_measure_sees_overlap_flip_and_empty_charts() -> None:
+    mesh, charts = square_mesh()
+    good = measure(mesh, charts)
+    assert (good.charts, good.overlap, good.flipped, good.empty) == (1, 0, 0, 0)
+    assert good.utilisation == pytest.approx(0.25, abs=2e-3) and good.stretch == pytest.approx(1, abs=1e-5)
+    folded_uvs = charts.uvs.copy()
+    folded_uvs[3] = [0.6, 0.2]  # the second triangle folds over the first
+    folded = measure(mesh, Charts(folded_uvs, charts.faces))
+    assert folded.overlap > 0.1 and folded.flipped == pytest.approx(0.5)
+    flat_uvs = charts.uvs.copy()
+    flat_uvs[3] = 0.5 * (flat_uvs[0] + flat_uvs[2])
+    assert measure(mesh, Charts(flat_uvs, charts.faces)).empty == pytest.approx(0.5)
+
+
+def test_mirrored_charts_are_turned_and_spread_apart() -> None:
+    uvs = np.array([[0, 0], [1, 0], [0, 1], [0.2, 0.2], [0.2, 1], [1, 0.2]], float)
+    faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
+    assert (unwrap.signed_areas(uvs, faces) > 0).tolist() == [True, False]
+    turned = unwrap.turned_over(uvs, faces)
+    assert (unwrap.signed_areas(turned, faces) > 0).all()
+    apart = unwrap.spread(turned, faces)
+    assert apart[3:, 0].min() > apart[:3, 0].max() or apart[:3, 0].min() > apart[3:, 0].max()
+    assert np.allclose(unwrap.signed_areas(apart, faces), [0.5, 0.32])
+
+
+def test_raster_layers_agree_with_the_other_rasteriser(built: Built) -> None:
+    size = 300
+    ours = raster.layers(raster.texel_corners(built.charts, size), size)[::-1]
+    other, _ = painted(built.charts, size)
+    assert (ours != other).mean() < 1e-3  # only texels on edges, where the margins differ
