@@ -20,7 +20,7 @@ NEAR = 24  # 8-bit levels: first guess of what is background
 SAMPLES = 4000  # border pixels per view
 MAX_SPREAD = 6.0  # levels, robust standard deviation: above it a background is not uniform
 MIN_SHARE, MIN_SHARE_ANY = 0.5, 0.25  # of all border pixels, and of one view's, that must be background
-HOLE = 0.002  # of the photo: an enclosed patch of background colour this large may be a hole
+HOLE = 0.005  # of the photo: an enclosed patch of background colour this large may be a hole
 EDGE = 3  # pixels: the threshold's contour is right to this
 
 

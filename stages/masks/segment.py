@@ -165,8 +165,8 @@ def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
 def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context: Context) -> Masked:
     """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
     inside = made.small >= 0.5
-    if made.source == "given" or made.view.holdout:
-        return made
+    if made.source == "given" or made.view.holdout or (made.source == "key" and made.useless):
+        return made  # a photo that is all background shows no subject whose edge could be found
     doubtful = made.source in ("person", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
     if not (bad or doubtful):
         return made
