@@ -63,7 +63,8 @@ def read_linear(path: Path) -> F32:
         return rgb.astype(np.float32)
     levels = np.iinfo(rgb.dtype).max
     table = linear_from_srgb(np.arange(levels + 1, dtype=np.float64) / levels).astype(np.float32)
-    return table[rgb]
+    out: F32 = table[rgb]
+    return out
 
 
 def read_alpha(path: Path) -> F32:

@@ -15,7 +15,7 @@ from typing import Any
 from pipeline.errors import Cancelled, StageError
 from workflows import environment, folders
 from workflows.console import Console
-from workflows.interrupt import interruptible
+from workflows.interrupt import deaf_children, interruptible
 from workflows.plan import RunRequest, make_plan, preview
 from workflows.session import Session, session
 
@@ -53,9 +53,10 @@ def _through_prefect(request: RunRequest) -> dict[str, Any]:
     if get_current_settings().api.url is None:  # nobody reads Prefect's log of this run: the console tells it all
         for name in ("prefect.flow_runs", "prefect.task_runs"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-    with get_client(sync_client=True):  # starts the server while SIGINT is blocked, so that Ctrl-C does not reach it
-        parameters = request.model_dump()
-        record: dict[str, Any] = capture_to_asset(**{**parameters, "sets": list(request.sets)})
+    with deaf_children():  # Prefect's server outlives a Ctrl-C, so that the run can end in order
+        client = get_client(sync_client=True)
+    with client:
+        record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
     return record
 
 

@@ -1,0 +1,107 @@
+"""A real server, a real worker, a deployment run of the real first stage: all on this machine, over loopback."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.images import write_png
+
+PREFECT = Path(sys.executable).parent / "prefect"
+
+
+def call(environment: dict[str, str], *arguments: object, cwd: Path) -> str:
+    done = subprocess.run([PREFECT, *map(str, arguments)], env=environment, cwd=cwd, text=True, capture_output=True,
+                          timeout=240)  # fmt: skip
+    assert done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+@contextmanager
+def running(environment: dict[str, str], log: Path, *arguments: object, cwd: Path) -> Iterator[subprocess.Popen[bytes]]:
+    with log.open("wb") as f:
+        child = subprocess.Popen([PREFECT, *map(str, arguments)], env=environment, cwd=cwd, stdout=f,
+                                 stderr=subprocess.STDOUT, start_new_session=True)  # fmt: skip
+    try:
+        yield child
+    finally:
+        os.killpg(child.pid, signal.SIGTERM)
+        try:
+            child.wait(20)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+
+
+def ask(url: str, path: str, body: dict[str, Any] | None = None) -> Any:
+    request = urllib.request.Request(f"{url}{path}", None if body is None else json.dumps(body).encode(),
+                                     {"Content-Type": "application/json"})  # fmt: skip
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return json.loads(answer.read())
+
+
+def wait_healthy(url: str, seconds: float = 240) -> None:
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            ask(url, "/health")
+            return
+        except OSError:
+            assert time.monotonic() < end, "the server did not start"
+            time.sleep(0.3)
+
+
+@pytest.mark.slow
+def test_deployment_run_on_a_server_with_a_worker(
+    tmp_path: Path, repo: Path, child_environment: dict[str, str]
+) -> None:
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    for i in range(4):
+        write_png(photos / f"{i}.png", np.random.default_rng(i).uniform(0, 1, (96, 128, 3)))
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port = s.getsockname()[1]
+    url = f"http://127.0.0.1:{port}/api"
+    environment = {**child_environment, "PREFECT_API_URL": url, "PREFECT_HOME": str(tmp_path / "home")}
+    with running(
+        environment, tmp_path / "server.log", "server", "start", "--host", "127.0.0.1", "--port", port, cwd=repo
+    ):
+        wait_healthy(url)
+        call(environment, "work-pool", "create", "heads", "--type", "process", cwd=repo)
+        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        with running(
+            environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
+        ):
+            good = {"capture": photos, "out": out, "until": "capture", "sets": '["capture.min_views=4"]'}
+            parameters = [x for k, v in good.items() for x in ("--param", f"{k}={v}")]
+            call(environment, "deployment", "run", "capture-to-asset/local", *parameters, "--watch", cwd=tmp_path)
+            bad = subprocess.run([PREFECT, "deployment", "run", "capture-to-asset/local", "--param", "capture=/nowhere",
+                                  "--param", f"out={tmp_path / 'bad'}", "--watch"], env=environment, cwd=tmp_path,
+                                 text=True, capture_output=True, timeout=240)  # fmt: skip
+        assert list(json.loads((out / "run.json").read_text())["stages"]) == ["capture"]
+        failed, completed = sorted(ask(url, "/flow_runs/filter", {}), key=lambda r: str(r["state_type"]), reverse=True)
+        tasks = ask(url, "/task_runs/filter", {})
+        artifacts = {a["key"]: a for a in ask(url, "/artifacts/filter", {})}
+    assert completed["state_type"] == "COMPLETED", (tmp_path / "worker.log").read_text()
+    assert failed["state_type"] == "FAILED"
+    assert "/nowhere" in failed["state"]["message"]
+    assert bad.returncode != 0
+    assert not (tmp_path / "bad").exists()
+    assert [(t["name"], t["state_type"]) for t in tasks] == [("capture", "COMPLETED")]
+    assert artifacts["progress-capture"]["data"] == 100
+    assert "| capture |" in artifacts["run"]["data"]
+    assert str(out) in artifacts["run"]["data"]
