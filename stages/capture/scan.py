@@ -26,7 +26,7 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
     Raises:
         StageError: no such folder, no photos or too few of them, `params.json` is not readable, two files for one view.
     """
-    folder = Path(folder)
+    folder = Path(folder).absolute()
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise StageError(

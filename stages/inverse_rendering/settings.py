@@ -16,7 +16,7 @@ class FitSettings:
     seed: int = 0
     # size
     image_side: int = 512
-    steps: int = 3000
+    steps: int = 1800
     batch: int = 4096
     samples: int = 10
     grid_cells: int = 288
@@ -41,7 +41,7 @@ class FitSettings:
     white: float = 5e-3
     specular_energy: float = 8e-3
     eikonal: float = 0.1
-    smooth: float = 0.05
+    smooth: float = 0.03
     # learning
     lr_sdf: float = 0.1
     lr_appearance: float = 1e-2

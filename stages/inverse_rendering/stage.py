@@ -135,10 +135,10 @@ def read_views(inputs: Inputs, indices: list[int], side: int) -> list[PhotoView]
     views = []
     for i in indices:
         c = cameras[i]
-        views.append(PhotoView(
+        views.append(shrunk(PhotoView(
             i, read_linear(inputs.capture.path(photos[i].image)), read_alpha(inputs.masks.path(masks[i].mask)),
-            transforms.matrix(c.K), transforms.matrix(c.world_from_cam), np.array(c.distortion)))
-    return [shrunk(v, side) for v in views]
+            transforms.matrix(c.K), transforms.matrix(c.world_from_cam), np.array(c.distortion)), side))
+    return views
 
 
 def shrunk(view: PhotoView, side: int) -> PhotoView:
@@ -149,14 +149,14 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
     from dataclasses import replace
 
     from pipeline.images import shrink
-    from stages.inverse_rendering.views import factor_for
+    from stages.inverse_rendering.views import factor_for, whole_blocks
 
     f = factor_for(view.size, max(side, 1024))
     if f == 1:
         return view
     K = view.K.copy()
     K[:2] /= f
-    return replace(view, rgb=shrink(view.rgb, f), alpha=shrink(view.alpha, f), K=K)
+    return replace(view, rgb=shrink(whole_blocks(view.rgb, f), f), alpha=shrink(whole_blocks(view.alpha, f), f), K=K)
 
 
 def write_light(model: FaceModel, context: Context) -> None:
@@ -182,7 +182,7 @@ def predict_held_out(model: FaceModel, inputs: Inputs, config: Config, context: 
     for n, c in enumerate(known):
         context.check()
         context.progress(n, len(known), "held-out views")
-        factor = factor_for((c.width, c.height), config.image_side)
+        factor = factor_for((c.width, c.height), config.image_side, exact=True)
         view = camera_only(c)
         rgba = predict_view(model, view, factor, config.samples, context.device)
         exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"

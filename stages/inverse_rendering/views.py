@@ -64,12 +64,20 @@ class Batch:
     share: Tensor
 
 
-def factor_for(size: tuple[int, int], side: int) -> int:
-    """The smallest block that brings the longest side to `side` or below, and divides the photo exactly."""
-    for f in range(1, max(size) + 1):
-        if max(size) <= side * f and size[0] % f == 0 and size[1] % f == 0:
-            return f
-    return 1
+def factor_for(size: tuple[int, int], side: int, *, exact: bool = False) -> int:
+    """The smallest block that brings the longest side to `side` or below.
+
+    exact: the largest block up to that which divides the photo, for pictures that are compared with it.
+    """
+    f = max(-(-max(size) // side), 1)
+    if exact:
+        f = next(k for k in range(f, 0, -1) if size[0] % k == 0 and size[1] % k == 0)
+    return f
+
+
+def whole_blocks(image: F32, factor: int) -> F32:
+    """The image without the last columns and rows that fill no block."""
+    return image[: image.shape[0] // factor * factor, : image.shape[1] // factor * factor]
 
 
 def normalised_positions(view: PhotoView, factor: int) -> F32:
@@ -123,8 +131,8 @@ def _pixels_of(
     view: PhotoView, n: int, factor: int
 ) -> tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]:
     """Candidate pixels of one view: (x, y), encoded target, alpha, view number, 1 inside or 0 outside."""
-    alpha = shrink(view.alpha, factor)
-    encoded = srgb_from_linear(shrink(view.rgb, factor)).astype(np.float16)
+    alpha = shrink(whole_blocks(view.alpha, factor), factor)
+    encoded = srgb_from_linear(shrink(whole_blocks(view.rgb, factor), factor)).astype(np.float16)
     xy = normalised_positions(view, factor)
     reach = 2 * max(int(max(alpha.shape) * NEAR_BAND), 2) + 1
     near = cv2.dilate((alpha > 0.01).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0

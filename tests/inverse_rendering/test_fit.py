@@ -156,10 +156,18 @@ def test_a_draw_depends_on_its_seed_alone() -> None:
     assert int((a.alpha <= 0.5).sum()) == 16
 
 
-@pytest.mark.parametrize(("size", "side", "factor"), [((1024, 1024), 512, 2), ((640, 640), 512, 2), ((512, 512), 512, 1),
-                                                      ((997, 991), 512, 1), ((1368, 770), 512, 1), ((10, 10), 3, 5)])
-def test_factor_divides_the_photo(size: tuple[int, int], side: int, factor: int) -> None:
-    assert factor_for(size, side) == factor or size == (1368, 770)
+@pytest.mark.parametrize(("size", "side", "loose", "exact"), [
+    ((1024, 1024), 512, 2, 2), ((640, 640), 512, 2, 2), ((512, 512), 512, 1, 1), ((997, 991), 512, 2, 1),
+    ((1368, 770), 512, 3, 2), ((4, 4), 100, 1, 1)])
+def test_blocks(size: tuple[int, int], side: int, loose: int, exact: int) -> None:
+    assert factor_for(size, side) == loose and factor_for(size, side, exact=True) == exact
+
+
+def test_odd_sizes_lose_only_the_blocks_that_do_not_fill() -> None:
+    v = ball_view(0)
+    v = replace(v, rgb=v.rgb[:63, :61], alpha=v.alpha[:63, :61])
+    table = PixelTable([v], 32, "cpu")
+    assert len(table.alpha) <= 31 * 30
 
 
 def test_rays_undo_the_lens() -> None:
