@@ -1,0 +1,121 @@
+"""The house rules that a linter can't hold: where packages lie, what stays light, and that the registry adds up."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import stages
+from pipeline.artifacts import Artifact, Located
+from pipeline.contract import StageConfig
+
+HEAVY = ("torch", "pxr", "pycolmap", "prefect", "xatlas", "pymeshlab", "trimesh", "cv2", "numba", "OpenEXR", "skimage")
+
+
+@pytest.mark.parametrize("name", ["pipeline", "stages", "workflows", *(f"stages.{s.name}" for s in stages.REGISTRY)])
+def test_our_packages_are_ours(name: str, repo: Path) -> None:
+    """The names are general: another distribution may own one."""
+    file = importlib.import_module(name).__file__
+    assert file is not None
+    assert Path(file) == repo / Path(*name.split(".")) / "__init__.py"
+
+
+def test_no_python_in_docker(repo: Path) -> None:
+    """A folder `docker` with Python in it would hide the SDK of that name, which Prefect imports."""
+    assert list((repo / "docker").rglob("*.py")) == []
+    import docker
+
+    assert docker.__file__ is None or not Path(docker.__file__).is_relative_to(repo / "docker")
+
+
+@pytest.mark.parametrize(
+    "module", ["stages", "workflows.plan", "workflows.commands", "workflows.cli", "stages.presets"]
+)
+def test_importing_is_light(module: str, repo: Path) -> None:
+    code = f"import sys, {module}; print(*sorted(m for m in {HEAVY!r} if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=repo, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize("module", ["workflows.cli", "stages.__main__", "workflows.flows"])
+def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path) -> None:
+    code = (
+        "import os, sys\n"
+        "class Watch:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'torch': sys.exit('too late' if 'OMP_WAIT_POLICY' not in os.environ else 0)\n"
+        "sys.meta_path.insert(0, Watch())\n"
+        f"import {module}, torch\n"
+    )
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(repo), "HOME": "/tmp"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=repo, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_registry_adds_up() -> None:
+    names = [s.name for s in stages.REGISTRY]
+    assert len(set(names)) == len(names)
+    known = {stages.SOURCE}
+    made: dict[str, type[Artifact]] = {}
+    for stage in stages.REGISTRY:
+        assert re.fullmatch(r"[a-z][a-z_]*", stage.name)
+        assert stage.version >= 1
+        assert issubclass(stage.config, StageConfig) and issubclass(stage.output, Artifact)
+        fields = importlib.import_module(f"stages.{stage.name}.stage").Inputs.__annotations__
+        assert set(stage.inputs.__dataclass_fields__) <= known, f"{stage.name} needs what no earlier stage makes"
+        for field, annotation in fields.items():
+            if field in made:  # the annotation names what that stage hands on
+                assert str(annotation).endswith(f"[{made[field].__name__}]"), (stage.name, field, annotation)
+        known.add(stage.name)
+        made[stage.name] = stage.output
+    assert names[0] == "capture" and names[-1] == "report"
+    assert Located.__name__ == "Located"
+
+
+def test_every_setting_says_what_it_is() -> None:
+    silent = [f"{s.name}.{n}" for s in stages.REGISTRY for n, f in s.config.model_fields.items() if not f.description]
+    assert silent == []
+
+
+def test_every_stage_has_defaults() -> None:
+    for stage in stages.REGISTRY:
+        assert isinstance(stage.config(), StageConfig), stage.name
+
+
+def requirement(line: str) -> str:
+    return re.sub(r"[-_.]+", "-", re.split(r"[<>=!~\[; ]", line.strip(), maxsplit=1)[0]).lower()
+
+
+def test_locks_pin_all_that_pyproject_names(repo: Path) -> None:
+    project = tomllib.loads((repo / "pyproject.toml").read_text())["project"]
+    named = project["dependencies"]
+    tools = project["optional-dependencies"]["dev"]
+    for lock, wanted in (("requirements.lock", named), ("requirements-dev.lock", named + tools)):
+        lines = [x for x in (repo / lock).read_text().splitlines() if x and not x.startswith("#")]
+        assert all(re.match(r"[A-Za-z0-9_.-]+==[^ ]+", x) for x in lines)
+        pinned = {requirement(x) for x in lines}
+        assert {requirement(w) for w in wanted} <= pinned
+
+
+def test_data_files_are_packaged(repo: Path) -> None:
+    """Everything below our packages that is not Python is matched by a pattern of package-data."""
+    import fnmatch
+
+    data = tomllib.loads((repo / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["*"]
+    for package in ("pipeline", "stages", "workflows"):
+        for path in (repo / package).rglob("*"):
+            if path.is_file() and path.suffix not in (".py", ".pyc") and "__pycache__" not in path.parts:
+                names = (path.name, f"{path.parent.name}/{path.name}")
+                assert any(fnmatch.fnmatch(n, p) for n in names for p in data), path
+
+
+def test_console_script_is_installed() -> None:
+    found = [e for e in importlib.metadata.entry_points(group="console_scripts") if e.name == "neuface"]
+    assert [e.value for e in found] == ["workflows.cli:main"]
