@@ -1,0 +1,125 @@
+"""The field on texels: where each lies on the true surface, and what the skin is like there.
+
+Symbols
+    p       point of the UV mesh under a texel's centre
+    N       interpolated vertex normal at p
+    t       signed distance (m) along N from the mesh to the zero set of the SDF d
+    x       p + t N, where everything is evaluated
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline import tangents
+from pipeline.errors import StageError
+from pipeline.fields.protocol import Field
+from pipeline.maths import microfacet
+from pipeline.meshes import F32, F64, Mask, Mesh
+from pipeline.raster import Hits
+from pipeline.tangents import Frames
+
+NEWTON_STEPS = 3
+LEAST_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
+REACH_CELLS = 3.0  # of the field's cells: the decimated mesh is never further from the zero set than that
+LEAST_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
+LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
+LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """One row a texel, in the order of its Hits. All float32.
+
+    albedo (N, 3); rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); f0 (N,); normal (N, 3) in
+    tangent space, unit; displacement (N,) metres. landed (N,): False where the mesh has no zero set near it (the cap).
+    """
+
+    albedo: F32
+    rho: F32
+    coefficients: F32
+    inv_kappa: F32
+    f0: F32
+    normal: F32
+    displacement: F32
+    landed: Mask
+
+
+def sample(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Samples:
+    """Everything that the maps need. Raises StageError where the field is not finite."""
+    weights = hits.weights.astype(np.float64)
+    start = (mesh.vertices.astype(np.float64)[mesh.faces[hits.face]] * weights[..., None]).sum(1)
+    t, b, n = tangents.at(frame, mesh, hits.face, weights)
+    moved, gradient, landed = land(field, start, n)
+    x = (start + moved[:, None] * n).astype(np.float32)
+    world = _unit(np.where(landed[:, None], gradient, n))
+    material = field.material(x)
+    straight = world.astype(np.float32)
+    strength = material.rho * (material.coefficients * field.basis(straight, straight)).sum(1)
+    f0 = microfacet.f0_from_lobe(strength, material.inv_kappa)
+    found = Samples(
+        np.asarray(material.albedo, np.float32),
+        np.asarray(material.rho, np.float32),
+        np.asarray(material.coefficients, np.float32),
+        np.asarray(material.inv_kappa, np.float32),
+        f0.astype(np.float32),
+        in_frame(world, t, b, n),
+        moved.astype(np.float32),
+        landed,
+    )
+    _check(found)
+    return found
+
+
+def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
+    """Newton's method along the normal: t (N,), the gradient there (N, 3), and where the surface was reached (N,).
+
+        t <- t - d / max(g . N, LEAST_SLOPE)
+
+    clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not arrive keep t = 0.
+    """
+    reach = REACH_CELLS * field.cell
+    t = np.zeros(len(start))
+    value, gradient = _evaluate(field, start)
+    for _ in range(NEWTON_STEPS):
+        slope = np.maximum((gradient * normal).sum(1), LEAST_SLOPE)
+        t = (t - value / slope).clip(-reach, reach)
+        value, gradient = _evaluate(field, start + t[:, None] * normal)
+    # a wall across the normal is not the surface that this texel stands for (the rim of the neck's cut)
+    facing = (_unit(gradient) * normal).sum(1) > LEAST_FACING
+    landed = (np.abs(value) < LANDED_CELLS * field.cell) & facing
+    return np.where(landed, t, 0.0), gradient, landed
+
+
+def in_frame(world: F64, t: F64, b: F64, n: F64) -> F32:
+    """(N, 3) directions in the frame T, B, N, kept on the outer side of the surface."""
+    local = np.stack([(world * axis).sum(1) for axis in (t, b, n)], 1)
+    local[:, 2] = np.maximum(local[:, 2], LEAST_Z)
+    return _unit(local).astype(np.float32)
+
+
+def _evaluate(field: Field, points: F64) -> tuple[F64, F64]:
+    value, gradient = field.sdf_and_gradient(points.astype(np.float32))
+    return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
+
+
+def _unit(v: npt.NDArray[np.floating]) -> F64:
+    w = np.asarray(v, np.float64)
+    out: F64 = w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-30)
+    return out
+
+
+def _check(s: Samples) -> None:
+    for name in ("albedo", "rho", "coefficients", "inv_kappa", "normal"):
+        values = getattr(s, name)
+        if not np.isfinite(values).all():
+            raise StageError(
+                "the fitted field is not finite on the surface",
+                where=f"bake: {name}",
+                value=f"{(~np.isfinite(values)).sum()} of {values.size} values",
+                limit="finite everywhere",
+                remedy="fit the model again with another seed",
+            )

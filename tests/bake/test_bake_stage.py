@@ -1,0 +1,85 @@
+"""The bake stage through its contract."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from pipeline import meshes
+from pipeline.artifacts import FileRef, Located, MaskSet, UvMesh, ViewMask
+from pipeline.contract import Context
+from pipeline.errors import Cancelled
+from pipeline.images import read_encoded, read_exr, write_png
+from stages.bake.confidence import seen_by
+from stages.bake.stage import Config, Inputs, run
+from stages.surface.build import build as surface_build
+from stages.uv.decimate import decimated
+from stages.uv.unwrap import Options, unwrap
+from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.field_artifacts import fitted, poses
+
+PNG = {"albedo", "specular_intensity", "roughness", "f0", "normal", "confidence", "coverage"}
+ALL = PNG | {"specular_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
+
+
+@pytest.fixture
+def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
+    field = AnalyticField(sphere(0.08))
+    mesh = decimated(surface_build(field, 32, lambda done, total: None).mesh, 800)
+    charts = unwrap(mesh, Options(256, 2))
+    meshes.save(tmp_path / "uv.npz", mesh, charts)
+    uv = UvMesh(
+        mesh=FileRef.of(tmp_path, "uv.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), charts=1,
+        utilisation=0.5, stretch=1.0, overlap=0.0, deviation_mm=0.1,
+    )  # fmt: skip
+    write_png(tmp_path / "mask.png", np.ones((64, 64)))
+    mask = ViewMask(index=1, mask=FileRef.of(tmp_path, "mask.png"), source="given", coverage=1.0)
+    return Inputs(
+        Located(uv, tmp_path),
+        fitted(tmp_path, field, monkeypatch, views=3),
+        poses(tmp_path),
+        Located(MaskSet(masks=(mask,)), tmp_path),
+    )
+
+
+def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
+    textures = run(inputs, Config(size=256), Context(tmp_path, tmp_path))
+    assert set(textures.maps) == ALL and textures.size == 256 and 0.3 < textures.coverage < 1
+    for name, found in textures.maps.items():
+        assert set(found.files) == ({"exr", "png"} if name in PNG else {"exr"})
+        assert found.files["exr"].path == f"textures/{name}.exr"
+        image, _ = read_exr(tmp_path / found.files["exr"].path)
+        assert image.shape == ((1, 64, 3) if name == "basis_lut" else (256, 256, found.channels))
+        assert np.isfinite(image).all() and found.minimum <= found.mean <= found.maximum
+    assert read_encoded(tmp_path / "textures/f0.png").dtype == np.uint16
+    assert textures.maps["albedo"].space == "srgb_png" and textures.maps["normal"].space == "raw"
+    covered = read_exr(tmp_path / "textures/coverage.exr")[0][..., 0] > 0.5
+    rho = read_exr(tmp_path / "textures/specular_intensity.exr")[0][covered]
+    assert textures.maps["specular_intensity"].mean == pytest.approx(float(rho.mean()), rel=1e-5)
+    png = read_encoded(tmp_path / "textures/roughness.png")[..., 0] / 255
+    assert np.abs(png - read_exr(tmp_path / "textures/roughness.exr")[0][..., 0]).max() < 0.003
+
+
+def test_manifest_is_the_same_twice(inputs: Inputs, tmp_path: Path) -> None:
+    a, b = (run(inputs, Config(size=256), Context(tmp_path / x, tmp_path)) for x in "ab")
+    assert a.canonical_json() == b.canonical_json()
+
+
+def test_views_are_the_fitted_ones_with_their_masks(inputs: Inputs, tmp_path: Path) -> None:
+    views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks)
+    assert [v.camera.index for v in views] == [0, 1, 2]
+    assert [v.mask for v in views] == [None, tmp_path / "mask.png", None]
+
+
+def test_run_can_be_stopped(inputs: Inputs, tmp_path: Path) -> None:
+    with pytest.raises(Cancelled):
+        run(inputs, Config(size=256), Context(tmp_path, tmp_path, cancelled=lambda: True))
+
+
+@pytest.mark.parametrize("size", [0, 255, 8193])
+def test_size_limits(size: int) -> None:
+    with pytest.raises(ValidationError):
+        Config(size=size)
