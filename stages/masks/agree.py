@@ -93,7 +93,9 @@ def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:
     out[~inside & ~near] = cv2.GC_BGD
     clear = eroded(opinion.silhouette, opinion.margin)
     empty = ~dilated(opinion.silhouette, opinion.margin)
-    here = opinion.here
+    # a mask that misses most of the subject has no say outside the region of interest either
+    lost = (inside & opinion.silhouette).sum() < 0.3 * opinion.silhouette.sum()
+    here = np.ones_like(inside) if lost else opinion.here
     out[here & ~clear & ~empty] = np.where(opinion.silhouette, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
     agreed = here & ~clear & ~empty & near  # both leave it open: the view's own contour is the better first guess
     out[agreed] = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[agreed]

@@ -68,7 +68,8 @@ def key_out(image: U8, background: Background) -> F32:
 
 
 def _inside(image: U8, background: Background) -> Bool:
-    away = np.abs(image.astype(np.float32) - np.array(background.colour, np.float32)).max(-1)
+    apart = [np.abs(image[..., k].astype(np.float32) - np.float32(background.colour[k])) for k in range(3)]
+    away = np.maximum(np.maximum(apart[0], apart[1]), apart[2])
     like = away <= background.tolerance
     count, label, stats, _ = cv2.connectedComponentsWithStats(like.astype(np.uint8), connectivity=4)
     frame = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])

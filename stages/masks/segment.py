@@ -19,11 +19,12 @@ from pipeline.images import read_alpha, read_encoded, write_png
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
+from stages.masks.segment_person import of_subject
 from stages.masks.sources import Method, Plan, View, mask, plan, to_full_size
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
-CONTRADICTED = 0.02  # share of a mask's area from which it is cut out anew
+CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
 T = TypeVar("T")
 R = TypeVar("R")
@@ -175,6 +176,7 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     opinion_here = _at_size(opinion, w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
     new = cut(np.asarray(resized(image, w, h), np.uint8), trimap(prior, opinion_here), settings.seed)
+    new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
         return made

@@ -36,8 +36,8 @@ def _solve(colour: F32, inside: Bool, inner: Bool, outer: Bool, radius: int) -> 
     foreground, noise_f, has_f = _near(colour, inner, 2 * radius + 1)
     background, noise_b, has_b = _near(colour, outer, 2 * radius + 1)
     difference = foreground - background
-    square = (difference**2).sum(-1)
-    by_colour = ((colour - background) * difference).sum(-1) / np.maximum(square, 1e-6)
+    square = _dot(difference, difference)
+    by_colour = _dot(colour - background, difference) / np.maximum(square, 1e-6)
     doubt = CONTRAST**2 + NOISE * (noise_f + noise_b)
     trust = np.where(has_f & has_b, square / (square + doubt), 0.0)
     blurred = np.asarray(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.7), np.float32)
@@ -46,16 +46,21 @@ def _solve(colour: F32, inside: Bool, inner: Bool, outer: Bool, radius: int) -> 
     return np.asarray(np.where(inner, 1, np.where(outer, 0, alpha)), np.float32)
 
 
+def _dot(a: F32, b: F32) -> F32:
+    """(H, W) dot products of (H, W, 3) colours; several times faster than a sum over a short axis."""
+    return np.asarray(np.einsum("ijk,ijk->ij", a, b), np.float32)
+
+
 def _near(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
     """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` within `reach`, and whether there are any."""
     size = (2 * reach + 1, 2 * reach + 1)
     weight = where.astype(np.float32)
-    square = (colour**2).sum(-1)
+    square = _dot(colour, colour)
     stack = np.dstack([weight, square * weight, colour * weight[..., None]])
     total = np.asarray(cv2.boxFilter(stack, -1, size, normalize=False, borderType=cv2.BORDER_CONSTANT), np.float32)
     count = np.maximum(total[..., 0], 1)
     mean = np.asarray(total[..., 2:] / count[..., None], np.float32)
-    return mean, np.asarray(np.maximum(total[..., 1] / count - (mean**2).sum(-1), 0), np.float32), total[..., 0] > 0.5
+    return mean, np.asarray(np.maximum(total[..., 1] / count - _dot(mean, mean), 0), np.float32), total[..., 0] > 0.5
 
 
 def largest_parts(inside: Bool, share: float) -> Bool:
