@@ -1,13 +1,32 @@
-"""Moves cameras from the capture's world to asset coordinates."""
+"""Writes cameras and sparse points in asset coordinates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.artifacts import Camera
-from pipeline.transforms import F64, matrix, rescale_camera, rows
+from pipeline.artifacts import Camera, CaptureView
+from pipeline.transforms import F64, apply, matrix, rescale_camera, rows
+
+if TYPE_CHECKING:
+    from stages.poses.solve import Model
+
+
+def camera_of(view: CaptureView, K: F64, world_from_cam: F64, distortion: Sequence[float]) -> Camera:
+    """A view's camera, still in the capture's world."""
+    k1, k2, p1, p2, k3 = distortion
+    return Camera(
+        index=view.index,
+        name=view.name,
+        width=view.width,
+        height=view.height,
+        K=rows(K),
+        world_from_cam=rows(world_from_cam),
+        distortion=(k1, k2, p1, p2, k3),
+    )
 
 
 def in_asset(cameras: Sequence[Camera], capture_from_asset: F64) -> tuple[Camera, ...]:
@@ -16,4 +35,15 @@ def in_asset(cameras: Sequence[Camera], capture_from_asset: F64) -> tuple[Camera
     return tuple(
         c.model_copy(update={"world_from_cam": rows(rescale_camera(asset_from_capture, matrix(c.world_from_cam)))})
         for c in cameras
+    )
+
+
+def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
+    """Sparse points. npz: points (M, 3) float32 in asset coordinates, error_px (M,), track (M,) photos per point."""
+    asset_from_capture: F64 = np.asarray(np.linalg.inv(capture_from_asset), np.float64)
+    np.savez(
+        path,
+        points=apply(asset_from_capture, model.points).astype(np.float32),
+        error_px=model.error_px.astype(np.float32),
+        track=model.track.astype(np.int32),
     )

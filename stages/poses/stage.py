@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from pipeline.artifacts import Camera, CameraSet, Capture, Located
+from pipeline.artifacts import CameraSet, Capture, CaptureView, Located
 from pipeline.contract import Context, Stage, StageConfig
-from pipeline.errors import UsageError
+from pipeline.errors import StageError, UsageError
+
+if TYPE_CHECKING:
+    from stages.poses.normalise import Normalisation
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,58 +29,133 @@ class Config(StageConfig):
         "auto",
         description="given: cameras of the capture; colmap: solved from the photos; auto: given if there are any",
     )
-    seed: int = Field(0, ge=0, description="seed of every random choice")
+    seed: int = Field(0, ge=0, lt=2**31, description="seed of every random choice")
     max_image_size: int = Field(1200, ge=200, description="longest edge, in pixels, at which features are looked for")
-    max_features: int = Field(2500, ge=200, description="most features per photo")
+    max_features: int = Field(1500, ge=200, le=20000, description="most features per photo")
+    neighbours: int = Field(14, ge=2, description="partners that a photo is matched with; up to 20 photos, all")
     shared_intrinsics: Literal["auto", "yes", "no"] = Field(
-        "auto", description="one lens model for all photos of equal size and EXIF; auto: as long as the photos agree"
+        "auto", description="one lens for all photos of equal size and EXIF; auto: unless far more photos fit without"
     )
     camera_model: Literal["SIMPLE_RADIAL", "OPENCV"] = Field(
         "SIMPLE_RADIAL", description="lens model: one radial term, or two radial and two tangential ones"
     )
+    refine_focal: bool = Field(True, description="let the solver move focal lengths")
+    refine_distortion: bool = Field(True, description="let the solver move the lens distortion")
+    refine_principal_point: bool = Field(False, description="let the solver move the principal point")
+    use_masks: bool = Field(True, description="look for features on the subject only, where the capture has masks")
     min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
+
+
+MIN_FITTED = 3
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
     """Cameras around the subject.
 
     Raises:
-        StageError: no cameras where they were asked for, or photos that can't be placed.
+        UsageError: given cameras are asked for and there are none.
+        StageError: the given cameras share no view, or the photos can't be placed.
     """
-    capture = inputs.capture.artifact
-    with_camera = [v for v in capture.views if v.camera is not None]
-    if config.method == "given" and len(with_camera) < len(capture.views):
-        raise UsageError("the capture has no cameras", where="poses.method", value="given", limit="a camera for every "
-                         "view (params.json)", remedy="use poses.method=auto or colmap")  # fmt: skip
-    if config.method == "colmap" or len(with_camera) < len(capture.views):
-        raise NotImplementedError("structure from motion")
-    return given(capture)
+    views = inputs.capture.artifact.views
+    all_given = all(v.camera is not None for v in views)
+    if config.method == "given" and not all_given:
+        raise UsageError(
+            "the capture has no cameras",
+            where="poses.method",
+            value="given",
+            limit="a camera for every view (params.json)",
+            remedy="use poses.method=auto or poses.method=colmap",
+        )
+    if all_given and config.method != "colmap":
+        return _given(views)
+    return _solved(inputs.capture, config, context)
 
 
-def given(capture: Capture) -> CameraSet:
+def _given(views: tuple[CaptureView, ...]) -> CameraSet:
     """The capture's own cameras, moved to asset coordinates."""
-    from pipeline.transforms import inverse_rigid, matrix, rows
+    from pipeline.transforms import inverse_rigid, matrix
     from stages.poses.normalise import normalise
-    from stages.poses.place import in_asset
+    from stages.poses.place import camera_of, in_asset
 
-    cameras = []
-    for v in capture.views:
-        if v.camera is None:
-            continue
-        world_from_cam = inverse_rigid(matrix(v.camera.cam_from_world))
-        k1, k2, p1, p2, k3 = v.camera.distortion
-        cameras.append(
-            Camera(index=v.index, name=v.name, width=v.width, height=v.height, K=v.camera.K,
-                   world_from_cam=rows(world_from_cam), distortion=(k1, k2, p1, p2, k3))
-        )  # fmt: skip
+    cameras = [
+        camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
+        for v, c in ((v, v.camera) for v in views)
+        if c is not None
+    ]
     found = normalise(cameras, given=True)
     return CameraSet(
         source="given",
         metric=found.metric,
-        capture_from_asset=rows(found.capture_from_asset),
+        capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
         warnings=found.warnings,
+    )
+
+
+def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
+    """Cameras from the photos alone."""
+    from stages.poses.normalise import normalise
+    from stages.poses.photogrammetry import Settings, solve
+    from stages.poses.photos import photos_of
+    from stages.poses.place import camera_of, in_asset, save_points
+    from stages.poses.solve import Refine
+
+    def progress(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, message)
+
+    views = capture.artifact.views
+    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
+    settings = Settings(
+        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
+        config.camera_model, refine,
+    )  # fmt: skip
+    model = solve(photos_of(capture, config.use_masks), settings, context.scratch, progress)
+    placed = sorted(model.poses) if model is not None else []
+    missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
+    fitted = sum(not views[i].holdout for i in placed)
+    if model is None or len(placed) < config.min_registered * len(views) or fitted < MIN_FITTED:
+        raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
+    cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
+    found = normalise(cameras, model.points, given=False)
+    save_points(context.workdir / "points.npz", model, found.capture_from_asset)
+    warnings = [*found.warnings]
+    if missing:
+        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: " + ", ".join(missing))
+    return CameraSet(
+        source="colmap",
+        metric=found.metric,
+        capture_from_asset=_rows(found),
+        roi_radius=found.roi_radius,
+        cameras=in_asset(cameras, found.capture_from_asset),
+        unregistered=missing,
+        reprojection_error_px=model.reprojection_error_px,
+        points=context.file("points.npz"),
+        warnings=tuple(warnings),
+    )
+
+
+def _rows(found: Normalisation) -> tuple[tuple[float, ...], ...]:
+    from pipeline.transforms import rows
+
+    return rows(found.capture_from_asset)
+
+
+def _not_placed(total: int, placed: int, fitted: int, missing: tuple[str, ...], share: float) -> StageError:
+    named = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
+    if placed < share * total:
+        value, limit = f"{placed} of {total} placed; without a place: {named}", f"at least {share:.0%}"
+    else:
+        value, limit = f"{fitted} placed views that are not held out", f"at least {MIN_FITTED}"
+    return StageError(
+        "the photos do not fit together" if placed else "the photos show nothing in common",
+        where="poses",
+        value=value,
+        limit=limit,
+        remedy="take the photos around one still subject, sharp, each overlapping the next by two thirds (15 degrees "
+        "or less apart), with the lens at one zoom; remove those named if they show something else; or give the "
+        "cameras in params.json",
     )
 
 

@@ -1,0 +1,111 @@
+"""SIFT features of one photo, spread over the frame.
+
+Skin has little contrast: the detector's threshold is set far below its usual value and the strongest features of each
+cell of a grid are kept, so that a sharp background or the eyebrows alone don't take all the places.
+Image positions are in pixels of the full photo, first pixel's centre at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.colour import srgb_from_linear
+
+F32 = npt.NDArray[np.float32]
+U8 = npt.NDArray[np.uint8]
+
+LAYERS, SIGMA = 3, 1.6  # Lowe's values
+GRID = 8
+OVERSAMPLING = 2  # describe this many times more features than are kept, so that the cells have a choice
+NLM_STRENGTH, NLM_PATCH, NLM_WINDOW = 8.0, 5, 15  # levels of 255, pixels, pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How hard to look. contrast: cv2's threshold (its default 0.04 finds next to nothing on skin). edge_ratio: how
+    elongated a spot may be. ratio: Lowe's test on distances, when matching. denoise: non-local means beforehand.
+    """
+
+    contrast: float
+    edge_ratio: float
+    ratio: float
+    denoise: bool
+
+
+PLAIN = Effort(contrast=0.004, edge_ratio=10.0, ratio=0.85, denoise=False)
+# a second chance for noisy or small photos: wrinkles and hair count too, geometry weeds out what slides along them
+PATIENT = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """uv: (N, 2) float32, pixels of the full photo. descriptors: (N, 128) float32, unit length. Strongest first."""
+
+    uv: F32
+    descriptors: F32
+
+
+def grey8(image: npt.NDArray[np.generic], max_edge: int) -> U8:
+    """(H, W, C) as stored -> (h, w) 8-bit, encoded as sRGB, longest edge at most `max_edge`.
+
+    Float pictures are linear and without a fixed white: their brightest percent is mapped to white.
+    """
+    plane: F32 = np.asarray(image[..., :3], np.float32)
+    if np.issubdtype(image.dtype, np.floating):
+        white = max(float(np.quantile(plane, 0.99)), 1e-6)
+        plane = np.asarray(srgb_from_linear((plane / white).clip(0, 1)) * 255, np.float32)
+    elif image.dtype == np.uint16:
+        plane = plane / np.float32(257)
+    grey: F32 = plane[..., 0] if plane.shape[2] == 1 else plane @ np.array([0.299, 0.587, 0.114], np.float32)
+    h, w = grey.shape
+    scale = min(1.0, max_edge / max(h, w))
+    if scale < 1:
+        reduced = cv2.resize(grey, (round(w * scale), round(h * scale)), interpolation=cv2.INTER_AREA)
+        grey = np.asarray(reduced, np.float32)
+    return np.round(grey).clip(0, 255).astype(np.uint8)
+
+
+def detect(
+    grey: U8, size: tuple[int, int], max_features: int, effort: Effort = PLAIN, inside: U8 | None = None
+) -> Features:
+    """Features of a (possibly reduced) grey picture, in pixels of the photo of `size` (width, height).
+
+    inside: (h, w) mask at the grey picture's size; features where it is 0 are left out.
+    """
+    if effort.denoise:
+        grey = np.asarray(cv2.fastNlMeansDenoising(grey, None, NLM_STRENGTH, NLM_PATCH, NLM_WINDOW), np.uint8)
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+        max_features * OVERSAMPLING, LAYERS, effort.contrast, effort.edge_ratio, SIGMA, cv2.CV_32F, True
+    )
+    keypoints, raw = sift.detectAndCompute(grey, inside)
+    kept = _spread(keypoints, grey.shape, max_features)
+    if not len(kept):
+        return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+    raw = np.asarray(raw, np.float32)[kept]
+    root = np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-12))  # RootSIFT: unit length, Hellinger distance
+    # cv2 puts the first pixel's centre at 0; the reduced picture's pixels are size / shape photo pixels wide
+    stretch = np.array([size[0] / grey.shape[1], size[1] / grey.shape[0]])
+    uv = (np.array([keypoints[i].pt for i in kept], np.float64) + 0.5) * stretch
+    return Features(uv.astype(np.float32), root.astype(np.float32))
+
+
+def _spread(keypoints: tuple[cv2.KeyPoint, ...], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
+    """Indices of at most `count` keypoints: rank by rank over the cells of a grid, in each the strongest first."""
+    if not keypoints:
+        return np.zeros(0, np.int64)
+    xy = np.array([k.pt for k in keypoints])
+    response = np.array([k.response for k in keypoints])
+    cell = (xy[:, 1] * GRID / shape[0]).astype(int).clip(0, GRID - 1) * GRID
+    cell += (xy[:, 0] * GRID / shape[1]).astype(int).clip(0, GRID - 1)
+    # ties are broken by position, so that the order never depends on how the detector ran
+    order = np.lexsort((xy[:, 0], xy[:, 1], -response))
+    rank = np.empty(len(order), int)
+    for c in np.unique(cell):
+        members = order[cell[order] == c]
+        rank[members] = np.arange(len(members))
+    kept = order[np.argsort(rank[order], kind="stable")][:count]
+    return kept[np.argsort(-response[kept], kind="stable")]

@@ -1,0 +1,113 @@
+"""Which features of two photos show the same spot: nearest neighbours, checked both ways, then by geometry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.poses.features import F32, Features
+
+F64 = npt.NDArray[np.float64]
+U32 = npt.NDArray[np.uint32]
+Pair = tuple[int, int]
+
+FARTHEST = 0.8  # unit descriptors farther apart than this are never the same spot
+SCOUTS = 300  # strongest features of each photo, matched first to find the pairs worth a full match
+NEIGHBOURS = 14  # most promising partners per photo
+EXHAUSTIVE_UP_TO = 20  # photos; up to here every pair gets a full match
+MIN_INLIERS = 15
+EPIPOLAR_LIMIT = 1.5 / 1024  # of the photo's longest edge
+RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 3000
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """Matches of one pair that a fundamental matrix explains. F: (3, 3), second^T F first = 0. matches: (M, 2)."""
+
+    F: F64
+    matches: U32
+
+
+def match(a: F32, b: F32, ratio: float) -> U32:
+    """(M, 2) indices into descriptors a (N, 128) and b (K, 128), unit length: mutual nearest and unambiguous.
+
+    ratio: Lowe's test; geometry weeds out what it lets through.
+    """
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.uint32)
+    similarity = a @ b.T
+    best = similarity.argmax(1)
+    every = np.arange(len(a))
+    top = similarity[every, best]
+    mutual = top >= similarity.max(0)[best]
+    similarity[every, best] = -1
+    kept = mutual & _distinct(top, similarity.max(1), ratio)
+    return np.stack([every[kept], best[kept]], 1).astype(np.uint32)
+
+
+def promising_pairs(
+    features: Sequence[Features], ratio: float, neighbours: int = NEIGHBOURS, tick: Callable[[], None] = lambda: None
+) -> list[Pair]:
+    """Pairs (i < j) worth a full match: each photo's partners with the most matches among the strongest features.
+
+    Few photos are all paired. Cost: SCOUTS^2 x 128 products per pair, about a second for 50 photos.
+    """
+    n = len(features)
+    if n <= EXHAUSTIVE_UP_TO:
+        return list(combinations(range(n), 2))
+    scouts = np.full((n, SCOUTS, 128), 0, np.float32)  # absent features are zero: never similar to anything
+    for i, f in enumerate(features):
+        scouts[i, : len(f.descriptors)] = f.descriptors[:SCOUTS]
+    votes = np.zeros((n, n), int)
+    for i in range(n - 1):
+        tick()
+        votes[i, i + 1 :] = votes[i + 1 :, i] = _votes(scouts[i], scouts[i + 1 :], ratio)
+    pairs: set[Pair] = set()
+    for i in range(n):
+        order = [int(j) for j in np.argsort(-votes[i], kind="stable") if j != i][:neighbours]
+        pairs |= {(min(i, j), max(i, j)) for j in order}
+    return sorted(pairs)
+
+
+def _votes(one: F32, others: F32, ratio: float) -> npt.NDArray[np.int64]:
+    """Number of mutual, unambiguous matches of (S, 128) with each of (m, S, 128)."""
+    m, s = others.shape[:2]
+    similarity = (one @ others.reshape(m * s, -1).T).reshape(s, m, s)
+    best = similarity.argmax(2)[..., None]
+    top = np.take_along_axis(similarity, best, 2)[..., 0]
+    mutual = top >= np.take_along_axis(similarity.max(0), best[..., 0].T, 1).T
+    np.put_along_axis(similarity, best, -1, 2)
+    return np.asarray((mutual & _distinct(top, similarity.max(2), ratio)).sum(0), np.int64)
+
+
+def _distinct(top: F32, second: F32, ratio: float) -> npt.NDArray[np.bool_]:
+    """Lowe's ratio test and the limit on distance, from cosines; |a - b|^2 = 2 - 2 a.b for unit vectors."""
+    nearest, next_nearest = (np.sqrt(np.maximum(2 - 2 * s, 0)) for s in (top, second))
+    return np.asarray((nearest < ratio * next_nearest) & (nearest < FARTHEST))
+
+
+def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Verified | None:
+    """The matches that one fundamental matrix explains (MAGSAC), or None if there are too few to trust.
+
+    edge: longest edge of the photos in pixels. Pure in its arguments: the sampler is seeded.
+    """
+    if len(matches) < MIN_INLIERS:
+        return None
+    parameters = cv2.UsacParams()
+    parameters.confidence, parameters.maxIterations = RANSAC_CONFIDENCE, RANSAC_TRIALS
+    parameters.threshold = EPIPOLAR_LIMIT * edge
+    parameters.randomGeneratorState = seed
+    parameters.isParallel = False
+    parameters.score, parameters.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
+    parameters.loMethod, parameters.loIterations = cv2.LOCAL_OPTIM_SIGMA, 5
+    parameters.final_polisher = cv2.MAGSAC
+    uv_a, uv_b = a.uv[matches[:, 0]], b.uv[matches[:, 1]]
+    F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
+    if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
+        return None
+    return Verified(np.asarray(F, np.float64), matches[inliers.ravel() > 0])

@@ -1,0 +1,184 @@
+"""Cameras from photos alone: features, matches, structure from motion, and more effort if that is not enough.
+
+Held-out views take part here: their cameras have to come from somewhere, and no pixel of theirs reaches the fit.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from stages.poses.features import PATIENT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.matching import Pair, Verified, match, promising_pairs, verify
+from stages.poses.solve import Lens, Model, Refine, reconstruct
+
+WORKERS = 2  # the result does not depend on it: each photo is a task of its own
+GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth another try
+BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
+
+
+class Photo(Protocol):
+    """One photo: how to read it, and what is known of its lens."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+    @property
+    def focal(self) -> float | None:
+        """Pixels, if known."""
+        ...
+
+    @property
+    def group(self) -> str:
+        """Photos of one lens have the same."""
+        ...
+
+    def pixels(self) -> npt.NDArray[np.generic]:
+        """(H, W, C) as stored."""
+        ...
+
+    def inside(self) -> npt.NDArray[np.float32] | None:
+        """(H, W) alpha of the subject, or None."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """See the stage's Config."""
+
+    seed: int
+    max_image_size: int
+    max_features: int
+    neighbours: int
+    shared: Literal["auto", "yes", "no"]
+    camera_model: str
+    refine: Refine
+
+
+Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
+
+
+def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: Progress) -> Model | None:
+    """The model with the most photos of all tries, or None if no two photos fit together."""
+    best: Model | None = None
+    for effort in (PLAIN, PATIENT):
+        features = detect_all(photos, settings, effort, progress)
+        verified = match_all(photos, features, settings, effort, progress)
+        best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
+        if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
+            return best
+    if settings.shared == "auto":
+        separate = _place(photos, features, verified, settings, False, scratch, progress)
+        if best is None or (separate is not None and len(separate.poses) >= BETTER_BY * len(best.poses)):
+            best = separate
+    return best
+
+
+def detect_all(photos: Sequence[Photo], settings: Settings, effort: Effort, progress: Progress) -> list[Features]:
+    """Features of every photo."""
+
+    def one(photo: Photo) -> Features:
+        grey = grey8(photo.pixels(), settings.max_image_size)
+        alpha = photo.inside()
+        inside = None
+        if alpha is not None:
+            inside = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5).astype(np.uint8)
+        return detect(grey, (photo.width, photo.height), settings.max_features, effort, inside)
+
+    found = []
+    with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
+        tasks = [pool.submit(one, p) for p in photos]
+        try:
+            for i, task in enumerate(tasks):
+                progress(i, len(photos), "looking for features")
+                found.append(task.result())
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return found
+
+
+def match_all(
+    photos: Sequence[Photo], features: Sequence[Features], settings: Settings, effort: Effort, progress: Progress
+) -> dict[Pair, Verified]:
+    """Verified matches by pair of photos."""
+    pairs = promising_pairs(features, effort.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"))
+    found = {}
+    with _single_threaded_cv2():
+        for n, (i, j) in enumerate(pairs):
+            if n % 16 == 0:
+                progress(n, len(pairs), "matching photos")
+            matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
+            edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
+            pair = verify(features[i], features[j], matches, edge, settings.seed)
+            if pair is not None:
+                found[i, j] = pair
+    return found
+
+
+def _place(
+    photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], settings: Settings,
+    shared: bool, scratch: Path, progress: Progress,
+) -> Model | None:  # fmt: skip
+    if not verified:
+        return None
+    groups = list(dict.fromkeys(p.group for p in photos)) if shared else []
+    lens_of = [groups.index(p.group) for p in photos] if shared else list(range(len(photos)))
+    lenses = []
+    for lens in range(max(lens_of) + 1):
+        members = [p for p, of in zip(photos, lens_of, strict=True) if of == lens]
+        focals = [p.focal for p in members if p.focal is not None]
+        lenses.append(Lens(members[0].width, members[0].height, float(np.median(focals)) if focals else None))
+    folder = scratch / "mapper"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    stopped: list[BaseException] = []
+    placed = 0
+
+    def next_image() -> bool:
+        """Progress must not raise through COLMAP's own frames: the exception is kept and raised behind it."""
+        nonlocal placed
+        try:
+            progress(min(placed, len(photos) - 1), len(photos), "placing photos")
+        except BaseException as e:
+            stopped.append(e)
+        placed += 1
+        return bool(stopped)
+
+    model = reconstruct(
+        folder, lenses, lens_of, features, verified, camera_model=settings.camera_model, refine=settings.refine,
+        seed=settings.seed, next_image=next_image,
+    )  # fmt: skip
+    shutil.rmtree(folder, ignore_errors=True)
+    if stopped:
+        raise stopped[0]
+    return model
+
+
+def _larger(a: Model | None, b: Model | None) -> Model | None:
+    if a is None or b is None:
+        return b if a is None else a
+    return b if len(b.poses) > len(a.poses) else a
+
+
+@contextmanager
+def _single_threaded_cv2() -> Iterator[None]:
+    """OpenCV's own threads would fight over the cores with ours."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,173 @@
+"""Structure from motion: features and matches in, cameras and sparse points out, by COLMAP's incremental mapper.
+
+The same input gives the same cameras: every sampler is seeded and the mapper runs on one thread, because the order of
+a parallel sum is not fixed. COLMAP has the first pixel's centre at (0.5, 0.5), as everything here has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from pipeline.transforms import F64, inverse_rigid, rigid
+from stages.poses.features import Features
+from stages.poses.matching import Pair, Verified
+
+DEFAULT_FOCAL = 1.2  # of the longest edge: COLMAP's own guess, a 43 mm lens on full frame
+MAX_MODELS = 8
+MIN_MODEL = 3
+GLOG_ERROR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """A start for the intrinsics of the photos that share them. focal: pixels, None if nothing is known."""
+
+    width: int
+    height: int
+    focal: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Refine:
+    """What bundle adjustment may move, besides poses and points."""
+
+    focal: bool = True
+    distortion: bool = True
+    principal_point: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """A registered photo. K (3, 3); world_from_cam (4, 4) rigid; distortion k1 k2 p1 p2 k3."""
+
+    K: F64
+    world_from_cam: F64
+    distortion: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """The largest reconstruction. poses: by photo number. points (M, 3); error_px (M,); track (M,) photos per point."""
+
+    poses: dict[int, Pose]
+    points: F64
+    error_px: F64
+    track: F64
+    reprojection_error_px: float
+
+
+def reconstruct(
+    scratch: Path,
+    lenses: Sequence[Lens],
+    lens_of: Sequence[int],
+    features: Sequence[Features],
+    verified: Mapping[Pair, Verified],
+    *,
+    camera_model: str,
+    refine: Refine,
+    seed: int,
+    next_image: Callable[[], bool],
+) -> Model | None:
+    """The largest model that COLMAP finds, or None. lens_of: for each photo, its place in `lenses`.
+
+    next_image: called before each photo is placed; True stops the mapper. scratch: an empty folder.
+    """
+    pycolmap.logging.minloglevel = GLOG_ERROR
+    database = scratch / "matches.db"
+    numbers = _write_database(database, lenses, lens_of, features, verified, camera_model)
+    token = pycolmap.CancellationToken()
+
+    def tick() -> None:
+        if next_image():
+            token.cancel()
+
+    found = pycolmap.incremental_mapping(
+        database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
+        cancellation_token=token,
+    )  # fmt: skip
+    if not found:
+        return None
+    # the most photos; of equally large ones the one with more points
+    largest = max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()))
+    return _model(largest, numbers)
+
+
+def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float, float, float, float]:
+    """(k1, k2, p1, p2, k3) of a COLMAP camera, exactly. Only models that OpenCV's five terms can say are accepted."""
+    if model == "SIMPLE_RADIAL":  # f, cx, cy, k
+        return (float(params[3]), 0.0, 0.0, 0.0, 0.0)
+    if model == "OPENCV":  # fx, fy, cx, cy, k1, k2, p1, p2
+        k1, k2, p1, p2 = (float(p) for p in params[4:8])
+        return (k1, k2, p1, p2, 0.0)
+    raise ValueError(f"camera model {model} has no exact k1 k2 p1 p2 k3")
+
+
+def _options(refine: Refine, seed: int) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.min_model_size = MIN_MODEL
+    options.max_num_models = MAX_MODELS
+    options.extract_colors = False
+    options.ba_refine_focal_length = refine.focal
+    options.ba_refine_extra_params = refine.distortion
+    options.ba_refine_principal_point = refine.principal_point
+    return options
+
+
+def _write_database(
+    path: Path,
+    lenses: Sequence[Lens],
+    lens_of: Sequence[int],
+    features: Sequence[Features],
+    verified: Mapping[Pair, Verified],
+    camera_model: str,
+) -> dict[str, int]:
+    """COLMAP's database of cameras, keypoints and verified pairs. Returns photo numbers by image name."""
+    database = pycolmap.Database.open(path)
+    cameras = []
+    for lens in lenses:
+        focal = lens.focal or DEFAULT_FOCAL * max(lens.width, lens.height)
+        camera = pycolmap.Camera.create_from_model_name(0, camera_model, focal, lens.width, lens.height)
+        camera.has_prior_focal_length = lens.focal is not None
+        cameras.append(database.write_camera(camera))
+    images = []
+    for i, f in enumerate(features):
+        images.append(database.write_image(pycolmap.Image(name=f"{i:05d}", camera_id=cameras[lens_of[i]])))
+        database.write_keypoints(images[-1], f.uv)
+    for (i, j), pair in sorted(verified.items()):
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.config = int(pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED)
+        geometry.F, geometry.inlier_matches = pair.F, pair.matches
+        database.write_matches(images[i], images[j], pair.matches)
+        database.write_two_view_geometry(images[i], images[j], geometry)
+    database.close()
+    return {f"{i:05d}": i for i in range(len(features))}
+
+
+def _model(reconstruction: Any, numbers: Mapping[str, int]) -> Model:
+    poses = {}
+    for image in reconstruction.images.values():
+        if not image.has_pose:
+            continue
+        camera = reconstruction.cameras[image.camera_id]
+        m = np.asarray(image.cam_from_world().matrix(), np.float64)
+        poses[numbers[image.name]] = Pose(
+            K=np.asarray(camera.calibration_matrix(), np.float64),
+            world_from_cam=inverse_rigid(rigid(m[:, :3], m[:, 3])),
+            distortion=opencv_distortion(camera.model_name, list(camera.params)),
+        )
+    points = [reconstruction.points3D[k] for k in sorted(reconstruction.points3D)]
+    return Model(
+        poses=dict(sorted(poses.items())),
+        points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
+        error_px=np.array([p.error for p in points], np.float64),
+        track=np.array([p.track.length() for p in points], np.float64),
+        reprojection_error_px=float(reconstruction.compute_mean_reprojection_error()),
+    )
