@@ -168,9 +168,7 @@ def to_world(t: Triple, b: Triple, n: Triple, x: float, y: float, z: float) -> T
 
 
 @compiled
-def sample_directions(
-    normal: F64, to_eye: F64, f0: F64, a: F64, shift: F64, point: F64
-) -> tuple[F64, F64, F64]:
+def sample_directions(normal: F64, to_eye: F64, f0: F64, a: F64, shift: F64, point: F64) -> tuple[F64, F64, F64]:
     """One sample for every shading point: diffuse and specular directions (N, 3), specular weight (N,).
 
     `normal`, `to_eye` (N, 3); `f0`, `a` (N,); `shift` (N, 2) rotates the net's `point` (2,).
@@ -189,9 +187,7 @@ def sample_directions(
 
 
 @compiled
-def shade(
-    normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32
-) -> F64:
+def shade(normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, points: F64, table: F32) -> F64:
     """Unshadowed radiance (N, 3) towards the eye, with the net `points` (S, 2) for each lobe.
 
     `normal`, `to_eye`, `albedo` (N, 3); `f0`, `a` (N,); `shift` (N, 2); `table` as from `cube_table`.
@@ -228,7 +224,5 @@ def look_up_many(table: F32, directions: F64) -> F64:
     """Radiance (N, 3) from `directions` (N, 3)."""
     out = np.empty((directions.shape[0], 3))
     for i in range(directions.shape[0]):
-        out[i, 0], out[i, 1], out[i, 2] = look_up(
-            table, directions[i, 0], directions[i, 1], directions[i, 2]
-        )
+        out[i, 0], out[i, 1], out[i, 2] = look_up(table, directions[i, 0], directions[i, 1], directions[i, 2])
     return out

@@ -96,7 +96,7 @@ def write_demo_capture(
     try:
         _write(partial, request, progress or (lambda done, total, what: None))
         partial.chmod(0o755)  # mkdtemp makes it private
-        os.replace(partial, folder)
+        partial.replace(folder)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
@@ -129,8 +129,8 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     total = request.views + 1
     progress(0, total, "sculpting the head")
     mesh = _head_mesh(request.mesh_step)
-    coarser = max(request.mesh_step, _TRUTH_STEP)
-    _write_mesh(folder / "truth" / "mesh_gt.ply", mesh if coarser == request.mesh_step else _head_mesh(coarser))
+    truth = mesh if request.mesh_step >= _TRUTH_STEP else _head_mesh(_TRUTH_STEP)
+    _write_mesh(folder / "truth" / "mesh_gt.ply", truth)
     coefficients = light.studio_coefficients(EXPOSURE)
     _write_light(folder / "truth", coefficients)
     scene = scene_from_mesh(mesh, coefficients, request.samples, request.seed, request.shadows)

@@ -51,10 +51,22 @@ _EARS = (78.0, -20.0, -15.0, 48.0)
 _LID = (32.0, -2.0, 64.0)  # centre and radii of the closed lids
 _LID_RADII = (17.0, 14.0, 14.0)
 # Curves of the ear, in its own frame: x, y, z and the tube's radius.
-_HELIX = spline([(9, -2, 0.5, 2.2), (12, 12, 0, 2.5), (8, 26, 0.8, 2.7), (-4, 30, 1.6, 2.7), (-14, 20, 2.2, 2.7),
-                 (-15.6, 4, 2.2, 2.7), (-12, -12, 1.8, 2.8), (-3, -24, 0.5, 3.2)], 5)
-_ANTIHELIX = spline([(2, 22, 1.4, 1.4), (-6, 14, 2.0, 2.0), (-8.6, 2, 2.2, 2.0), (-6, -11, 2.2, 2.0),
-                     (1, -18, 1.6, 1.8)], 5)
+_HELIX = spline(
+    [
+        (9, -2, 0.5, 2.2),
+        (12, 12, 0, 2.5),
+        (8, 26, 0.8, 2.7),
+        (-4, 30, 1.6, 2.7),
+        (-14, 20, 2.2, 2.7),
+        (-15.6, 4, 2.2, 2.7),
+        (-12, -12, 1.8, 2.8),
+        (-3, -24, 0.5, 3.2),
+    ],
+    5,
+)
+_ANTIHELIX = spline(
+    [(2, 22, 1.4, 1.4), (-6, 14, 2.0, 2.0), (-8.6, 2, 2.2, 2.0), (-6, -11, 2.2, 2.0), (1, -18, 1.6, 1.8)], 5
+)
 _CHEEK_FOLD = spline([(17, -40, 96), (25, -54, 94), (32, -70, 84)], 6)
 _ARCH_AXIS = 56.0  # the arch of the teeth: z of its axis, and its radius
 _ARCH_RADIUS = 38.0
@@ -212,12 +224,12 @@ def _mouth(head: Distance, middle: Frame, pair: Frame) -> Distance:
     head = smooth_cut(head, fold, 8.0)
     head = smooth_cut(head, ellipsoid(arch, (0, -54, 4.6), (3.2, 9.5, 4.4)), 4.5)
     upper = arched(arch_pair, -0.004)
-    head = smooth_union(head, ellipsoid(upper, (8, -64.8, -1.8), (18.5, 4.4, 4.6)), 6.0)
+    head = smooth_union(head, ellipsoid(upper, (8, -65.2, -2.0), (18.5, 4.0, 4.4)), 7.0)
     head = smooth_union(head, ellipsoid(arch, (0, -66.2, -1.0), (7, 3.6, 4.8)), 5.0)
     lower = arched(arch, 0.003)
-    head = smooth_union(head, ellipsoid(lower, (0, -73.6, -2.4), (22, 5.0, 6.0)), 6.5)
+    head = smooth_union(head, ellipsoid(lower, (0, -73.2, -2.6), (21, 4.6, 5.8)), 7.5)
     line = arched(arch, -0.002)
-    head = smooth_cut(head, tube(line, [(-23.5, -69.2, 2.0), (23.5, -69.2, 2.0)], (1.0, 1.0)), 3.2)
+    head = smooth_cut(head, tube(line, [(-25, -69.2, 1.6), (25, -69.2, 1.6)], (1.0, 1.0)), 3.0)
     return smooth_cut(head, ellipsoid(arch_pair, (28, -71, 2.0), (3, 3, 3)), 5.0)
 
 
@@ -267,8 +279,8 @@ def lip_borders(along: F64) -> tuple[F64, F64]:
     """Heights of the upper and the lower border of the lips' red at arc length `along`, millimetres."""
     x = np.abs(along)
     bow = 1.1 * np.exp(-((x / 3.0) ** 2))
-    upper = -66.0 + 4.6 * np.sqrt(np.maximum(1.0 - ((x - 6.0) / 22.0) ** 2, 0.0)) - 0.004 * x * x - bow
-    lower = -72.5 - 5.2 * np.sqrt(np.maximum(1.0 - (x / 27.0) ** 2, 0.0)) + 0.003 * x * x
+    upper = -66.2 + 4.0 * np.sqrt(np.maximum(1.0 - ((x - 6.0) / 22.0) ** 2, 0.0)) - 0.004 * x * x - bow
+    lower = -72.3 - 4.7 * np.sqrt(np.maximum(1.0 - (x / 27.0) ** 2, 0.0)) + 0.003 * x * x
     return upper, lower
 
 

@@ -74,8 +74,9 @@ def _spread(coarse: F64, near: npt.NDArray[np.bool_]) -> tuple[F64, npt.NDArray[
     """Fine volume holding coarse values, and the mask of its nodes that belong to near cells."""
     shape = tuple(_COARSE * n + 1 for n in near.shape)
     volume = np.empty(shape)
-    rows = [np.minimum((np.arange(n) + _COARSE // 2) // _COARSE, m - 1)
-            for n, m in zip(shape, coarse.shape, strict=True)]
+    rows = [
+        np.minimum((np.arange(n) + _COARSE // 2) // _COARSE, m - 1) for n, m in zip(shape, coarse.shape, strict=True)
+    ]
     volume[...] = coarse[np.ix_(*rows)]
     known = np.zeros(shape, dtype=bool)
     dense = near.repeat(_COARSE, 0).repeat(_COARSE, 1).repeat(_COARSE, 2)

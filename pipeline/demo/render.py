@@ -169,9 +169,7 @@ def _shade(scene: Scene, hits: Hits, look: skin.Material, shift: F64, net: F64) 
         return brdf.shade(hits.normals, hits.to_eye, look.albedo, look.f0, width, shift, net, scene.table)
     total = np.zeros_like(hits.points)
     for point in net:
-        diffuse, specular, weight = brdf.sample_directions(
-            hits.normals, hits.to_eye, look.f0, width, shift, point
-        )
+        diffuse, specular, weight = brdf.sample_directions(hits.normals, hits.to_eye, look.f0, width, shift, point)
         lit = _visible(scene, hits, diffuse)[:, None] * brdf.look_up_many(scene.table, diffuse)
         shine = _visible(scene, hits, specular)[:, None] * brdf.look_up_many(scene.table, specular)
         total += look.albedo * lit + weight[:, None] * shine

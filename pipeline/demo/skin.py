@@ -55,7 +55,7 @@ def material(points: F64, seed: int = 0) -> Material:
     side = np.abs(p[:, 0])
     lips, brow, lash, crop = _lips(points), _brows(p, side, seed), _lashes(p, side), _crop(p, side, seed)
     flush = 0.16 * _noise(p, 22.0, 2, seed + 1) + 0.10 * _noise(p, 3.0, 2, seed + 2)
-    blood = _blood(p, side) + 0.95 * lips + flush
+    blood = _blood(p, side) + 0.80 * lips + flush
     melanin = 0.10 + 0.14 * _noise(p, 9.0, 3, seed + 3) + 0.75 * _freckles(p, side, seed) * (1.0 - lips)
     # Pores are small dark dots; their relief is too fine for the pictures and is left to the colour.
     pores = 0.10 * _noise(p, 0.9, 2, seed + 4) + 0.05 * _noise(p, 2.0, 1, seed + 5)

@@ -99,9 +99,7 @@ def specular_by_normals(f0: float, width: float, cosine: float, coefficients: F6
     uu, pp = (x.ravel() for x in np.meshgrid(0.5 * (u + 1), phi, indexing="ij"))
     tan = width * np.sqrt(uu / (1 - uu))
     nh = 1 / np.sqrt(1 + tan**2)
-    h = nh[:, None] * NORMAL + (tan * nh)[:, None] * (
-        np.cos(pp)[:, None] * TANGENT + np.sin(pp)[:, None] * BITANGENT
-    )
+    h = nh[:, None] * NORMAL + (tan * nh)[:, None] * (np.cos(pp)[:, None] * TANGENT + np.sin(pp)[:, None] * BITANGENT)
     wo = eye(cosine)
     oh = h @ wo
     wi = 2 * oh[:, None] * h - wo
@@ -115,9 +113,7 @@ def specular_by_normals(f0: float, width: float, cosine: float, coefficients: F6
 
 @pytest.mark.parametrize("cosine", [1.0, 0.7, 0.25, 0.05])
 @pytest.mark.parametrize("width", [0.16, 0.3, 1.0])
-def test_specular_is_the_integral_over_the_hemisphere(
-    width: float, cosine: float, table: F32
-) -> None:
+def test_specular_is_the_integral_over_the_hemisphere(width: float, cosine: float, table: F32) -> None:
     expected = specular_by_directions(F0, width, cosine)
     np.testing.assert_allclose(shaded(0.0, F0, width, cosine, table), expected, rtol=6e-3)
 

@@ -205,9 +205,7 @@ def test_shadows_only_darken() -> None:
     mesh = mesh_from_distance(head.signed_distance, head.distance_and_gradient, head.BOUNDS, 0.004)
     coefficients = light.studio_coefficients(capture.EXPOSURE)
     camera = rig.rig_cameras(8, 32, 0)[4]
-    open_, shadowed = (
-        render(scene_from_mesh(mesh, coefficients, 4, 0, shadows=s), camera, 0) for s in (False, True)
-    )
+    open_, shadowed = (render(scene_from_mesh(mesh, coefficients, 4, 0, shadows=s), camera, 0) for s in (False, True))
     np.testing.assert_array_equal(open_.alpha, shadowed.alpha)
     assert (shadowed.radiance <= open_.radiance + 1e-9).all()
     assert 0.5 < shadowed.radiance.sum() / open_.radiance.sum() < 0.97
