@@ -1,7 +1,7 @@
 """The demo's result against what the demo knows to be true: pictures, surface and albedo.
 
 Everything is measured on the published files (USD, maps, predicted views), brought into the capture's world by
-run.json's capture_from_asset. Distances are in millimetres, colours as PSNR in dB.
+run.json's capture_from_asset. Distances are in millimetres, colours as PSNR of sRGB-encoded values in dB.
 """
 
 from __future__ import annotations
@@ -77,6 +77,10 @@ def psnr(got: npt.NDArray[Any], expected: npt.NDArray[Any]) -> float:
     return float(-10 * np.log10(max(np.mean((np.asarray(got, np.float64) - expected) ** 2), 1e-12)))
 
 
+def _as_seen(linear: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return srgb_from_linear(linear.clip(0, 1))
+
+
 def _mean(values: Iterator[float]) -> float:
     found = list(values)
     return float(np.mean(found)) if found else float("nan")
@@ -88,7 +92,7 @@ def _picture_psnr(views: Path, capture_folder: Path, view: CaptureView) -> float
     photo = (read_encoded(capture_folder / view.name)[..., :3].astype(np.float32) / 255).astype(np.float32)
     factor = photo.shape[0] // predicted.shape[0]
     subject = shrink(read_alpha(capture_folder / f"truth/alpha/{view.index}.png"), factor) > 0.5
-    return psnr(srgb_from_linear(predicted.clip(0, 1))[subject], shrink(photo, factor)[subject])
+    return psnr(_as_seen(predicted)[subject], shrink(photo, factor)[subject])
 
 
 # ------------------------------------------------------------------ surface
@@ -174,7 +178,7 @@ def _albedo_psnr(out: Path, capture_folder: Path, mesh: Any, st: F64, views: lis
         return float("nan")
     mine, true = np.concatenate(got), np.concatenate(expected)
     gain = (mine * true).sum() / max((mine * mine).sum(), 1e-12)
-    return psnr(gain * mine, true)
+    return _mean(psnr(_as_seen(gain * a), _as_seen(b)) for a, b in zip(got, expected, strict=True))
 
 
 def _albedo_of_view(
