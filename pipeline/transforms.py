@@ -115,7 +115,7 @@ def project(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np
 
 def rays(K: F64, world_from_cam: F64, distortion: F64, uv: F64) -> tuple[F64, F64]:
     """Origin (3,) and unit directions (N, 3), in the world, through image positions uv (N, 2)."""
-    xy = np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T
+    xy: F64 = np.asarray(np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T, np.float64)
     xy = undistort(xy, distortion)
     directions = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ world_from_cam[:3, :3].T
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
