@@ -14,7 +14,8 @@ from torch.nn import functional
 
 from pipeline.fields.encodings import HashEncoding
 
-START_ALBEDO, START_RHO, START_INV_KAPPA = 0.4, 0.05, 0.05
+START_ALBEDO, START_RHO = 0.4, 0.05
+TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: skin's middle
 
 
 def mlp(width_in: int, width: int, depth: int, width_out: int) -> nn.Sequential:
@@ -42,7 +43,7 @@ class SpatialField(nn.Module):
             last.weight *= 0.1
             last.bias[:3] = math.log(START_ALBEDO / (1 - START_ALBEDO))
             last.bias[3] = math.log(START_RHO / (1 - START_RHO))
-            last.bias[4] = math.log(math.expm1(START_INV_KAPPA))
+            last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
             last.bias[5:] = math.log(math.expm1(1.0))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

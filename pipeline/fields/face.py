@@ -60,6 +60,7 @@ class Shaded:
     diffuse: Tensor
     specular: Tensor
     albedo: Tensor
+    inv_kappa: Tensor
 
 
 class FaceModel(nn.Module):
@@ -85,10 +86,10 @@ class FaceModel(nn.Module):
         light = self.light()
         diffuse = brdf.diffuse(albedo, n, light)
         if not self.spec.specular:
-            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo)
+            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
         incident = brdf.light_integral(brdf.reflect(wo, n), inv_kappa, light, self.spec.attenuation)
         specular = brdf.specular(rho, (c * self.basis(wo, n)).sum(-1), incident)
-        return Shaded(diffuse + specular, diffuse, specular, albedo)
+        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
 
     def save(self, path: Path) -> None:
         """Write the file that `load_model` reads."""

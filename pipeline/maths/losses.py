@@ -30,6 +30,16 @@ def specular_energy(specular: Tensor) -> Tensor:
     return specular.mean(-1)
 
 
+def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
+    """ln^2(s / s_0): (N,) -> (N,), s = 1 / kappa. Not in the paper.
+
+    Differs: the photos fix only the product of the light's band l and exp(-l (l + 1) s / 2), so that a duller skin
+    under a sharper light looks the same, and without a gauge s runs to 0 everywhere. A weak pull of its mean towards
+    skin's usual width leaves the differences between places to the photos.
+    """
+    return torch.log(inv_kappa.clamp(min=1e-6) / typical) ** 2
+
+
 def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
     """| |grad SDF| - 1 | or its square: (N, 3) -> (N,). The second term of [NeuFace eq. 24].
 

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from pipeline.colour import srgb_from_linear
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel
 from pipeline.maths import density, losses
 from pipeline.maths.sdf import unit
-from stages.inverse_rendering.render import sample_shell, shade_shell
+from stages.inverse_rendering.render import sample_shell, shade_shell, solid_behind
 from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import WHOLE, Batch
 
@@ -23,7 +24,8 @@ def objective(
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
     alpha = batch.alpha[shell.kept]
     n_rays = len(batch.alpha)
-    silhouette = density.opacity_cross_entropy(shell.tau, alpha).clamp(max=20) * batch.share[shell.kept]
+    tau = shell.tau + solid_behind(model, shell, batch.rays)
+    silhouette = density.opacity_cross_entropy(tau, alpha).clamp(max=20) * batch.share[shell.kept]
     loss = settings.mask * silhouette.sum() / n_rays
     loss = loss + settings.eikonal * losses.eikonal(shell.gradient).mean()
     pick = torch.nonzero(shell.hit & (alpha > WHOLE)).squeeze(-1)
@@ -36,6 +38,9 @@ def objective(
     loss = loss + settings.rgb * losses.rgb_l1(colour, target).sum() / n_rays
     loss = loss + settings.white * losses.white_light(model.light()).sum()
     loss = loss + settings.specular_energy * losses.specular_energy(shaded.specular).mean()
+    if model.spec.specular:
+        gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
+        loss = loss + settings.shininess * gauge.mean()
     loss = loss + settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator)
     with torch.no_grad():
         error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())

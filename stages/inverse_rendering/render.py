@@ -15,34 +15,39 @@ import torch
 from torch import Tensor
 
 from pipeline.fields.face import FaceModel, Shaded
-from pipeline.maths.density import crossing_weights, laplace_density, ray_weights
+from pipeline.maths.density import OPAQUE, crossing_weights, laplace_density, ray_weights
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.views import Rays
 
 SHELL_CELLS, SHELL_BETAS = 1.5, 4.0
 MIN_COSINE = 0.25
+LAYERS = 3
 REACH_BETAS = 12.0  # beyond this closest approach a ray's opacity is below e^-12 whatever its length in the shell
 
 
 @dataclass(frozen=True, slots=True)
 class Shell:
-    """Samples of M kept rays of a batch of N: kept (M,) indices, tau (M,), x (M, 3), n (M, 3), hit (M,), and the raw
-    gradient at every sample (M * S, 3) for the eikonal term."""
+    """Samples of M kept rays of a batch of N: kept (M,) indices, tau (M,), x (M, 3), n (M, 3), hit (M,), end (M,) the t
+    behind the last sample, and the raw gradient at every sample (M * S, 3) for the eikonal term."""
 
     kept: Tensor
     tau: Tensor
+    end: Tensor
     x: Tensor
     n: Tensor
     hit: Tensor
     gradient: Tensor
 
 
-def sample_shell(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None, keep: Tensor | None) -> Shell:
+def sample_shell(
+    model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None, keep: Tensor | None, start: Tensor | None = None
+) -> Shell:
     """Trace the rays and weigh samples around the surface. `jitter` (N, S) in [0, 1), default the middle of each
-    interval. `keep`: rays that are wanted even if they pass far from the surface."""
+    interval. `keep`: rays that are wanted even if they pass far from the surface. `start`: (N,) t to begin at."""
     geometry = model.geometry
     near, far = box_interval(rays.o, rays.d, *geometry.box())
+    near = near if start is None else torch.maximum(near, start)
     t0, hit, s0 = geometry.trace(rays.o, rays.d, near, far)
     wanted = (far > near) & (hit | (s0 < REACH_BETAS * float(model.beta)))
     if keep is not None:
@@ -58,7 +63,7 @@ def sample_shell(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | No
     share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-8)
     x_s = o + (share * t).sum(-1, keepdim=True) * d
     n = unit((share[..., None] * g.reshape(*t.shape, 3)).sum(1))
-    return Shell(kept, tau, x_s, n, hit, g)
+    return Shell(kept, tau, t0 + w, x_s, n, hit, g)
 
 
 def _weigh(model: FaceModel, s: Tensor, w: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
@@ -82,17 +87,52 @@ def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Sha
     return model.shade(shell.x[pick], shell.n[pick], -rays.d[shell.kept[pick]])
 
 
+def solid_behind(model: FaceModel, shell: Shell, rays: Rays) -> Tensor:
+    """(M,) OPAQUE for rays that graze an edge and then hit what lies behind it (an ear before the head), else 0.
+
+    Such a ray's mask says nothing about the edge; without this, every inner contour would be pushed outward.
+    """
+    out = torch.zeros_like(shell.tau)
+    thin = torch.nonzero(shell.hit & (shell.tau.detach() < OPAQUE)).squeeze(-1)
+    if len(thin):
+        i = shell.kept[thin]
+        o, d = rays.o[i], rays.d[i]
+        _, far = box_interval(o, d, *model.geometry.box())
+        out[thin[_covered(model, o, d, shell.end[thin].detach(), far)]] = OPAQUE
+    return out
+
+
+def _covered(model: FaceModel, o: Tensor, d: Tensor, near: Tensor, far: Tensor) -> Tensor:
+    """Whether rays hit something from `near` on, or are inside it there."""
+    _, hit, _ = model.geometry.trace(o, d, near, far)
+    with torch.no_grad():
+        return hit | ((model.geometry(o + near[:, None] * d)[0] <= 0) & (near < far))
+
+
 def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536) -> tuple[Tensor, Tensor]:
     """Premultiplied linear colour (N, 3) and opacity (N,) of any number of rays, without gradients."""
-    colour = torch.zeros(len(rays.d), 3, device=rays.d.device)
-    opacity = torch.zeros(len(rays.d), device=rays.d.device)
+    parts = [
+        _render_chunk(model, Rays(rays.o[i : i + chunk], rays.d[i : i + chunk]), samples)
+        for i in range(0, len(rays.d), chunk)
+    ]
+    return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
+
+
+def _render_chunk(model: FaceModel, rays: Rays, samples: int) -> tuple[Tensor, Tensor]:
+    """Layers front to back: where an edge is thin, what lies behind it shows through."""
+    colour, opacity = torch.zeros_like(rays.d), torch.zeros_like(rays.d[:, 0])
+    index, start = torch.arange(len(rays.d), device=rays.d.device), None
     with torch.no_grad():
-        for i in range(0, len(rays.d), chunk):
-            part = Rays(rays.o[i : i + chunk], rays.d[i : i + chunk])
-            shell = sample_shell(model, part, samples, None, None)
+        for _ in range(LAYERS):
+            part = Rays(rays.o[index], rays.d[index])
+            shell = sample_shell(model, part, samples, None, None, start)
             if not len(shell.kept):
-                continue
-            a = -torch.expm1(-shell.tau)
-            total = shade_shell(model, shell, part, torch.arange(len(shell.kept), device=rays.d.device)).total
-            colour[i + shell.kept], opacity[i + shell.kept] = total * a[:, None], a
+                break
+            at = index[shell.kept]
+            total = shade_shell(model, shell, part, torch.arange(len(at), device=at.device)).total
+            a = -torch.expm1(-shell.tau) * (1 - opacity[at])
+            colour[at] += total * a[:, None]
+            opacity[at] += a
+            thin = shell.hit & (shell.tau < OPAQUE)
+            index, start = at[thin], shell.end[thin]
     return colour, opacity

@@ -40,13 +40,14 @@ class FitSettings:
     mask: float = 0.1
     white: float = 5e-3
     specular_energy: float = 8e-3
+    shininess: float = 1e-3
     eikonal: float = 0.1
     smooth: float = 0.03
     # learning
     lr_sdf: float = 0.1
     lr_appearance: float = 1e-2
     lr_light: float = 1e-2
-    beta_end: float = 0.3
+    beta_end: float = 0.15
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -57,6 +57,7 @@ class Config(StageConfig):
     mask: float = Field(description="weight of the opacity's cross-entropy against the masks", ge=0)
     white: float = Field(description="lambda 2 [NeuFace eq. 22]", ge=0)
     specular_energy: float = Field(description="lambda 3 [NeuFace eq. 23]", ge=0)
+    shininess: float = Field(description="weight of the gauge that holds 1 / kappa near skin's", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
     lr_sdf: float = Field(description="learning rate of the SDF, cells a step", gt=0, le=1)

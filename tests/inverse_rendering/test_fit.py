@@ -181,3 +181,26 @@ def test_rays_undo_the_lens() -> None:
     rvec, _ = cv2.Rodrigues(cam_from_world[:3, :3])
     uv, _ = cv2.projectPoints(points, rvec, cam_from_world[:3, 3], transforms.centre_K_from_corner_K(view.K), lens)
     assert np.abs(uv[:, 0] + 0.5 - transforms.pixel_centres(SIDE, SIDE, 2)).max() < 2e-3
+
+
+def test_what_lies_behind_an_edge_shows() -> None:
+    """A ray that grazes a small ball before a large one: covered, in the render and for the mask's term."""
+    from stages.inverse_rendering.render import render_rays, sample_shell, solid_behind
+    from stages.inverse_rendering.views import Rays
+
+    lo, cell = -0.14, 0.005
+    i = np.stack(np.meshgrid(*[np.arange(57)] * 3, indexing="ij"), -1)
+    p = lo + cell * i
+    values = np.minimum(np.linalg.norm(p - [0, 0, -0.06], axis=-1) - 0.06, np.linalg.norm(p - [0, 0, 0.08], axis=-1) - 0.03)
+    start = Start(values.astype(np.float32), np.full(3, lo, np.float32), cell)
+    t = new_trainer([ball_view(k) for k in range(3)], start, replace(SMALL, levels=1), False, "cpu")
+    t.model.beta.fill_(0.002)
+    x = torch.tensor([0.0292, 0.0292, 0.0, 0.065])
+    o = torch.stack([x, torch.zeros(4), torch.full((4,), 0.5)], -1)
+    o[1, 0], o[1, 1] = 0.0, 0.0292
+    rays = Rays(o, torch.tensor([[0.0, 0, -1]]).expand(4, 3).contiguous())
+    shell = sample_shell(t.model, rays, 16, None, torch.ones(4, dtype=torch.bool))
+    behind = solid_behind(t.model, shell, rays)
+    assert (shell.tau[:2] < 3.5).all() and (behind[:2] > 0).all() and behind[3] == 0
+    _, opacity = render_rays(t.model, rays, 16)
+    assert (opacity[:3] > 0.95).all() and opacity[3] < 0.2

@@ -37,3 +37,11 @@ def test_the_other_terms() -> None:
     assert losses.specular_energy(torch.tensor([[0.0, 0.3, 0.6]])).item() == pytest.approx(0.3)
     n = torch.tensor([[0.0, 0, 1]])
     assert losses.normal_consistency(n, n).item() == 0 and losses.normal_consistency(n, -n).item() == 2
+
+
+def test_shininess_gauge_is_even_and_finite_at_a_mirror() -> None:
+    s = torch.tensor([0.1, 0.2, 0.05, 0.0, 1e6], requires_grad=True)
+    found = losses.shininess_gauge(s, 0.1)
+    assert found[0].item() == 0 and found[1].item() == pytest.approx(found[2].item(), rel=1e-5)
+    found.sum().backward()
+    assert torch.isfinite(found).all() and torch.isfinite(s.grad).all()
