@@ -24,7 +24,7 @@ from pipeline.tangents import Frames
 
 NEWTON_STEPS = 3
 LEAST_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
-REACH_CELLS = 3.0  # of the field's cells: the decimated mesh is never further from the zero set than that
+REACH_CELLS = 1.5  # of the field's cells: the decimated mesh is never further from the zero set than that
 LEAST_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
 LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface

@@ -80,7 +80,7 @@ def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
 
 
 def filled(faces: Faces) -> Faces:
-    """Close the small holes, of up to LOOP edges, with fans of faces: a ring that held a bubble may be a face itself."""
+    """Close holes of up to LOOP edges with fans of faces: the ring that held a bubble may be a face itself."""
     e = meshes.edges(faces)
     count = int(faces.max()) + 1
     open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]

@@ -13,10 +13,12 @@ import numpy as np
 from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
+from stages.uv.pack import pack
 
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
 SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
-PACK_MARGIN = 1.3  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
+PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
+MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +38,13 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
         StageError: xatlas gives up, or leaves faces without a chart.
     """
     uvs, faces = _cut(mesh, options)
-    upright = turned_over(uvs, faces)
-    return _packed(spread(upright, faces), faces, options)
+    even = evened(turned_over(uvs, faces), faces, meshes.areas(mesh.vertices, mesh.faces))
+    label = chart_of_face(faces, len(even))
+    if label.max() < MANY_CHARTS:
+        placed = pack(even, faces, label, options.padding / options.texture_size)
+        if placed is not None:
+            return Charts(placed, faces)
+    return _packed(spread(even, faces), faces, options)
 
 
 def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
@@ -62,13 +69,13 @@ def _cut(mesh: Mesh, options: Options) -> tuple[F64, Faces]:
     points = mesh.vertices.astype(np.float64) * (UNIT / span)
     points = smoothed(points, mesh.faces, SMOOTH_SHARE * UNIT)
     atlas = xatlas.Atlas()
-    charts, pack = xatlas.ChartOptions(), xatlas.PackOptions()
+    charts, quick = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost, charts.max_iterations = options.max_cost, options.iterations
-    pack.resolution, pack.padding, pack.bilinear = 256, 0, False  # thrown away: the charts are packed again
+    quick.resolution, quick.padding, quick.bilinear = 256, 0, False  # thrown away: the charts are packed again
     normals = meshes.vertex_normals(points, mesh.faces)
     try:
         atlas.add_mesh(points.astype(np.float32), mesh.faces.astype(np.uint32), normals)
-        atlas.generate(charts, pack)
+        atlas.generate(charts, quick)
         _, faces, uvs = atlas[0]
     except (RuntimeError, ValueError, IndexError) as e:
         raise _failed(str(e)) from e
@@ -115,6 +122,16 @@ def turned_over(uvs: F64, faces: Faces) -> F64:
     return np.where(flip[:, None], uvs * [-1, 1], uvs)
 
 
+def evened(uvs: F64, faces: Faces, areas: F64) -> F64:
+    """Every chart at the same scale against the true surface (smoothing had shrunk the bumpy ones)."""
+    chart = chart_of_face(faces, len(uvs))
+    flat, true = np.bincount(chart, np.abs(signed_areas(uvs, faces))), np.bincount(chart, areas)
+    scale = np.sqrt(true / np.maximum(flat, 1e-9 * flat.sum()))
+    of_vertex = np.ones(len(uvs))
+    of_vertex[faces.ravel()] = np.repeat(scale[chart], 3)
+    return np.asarray(uvs * of_vertex[:, None], np.float64)
+
+
 def spread(uvs: F64, faces: Faces) -> F64:
     """Charts side by side, so that none touches another before they are packed."""
     chart = chart_of_face(faces, len(uvs))
@@ -127,22 +144,22 @@ def spread(uvs: F64, faces: Faces) -> F64:
     width = high[:, 0] - low[:, 0]
     gap = float(width.max())
     start = np.concatenate([[0.0], np.cumsum(width + 0.01 * gap)[:-1]])
-    return uvs - low[of_vertex] + np.stack([start[of_vertex], np.zeros(len(uvs))], 1)
+    return np.asarray(uvs - low[of_vertex] + np.stack([start[of_vertex], np.zeros(len(uvs))], 1), np.float64)
 
 
 def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
-    """The charts in one square, at one scale, as xatlas places and turns them."""
+    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight."""
     import xatlas
 
     atlas = xatlas.Atlas()
-    pack = xatlas.PackOptions()
-    pack.resolution = options.texture_size
-    pack.padding = int(np.ceil(options.padding * PACK_MARGIN))
-    pack.bilinear, pack.bruteForce = True, False
-    pack.rotate_charts = False  # xatlas turns a chart by swapping its axes, which mirrors it
+    settings = xatlas.PackOptions()
+    settings.resolution = options.texture_size
+    settings.padding = int(np.ceil(options.padding * PACK_MARGIN))
+    settings.bilinear, settings.bruteForce = True, False
+    settings.rotate_charts = False  # xatlas turns a chart by swapping its axes, which mirrors it
     try:
         atlas.add_uv_mesh(uvs.astype(np.float32), faces.astype(np.uint32))
-        atlas.generate(xatlas.ChartOptions(), pack)
+        atlas.generate(xatlas.ChartOptions(), settings)
         _, packed_faces, packed = atlas[0]
     except (RuntimeError, ValueError, IndexError) as e:
         raise _failed(str(e)) from e

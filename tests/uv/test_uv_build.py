@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from pipeline import meshes, raster
 from pipeline.errors import StageError
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
 from stages.uv import decimate, unwrap
+from stages.uv import pack as packing
 from stages.uv.build import Built, build
 from stages.uv.measure import measure, stretch
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
@@ -187,3 +189,59 @@ def test_raster_layers_agree_with_the_other_rasteriser(built: Built) -> None:
     ours = raster.layers(raster.texel_corners(built.charts, size), size)[::-1]
     other, _ = painted(built.charts, size)
     assert (ours != other).mean() < 1e-3  # only texels on edges, where the margins differ
+
+
+def random_charts(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rectangles of two triangles, turned by random angles, on top of each other."""
+    rng = np.random.default_rng(3)
+    uvs, faces = [], []
+    for i in range(count):
+        w, h, angle = *rng.uniform(0.2, 2, 2), rng.uniform(0, 6)
+        corner = np.array([[0, 0], [w, 0], [w, h], [0, h]]) @ np.array(
+            [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+        )
+        uvs.append(corner)
+        faces += [[4 * i, 4 * i + 1, 4 * i + 2], [4 * i, 4 * i + 2, 4 * i + 3]]
+    return np.concatenate(uvs), np.array(faces, np.int32)
+
+
+def test_packing_keeps_shapes_and_distance() -> None:
+    uvs, faces = random_charts(25)
+    placed = packing.pack(uvs, faces, np.repeat(np.arange(25), 2), 0.01)
+    assert placed is not None and placed.min() >= 0 and placed.max() <= 1
+    before, after = unwrap.signed_areas(uvs, faces), unwrap.signed_areas(placed.astype(np.float64), faces)
+    assert (after > 0).all() and np.allclose(after / before, after[0] / before[0], rtol=1e-3)
+    assert after.sum() > 0.6
+    corners = placed.reshape(25, 4, 2).astype(np.float64)
+    steps = np.linspace(0, 1, 60)[:, None]
+    outline = [
+        np.concatenate([a + steps * (b - a) for a, b in zip(c, np.roll(c, -1, 0), strict=True)]) for c in corners
+    ]
+    for i in range(25):
+        for j in range(i):
+            assert cKDTree(outline[i]).query(outline[j])[0].min() > 0.01
+
+
+def test_packing_turns_without_mirroring() -> None:
+    uvs, faces = random_charts(9)
+    placed = packing.pack(uvs, faces, np.repeat(np.arange(9), 2), 0.02)
+    assert placed is not None
+    for old, new in zip(uvs.reshape(9, 4, 2), placed.reshape(9, 4, 2).astype(np.float64), strict=True):
+        a, b = (q - q.mean(0) for q in (old, new))
+        u, _, vt = np.linalg.svd(a.T @ b)
+        assert np.linalg.det(u @ vt) > 0
+        assert np.allclose(a @ (u @ vt) * np.linalg.norm(b) / np.linalg.norm(a), b, atol=1e-5)
+
+
+def test_packing_a_line_and_a_point() -> None:
+    uvs = np.array([[0, 0], [1, 0], [0, 1], [0, 0], [0.2, 0.2], [0.4, 0.4], [3, 3], [3, 3], [3, 3]], float)
+    faces = np.arange(9, dtype=np.int32).reshape(3, 3)
+    placed = packing.pack(uvs, faces, np.arange(3), 0.01)
+    assert placed is not None and np.isfinite(placed).all()
+
+
+def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unwrap, "MANY_CHARTS", 0)
+    charts = unwrap.unwrap(decimate.decimated(dense, 2000), unwrap.Options(512, 4))
+    assert painted(charts, 500)[0].max() == 1
+    assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).mean() > 0.99
