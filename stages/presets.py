@@ -20,8 +20,7 @@ from pipeline.errors import UsageError
 
 Settings = Mapping[str, Mapping[str, Any]]
 
-# Speed against accuracy. draft: look at it in minutes. studio: the default. film: hours. paper: the paper's own
-# formulas and schedule, for comparison.
+# Speed against accuracy. draft: look at it in minutes. studio: the default. film: hours, or a GPU.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},
@@ -40,12 +39,6 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "surface": {"resolution": 512},
         "uv": {"target_faces": 60_000},
         "bake": {"size": 4096},
-    },
-    "paper": {
-        "inverse_rendering": {"preset": "paper"},
-        "surface": {"resolution": 512},
-        "uv": {"target_faces": 60_000},
-        "bake": {"size": 2048},
     },
 }
 DEFAULT_PRESET = "studio"
@@ -96,7 +89,7 @@ def configs_for(
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:
-    from stages import REGISTRY
+    from stages.registry import REGISTRY
 
     return REGISTRY
 

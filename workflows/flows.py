@@ -35,7 +35,7 @@ def capture_to_asset(
     Args:
         capture: folder with the photos.
         out: folder for the results; made if it is not there.
-        preset: draft, studio, film or paper.
+        preset: draft, studio or film.
         holdout: views kept from the fit and used for the metrics, "every:5:2" or "names:a.jpg,b.jpg".
         name: name of the asset.
         seed: of every random draw.

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-import stages
+from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
 from pipeline.errors import StageError, UsageError
@@ -73,7 +73,7 @@ def make_plan(request: RunRequest) -> Plan:
         holdout=request.holdout,
         name=request.name,
         seed=request.seed,
-        registry=stages.REGISTRY,
+        registry=registry.REGISTRY,
     )
     known(request.device, DEVICES, what="unknown device", where="--device")
     _names_a_folder(request.out, "--out")
@@ -101,7 +101,7 @@ def make_plan(request: RunRequest) -> Plan:
 
 
 def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
-    names = [s.name for s in stages.REGISTRY]
+    names = [s.name for s in registry.REGISTRY]
     for option, value in (("--until", until), ("--from-stage", from_stage)):
         if value is not None:
             known(value, names, what="unknown stage", where=option)
@@ -115,7 +115,7 @@ def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any,
             limit="a first stage that is not after the last",
             remedy="swap them, or leave one out",
         )
-    return tuple(stages.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
+    return tuple(registry.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
 
 
 def _names_a_folder(text: str, option: str) -> None:
@@ -153,7 +153,7 @@ class Step:
 
 def preview(plan: Plan) -> list[Step]:
     """What `run` would do, from the manifests in the store; nothing is run, hashed or written."""
-    finished: dict[str, Located[Artifact]] = {stages.SOURCE: plan.source}
+    finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
     steps: list[Step] = []
     for stage in plan.stages:
         if not all(f in finished for f in stage.inputs.__dataclass_fields__):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import stages
+from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
@@ -23,7 +23,7 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         Cancelled: the user stopped the run.
     """
     watch = current()
-    finished: dict[str, Located[Artifact]] = {stages.SOURCE: plan.source}
+    finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
     done: list[Done[Any]] = []
     for number, stage in enumerate(plan.stages, 1):
         if watch.stop.is_set():

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-import stages
+from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import StageConfig
 
 HEAVY = ("torch", "pxr", "pycolmap", "prefect", "xatlas", "pymeshlab", "trimesh", "cv2", "numba", "OpenEXR", "skimage")
 
 
-@pytest.mark.parametrize("name", ["pipeline", "stages", "workflows", *(f"stages.{s.name}" for s in stages.REGISTRY)])
+@pytest.mark.parametrize("name", ["pipeline", "stages", "workflows", *(f"stages.{s.name}" for s in registry.REGISTRY)])
 def test_our_packages_are_ours(name: str, repo: Path) -> None:
     """The names are general: another distribution may own one."""
     file = importlib.import_module(name).__file__
@@ -60,11 +60,11 @@ def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path
 
 
 def test_registry_adds_up() -> None:
-    names = [s.name for s in stages.REGISTRY]
+    names = [s.name for s in registry.REGISTRY]
     assert len(set(names)) == len(names)
-    known = {stages.SOURCE}
+    known = {registry.SOURCE}
     made: dict[str, type[Artifact]] = {}
-    for stage in stages.REGISTRY:
+    for stage in registry.REGISTRY:
         assert re.fullmatch(r"[a-z][a-z_]*", stage.name)
         assert stage.version >= 1
         assert issubclass(stage.config, StageConfig) and issubclass(stage.output, Artifact)
@@ -80,12 +80,12 @@ def test_registry_adds_up() -> None:
 
 
 def test_every_setting_says_what_it_is() -> None:
-    silent = [f"{s.name}.{n}" for s in stages.REGISTRY for n, f in s.config.model_fields.items() if not f.description]
+    silent = [f"{s.name}.{n}" for s in registry.REGISTRY for n, f in s.config.model_fields.items() if not f.description]
     assert silent == []
 
 
 def test_every_stage_has_defaults() -> None:
-    for stage in stages.REGISTRY:
+    for stage in registry.REGISTRY:
         assert isinstance(stage.config(), StageConfig), stage.name
 
 

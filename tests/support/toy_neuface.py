@@ -5,11 +5,11 @@ from __future__ import annotations
 import sys
 
 import pipeline.threads  # noqa: F401
-import stages
+from stages import registry
 import stages.capture.scan
 from tests.support.toy_stages import TOYS, source
 
-stages.REGISTRY = TOYS
+registry.REGISTRY = TOYS
 stages.capture.scan.scan_capture = source  # type: ignore[assignment]
 
 if __name__ == "__main__":

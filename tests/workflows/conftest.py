@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-import stages
+from stages import registry
 import stages.capture.scan
 from tests.support.toy_stages import TOYS, source
 
@@ -22,5 +22,5 @@ def photos(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "REGISTRY", TOYS)
+    monkeypatch.setattr(registry, "REGISTRY", TOYS)
     monkeypatch.setattr(stages.capture.scan, "scan_capture", source)

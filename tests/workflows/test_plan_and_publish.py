@@ -46,7 +46,7 @@ def test_until_and_from_stage(photos: Path) -> None:
         ({"from_stage": "x"}, "first, second, third"),
         ({"from_stage": "third", "until": "first"}, "nothing would run"),
         ({"device": "gpu"}, "auto, cpu, cuda"),
-        ({"preset": "best"}, "draft, studio, film, paper"),
+        ({"preset": "best"}, "draft, studio, film"),
         ({"out": " "}, "no folder is named"),
     ],
 )
