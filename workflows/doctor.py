@@ -118,7 +118,7 @@ def _device() -> Finding:
         return Finding("fault", "device", "torch can't be loaded", "pip install -r requirements.lock")
     if torch.cuda.is_available():
         return Finding("ok", "device", f"cuda, {torch.cuda.get_device_name(0)}")
-    return Finding("note", "device", "cpu", "the fit is several times faster on a CUDA device; a CPU does as well")
+    return Finding("note", "device", "cpu", "where there is a CUDA device, the fit runs on it")
 
 
 def _threads() -> Finding:
