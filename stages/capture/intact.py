@@ -17,7 +17,9 @@ from stages.capture.exif import first_ifd, jpeg_segments, png_chunks
 
 _STRIPS, _TILES = (273, 279), (324, 325)  # TIFF tags: offsets, byte counts
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # in a scan, FF 00 is a data byte and FF D0..D7 are restarts
-GREY, GREY_ROWS, CUT = 128, 8, 8  # libjpeg's fill; 8 bytes hold at most 32 flat blocks, 8 rows of 512 px hold 64
+GREY, GREY_ROWS = 128, 32  # libjpeg's fill; two rows of its largest blocks
+CUT = 8  # bytes: far fewer blocks than two rows of them
+BASELINE = (0xC0, 0xC1)  # a progressive file that is cut off gets blurred and not grey
 
 
 def fault_of(data: bytes) -> str | None:
@@ -36,7 +38,8 @@ def _jpeg_fault(data: bytes) -> str | None:
     end = _end_of_image(data, scan)
     if end is None:
         return "cut off: the JPEG has no end marker"
-    return "the JPEG's data ends before the picture does" if _ends_in_grey(data[:end]) else None
+    baseline = any(marker in BASELINE for marker, _, _ in jpeg_segments(data))
+    return "the JPEG's data ends before the picture does" if baseline and _ends_in_grey(data[:end]) else None
 
 
 def _end_of_image(data: bytes, scan: int) -> int | None:
@@ -50,16 +53,18 @@ def _end_of_image(data: bytes, scan: int) -> int | None:
 
 
 def _ends_in_grey(data: bytes) -> bool:
-    """True if the last rows are the decoder's fill. `data`: the file without its EOI marker.
+    """True if the last rows are the decoder's fill. `data`: a file without its EOI marker.
 
-    A photo may well end in an exact mid grey; then its last bytes encode just that, and the picture stays the same
-    without them. Where the decoder filled in, the last bytes encode something else, and cutting them changes it.
+    A photo may well end in an exact mid grey. Then its last bytes encode that grey, and nothing above it changes
+    without them. Where the decoder filled in, the last bytes encode what lies above the grey.
     """
     whole = _decode(data)
-    if whole is None or whole.shape[0] < GREY_ROWS or whole.shape[1] < 512 or not (whole[-GREY_ROWS:] == GREY).all():
+    if whole is None or not (whole[-GREY_ROWS:] == GREY).all():
         return False
+    other = np.flatnonzero((whole.reshape(len(whole), -1) != GREY).any(1))
+    above = int(other[-1]) + 1 if len(other) else 0
     shorter = _decode(data[:-CUT])
-    return shorter is None or not np.array_equal(whole, shorter)
+    return shorter is None or not np.array_equal(whole[:above], shorter[:above])
 
 
 def _decode(data: bytes) -> npt.NDArray[np.generic] | None:

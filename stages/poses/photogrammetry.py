@@ -22,7 +22,8 @@ from stages.poses.matching import Pair, Verified, match, promising_pairs, verify
 from stages.poses.solve import Lens, Model, Refine, reconstruct
 
 WORKERS = 2  # the result does not depend on it: each photo is a task of its own
-GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth another try
+GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth a second, slower look at the photos
+POOR_SHARE = 0.75  # and with fewer than this it is worth doubting that they share a lens
 BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
 
 
@@ -79,7 +80,7 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
         if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
             return best
-    if settings.shared == "auto":
+    if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):
         separate = _place(photos, features, verified, settings, False, scratch, progress)
         if best is None or (separate is not None and len(separate.poses) >= BETTER_BY * len(best.poses)):
             best = separate

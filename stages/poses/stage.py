@@ -30,7 +30,7 @@ class Config(StageConfig):
         description="given: cameras of the capture; colmap: solved from the photos; auto: given if there are any",
     )
     seed: int = Field(0, ge=0, lt=2**31, description="seed of every random choice")
-    max_image_size: int = Field(1200, ge=200, description="longest edge, in pixels, at which features are looked for")
+    max_image_size: int = Field(1000, ge=200, description="longest edge, in pixels, at which features are looked for")
     max_features: int = Field(1500, ge=200, le=20000, description="most features per photo")
     neighbours: int = Field(14, ge=2, description="partners that a photo is matched with; up to 20 photos, all")
     shared_intrinsics: Literal["auto", "yes", "no"] = Field(

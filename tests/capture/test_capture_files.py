@@ -1,0 +1,169 @@
+"""Whole files pass, files that are cut off do not, metadata is read, photos are turned upright."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stages.capture.exif import Exif, read_exif
+from stages.capture.gather import turn_upright
+from stages.capture.intact import fault_of
+
+TEXTURE = np.random.default_rng(0).integers(0, 255, (600, 640, 3), np.uint8)
+
+
+def encoded(kind: str, image: np.ndarray = TEXTURE, *options: int) -> bytes:
+    ok, data = cv2.imencode(kind, image, list(options))
+    assert ok
+    return data.tobytes()
+
+
+PROGRESSIVE = (cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+RESTARTS = (cv2.IMWRITE_JPEG_RST_INTERVAL, 4)
+
+
+@pytest.mark.parametrize(("kind", "options"), [
+    (".jpg", ()), (".jpg", PROGRESSIVE), (".jpg", RESTARTS), (".png", ()), (".tiff", ()),
+])  # fmt: skip
+def test_whole_files_pass_and_every_cut_is_found(kind: str, options: tuple[int, ...]) -> None:
+    data = encoded(kind, TEXTURE, *options)
+    assert fault_of(data) is None
+    for share in (0.01, 0.3, 0.7, 0.98):
+        cut = data[: int(len(data) * share)]
+        decoded = cv2.imdecode(np.frombuffer(cut, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert fault_of(cut) is not None or decoded is None, share
+    if kind != ".tiff":  # its directory at the end closes the file
+        assert fault_of(data[:-1]) is not None
+
+
+def test_bytes_behind_the_end_are_no_fault() -> None:
+    assert fault_of(encoded(".jpg") + b"\0" * 100) is None
+
+
+def test_a_cut_jpeg_with_an_end_marker_put_on_is_found() -> None:
+    data = encoded(".jpg")
+    patched = data[: len(data) // 2] + b"\xff\xd9"
+    decoded = cv2.imdecode(np.frombuffer(patched, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded is not None and (decoded[-8:] == 128).all()  # the decoder filled in, and said nothing
+    assert "before the picture" in (fault_of(patched) or "")
+
+
+@pytest.mark.parametrize("options", [(), PROGRESSIVE, (cv2.IMWRITE_JPEG_OPTIMIZE, 1)])
+def test_a_photo_that_really_ends_in_mid_grey_passes(options: tuple[int, ...]) -> None:
+    image = TEXTURE.copy()
+    image[-64:] = 128
+    assert (cv2.imdecode(np.frombuffer(encoded(".jpg", image, *options), np.uint8), -1)[-8:] == 128).all()
+    assert fault_of(encoded(".jpg", image, *options)) is None
+    grey = encoded(".jpg", np.full((600, 640), 128, np.uint8), *options)
+    assert fault_of(grey) is None
+
+
+def test_a_png_with_a_flipped_bit_is_found() -> None:
+    data = bytearray(encoded(".png"))
+    data[len(data) // 2] ^= 1
+    assert "checksum" in (fault_of(bytes(data)) or "")
+
+
+def test_a_tiff_whose_strips_lie_outside_is_found() -> None:
+    # directory first, pixels behind it: cutting the end leaves a readable directory
+    entries = [(256, 3, 1, 8), (257, 3, 1, 8), (273, 4, 1, 200), (279, 4, 1, 64)]
+    ifd = struct.pack("<H", len(entries)) + b"".join(struct.pack("<HHII", *e) for e in entries) + b"\0" * 4
+    data = (b"II*\0" + struct.pack("<I", 8) + ifd).ljust(264, b"\1")
+    assert fault_of(data) is None
+    assert "beyond the end" in (fault_of(data[:-1]) or "")
+
+
+# ------------------------------------------------------------------ EXIF
+def tiff_block(order: str, ifd0: list[tuple], sub: list[tuple]) -> bytes:
+    """A TIFF block with two directories; values: (tag, type, count, payload bytes)."""
+    def directory(entries: list[tuple], at: int) -> bytes:
+        head, extra = struct.pack(order + "H", len(entries)), b""
+        data_at = at + 2 + 12 * len(entries) + 4
+        for tag, kind, count, payload in entries:
+            head += struct.pack(order + "HHI", tag, kind, count)
+            if len(payload) <= 4:
+                head += payload.ljust(4, b"\0")
+            else:
+                head += struct.pack(order + "I", data_at + len(extra))
+                extra += payload
+        return head + b"\0" * 4 + extra
+
+    first = directory([*ifd0, (0x8769, 4, 1, b"\0\0\0\0")], 8)
+    pointer = struct.pack(order + "I", 8 + len(first))
+    first = directory([*ifd0, (0x8769, 4, 1, pointer)], 8)
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    return mark + struct.pack(order + "I", 8) + first + directory(sub, 8 + len(first))
+
+
+def exif_jpeg(block: bytes, image: np.ndarray = TEXTURE) -> bytes:
+    body = b"Exif\0\0" + block
+    data = encoded(".jpg", image)
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:]
+
+
+def camera_block(order: str, orientation: int = 6) -> bytes:
+    def rational(n: int, d: int) -> bytes:
+        return struct.pack(order + "II", n, d)
+
+    short = struct.Struct(order + "H").pack
+    return tiff_block(
+        order,
+        [(0x10F, 2, 6, b"Maker\0"), (0x110, 2, 4, b"M 7\0"), (0x112, 3, 1, short(orientation))],
+        [(0x920A, 5, 1, rational(850, 10)), (0xA405, 3, 1, short(127)), (0xA434, 2, 5, b"85mm\0"),
+         (0xA002, 4, 1, struct.pack(order + "I", 4000)), (0xA20E, 5, 1, rational(4000, 3)), (0xA210, 3, 1, short(3))],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_exif_of_a_jpeg_in_both_byte_orders(order: str) -> None:
+    data = exif_jpeg(camera_block(order))
+    exif = read_exif(data)
+    assert (exif.orientation, exif.body) == (6, "Maker M 7 85mm")
+    assert exif.focal_mm == 85 and exif.focal_35mm == 127
+    # equivalent focal length: 127 mm on a frame with a diagonal of 43.267 mm
+    assert exif.focal_px(640, 600) == pytest.approx(127 / 43.2666 * np.hypot(640, 600), rel=1e-5)
+    assert fault_of(data) is None
+
+
+def test_focal_length_from_the_sensor_s_resolution() -> None:
+    # 85 mm, 4000 / 3 pixels per cm = 133.33 per mm, recorded 4000 wide, and the copy is 1000 wide
+    exif = Exif(focal_mm=85, pixels_per_mm=4000 / 30, recorded_width=4000)
+    assert exif.focal_px(1000, 750) == pytest.approx(85 * 4000 / 30 / 4)
+    assert Exif(focal_mm=85).focal_px(1000, 750) is None
+
+
+def test_exif_of_png_and_tiff() -> None:
+    block = camera_block("<", 3)
+    png = encoded(".png")
+    chunk = struct.pack(">I", len(block)) + b"eXIf" + block + b"\0" * 4
+    assert read_exif(png[:33] + chunk + png[33:]).orientation == 3
+    assert read_exif(block).body == "Maker M 7 85mm"
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe1\x00\x08Exif\0\0", b"II*\0", b"II*\0\xff\xff\xff\xff"])
+def test_damaged_metadata_gives_nothing(data: bytes) -> None:
+    assert read_exif(data) == Exif()
+
+
+def test_metadata_that_points_anywhere_never_raises() -> None:
+    random = np.random.default_rng(1)
+    block = bytearray(camera_block("<"))
+    for _ in range(300):
+        broken = bytearray(block)
+        for at in random.integers(4, len(broken), 6):
+            broken[at] = random.integers(256)
+        read_exif(exif_jpeg(bytes(broken), TEXTURE[:64, :64]))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_upright_is_what_opencv_shows(orientation: int, tmp_path: Path) -> None:
+    """Oracle: imdecode in colour applies the orientation itself."""
+    image = cv2.GaussianBlur(TEXTURE[:160, :200], (0, 0), 4)
+    data = np.frombuffer(exif_jpeg(camera_block("<", orientation), image), np.uint8)
+    stored = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert stored.shape == image.shape  # not turned by itself
+    np.testing.assert_array_equal(turn_upright(stored, orientation), cv2.imdecode(data, cv2.IMREAD_COLOR))
