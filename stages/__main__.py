@@ -19,8 +19,8 @@ from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import NeufaceError, StageError
 from pipeline.store import Store
-from stages.registry import REGISTRY, SOURCE
 from stages.presets import DEFAULT_PRESET, PRESETS, configs_for, known, parse_sets, read_config_file
+from stages.registry import REGISTRY, SOURCE
 
 
 def before(name: str) -> list[Stage[Any, Any, Any]]:

@@ -8,11 +8,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
 from pipeline.errors import StageError, UsageError
 from pipeline.store import MANIFEST, Store
+from stages import registry
 from stages.presets import DEFAULT_PRESET, configs_for, known, parse_sets
 
 DEVICES = ("auto", "cpu", "cuda")

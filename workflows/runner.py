@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
+from stages import registry
 from workflows.plan import Plan
 from workflows.session import current
 

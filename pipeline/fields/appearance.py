@@ -49,8 +49,12 @@ class SpatialField(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Material at x."""
         raw = self.net(self.encoding(x))
-        return (torch.sigmoid(raw[:, :3]), torch.sigmoid(raw[:, 3]), functional.softplus(raw[:, 5:]),
-                functional.softplus(raw[:, 4]))
+        return (
+            torch.sigmoid(raw[:, :3]),
+            torch.sigmoid(raw[:, 3]),
+            functional.softplus(raw[:, 5:]),
+            functional.softplus(raw[:, 4]),
+        )
 
 
 class IntegratedBasis(nn.Module):
@@ -67,7 +71,7 @@ class IntegratedBasis(nn.Module):
         with torch.no_grad():
             last = self.net[-1]
             assert isinstance(last, nn.Linear)
-            last.bias += math.log(math.expm1(1.0 / rank))
+            last.bias.add_(math.log(math.expm1(1.0 / rank)))
 
     def forward(self, wo: Tensor, n: Tensor) -> Tensor:
         """B at unit directions, (N, 3) each; wo . n is taken as >= 0, which visible points have."""

@@ -16,6 +16,8 @@ from torch import Tensor, nn
 
 from pipeline.fields import kernels
 
+nb: Any = kernels.nb
+
 PRIMES = (1, 2654435761, 805459861)
 FEATURES = 2
 
@@ -75,8 +77,11 @@ class HashEncoding(nn.Module):
             for c in range(8):
                 step = torch.tensor([c >> 2, (c >> 1) & 1, c & 1], device=x.device)
                 i, j, k = (node + step).unbind(-1)
-                at = ((i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & mask) if self.hashed[level] else (
-                    (i * size[1] + j) * size[2] + k)
+                at = (
+                    ((i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & mask)
+                    if self.hashed[level]
+                    else ((i * size[1] + j) * size[2] + k)
+                )
                 w = torch.where(step.bool(), f, 1 - f).prod(-1, keepdim=True)
                 total = total + w * self.table[self.offset[level] + at].to(x)
             columns.append(total)
@@ -84,8 +89,14 @@ class HashEncoding(nn.Module):
 
     def tables(self) -> tuple[Any, ...]:
         """What the compiled kernels read."""
-        return (self.offset.numpy(), self.size.numpy(), self.hashed.numpy(), np.uint32(2**self.log2_size - 1),
-                self.lo.numpy(), self.inv.numpy())
+        return (
+            self.offset.numpy(),
+            self.size.numpy(),
+            self.hashed.numpy(),
+            np.uint32(2**self.log2_size - 1),
+            self.lo.numpy(),
+            self.inv.numpy(),
+        )
 
 
 class _Hash(torch.autograd.Function):
@@ -94,8 +105,7 @@ class _Hash(torch.autograd.Function):
         ctx.save_for_backward(x, table)
         ctx.encoding = encoding
         out = torch.empty(len(x), encoding.width)
-        kernels.nb.hash_forward(table.detach().numpy(), *encoding.tables(), x.detach().contiguous().numpy(),
-                                out.numpy())
+        nb.hash_forward(table.detach().numpy(), *encoding.tables(), x.detach().contiguous().numpy(), out.numpy())
         return out
 
     @staticmethod
@@ -104,6 +114,12 @@ class _Hash(torch.autograd.Function):
         encoding: HashEncoding = ctx.encoding
         grad_table = torch.zeros_like(table)
         grad_x = torch.empty(len(encoding.offset), len(x), 3)
-        kernels.nb.hash_backward(table.detach().numpy(), *encoding.tables(), x.detach().contiguous().numpy(),
-                                 grads[0].contiguous().numpy(), grad_table.numpy(), grad_x.numpy())
+        nb.hash_backward(
+            table.detach().numpy(),
+            *encoding.tables(),
+            x.detach().contiguous().numpy(),
+            grads[0].contiguous().numpy(),
+            grad_table.numpy(),
+            grad_x.numpy(),
+        )
         return grad_x.sum(0) if ctx.needs_input_grad[0] else None, grad_table, None

@@ -72,8 +72,9 @@ class FaceModel(nn.Module):
         super().__init__()
         self.spec = spec
         self.geometry = GridSdf(values, lo, cell)
-        encoding = HashEncoding(torch.tensor(spec.lo), torch.tensor(spec.hi), spec.coarse, spec.fine, spec.levels,
-                                spec.log2_size)
+        encoding = HashEncoding(
+            torch.tensor(spec.lo), torch.tensor(spec.hi), spec.coarse, spec.fine, spec.levels, spec.log2_size
+        )
         self.spatial = SpatialField(encoding, spec.rank, spec.width, spec.depth)
         self.basis = IntegratedBasis(spec.rank, 64, 2, spec.basis_inputs == "cosine")
         self.light = ShLight(spec.light_order, spec.light_start)
@@ -104,8 +105,13 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
         spec: dict[str, Any] = json.loads(bytes(file["spec"]).decode())
         arrays = {k: torch.from_numpy(file[k]) for k in file.files if k != "spec"}
     if spec.pop("format", None) != FORMAT:
-        raise StageError("the fitted field is of another format", where=path.name, value=spec.get("format"),
-                         limit=f"format {FORMAT}", remedy="run the fit again with this version")
+        raise StageError(
+            "the fitted field is of another format",
+            where=path.name,
+            value=spec.get("format"),
+            limit=f"format {FORMAT}",
+            remedy="run the fit again with this version",
+        )
     cell = float(spec.pop("cell"))
     spec["lo"], spec["hi"] = tuple(spec["lo"]), tuple(spec["hi"])
     model = FaceModel(FaceSpec(**spec), arrays["geometry.values"], arrays["geometry.lo"], cell)
@@ -145,8 +151,12 @@ class FittedField:
         out = []
         with torch.no_grad():
             for i in range(0, max(len(arrays[0]), 1), CHUNK):
-                part = function(*(torch.from_numpy(np.ascontiguousarray(a[i : i + CHUNK], np.float32)).to(self.device)
-                                  for a in arrays))
+                part = function(
+                    *(
+                        torch.from_numpy(np.ascontiguousarray(a[i : i + CHUNK], np.float32)).to(self.device)
+                        for a in arrays
+                    )
+                )
                 out.append([p.cpu().numpy() for p in part])
         return tuple(np.concatenate(p) for p in zip(*out, strict=True))
 

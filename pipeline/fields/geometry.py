@@ -117,8 +117,12 @@ class GridSdf(nn.Module):
 
     def optimiser_state(self) -> dict[str, Tensor | int]:
         """State of the band's optimiser, as far as it can move."""
-        return {"active": self.active, "m": self.m.view(-1)[self.active], "v": self.v.view(-1)[self.active],
-                "steps": self.steps}
+        return {
+            "active": self.active,
+            "m": self.m.view(-1)[self.active],
+            "v": self.v.view(-1)[self.active],
+            "steps": self.steps,
+        }
 
     def load_optimiser_state(self, state: dict[str, Tensor | int]) -> None:
         """Inverse of `optimiser_state`, on the same grid."""
@@ -138,6 +142,9 @@ def largest_solid(inside: np.ndarray) -> np.ndarray:
     sizes[0] = 0
     piece = labels == sizes.argmax()
     empty, _ = ndimage.label(~piece)
-    border = np.unique(np.concatenate([f.ravel() for f in (
-        empty[0], empty[-1], empty[:, 0], empty[:, -1], empty[:, :, 0], empty[:, :, -1])]))
+    border = np.unique(
+        np.concatenate(
+            [f.ravel() for f in (empty[0], empty[-1], empty[:, 0], empty[:, -1], empty[:, :, 0], empty[:, :, -1])]
+        )
+    )
     return ~np.isin(empty, border[border > 0])

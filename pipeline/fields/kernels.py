@@ -14,10 +14,11 @@ from torch import Tensor
 from pipeline.maths.sdf import spline_sdf, spline_stencil
 from pipeline.maths.tracing import MAX_STEPS, REFINE_STEPS, sphere_trace
 
+nb: Any
 try:
     from pipeline.fields import kernels_numba as nb
 except ImportError:  # a bare GPU machine has torch, numpy and scipy alone
-    nb = None  # type: ignore[assignment]
+    nb = None
 
 _enabled = True
 
@@ -44,9 +45,7 @@ class SplineSdf(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, values: Tensor, sink: Tensor, lo: Tensor, cell: float
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, x: Tensor, values: Tensor, sink: Tensor, lo: Tensor, cell: float) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(x)
         ctx.grid = (values.shape, sink, lo, cell)
         if not compiled(x):
@@ -70,24 +69,54 @@ class SplineSdf(torch.autograd.Function):
 
 
 def trace(
-    values: Tensor, lo: Tensor, cell: float, o: Tensor, d: Tensor, t_near: Tensor, t_far: Tensor, *, min_step: float,
+    values: Tensor,
+    lo: Tensor,
+    cell: float,
+    o: Tensor,
+    d: Tensor,
+    t_near: Tensor,
+    t_far: Tensor,
+    *,
+    min_step: float,
     factor: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`pipeline.maths.tracing.sphere_trace` on a spline grid: t, hit, sdf there. No gradients."""
     values, o, d = values.detach(), o.detach(), d.detach()
     if not compiled(o):
         with torch.no_grad():
-            return sphere_trace(lambda p: spline_sdf(values, p, lo, cell)[0], o, d, t_near, t_far,
-                                min_step=min_step, factor=factor)
+            return sphere_trace(
+                lambda p: spline_sdf(values, p, lo, cell)[0], o, d, t_near, t_far, min_step=min_step, factor=factor
+            )
     t, s, hit = torch.empty(len(o)), torch.empty(len(o)), torch.empty(len(o), dtype=torch.bool)
-    nb.march(_np(values), _np(lo), np.float32(1 / cell), _np(o), _np(d), _np(t_near), _np(t_far), np.float32(factor),
-             np.float32(min_step), MAX_STEPS, REFINE_STEPS, t.numpy(), hit.numpy(), s.numpy())
+    nb.march(
+        _np(values),
+        _np(lo),
+        np.float32(1 / cell),
+        _np(o),
+        _np(d),
+        _np(t_near),
+        _np(t_far),
+        np.float32(factor),
+        np.float32(min_step),
+        MAX_STEPS,
+        REFINE_STEPS,
+        t.numpy(),
+        hit.numpy(),
+        s.numpy(),
+    )
     return t, hit, s
 
 
 def adam_on_band(
-    values: Tensor, grad: Tensor, m: Tensor, v: Tensor, active: Tensor, step: int, lr: float,
-    betas: tuple[float, float], eps: float = 1e-12,
+    values: Tensor,
+    grad: Tensor,
+    m: Tensor,
+    v: Tensor,
+    active: Tensor,
+    step: int,
+    lr: float,
+    betas: tuple[float, float],
+    eps: float = 1e-12,
 ) -> None:
     """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
 
@@ -100,8 +129,9 @@ def adam_on_band(
     c1, c2 = 1 - b1**step, 1 - b2**step
     if compiled(values):
         f = np.float32
-        nb.band_adam(_np(values), grad.numpy(), m.numpy(), v.numpy(), active.numpy(), f(lr), f(b1), f(b2), f(eps),
-                     f(c1), f(c2))
+        nb.band_adam(
+            _np(values), grad.numpy(), m.numpy(), v.numpy(), active.numpy(), f(lr), f(b1), f(b2), f(eps), f(c1), f(c2)
+        )
         return
     flat = [x.detach().view(-1) for x in (values, grad, m, v)]
     active = active[flat[1][active] != 0]

@@ -5,6 +5,8 @@ tests hold them to it. Sums are done in an order that does not depend on timing,
 scatters run in parallel only over regions that can't touch (slabs of the grid, levels of the table).
 """
 
+# mypy: disable-error-code=no-untyped-def
+# ruff: noqa: E741
 from __future__ import annotations
 
 import numpy as np
@@ -35,8 +37,9 @@ def _value(values, lo, inv, x, y, z):
     for a in range(3):
         wx = HALF * (HALF - fx) ** 2 if a == 0 else (THREE_QUARTERS - fx * fx if a == 1 else HALF * (HALF + fx) ** 2)
         for b in range(3):
-            wy = HALF * (HALF - fy) ** 2 if b == 0 else (
-                THREE_QUARTERS - fy * fy if b == 1 else HALF * (HALF + fy) ** 2)
+            wy = (
+                HALF * (HALF - fy) ** 2 if b == 0 else (THREE_QUARTERS - fy * fy if b == 1 else HALF * (HALF + fy) ** 2)
+            )
             ii, jj = i + a - 1, j + b - 1
             line = z0 * values[ii, jj, k - 1] + z1 * values[ii, jj, k] + z2 * values[ii, jj, k + 1]
             total += wx * wy * line
@@ -156,8 +159,14 @@ def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, ref
                     t0, s0, last = t, s, 0
                     for _ in range(refine_steps):
                         best_t = t0 + (t1 - t0) * (s0 / max(s0 - s1, np.float32(1e-12)))
-                        best_s = _value(values, lo, inv, o[n, 0] + best_t * d[n, 0], o[n, 1] + best_t * d[n, 1],
-                                        o[n, 2] + best_t * d[n, 2])
+                        best_s = _value(
+                            values,
+                            lo,
+                            inv,
+                            o[n, 0] + best_t * d[n, 0],
+                            o[n, 1] + best_t * d[n, 1],
+                            o[n, 2] + best_t * d[n, 2],
+                        )
                         if abs(best_s) < np.float32(1e-3) * min_step:
                             break
                         if best_s > 0:
@@ -203,12 +212,21 @@ def hash_forward(table, offset, size, hashed, mask, lo, inv, x, out):
     """Trilinear features: x (N, 3) -> out (N, 2 L). One level of the table at a time inside a sample."""
     for n in prange(x.shape[0]):
         for level in range(offset.shape[0]):
-            ux, uy, uz = ((x[n, 0] - lo[0]) * inv[level], (x[n, 1] - lo[1]) * inv[level],
-                          (x[n, 2] - lo[2]) * inv[level])
-            i, j, k = (min(max(int(np.floor(ux)), 0), size[level, 0] - 2), min(max(int(np.floor(uy)), 0), size[level, 1]
-                       - 2), min(max(int(np.floor(uz)), 0), size[level, 2] - 2))
-            fx, fy, fz = (min(max(ux - np.float32(i), ZERO), ONE), min(max(uy - np.float32(j), ZERO), ONE),
-                          min(max(uz - np.float32(k), ZERO), ONE))
+            ux, uy, uz = (
+                (x[n, 0] - lo[0]) * inv[level],
+                (x[n, 1] - lo[1]) * inv[level],
+                (x[n, 2] - lo[2]) * inv[level],
+            )
+            i, j, k = (
+                min(max(int(np.floor(ux)), 0), size[level, 0] - 2),
+                min(max(int(np.floor(uy)), 0), size[level, 1] - 2),
+                min(max(int(np.floor(uz)), 0), size[level, 2] - 2),
+            )
+            fx, fy, fz = (
+                min(max(ux - np.float32(i), ZERO), ONE),
+                min(max(uy - np.float32(j), ZERO), ONE),
+                min(max(uz - np.float32(k), ZERO), ONE),
+            )
             a0, a1 = ZERO, ZERO
             for c in range(8):
                 di, dj, dk = c >> 2, (c >> 1) & 1, c & 1
@@ -224,12 +242,21 @@ def hash_backward(table, offset, size, hashed, mask, lo, inv, x, grad_out, grad_
     """Gradients of the table (added) and of x, (L, N, 3) to be summed over levels. Levels own disjoint table rows."""
     for level in prange(offset.shape[0]):
         for n in range(x.shape[0]):
-            ux, uy, uz = ((x[n, 0] - lo[0]) * inv[level], (x[n, 1] - lo[1]) * inv[level],
-                          (x[n, 2] - lo[2]) * inv[level])
-            i, j, k = (min(max(int(np.floor(ux)), 0), size[level, 0] - 2), min(max(int(np.floor(uy)), 0), size[level, 1]
-                       - 2), min(max(int(np.floor(uz)), 0), size[level, 2] - 2))
-            fx, fy, fz = (min(max(ux - np.float32(i), ZERO), ONE), min(max(uy - np.float32(j), ZERO), ONE),
-                          min(max(uz - np.float32(k), ZERO), ONE))
+            ux, uy, uz = (
+                (x[n, 0] - lo[0]) * inv[level],
+                (x[n, 1] - lo[1]) * inv[level],
+                (x[n, 2] - lo[2]) * inv[level],
+            )
+            i, j, k = (
+                min(max(int(np.floor(ux)), 0), size[level, 0] - 2),
+                min(max(int(np.floor(uy)), 0), size[level, 1] - 2),
+                min(max(int(np.floor(uz)), 0), size[level, 2] - 2),
+            )
+            fx, fy, fz = (
+                min(max(ux - np.float32(i), ZERO), ONE),
+                min(max(uy - np.float32(j), ZERO), ONE),
+                min(max(uz - np.float32(k), ZERO), ONE),
+            )
             g0, g1 = grad_out[n, 2 * level], grad_out[n, 2 * level + 1]
             gx, gy, gz = ZERO, ZERO, ZERO
             for c in range(8):

@@ -27,7 +27,7 @@ def diffuse(albedo: Tensor, n: Tensor, light: Tensor) -> Tensor:
 
 
 def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: str = "exponential") -> Tensor:
-    """max(sum_l A_l(s) sum_m c_lm Y_lm(w_r), 0), (N, 3). [NeuFace eq. 11]; the clamp is the supplement's (section B)."""
+    """max(sum_l A_l(s) sum_m c_lm Y_lm(w_r), 0), (N, 3). [NeuFace eq. 11]; clamp: supplement, section B."""
     bands = sh.band_radiance(light, w_r)
     a = ATTENUATIONS[attenuation](inv_kappa, bands.shape[1] - 1)
     return torch.einsum("nl,nlc->nc", a, bands).clamp(min=0)

@@ -1,4 +1,4 @@
-"""The terms of the fit's objective, unreduced; stages.inverse_rendering.objective weighs and sums them ([NeuFace eq. 20])."""
+"""Terms of the objective, unreduced; stages.inverse_rendering.objective weighs and sums them."""
 
 from __future__ import annotations
 

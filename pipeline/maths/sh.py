@@ -88,9 +88,17 @@ def _recurrence(order: int) -> tuple[list[float], list[Tensor], list[Tensor]]:
     for l in range(order + 1):  # noqa: E741
         ms = range(l)
         a.append(torch.tensor([math.sqrt((4 * l * l - 1) / (l * l - m * m)) for m in ms], dtype=torch.float64))
-        b.append(torch.tensor(
-            [math.sqrt((2 * l + 1) * (l + m - 1) * (l - m - 1) / ((2 * l - 3) * (l * l - m * m))) if l > 1 else 0.0
-             for m in ms], dtype=torch.float64))
+        b.append(
+            torch.tensor(
+                [
+                    math.sqrt((2 * l + 1) * (l + m - 1) * (l - m - 1) / ((2 * l - 3) * (l * l - m * m)))
+                    if l > 1
+                    else 0.0
+                    for m in ms
+                ],
+                dtype=torch.float64,
+            )
+        )
     return start, a, b
 
 

@@ -5,6 +5,8 @@ l inside, so that Q_l^m needs only its two predecessors; the innermost loop runs
 Sums over directions are taken in fixed chunks, so that results do not depend on the number of threads.
 """
 
+# mypy: disable-error-code=no-untyped-def
+# ruff: noqa: E741
 from __future__ import annotations
 
 from functools import lru_cache
@@ -29,7 +31,7 @@ def tables(order: int) -> tuple[F32, F32, F32]:
     start, a, b = _recurrence(order)
     q = np.array(start) * np.where(np.arange(order + 1) > 0, np.sqrt(2), 1.0)
     aa, bb = np.zeros((order + 1, order + 1), np.float32), np.zeros((order + 1, order + 1), np.float32)
-    for l in range(1, order + 1):  # noqa: E741
+    for l in range(1, order + 1):
         aa[l, :l], bb[l, :l] = a[l].numpy(), b[l].numpy()
     return q.astype(np.float32), aa, bb
 

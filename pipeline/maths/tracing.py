@@ -27,7 +27,13 @@ def box_interval(o: Tensor, d: Tensor, lo: Tensor, hi: Tensor) -> tuple[Tensor, 
 
 
 def sphere_trace(
-    sdf: Callable[[Tensor], Tensor], o: Tensor, d: Tensor, t_near: Tensor, t_far: Tensor, *, min_step: float,
+    sdf: Callable[[Tensor], Tensor],
+    o: Tensor,
+    d: Tensor,
+    t_near: Tensor,
+    t_far: Tensor,
+    *,
+    min_step: float,
     factor: float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """t of the hit or of the closest approach, whether it is a hit, and the SDF there: (N,) each.

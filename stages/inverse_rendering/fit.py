@@ -95,7 +95,7 @@ class Trainer:
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
         """
         s, p = self.settings, self.share()
-        decay = 0.1 ** max((p - 0.3) / 0.7, 0.0)
+        decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
         for group in self.optimiser.param_groups:
             group["lr"] = group["start"] * decay * warm
@@ -127,9 +127,14 @@ class Trainer:
 
     def _note(self, loss: float, error: float) -> None:
         if not math.isfinite(loss):
-            raise StageError("the fit diverged", where=f"inverse_rendering, step {self.step}", value=f"loss {loss}",
-                             limit="a finite loss", remedy="lower --set inverse_rendering.lr_sdf or lr_appearance by "
-                             "half, and check cameras and masks in the report of the stages before")
+            raise StageError(
+                "the fit diverged",
+                where=f"inverse_rendering, step {self.step}",
+                value=f"loss {loss}",
+                limit="a finite loss",
+                remedy="lower --set inverse_rendering.lr_sdf or lr_appearance by "
+                "half, and check cameras and masks in the report of the stages before",
+            )
         self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         if math.isfinite(error):
             known = math.isfinite(self.error)
@@ -139,16 +144,27 @@ class Trainer:
     def save(self, path: Path) -> None:
         """Write everything that the rest of the fit depends on; the old file stays until the new one is whole."""
         g = self.model.geometry
-        torch.save({"settings": repr(self.settings), "step": self.step, "level": self.level, "loss": self.loss,
-                    "error": self.error, "cell": g.cell, "model": self.model.state_dict(),
-                    "band": g.optimiser_state(), "optimiser": self.optimiser.state_dict()}, path.with_suffix(".new"))
+        torch.save(
+            {
+                "settings": repr(self.settings),
+                "step": self.step,
+                "level": self.level,
+                "loss": self.loss,
+                "error": self.error,
+                "cell": g.cell,
+                "model": self.model.state_dict(),
+                "band": g.optimiser_state(),
+                "optimiser": self.optimiser.state_dict(),
+            },
+            path.with_suffix(".new"),
+        )
         path.with_suffix(".new").rename(path)
 
     def load(self, path: Path) -> bool:
         """Go on from a checkpoint. False if there is none that can be read, or it is of other settings."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:  # noqa: BLE001  a torn or foreign file: begin anew
+        except Exception:  # a torn or foreign file: begin anew
             return False
         if state["settings"] != repr(self.settings):
             return False
@@ -168,8 +184,7 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
     small, because most of its entries see a gradient only now and then."""
     groups = [
         {"params": [model.spatial.encoding.table], "start": settings.lr_appearance},
-        {"params": [*model.spatial.net.parameters(), *model.basis.parameters()],
-         "start": 0.3 * settings.lr_appearance},
+        {"params": [*model.spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
         {"params": [model.light.coefficients], "start": settings.lr_light},
         {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
     ]
@@ -182,17 +197,31 @@ def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, cal
     coarse_table = PixelTable(views, 256, device)
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
     spec = FaceSpec(
-        lo=tuple(map(float, lo)), hi=tuple(map(float, hi)), views=len(views), rank=settings.rank,
-        light_order=settings.light_order, light_start=coarse_table.mean_colour() / 0.4,
-        attenuation=settings.attenuation, basis_inputs=settings.basis_inputs, density=settings.density,
+        lo=_triple(lo),
+        hi=_triple(hi),
+        views=len(views),
+        rank=settings.rank,
+        light_order=settings.light_order,
+        light_start=coarse_table.mean_colour() / 0.4,
+        attenuation=settings.attenuation,
+        basis_inputs=settings.basis_inputs,
+        density=settings.density,
         specular=settings.specular,
-        calibrated=calibrated, levels=settings.hash_levels, log2_size=settings.hash_log2_size,
-        coarse=float((hi - lo).max()) / 16, fine=settings.hash_fine, width=settings.width,
+        calibrated=calibrated,
+        levels=settings.hash_levels,
+        log2_size=settings.hash_log2_size,
+        coarse=float((hi - lo).max()) / 16,
+        fine=settings.hash_fine,
+        width=settings.width,
     )
     model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(lo.astype(np.float32)), start.cell)
     model.to(device)
     model.geometry.to_device(device)
     return Trainer(views, settings, device, model)
+
+
+def _triple(v: npt.NDArray[np.floating]) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
 
 
 def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:

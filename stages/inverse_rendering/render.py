@@ -106,7 +106,8 @@ def _covered(model: FaceModel, o: Tensor, d: Tensor, near: Tensor, far: Tensor) 
     """Whether rays hit something from `near` on, or are inside it there."""
     _, hit, _ = model.geometry.trace(o, d, near, far)
     with torch.no_grad():
-        return hit | ((model.geometry(o + near[:, None] * d)[0] <= 0) & (near < far))
+        inside: Tensor = model.geometry(o + near[:, None] * d)[0] <= 0
+    return hit | (inside & (near < far))
 
 
 def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536) -> tuple[Tensor, Tensor]:

@@ -11,7 +11,7 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
-    """Everything that the fit reads. Lengths in asset units (metres), weights as in [NeuFace eq. 20]-[NeuFace eq. 24]."""
+    """Everything that the fit reads. Lengths in asset units (metres); weights of the terms of [NeuFace eq. 20]."""
 
     seed: int = 0
     # size
@@ -52,8 +52,22 @@ class FitSettings:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {},
-    "studio": {"image_side": 1024, "steps": 12000, "batch": 8192, "grid_cells": 448, "hash_fine": 0.0005,
-               "hash_log2_size": 18},
-    "film": {"image_side": 2048, "steps": 30000, "batch": 16384, "grid_cells": 768, "levels": 4, "hash_fine": 0.0003,
-             "hash_log2_size": 20, "samples": 16},
+    "studio": {
+        "image_side": 1024,
+        "steps": 12000,
+        "batch": 8192,
+        "grid_cells": 448,
+        "hash_fine": 0.0005,
+        "hash_log2_size": 18,
+    },
+    "film": {
+        "image_side": 2048,
+        "steps": 30000,
+        "batch": 16384,
+        "grid_cells": 768,
+        "levels": 4,
+        "hash_fine": 0.0003,
+        "hash_log2_size": 20,
+        "samples": 16,
+    },
 }

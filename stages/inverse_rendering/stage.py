@@ -45,8 +45,10 @@ class Config(StageConfig):
     basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
     density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
     specular: bool = Field(description="model a specular term at all")
-    calibration: Literal["auto", "on", "off"] = Field(description="per-image colour matrices [NeuFace eq. 19]; auto: "
-                                                      "where the capture has more than one kind of camera")
+    calibration: Literal["auto", "on", "off"] = Field(
+        description="per-image colour matrices [NeuFace eq. 19]; auto: "
+        "where the capture has more than one kind of camera"
+    )
     hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
     hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
     hash_fine: float = Field(description="finest cell of the appearance encoding, asset units", gt=0, le=0.1)
@@ -94,23 +96,37 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     held = {v.index for v in inputs.capture.artifact.views if v.holdout}
     usable = [c.index for c in inputs.poses.artifact.cameras if c.index not in held and c.index not in dropped]
     if len(usable) < MIN_VIEWS:
-        raise StageError("too few views are left to fit", where="inverse_rendering", value=len(usable),
-                         limit=f"at least {MIN_VIEWS}", remedy="add photos, or hold fewer back with --holdout")
+        raise StageError(
+            "too few views are left to fit",
+            where="inverse_rendering",
+            value=len(usable),
+            limit=f"at least {MIN_VIEWS}",
+            remedy="add photos, or hold fewer back with --holdout",
+        )
     context.progress(0, settings.steps, "reading photos")
     views = read_views(inputs, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
-    start = hull_start(cameras, [v.alpha for v in views], inputs.poses.artifact.roi_radius, settings.grid_cells,
-                       settings.levels)
+    start = hull_start(
+        cameras, [v.alpha for v in views], inputs.poses.artifact.roi_radius, settings.grid_cells, settings.levels
+    )
     trainer = new_trainer(views, start, settings, calibrated(inputs, usable, config), context.device)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
     held_out = predict_held_out(model, inputs, config, context)
     return FittedFace(
-        field=context.file("field.npz"), light=context.file("light.json"), rank=settings.rank,
-        light_order=settings.light_order, fitted_views=tuple(usable), held_out=held_out, steps=trainer.step,
-        loss=round(trainer.loss, 8), psnr=round(trainer.psnr, 4), beta=float(model.beta), cell=model.geometry.cell,
+        field=context.file("field.npz"),
+        light=context.file("light.json"),
+        rank=settings.rank,
+        light_order=settings.light_order,
+        fitted_views=tuple(usable),
+        held_out=held_out,
+        steps=trainer.step,
+        loss=round(trainer.loss, 8),
+        psnr=round(trainer.psnr, 4),
+        beta=float(model.beta),
+        cell=model.geometry.cell,
         model=model_facts(config, model),
     )
 
@@ -136,9 +152,19 @@ def read_views(inputs: Inputs, indices: list[int], side: int) -> list[PhotoView]
     views = []
     for i in indices:
         c = cameras[i]
-        views.append(shrunk(PhotoView(
-            i, read_linear(inputs.capture.path(photos[i].image)), read_alpha(inputs.masks.path(masks[i].mask)),
-            transforms.matrix(c.K), transforms.matrix(c.world_from_cam), np.array(c.distortion)), side))
+        views.append(
+            shrunk(
+                PhotoView(
+                    i,
+                    read_linear(inputs.capture.path(photos[i].image)),
+                    read_alpha(inputs.masks.path(masks[i].mask)),
+                    transforms.matrix(c.K),
+                    transforms.matrix(c.world_from_cam),
+                    np.array(c.distortion),
+                ),
+                side,
+            )
+        )
     return views
 
 
@@ -165,10 +191,18 @@ def write_light(model: FaceModel, context: Context) -> None:
     import json
 
     rows = model.light().detach().cpu().double().numpy().round(7).tolist()
-    (context.workdir / "light.json").write_text(json.dumps({
-        "order": model.spec.light_order, "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
-        "frame": "asset coordinates, +Y up, direction towards the light", "colour": "linear Rec.709 radiance",
-        "coefficients": rows}, indent=1))
+    (context.workdir / "light.json").write_text(
+        json.dumps(
+            {
+                "order": model.spec.light_order,
+                "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
+                "frame": "asset coordinates, +Y up, direction towards the light",
+                "colour": "linear Rec.709 radiance",
+                "coefficients": rows,
+            },
+            indent=1,
+        )
+    )
 
 
 def predict_held_out(model: FaceModel, inputs: Inputs, config: Config, context: Context) -> tuple[HeldOutView, ...]:
@@ -201,8 +235,14 @@ def camera_only(c: Any) -> PhotoView:
     from stages.inverse_rendering.views import PhotoView
 
     empty = np.broadcast_to(np.zeros((), np.float32), (c.height, c.width, 3))
-    return PhotoView(c.index, empty, empty[..., 0], transforms.matrix(c.K), transforms.matrix(c.world_from_cam),
-                     np.array(c.distortion))
+    return PhotoView(
+        c.index,
+        empty,
+        empty[..., 0],
+        transforms.matrix(c.K),
+        transforms.matrix(c.world_from_cam),
+        np.array(c.distortion),
+    )
 
 
 def model_facts(config: Config, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
@@ -211,10 +251,19 @@ def model_facts(config: Config, model: FaceModel) -> dict[str, dict[str, str | f
         "specular": {"modelled": config.specular, "attenuation": config.attenuation, "why": "setting"},
         "light": {"order": config.light_order, "why": "setting"},
         "rank": {"k": config.rank, "why": "setting"},
-        "calibration": {"modelled": model.spec.calibrated, "why": "more than one kind of camera" if
-                        config.calibration == "auto" and model.spec.calibrated else "one kind of camera" if
-                        config.calibration == "auto" else "setting"},
-        "geometry": {"prior": "visual hull", "cell_mm": round(model.geometry.cell * 1e3, 4), "why": "no licensed prior"},
+        "calibration": {
+            "modelled": model.spec.calibrated,
+            "why": "more than one kind of camera"
+            if config.calibration == "auto" and model.spec.calibrated
+            else "one kind of camera"
+            if config.calibration == "auto"
+            else "setting",
+        },
+        "geometry": {
+            "prior": "visual hull",
+            "cell_mm": round(model.geometry.cell * 1e3, 4),
+            "why": "no licensed prior",
+        },
         "density": {"kind": config.density, "why": "setting"},
     }
 

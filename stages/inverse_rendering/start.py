@@ -24,7 +24,11 @@ def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cell
     lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
     hull = visual_hull(cameras, alphas, lo, hi, cell)
     if not hull.occupied.any():
-        raise StageError("the masks have no common body", where="inverse_rendering", value="an empty visual hull",
-                         limit="at least one voxel inside every view's silhouette", remedy="look at the masks and the "
-                         "cameras: one of them is wrong, or views show different subjects")
+        raise StageError(
+            "the masks have no common body",
+            where="inverse_rendering",
+            value="an empty visual hull",
+            limit="at least one voxel inside every view's silhouette",
+            remedy="look at the masks and the cameras: one of them is wrong, or views show different subjects",
+        )
     return Start(hull_sdf(hull).astype(np.float32), (hull.lo + 0.5 * cell).astype(np.float32), cell)

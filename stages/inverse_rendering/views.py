@@ -18,7 +18,8 @@ from pipeline import transforms
 from pipeline.colour import srgb_from_linear
 from pipeline.images import shrink
 
-F32, F64 = npt.NDArray[np.float32], npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
 NEAR_BAND = 0.05  # background pixels within this share of the image side of the subject are worth rays
 FAR_EVERY = 16  # of the background beyond, one pixel in so many keeps stray matter away
 WHOLE = 0.99  # alpha from which a pixel shows the subject alone
@@ -84,7 +85,7 @@ def normalised_positions(view: PhotoView, factor: int) -> F32:
     """(H, W, 2) of (x, y) on the z = 1 plane, for blocks of factor x factor pixels."""
     w, h = view.size
     uv = transforms.pixel_centres(w, h, factor)
-    xy = np.linalg.solve(view.K[:2, :2], (uv - view.K[:2, 2]).T).T
+    xy = np.asarray(np.linalg.solve(view.K[:2, :2], (uv - view.K[:2, 2]).T).T, np.float64)
     return transforms.undistort(xy, view.distortion).astype(np.float32).reshape(h // factor, w // factor, 2)
 
 

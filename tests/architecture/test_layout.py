@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from stages import registry
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import StageConfig
+from stages import registry
 
 HEAVY = ("torch", "pxr", "pycolmap", "prefect", "xatlas", "pymeshlab", "trimesh", "cv2", "numba", "OpenEXR", "skimage")
 

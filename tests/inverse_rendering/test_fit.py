@@ -21,8 +21,18 @@ from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import PhotoView, PixelTable, factor_for, image_rays
 
 RADIUS, SIDE = 0.1, 64
-SMALL = FitSettings(image_side=64, steps=200, batch=512, samples=8, grid_cells=48, levels=2, hash_levels=6,
-                    hash_log2_size=12, hash_fine=0.004, width=32)
+SMALL = FitSettings(
+    image_side=64,
+    steps=200,
+    batch=512,
+    samples=8,
+    grid_cells=48,
+    levels=2,
+    hash_levels=6,
+    hash_log2_size=12,
+    hash_fine=0.004,
+    width=32,
+)
 
 
 def ball_view(index: int, gain: float = 1.0) -> PhotoView:
@@ -55,7 +65,9 @@ def ball_start(radius: float = 0.108) -> Start:
     return Start(values.astype(np.float32), np.full(3, lo, np.float32), cell)
 
 
-def trainer(settings: FitSettings = SMALL, calibrated: bool = False, gains: Callable[[int], float] = lambda i: 1.0) -> Trainer:
+def trainer(
+    settings: FitSettings = SMALL, calibrated: bool = False, gains: Callable[[int], float] = lambda i: 1.0
+) -> Trainer:
     views = [ball_view(i, gains(i)) for i in range(12) if i != 5]
     return new_trainer(views, ball_start(), settings, calibrated, "cpu")
 
@@ -156,9 +168,17 @@ def test_a_draw_depends_on_its_seed_alone() -> None:
     assert int((a.alpha <= 0.5).sum()) == 16
 
 
-@pytest.mark.parametrize(("size", "side", "loose", "exact"), [
-    ((1024, 1024), 512, 2, 2), ((640, 640), 512, 2, 2), ((512, 512), 512, 1, 1), ((997, 991), 512, 2, 1),
-    ((1368, 770), 512, 3, 2), ((4, 4), 100, 1, 1)])
+@pytest.mark.parametrize(
+    ("size", "side", "loose", "exact"),
+    [
+        ((1024, 1024), 512, 2, 2),
+        ((640, 640), 512, 2, 2),
+        ((512, 512), 512, 1, 1),
+        ((997, 991), 512, 2, 1),
+        ((1368, 770), 512, 3, 2),
+        ((4, 4), 100, 1, 1),
+    ],
+)
 def test_blocks(size: tuple[int, int], side: int, loose: int, exact: int) -> None:
     assert factor_for(size, side) == loose and factor_for(size, side, exact=True) == exact
 
@@ -191,7 +211,9 @@ def test_what_lies_behind_an_edge_shows() -> None:
     lo, cell = -0.14, 0.005
     i = np.stack(np.meshgrid(*[np.arange(57)] * 3, indexing="ij"), -1)
     p = lo + cell * i
-    values = np.minimum(np.linalg.norm(p - [0, 0, -0.06], axis=-1) - 0.06, np.linalg.norm(p - [0, 0, 0.08], axis=-1) - 0.03)
+    values = np.minimum(
+        np.linalg.norm(p - [0, 0, -0.06], axis=-1) - 0.06, np.linalg.norm(p - [0, 0, 0.08], axis=-1) - 0.03
+    )
     start = Start(values.astype(np.float32), np.full(3, lo, np.float32), cell)
     t = new_trainer([ball_view(k) for k in range(3)], start, replace(SMALL, levels=1), False, "cpu")
     t.model.beta.fill_(0.002)

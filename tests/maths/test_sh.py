@@ -115,8 +115,10 @@ def test_compiled_contraction_matches_the_reference(order: int, n: int) -> None:
     c = torch.randn((order + 1) ** 2, 3, generator=g)
     d, upstream = directions(n).float().detach(), torch.randn(n, order + 1, 3, generator=g)
     results = []
-    for function, kind in ((lambda c, d: sh.band_radiance(c, d), torch.float32),
-                           (lambda c, d: sh.band_radiance_reference(c, d, order), torch.float64)):
+    for function, kind in (
+        (lambda c, d: sh.band_radiance(c, d), torch.float32),
+        (lambda c, d: sh.band_radiance_reference(c, d, order), torch.float64),
+    ):
         cc, dd = c.clone().to(kind).requires_grad_(), d.clone().to(kind).requires_grad_()
         out = function(cc, dd)
         (out * upstream).sum().backward()

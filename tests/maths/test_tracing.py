@@ -12,9 +12,18 @@ def ball(p: torch.Tensor) -> torch.Tensor:
     return p.norm(dim=-1) - 1.0
 
 
-def trace(o: list[float], d: list[float], near: float = 0.0, far: float = 10.0, **kw: float) -> tuple[float, bool, float]:
-    t, hit, s = tracing.sphere_trace(ball, torch.tensor([o]).double(), torch.tensor([d]).double(),
-                                     torch.tensor([near]).double(), torch.tensor([far]).double(), min_step=0.01, **kw)
+def trace(
+    o: list[float], d: list[float], near: float = 0.0, far: float = 10.0, **kw: float
+) -> tuple[float, bool, float]:
+    t, hit, s = tracing.sphere_trace(
+        ball,
+        torch.tensor([o]).double(),
+        torch.tensor([d]).double(),
+        torch.tensor([near]).double(),
+        torch.tensor([far]).double(),
+        min_step=0.01,
+        **kw,
+    )
     return float(t), bool(hit), float(s)
 
 
