@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 
 import pipeline.threads  # noqa: F401
-from stages import registry
 import stages.capture.scan
+from stages import registry
 from tests.support.toy_stages import TOYS, source
 
 registry.REGISTRY = TOYS

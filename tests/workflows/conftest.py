@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from stages import registry
 import stages.capture.scan
+from stages import registry
 from tests.support.toy_stages import TOYS, source
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stages import registry
 from pipeline.errors import UsageError
+from stages import registry
 from stages.presets import PRESETS, configs_for, parse_sets, read_config_file
 from tests.support.toy_stages import TOYS
 
