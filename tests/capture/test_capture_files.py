@@ -80,6 +80,7 @@ def test_a_tiff_whose_strips_lie_outside_is_found() -> None:
 # ------------------------------------------------------------------ EXIF
 def tiff_block(order: str, ifd0: list[tuple], sub: list[tuple]) -> bytes:
     """A TIFF block with two directories; values: (tag, type, count, payload bytes)."""
+
     def directory(entries: list[tuple], at: int) -> bytes:
         head, extra = struct.pack(order + "H", len(entries)), b""
         data_at = at + 2 + 12 * len(entries) + 4
@@ -144,7 +145,9 @@ def test_exif_of_png_and_tiff() -> None:
     assert read_exif(block).body == "Maker M 7 85mm"
 
 
-@pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe1\x00\x08Exif\0\0", b"II*\0", b"II*\0\xff\xff\xff\xff"])
+@pytest.mark.parametrize(
+    "data", [b"", b"\xff\xd8", b"\xff\xd8\xff\xe1\x00\x08Exif\0\0", b"II*\0", b"II*\0\xff\xff\xff\xff"]
+)
 def test_damaged_metadata_gives_nothing(data: bytes) -> None:
     assert read_exif(data) == Exif()
 

@@ -25,7 +25,9 @@ def test_rules(rule: str, indices: set[int]) -> None:
     assert held_out(rule, VIEWS) == indices
 
 
-@pytest.mark.parametrize("rule", ["", "some", "every:5", "every:5:5", "every:0:0", "every:-1:0", "names:", "names:a,,b"])
+@pytest.mark.parametrize(
+    "rule", ["", "some", "every:5", "every:5:5", "every:0:0", "every:-1:0", "names:", "names:a,,b"]
+)
 def test_grammar(rule: str) -> None:
     with pytest.raises(UsageError, match="every:N:K"):
         check_rule(rule)
