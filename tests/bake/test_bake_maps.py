@@ -151,6 +151,7 @@ def test_normal_map_gives_back_the_gradient(
     assert flat.mean() < 5  # the map corrects little on a smooth body: frames, not luck, make it agree
 
 
+@pytest.mark.slow
 def test_normal_map_brings_back_bumps() -> None:
     """Bumps that the decimated mesh has lost are in the map; +y is up (growing v)."""
     smooth, bumpy = AnalyticField(ellipsoid()), AnalyticField(bumpy_ellipsoid)
@@ -267,6 +268,7 @@ def test_maps_do_not_depend_on_bands(
     assert np.array_equal(again.nearest, baked.nearest)
 
 
+@pytest.mark.slow
 def test_cap_is_left_where_it_is() -> None:
     field = AnalyticField(bumpy_head(0.0005))
     mesh, charts = charted(field, 3000)

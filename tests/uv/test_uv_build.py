@@ -99,6 +99,7 @@ def test_few_charts_and_little_stretch(built: Built) -> None:
     assert built.quality.charts < 60 and built.quality.stretch < 1.35 and built.quality.empty < 0.005
 
 
+@pytest.mark.slow
 def test_twice_gives_the_same(dense: Mesh, built: Built) -> None:
     again = build(dense, 5000, 1000, unwrap.Options(512, 4), quiet)
     assert again.charts.uvs.tobytes() == built.charts.uvs.tobytes()
