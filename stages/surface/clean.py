@@ -93,12 +93,12 @@ def outward(vertices: F64, faces: Faces) -> Faces:
 
 
 def _solid(field: Field, grid: Lattice, points: F64) -> tuple[F64, F64, Mask]:
-    """max(sdf, box) with its gradient, and where the box is the larger."""
+    """The SDF cut by the box (see extract.cut) with its gradient, and where the box decides."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     for start in range(0, len(points), QUERY):
         part = slice(start, start + QUERY)
         inside = np.clip(points[part], grid.lower, grid.upper).astype(np.float32)
         value[part], gradient[part] = field.sdf_and_gradient(inside)
     wall, wall_gradient = box_distance(points, grid)
-    capped = wall > value
+    capped = (wall > value) & (wall > -grid.h)
     return np.where(capped, wall, value), np.where(capped[:, None], wall_gradient, gradient), capped

@@ -4,7 +4,7 @@ Symbols
     h       edge of a lattice cell
     block   BLOCK^3 cells; only blocks that the surface may cross are evaluated
     slab    a run of block layers along x that is held in memory at one time
-    g       max(sdf, box): the solid cut by the box of the field, so that the neck gets a flat cap
+    g       max(sdf, box) near the box's walls: the solid is cut by the field's box, so that the neck gets a flat cap
 
 The lattice is marched slab by slab and welded over slabs by the lattice edge that each vertex lies on.
 """
@@ -91,6 +91,15 @@ def box_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
     return sides.max(1), np.concatenate([-np.eye(3), np.eye(3)])[nearest]
 
 
+def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
+    """(N,) g: the larger of SDF and box distance within a cell of the wall, the SDF alone elsewhere.
+
+    Deep inside, an SDF that is steeper than a distance would fall below the box's and lose its say.
+    """
+    out: F64 = np.where(wall > -grid.h, np.maximum(value, wall), value)
+    return out
+
+
 def near_blocks(coarse: F32, reach: float) -> Mask:
     """(bx, by, bz): blocks that the surface may cross, from SDF values at the blocks' corners (bx + 1, ...).
 
@@ -124,7 +133,7 @@ def solid(field: Field, points: F64, grid: Lattice) -> F32:
                 limit="finite everywhere",
                 remedy="fit the model again with another seed or a smaller learning rate",
             )
-        out[start : start + QUERY] = np.maximum(value, box_distance(p, grid)[0])
+        out[start : start + QUERY] = cut(value, box_distance(p, grid)[0], grid)
     return out
 
 
