@@ -22,8 +22,8 @@ class Console:
         self.label, self.last, self.began = "", 0.0, time.monotonic()
 
     def started(self, stage: str, number: int, of: int) -> None:
-        """A stage begins."""
-        self.label = f"[{number}/{of}] {stage}"
+        """A stage begins; `of` is 0 for what is none of the run's stages."""
+        self.label = f"[{number}/{of}] {stage}" if of else stage
         self.last = time.monotonic()
         if self.bars:
             self.bar = tqdm(
