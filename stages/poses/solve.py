@@ -87,10 +87,13 @@ def reconstruct(
         if next_image():
             token.cancel()
 
-    found = pycolmap.incremental_mapping(
-        database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
-        cancellation_token=token,
-    )  # fmt: skip
+    try:
+        found = pycolmap.incremental_mapping(
+            database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
+            cancellation_token=token,
+        )  # fmt: skip
+    except InterruptedError:  # what a cancelled token raises; whoever cancelled knows why
+        return None
     if not found:
         return None
     # the most photos; of equally large ones the one with more points
