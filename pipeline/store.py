@@ -33,7 +33,7 @@ class Store:
     """Finished artifacts under `root`, found by stage name and content key."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root
+        self.root = root.absolute()  # a stage joins paths below it: a relative one would be joined twice
 
     # ---------------------------------------------------------------- where things are
     def folder(self, stage: str, key: str) -> Path:

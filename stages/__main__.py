@@ -112,7 +112,7 @@ def main(arguments: list[str] | None = None) -> int:
             seed=options.seed,
         )
         store = Store(options.store or options.out / ".store")
-        source = scan_capture(options.capture)
+        source = scan_capture(options.capture.absolute())
         done = run_one(options.name, source, configs, store, options.device, options.again)
     except NeufaceError as e:
         print(f"error: {e}", file=sys.stderr)

@@ -77,7 +77,7 @@ def make_plan(request: RunRequest) -> Plan:
     )
     known(request.device, DEVICES, what="unknown device", where="--device")
     _names_a_folder(request.out, "--out")
-    capture, out = Path(request.capture), Path(request.out)
+    capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
     if out.resolve() == capture.resolve():
         raise UsageError(

@@ -17,7 +17,7 @@ from pipeline.artifacts import Located
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, StageError
 from pipeline.store import Store
-from tests.support.toy_stages import FIRST, SECOND, THIRD, Config, FirstInputs, SlowConfig, source
+from tests.support.toy_stages import FIRST, SECOND, THIRD, Config, FirstInputs, Number, SlowConfig, source
 
 
 @pytest.fixture
@@ -193,6 +193,20 @@ def test_a_damaged_artifact_is_found_and_made_anew(
     assert not again.reused
     assert file.read_bytes() == content
     assert "damaged" in caplog.text
+
+
+def test_a_relative_store(photos: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages name their files by paths below workdir, which must not be joined to it a second time."""
+    monkeypatch.chdir(store.root.parent)
+
+    def run(inputs: FirstInputs, config: Config, context: Any) -> Any:
+        (context.workdir / "total.txt").write_text("1")
+        return Number(total=1, file=context.file(context.workdir / "total.txt"))
+
+    stage = Stage("first", 1, FirstInputs, Config, Number, run)
+    done = execute(stage, FirstInputs(source(photos)), Config(), Store(Path("store")))
+    assert done.located.artifact.file.path == "total.txt"
+    assert done.located.folder.is_absolute()
 
 
 def test_forget_makes_it_anew(photos: Path, store: Store) -> None:

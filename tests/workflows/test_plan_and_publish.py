@@ -94,6 +94,15 @@ def test_a_stopped_run_goes_on_where_it_left_off(photos: Path) -> None:
     assert [d.reused for d in run(photos)] == [True, False, False]
 
 
+def test_relative_paths(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(photos.parent)
+    plan = make_plan(RunRequest(capture="photos", out="deep/out"))
+    assert [d.reused for d in run_plan(plan, run_here(plan))] == [False] * 3
+    assert plan.out == photos.parent / "deep/out"
+    absolute = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "deep/out")))
+    assert [d.reused for d in run_plan(absolute, run_here(absolute))] == [True] * 3
+
+
 # ------------------------------------------------------------------ folders
 def test_failure_leaves_no_folder_that_was_not_there(tmp_path: Path) -> None:
     out = tmp_path / "new" / "deep"
