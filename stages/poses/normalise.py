@@ -21,8 +21,8 @@ PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
 UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 UP_LIMIT = np.cos(np.radians(45.0))
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points, air around them
-POINTS_SHRINK = 0.9  # least share of what the frames see: hair and a bald head have few points, and must stay inside
-POINTS_TAIL, SHIFT_LIMIT = 0.02, 0.2  # share of weight beyond the range; of the radius
+POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head have few points, and must stay inside
+POINTS_TAIL, SHIFT_LIMIT = 0.02, 0.12  # share of weight beyond the range; of the radius
 MIN_POINTS = 50
 ROBUST_STEPS = 30
 
