@@ -1,0 +1,144 @@
+"""The whole pipeline, every stage real, on a small demo capture: the asset, what runs again, what SIGKILL leaves."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipeline.artifacts import Capture, Located
+from pipeline.demo.capture import write_demo_capture
+
+pytestmark = pytest.mark.slow
+
+SMALL = {
+    "inverse_rendering.steps": 240,
+    "inverse_rendering.batch": 1024,
+    "inverse_rendering.grid_cells": 72,
+    "inverse_rendering.levels": 2,
+    "inverse_rendering.hash_log2_size": 14,
+    "inverse_rendering.hash_fine": 0.003,
+    "surface.resolution": 96,
+    "uv.target_faces": 3000,
+    "uv.proxy_faces": 800,
+    "bake.size": 256,
+    "usd.preview_size": 128,
+}
+STAGES = ["capture", "poses", "masks", "inverse_rendering", "surface", "uv", "bake", "usd", "report"]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo") / "capture"
+    write_demo_capture(folder, views=16, size=96, samples=8, mesh_step=0.003)
+    return folder
+
+
+def start(environment: dict[str, str], capture: Path, out: Path, **changes: object) -> subprocess.Popen[bytes]:
+    sets = [f"--set={k}={v}" for k, v in {**SMALL, **changes}.items()]
+    command = [sys.executable, "-m", "workflows.cli", "run", str(capture), "--out", str(out), "--preset", "draft"]
+    return subprocess.Popen(
+        [*command, "--holdout", "every:5:2", *sets],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+
+def run(environment: dict[str, str], capture: Path, out: Path, **changes: object) -> dict[str, object]:
+    child = start(environment, capture, out, **changes)
+    _, err = child.communicate(timeout=400)
+    assert child.returncode == 0, err.decode()
+    record: dict[str, object] = json.loads((out / "run.json").read_text())
+    return record
+
+
+def again(record: dict[str, object]) -> list[str]:
+    """The stages that were made and not reused."""
+    stages = record["stages"]
+    assert isinstance(stages, dict)
+    return [s for s in STAGES if not stages[s]["reused"]]
+
+
+@pytest.fixture(scope="module")
+def done(capture: Path, child_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    run(child_environment, capture, out)
+    return out
+
+
+def test_the_asset_is_valid_and_close_to_the_truth(done: Path, capture: Path) -> None:
+    from stages.usd.validate import validate
+    from workflows.truth import measure
+
+    assert not [f for f in validate(done / "asset/head.usd") if f.level == "error"]
+    record = json.loads((done / "run.json").read_text())
+    folder = done / ".store/capture" / record["stages"]["capture"]["key"]
+    manifest = Capture.model_validate_json((folder / "manifest.json").read_bytes())
+    figures = measure(done, capture, Located(manifest, folder).artifact)
+    assert figures.psnr > 24 and figures.psnr_asset > 22
+    assert figures.accuracy_median < 2.5 and figures.completeness_mean < 5
+
+
+def test_everything_promised_is_there(done: Path) -> None:
+    promised = ["asset/lookdev.usda", "asset/head.usdz", "asset/environment.exr", "asset/light.json", "run.json"]
+    promised += ["report/index.html", "report/metrics.json", "report/views/2.exr", "report/asset_views/2.exr"]
+    maps = ["albedo.exr", "albedo.png", "specular_coefficients.exr", "shininess.exr", "inv_kappa.exr", "normal.png"]
+    promised += [f"asset/textures/head_{m}" for m in [*maps, "specular_intensity.exr", "basis_lut.exr", "f0.exr"]]
+    assert [p for p in promised if not (done / p).is_file()] == []
+    page = (done / "report/index.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
+
+
+def test_only_what_depends_on_a_setting_runs_again(
+    done: Path, capture: Path, child_environment: dict[str, str]
+) -> None:
+    assert again(run(child_environment, capture, done)) == []
+    changed = run(child_environment, capture, done, **{"bake.size": 320})
+    assert again(changed) == ["bake", "usd", "report"]
+
+
+def test_a_changed_photo_runs_everything_again(
+    done: Path, capture: Path, child_environment: dict[str, str], tmp_path: Path
+) -> None:
+    """Up to the masks, which is where the chain that follows is seen to begin anew."""
+    copy = tmp_path / "capture"
+    shutil.copytree(capture, copy)
+    shutil.copy(copy / "1.png", copy / "0.png")
+    command = [sys.executable, "-m", "workflows.cli", "run", str(copy), "--out", str(tmp_path / "out")]
+    command += ["--holdout", "every:5:2", "--until", "poses", "--store", str(done / ".store")]
+    subprocess.run(command, env=child_environment, check=True, capture_output=True, timeout=200)
+    before, after = (len(list((done / ".store" / s).glob("*[0-9a-f]"))) for s in ("masks", "capture"))
+    assert (before, after) == (1, 2)
+
+
+def test_three_kills_leave_the_same_asset(
+    done: Path, capture: Path, child_environment: dict[str, str], tmp_path: Path
+) -> None:
+    """SIGKILL to the whole process group: early, in the fit, and after it."""
+    out = tmp_path / "out"
+    for stage in ("capture", "inverse_rendering", "uv"):
+        child = start(child_environment, capture, out)
+        deadline = time.monotonic() + 300
+        while not list((out / ".store" / stage).glob("*")) and child.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.05)
+        time.sleep(0.5 if stage != "inverse_rendering" else 3.0)
+        if child.poll() is None:
+            os.killpg(child.pid, signal.SIGKILL)
+        child.communicate()
+        assert not (out / "asset").exists() or stage == "uv"
+        finished = [p for p in (out / ".store").glob("*/*") if p.is_dir() and len(p.name) == 64]
+        assert all((p / "manifest.json").is_file() for p in finished)
+    resumed = run(child_environment, capture, out)
+    undisturbed = tmp_path / "undisturbed"
+    shutil.copytree(done / ".store", undisturbed / ".store")
+    assert again(run(child_environment, capture, undisturbed)) == []
+    assert resumed["asset_hash"] == json.loads((undisturbed / "run.json").read_text())["asset_hash"]
