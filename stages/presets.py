@@ -24,8 +24,8 @@ Settings = Mapping[str, Mapping[str, Any]]
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},
-        "surface": {"resolution": 192},
-        "uv": {"target_faces": 20_000},
+        "surface": {"resolution": 288},
+        "uv": {"target_faces": 26_000},
         "bake": {"size": 1024},
     },
     "studio": {
