@@ -13,6 +13,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from pipeline.maths.sh_recurrence import recurrence
+
 try:
     from pipeline.maths import sh_compiled as compiled
 except ImportError:  # a bare GPU machine has torch alone
@@ -66,7 +68,7 @@ def _powers(x: Tensor, y: Tensor, order: int) -> tuple[Tensor, Tensor]:
 
 def _associated(z: Tensor, order: int) -> list[Tensor]:
     """Q_l^m for l = 0..order, each (l + 1, N)."""
-    start, a, b = _recurrence(order)
+    start, a, b = recurrence(order)
     one = torch.ones_like(z)
     out = [start[0] * one[None]]
     for l in range(1, order + 1):  # noqa: E741
@@ -76,30 +78,6 @@ def _associated(z: Tensor, order: int) -> list[Tensor]:
         rows.append(start[l] * one[None])
         out.append(torch.cat(rows))
     return out
-
-
-@lru_cache(maxsize=32)
-def _recurrence(order: int) -> tuple[list[float], list[Tensor], list[Tensor]]:
-    """Q_m^m, and a_lm, b_lm of the recurrence, from the normalisation K_lm = sqrt((2l+1)(l-m)! / (4 pi (l+m)!))."""
-    start = [math.sqrt(1 / (4 * math.pi))]
-    for m in range(1, order + 1):
-        start.append(start[-1] * math.sqrt((2 * m + 1) / (2 * m)))
-    a, b = [], []
-    for l in range(order + 1):  # noqa: E741
-        ms = range(l)
-        a.append(torch.tensor([math.sqrt((4 * l * l - 1) / (l * l - m * m)) for m in ms], dtype=torch.float64))
-        b.append(
-            torch.tensor(
-                [
-                    math.sqrt((2 * l + 1) * (l + m - 1) * (l - m - 1) / ((2 * l - 3) * (l * l - m * m)))
-                    if l > 1
-                    else 0.0
-                    for m in ms
-                ],
-                dtype=torch.float64,
-            )
-        )
-    return start, a, b
 
 
 @lru_cache(maxsize=32)

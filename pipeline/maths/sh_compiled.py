@@ -18,6 +18,8 @@ import torch
 from numba import njit, prange
 from torch import Tensor
 
+from pipeline.maths.sh_recurrence import recurrence
+
 LANES = 128
 FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc"}
 F32 = npt.NDArray[np.float32]
@@ -26,9 +28,7 @@ F32 = npt.NDArray[np.float32]
 @lru_cache(maxsize=16)
 def tables(order: int) -> tuple[F32, F32, F32]:
     """Start values Q_m^m (with the sqrt(2) of m > 0) and recurrence factors a[l, m], b[l, m], rounded once."""
-    from pipeline.maths.sh import _recurrence
-
-    start, a, b = _recurrence(order)
+    start, a, b = recurrence(order)
     q = np.array(start) * np.where(np.arange(order + 1) > 0, np.sqrt(2), 1.0)
     aa, bb = np.zeros((order + 1, order + 1), np.float32), np.zeros((order + 1, order + 1), np.float32)
     for l in range(1, order + 1):
