@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, HeldOutView, Located, MaskSet
+from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError
 from stages.inverse_rendering.settings import PRESETS, FitSettings
-
-if TYPE_CHECKING:
-    from pipeline.fields.face import FaceModel
-    from stages.inverse_rendering.views import PhotoView
 
 MIN_VIEWS = 3
 
@@ -88,7 +84,9 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
+    from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
+    from stages.inverse_rendering.gather import read_views
     from stages.inverse_rendering.start import hull_start
 
     settings = config.settings()
@@ -104,7 +102,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
             remedy="add photos, or hold fewer back with --holdout",
         )
     context.progress(0, settings.steps, "reading photos")
-    views = read_views(inputs, usable, settings.image_side)
+    views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
     start = hull_start(
@@ -114,7 +112,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
-    held_out = predict_held_out(model, inputs, config, context)
+    held_out = predict_held_out(
+        model, inputs.capture.artifact, inputs.poses.artifact, config.image_side, config.samples, context
+    )
     return FittedFace(
         field=context.file("field.npz"),
         light=context.file("light.json"),
@@ -127,7 +127,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(config, model),
+        model=model_facts(settings, model),
     )
 
 
@@ -136,136 +136,6 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     if config.calibration != "auto":
         return config.calibration == "on"
     return len({v.camera_group for v in inputs.capture.artifact.views if v.index in set(usable)}) > 1
-
-
-def read_views(inputs: Inputs, indices: list[int], side: int) -> list[PhotoView]:
-    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`."""
-    import numpy as np
-
-    from pipeline import transforms
-    from pipeline.images import read_alpha, read_linear
-    from stages.inverse_rendering.views import PhotoView
-
-    cameras = {c.index: c for c in inputs.poses.artifact.cameras}
-    masks = {m.index: m for m in inputs.masks.artifact.masks}
-    photos = {v.index: v for v in inputs.capture.artifact.views}
-    views = []
-    for i in indices:
-        c = cameras[i]
-        views.append(
-            shrunk(
-                PhotoView(
-                    i,
-                    read_linear(inputs.capture.path(photos[i].image)),
-                    read_alpha(inputs.masks.path(masks[i].mask)),
-                    transforms.matrix(c.K),
-                    transforms.matrix(c.world_from_cam),
-                    np.array(c.distortion),
-                ),
-                side,
-            )
-        )
-    return views
-
-
-def shrunk(view: PhotoView, side: int) -> PhotoView:
-    """The view at the smallest whole-block size that still has `side` pixels, so that large photos fit in memory.
-
-    Lens positions are kept exact: intrinsics scale with the image, distortion does not change.
-    """
-    from dataclasses import replace
-
-    from pipeline.images import shrink
-    from stages.inverse_rendering.views import factor_for, whole_blocks
-
-    f = factor_for(view.size, max(side, 1024))
-    if f == 1:
-        return view
-    K = view.K.copy()
-    K[:2] /= f
-    return replace(view, rgb=shrink(whole_blocks(view.rgb, f), f), alpha=shrink(whole_blocks(view.alpha, f), f), K=K)
-
-
-def write_light(model: FaceModel, context: Context) -> None:
-    """light.json: raw coefficients and the conventions that they need."""
-    import json
-
-    rows = model.light().detach().cpu().double().numpy().round(7).tolist()
-    (context.workdir / "light.json").write_text(
-        json.dumps(
-            {
-                "order": model.spec.light_order,
-                "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
-                "frame": "asset coordinates, +Y up, direction towards the light",
-                "colour": "linear Rec.709 radiance",
-                "coefficients": rows,
-            },
-            indent=1,
-        )
-    )
-
-
-def predict_held_out(model: FaceModel, inputs: Inputs, config: Config, context: Context) -> tuple[HeldOutView, ...]:
-    """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
-    from pipeline.images import write_exr, write_png_from_linear
-    from stages.inverse_rendering.predict import predict_view
-    from stages.inverse_rendering.views import factor_for
-
-    held = {v.index: v for v in inputs.capture.artifact.views if v.holdout}
-    known = [c for c in inputs.poses.artifact.cameras if c.index in held]
-    out = []
-    for n, c in enumerate(known):
-        context.check()
-        context.progress(n, len(known), "held-out views")
-        factor = factor_for((c.width, c.height), config.image_side, exact=True)
-        view = camera_only(c)
-        rgba = predict_view(model, view, factor, config.samples, context.device)
-        exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
-        write_exr(context.workdir / exr, rgba)
-        write_png_from_linear(context.workdir / png, rgba[..., :3])
-        out.append(HeldOutView(index=c.index, exr=context.file(exr), png=context.file(png), scale=factor))
-    return tuple(out)
-
-
-def camera_only(c: Any) -> PhotoView:
-    """A camera as a view without a photo: what a prediction may see of a held-out view."""
-    import numpy as np
-
-    from pipeline import transforms
-    from stages.inverse_rendering.views import PhotoView
-
-    empty = np.broadcast_to(np.zeros((), np.float32), (c.height, c.width, 3))
-    return PhotoView(
-        c.index,
-        empty,
-        empty[..., 0],
-        transforms.matrix(c.K),
-        transforms.matrix(c.world_from_cam),
-        np.array(c.distortion),
-    )
-
-
-def model_facts(config: Config, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
-    """What was modelled and what was left out, for the report."""
-    return {
-        "specular": {"modelled": config.specular, "attenuation": config.attenuation, "why": "setting"},
-        "light": {"order": config.light_order, "why": "setting"},
-        "rank": {"k": config.rank, "why": "setting"},
-        "calibration": {
-            "modelled": model.spec.calibrated,
-            "why": "more than one kind of camera"
-            if config.calibration == "auto" and model.spec.calibrated
-            else "one kind of camera"
-            if config.calibration == "auto"
-            else "setting",
-        },
-        "geometry": {
-            "prior": "visual hull",
-            "cell_mm": round(model.geometry.cell * 1e3, 4),
-            "why": "no licensed prior",
-        },
-        "density": {"kind": config.density, "why": "setting"},
-    }
 
 
 STAGE = Stage(name="inverse_rendering", version=1, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -1,0 +1,74 @@
+"""From the fitted model to files: the light, the held-out views, and the facts that the report shows."""
+
+from __future__ import annotations
+
+import json
+
+from pipeline.artifacts import CameraSet, Capture, HeldOutView
+from pipeline.contract import Context
+from pipeline.fields.face import FaceModel
+from pipeline.images import write_exr, write_png_from_linear
+from stages.inverse_rendering.gather import camera_only
+from stages.inverse_rendering.predict import predict_view
+from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.views import factor_for
+
+
+def write_light(model: FaceModel, context: Context) -> None:
+    """light.json: raw coefficients and the conventions that they need."""
+    rows = model.light().detach().cpu().double().numpy().round(7).tolist()
+    (context.workdir / "light.json").write_text(
+        json.dumps(
+            {
+                "order": model.spec.light_order,
+                "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
+                "frame": "asset coordinates, +Y up, direction towards the light",
+                "colour": "linear Rec.709 radiance",
+                "coefficients": rows,
+            },
+            indent=1,
+        )
+    )
+
+
+def predict_held_out(
+    model: FaceModel, capture: Capture, poses: CameraSet, side: int, samples: int, context: Context
+) -> tuple[HeldOutView, ...]:
+    """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
+    held = {v.index: v for v in capture.views if v.holdout}
+    known = [c for c in poses.cameras if c.index in held]
+    out = []
+    for n, c in enumerate(known):
+        context.check()
+        context.progress(n, len(known), "held-out views")
+        factor = factor_for((c.width, c.height), side, exact=True)
+        view = camera_only(c)
+        rgba = predict_view(model, view, factor, samples, context.device)
+        exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
+        write_exr(context.workdir / exr, rgba)
+        write_png_from_linear(context.workdir / png, rgba[..., :3])
+        out.append(HeldOutView(index=c.index, exr=context.file(exr), png=context.file(png), scale=factor))
+    return tuple(out)
+
+
+def model_facts(settings: FitSettings, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
+    """What was modelled and what was left out, for the report."""
+    return {
+        "specular": {"modelled": settings.specular, "attenuation": settings.attenuation, "why": "setting"},
+        "light": {"order": settings.light_order, "why": "setting"},
+        "rank": {"k": settings.rank, "why": "setting"},
+        "calibration": {
+            "modelled": model.spec.calibrated,
+            "why": "more than one kind of camera"
+            if settings.calibration == "auto" and model.spec.calibrated
+            else "one kind of camera"
+            if settings.calibration == "auto"
+            else "setting",
+        },
+        "geometry": {
+            "prior": "visual hull",
+            "cell_mm": round(model.geometry.cell * 1e3, 4),
+            "why": "no licensed prior",
+        },
+        "density": {"kind": settings.density, "why": "setting"},
+    }
