@@ -31,8 +31,8 @@ format: $(VENV)/.ready-dev ## puts the code into shape
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(VENV)/.ready ## speed and accuracy on this machine: the demo with the default preset, timed stage by stage
-	$(BIN)/neuface demo --preset studio --out out/bench
+bench: $(VENV)/.ready ## speed and accuracy on this machine: the demo, timed stage by stage in out/bench/run.json
+	$(BIN)/neuface demo --out out/bench
 
 setup: $(VENV)/.ready-dev ## the environment in .venv, with the tools for development
 

@@ -20,7 +20,8 @@ from pipeline.errors import UsageError
 
 Settings = Mapping[str, Mapping[str, Any]]
 
-# Speed against accuracy. draft: look at it in minutes. studio: the default. film: hours, or a GPU.
+# Speed against accuracy. draft, the default: minutes, measured in docs/benchmarks.md. studio: tens of minutes on a
+# CPU. film: hours, or a GPU. Neither of the last two has been measured yet.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},
@@ -41,7 +42,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "bake": {"size": 4096},
     },
 }
-DEFAULT_PRESET = "studio"
+DEFAULT_PRESET = "draft"
 
 
 def configs_for(

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
+from stages.presets import DEFAULT_PRESET
 from workflows import commands
 from workflows.console import Console
 
@@ -59,7 +60,9 @@ def parser() -> argparse.ArgumentParser:
 def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
     run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
-    run.add_argument("--preset", default="studio", help="speed against accuracy: draft, studio or film (%(default)s)")
+    run.add_argument(
+        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio or film (%(default)s)"
+    )
     run.add_argument(
         "--holdout",
         metavar="RULE",

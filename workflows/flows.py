@@ -7,6 +7,7 @@ from typing import Any
 
 from prefect import flow
 
+from stages.presets import DEFAULT_PRESET
 from workflows.adapter import as_tasks, publish_result
 from workflows.folders import writable
 from workflows.plan import Plan, RunRequest, make_plan
@@ -19,7 +20,7 @@ from workflows.session import current
 def capture_to_asset(
     capture: str,
     out: str,
-    preset: str = "studio",
+    preset: str = DEFAULT_PRESET,
     holdout: str | None = None,
     name: str | None = None,
     seed: int = 0,
