@@ -34,7 +34,7 @@ def objective(
     shaded = shade_shell(model, shell, batch.rays, pick)
     colour, target = shaded.total, batch.target[shell.kept[pick]]
     if model.spec.calibrated:
-        colour = torch.einsum("nij,nj->ni", model.calibration()[batch.view[shell.kept[pick]]], colour)
+        colour = _calibrated(model.calibration(), batch.view[shell.kept[pick]], colour)
     loss = loss + settings.rgb * losses.rgb_l1(colour, target).sum() / n_rays
     loss = loss + settings.white * losses.white_light(model.light()).sum()
     loss = loss + settings.specular_energy * losses.specular_energy(shaded.specular).mean()
@@ -45,6 +45,16 @@ def objective(
     with torch.no_grad():
         error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
     return loss, error
+
+
+def _calibrated(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
+    """I_n = A_n I: (V, 3, 3), (N,), (N, 3) -> (N, 3). [NeuFace eq. 19]
+
+    The matrices are picked by a product with 0 and 1: the gradient of an indexed pick adds up in an order that depends
+    on timing, and a fit would no longer repeat bit by bit.
+    """
+    chosen = torch.nn.functional.one_hot(view, len(matrices)).to(colour) @ matrices.reshape(-1, 9)
+    return torch.einsum("nij,nj->ni", chosen.reshape(-1, 3, 3), colour)
 
 
 def _smoothness(model: FaceModel, x: Tensor, generator: torch.Generator) -> Tensor:

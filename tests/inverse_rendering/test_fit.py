@@ -104,6 +104,27 @@ def test_a_fit_repeats_bit_by_bit(fitted: Trainer) -> None:
         assert torch.equal(a, b), name
 
 
+def test_a_calibrated_fit_repeats_bit_by_bit() -> None:
+    """The colour matrices are shared by many rays: their gradient's sum must not depend on timing."""
+    short = replace(SMALL, steps=40, batch=4096)
+    states = []
+    for _ in range(2):
+        t = trainer(short, calibrated=True)
+        run_fit(t, hooks())
+        states.append(t.model.state_dict())
+    for name in states[0]:
+        assert torch.equal(states[0][name], states[1][name]), name
+
+
+def test_calibration_applies_each_views_matrix() -> None:
+    from stages.inverse_rendering.objective import _calibrated
+
+    a, colour = torch.randn(3, 3, 3), torch.rand(5, 3)
+    view = torch.tensor([2, 0, 0, 1, 2])
+    expected = torch.stack([a[v] @ c for v, c in zip(view, colour, strict=True)])
+    assert torch.allclose(_calibrated(a, view, colour), expected, atol=1e-6)
+
+
 def test_three_interruptions_change_nothing(fitted: Trainer, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
     for stop_at in (20, 75, 150):  # in the first level, across the refinement, in the second
