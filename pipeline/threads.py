@@ -8,3 +8,8 @@ when the machine is free. A setting that the user made is left alone.
 import os
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+# The same sums in the same order from run to run: the matrix library may else choose its number of threads and its code
+# path by what the machine happens to be doing and where an array happens to lie.
+os.environ.setdefault("MKL_DYNAMIC", "FALSE")
+os.environ.setdefault("MKL_CBWR", "AUTO")
