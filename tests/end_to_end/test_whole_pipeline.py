@@ -156,8 +156,11 @@ def test_a_run_killed_three_times_ends_in_a_valid_asset(done: Path, killed: Path
     assert not list((killed / ".store").glob("*/*.partial-*"))
 
 
-@pytest.mark.xfail(strict=False, reason="seen once on a busy machine: a run killed and gone on in a new process ended in "
-                   "a different fit; inside one process it repeats bit by bit (tests/inverse_rendering)")  # fmt: skip
+@pytest.mark.xfail(
+    strict=False,
+    reason="seen once on a busy machine: a run killed and gone on in a new process ended in a different fit; "
+    "inside one process it repeats bit by bit (tests/inverse_rendering)",
+)
 def test_a_run_killed_three_times_has_the_same_asset_hash(done: Path, killed: Path) -> None:
     """The fit is the only stage whose bits could move; everything after it follows from it."""
     assert artifacts(done, "inverse_rendering") == artifacts(killed, "inverse_rendering")
