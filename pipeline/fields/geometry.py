@@ -76,6 +76,7 @@ class GridSdf(nn.Module):
             near = (self.values.abs() < BAND * self.cell) & inner
             idle = ~near  # what leaves the band forgets its momentum, so that a checkpoint of the band is all there is
             self.m[idle], self.v[idle] = 0, 0
+            self.sink.zero_()  # and what enters it owes nothing to gradients from before
             self.active = torch.nonzero(near.view(-1)).squeeze(-1)
 
     def step(self, lr: float) -> None:

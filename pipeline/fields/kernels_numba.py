@@ -1,8 +1,10 @@
 """CPU kernels for the three gathers that rule the fit's cost: spline SDF, ray march, hash encoding.
 
 Each has its reference in plain torch (pipeline.maths.sdf, pipeline.maths.tracing, pipeline.fields.encodings), and the
-tests hold them to it. Sums are done in an order that does not depend on timing, so that a fit repeats bit by bit:
-scatters run in parallel only over regions that can't touch (slabs of the grid, levels of the table).
+tests hold them to it. A fit repeats bit by bit, for which two things are needed. Sums are done in an order that does
+not depend on timing: scatters run in parallel only over regions that can't touch (slabs of the grid, levels of the table).
+And arithmetic is strict, without `fastmath`: with it, a process that compiles a kernel and one that loads the same
+kernel from the cache round differently (seen in the first step of a fit). It costs a quarter of the kernels' speed.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -14,10 +16,9 @@ from numba import njit, prange
 
 SLAB = 4  # nodes; a stencil reaches one node beyond its slab, so slabs of one parity never meet
 HALF, THREE_QUARTERS, ONE, ZERO = np.float32(0.5), np.float32(0.75), np.float32(1), np.float32(0)
-FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc"}
 
 
-@njit(inline="always", fastmath=FAST)
+@njit(inline="always", error_model="numpy")
 def _axis(u, top):
     """Nearest node kept off the border, and f in [-1/2, 1/2]."""
     node = int(np.floor(u + HALF))
@@ -26,7 +27,7 @@ def _axis(u, top):
     return node, min(max(f, -HALF), HALF)
 
 
-@njit(inline="always", fastmath=FAST)
+@njit(inline="always", error_model="numpy")
 def _value(values, lo, inv, x, y, z):
     sx, sy, sz = values.shape
     i, fx = _axis((x - lo[0]) * inv, sx)
@@ -46,7 +47,7 @@ def _value(values, lo, inv, x, y, z):
     return total
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def spline_forward(values, lo, inv, x, s, g):
     """SDF s (N,) and gradient g (N, 3) at x (N, 3)."""
     sx, sy, sz = values.shape
@@ -83,7 +84,7 @@ def spline_forward(values, lo, inv, x, s, g):
         g[n, 0], g[n, 1], g[n, 2] = gx * inv, gy * inv, gz * inv
 
 
-@njit(cache=True)
+@njit(error_model="numpy", cache=True)
 def _by_slab(lo, inv, x, sx):
     """Samples in slab order: start (slabs + 1,) and order (N,), a stable counting sort."""
     slabs = (sx + SLAB - 1) // SLAB
@@ -102,7 +103,7 @@ def _by_slab(lo, inv, x, sx):
     return start, order
 
 
-@njit(inline="always", fastmath=FAST)
+@njit(inline="always", error_model="numpy")
 def _scatter_one(out, lo, inv, x, gs, gg, n):
     sx, sy, sz = out.shape
     i, fx = _axis((x[n, 0] - lo[0]) * inv, sx)
@@ -132,7 +133,7 @@ def _scatter_one(out, lo, inv, x, gs, gg, n):
             out[i + a - 1, j + b - 1, k + 1] += flat * z2 + deep * e2
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def spline_backward(out, lo, inv, x, gs, gg):
     """Add the gradient of the coefficients to out (X, Y, Z), from those of s (N,) and g (N, 3)."""
     start, order = _by_slab(lo, inv, x, out.shape[0])
@@ -144,7 +145,7 @@ def spline_backward(out, lo, inv, x, gs, gg):
                 _scatter_one(out, lo, inv, x, gs, gg, order[p])
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, refine_steps, t_out, hit, s_out):
     """Sphere tracing, one ray a time; see pipeline.maths.tracing.sphere_trace."""
     for n in prange(o.shape[0]):
@@ -185,7 +186,7 @@ def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, ref
         t_out[n], hit[n], s_out[n] = best_t, found, best_s
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def band_adam(values, grad, m, v, active, lr, b1, b2, eps, c1, c2):
     """One Adam step on the active coefficients (flat indices) that have a gradient, which it clears."""
     p, g0, m0, v0 = values.reshape(-1), grad.reshape(-1), m.reshape(-1), v.reshape(-1)
@@ -200,14 +201,14 @@ def band_adam(values, grad, m, v, active, lr, b1, b2, eps, c1, c2):
         p[i] -= lr * (m0[i] / c1) / (np.sqrt(v0[i] / c2) + eps)
 
 
-@njit(inline="always")
+@njit(inline="always", error_model="numpy")
 def _corner(i, j, k, size, hashed, mask):
     if hashed:
         return (np.uint32(i) ^ (np.uint32(j) * np.uint32(2654435761)) ^ (np.uint32(k) * np.uint32(805459861))) & mask
     return np.uint32((i * size[1] + j) * size[2] + k)
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def hash_forward(table, offset, size, hashed, mask, lo, inv, x, out):
     """Trilinear features: x (N, 3) -> out (N, 2 L). One level of the table at a time inside a sample."""
     for n in prange(x.shape[0]):
@@ -237,7 +238,7 @@ def hash_forward(table, offset, size, hashed, mask, lo, inv, x, out):
             out[n, 2 * level], out[n, 2 * level + 1] = a0, a1
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def hash_backward(table, offset, size, hashed, mask, lo, inv, x, grad_out, grad_table, grad_x):
     """Gradients of the table (added) and of x, (L, N, 3) to be summed over levels. Levels own disjoint table rows."""
     for level in prange(offset.shape[0]):

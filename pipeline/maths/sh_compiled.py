@@ -21,7 +21,6 @@ from torch import Tensor
 from pipeline.maths.sh_recurrence import recurrence
 
 LANES = 128
-FAST = {"nnan", "ninf", "nsz", "contract", "arcp", "reassoc"}
 F32 = npt.NDArray[np.float32]
 
 
@@ -36,7 +35,7 @@ def tables(order: int) -> tuple[F32, F32, F32]:
     return q.astype(np.float32), aa, bb
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(parallel=True, error_model="numpy", cache=True)
 def _forward(c, d, q0, a, b, out):
     order = q0.shape[0] - 1
     blocks = (d.shape[0] + LANES - 1) // LANES
@@ -71,7 +70,22 @@ def _forward(c, d, q0, a, b, out):
                     out[first + i, l, k] = acc[l, k, i]
 
 
-@njit(parallel=True, fastmath=FAST, cache=True)
+@njit(inline="always", error_model="numpy")
+def _sum(v):
+    """Sum of LANES numbers, which it overwrites. Halved by hand: arithmetic is strict (pipeline.fields.kernels_numba),
+    so that the compiler may not split a sum to vectorise it."""
+    for i in range(64):
+        v[i] += v[i + 64]
+    for i in range(32):
+        v[i] += v[i + 32]
+    for i in range(16):
+        v[i] += v[i + 16]
+    for i in range(8):
+        v[i] += v[i + 8]
+    return ((v[0] + v[1]) + (v[2] + v[3])) + ((v[4] + v[5]) + (v[6] + v[7]))
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
 def _backward(c, d, q0, a, b, g, grad_d, grad_c):
     """grad_d (N, 3); grad_c (blocks, K, 3), one share a block."""
     order = q0.shape[0] - 1
@@ -79,7 +93,7 @@ def _backward(c, d, q0, a, b, g, grad_d, grad_c):
         first = block * LANES
         n = min(LANES, d.shape[0] - first)
         x, y, z = np.empty(LANES, np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
-        gb = np.empty((order + 1, 3, LANES), np.float32)
+        gb = np.zeros((order + 1, 3, LANES), np.float32)
         for i in range(n):
             x[i], y[i], z[i] = d[first + i, 0], d[first + i, 1], d[first + i, 2]
             for l in range(order + 1):
@@ -88,7 +102,8 @@ def _backward(c, d, q0, a, b, g, grad_d, grad_c):
         gx, gy, gz = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)
         cm, sm = np.ones(LANES, np.float32), np.zeros(LANES, np.float32)
         cl, sl = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)  # of m - 1
-        p, pp = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+        p, pp = np.zeros(LANES, np.float32), np.zeros(LANES, np.float32)  # 0 beyond n: they add nothing
+        up, um = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
         s, ss = np.empty(LANES, np.float32), np.empty(LANES, np.float32)  # derivatives of p, pp by z
         for m in range(order + 1):
             fm = np.float32(m)
@@ -113,14 +128,12 @@ def _backward(c, d, q0, a, b, g, grad_d, grad_c):
                     gy[i] += fm * p[i] * (minus * cl[i] - plus * sl[i])
                     gz[i] += s[i] * (plus * cm[i] + minus * sm[i])
                 for k in range(3):
-                    up, um = np.float32(0), np.float32(0)
-                    for i in range(n):
+                    for i in range(LANES):
                         v = p[i] * gb[l, k, i]
-                        up += v * cm[i]
-                        um += v * sm[i]
-                    grad_c[block, at + m, k] = up
+                        up[i], um[i] = v * cm[i], v * sm[i]
+                    grad_c[block, at + m, k] = _sum(up)
                     if m:
-                        grad_c[block, at - m, k] = um
+                        grad_c[block, at - m, k] = _sum(um)
             for i in range(n):
                 cl[i], sl[i] = cm[i], sm[i]
                 cm[i], sm[i] = x[i] * cl[i] - y[i] * sl[i], x[i] * sl[i] + y[i] * cl[i]

@@ -25,7 +25,7 @@ from stages.inverse_rendering.views import PhotoView, PixelTable
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
-CHECKPOINT_SECONDS = 20.0
+CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
 SMOOTHING = 0.98  # of the running loss and error that are shown
 
 
@@ -229,6 +229,7 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
     if hooks.checkpoint is not None and hooks.checkpoint.is_file():
         trainer.load(hooks.checkpoint)
     saved = shown = time.monotonic()
+    writing = 0.1  # seconds a checkpoint takes, until one was written
     while trainer.step < trainer.settings.steps:
         trainer.advance()
         now = time.monotonic()
@@ -239,8 +240,9 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
         if now - shown > 0.5:
             hooks.progress(trainer.step, trainer.settings.steps, "fitting", loss=trainer.loss, psnr=trainer.psnr)
             shown = now
-        if hooks.checkpoint is not None and now - saved > CHECKPOINT_SECONDS:
+        if hooks.checkpoint is not None and now - saved > writing / CHECKPOINT_SHARE:
             trainer.save(hooks.checkpoint)
             saved = time.monotonic()
+            writing = saved - now
     trainer.model.geometry.redistance()
     return trainer.model

@@ -59,6 +59,13 @@ def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path
     assert done.returncode == 0, done.stderr
 
 
+def test_compiled_arithmetic_is_strict(repo: Path) -> None:
+    """With fastmath a kernel rounds differently when it is compiled and when it is loaded from the cache."""
+    sources = [p for top in ("pipeline", "stages", "workflows") for p in (repo / top).rglob("*.py")]
+    assert any("@njit" in p.read_text() for p in sources)
+    assert [str(p) for p in sources if re.search(r"fastmath\s*=", p.read_text())] == []
+
+
 def test_registry_adds_up() -> None:
     names = [s.name for s in registry.REGISTRY]
     assert len(set(names)) == len(names)

@@ -127,6 +127,21 @@ def test_refining_keeps_the_surface_and_cleans_the_volume() -> None:
     assert s[0] > 0.05 and s[1] < -0.05
 
 
+def test_what_enters_the_band_owes_nothing_to_the_past() -> None:
+    """Gradients that reached a coefficient outside the band are forgotten, as they are by a checkpoint."""
+    geometry = ball_model().geometry
+    far = int(torch.argmax(geometry.values.detach()[1:-1, 1:-1, 1:-1].reshape(-1)))
+    size = [n - 2 for n in geometry.shape]
+    i, j, k = (int(v) + 1 for v in np.unravel_index(far, size))
+    geometry.sink[i, j, k] = 1.0
+    geometry.step(0.01)
+    with torch.no_grad():
+        geometry.values[i, j, k] = 0.0  # the surface comes near
+    geometry.find_band()
+    geometry.step(0.01)
+    assert float(geometry.values.detach()[i, j, k]) == 0.0
+
+
 def test_largest_solid() -> None:
     v = np.zeros((12, 12, 12), bool)
     v[2:8, 2:8, 2:8], v[10, 10, 10], v[4, 4, 4] = True, True, False
