@@ -3,8 +3,9 @@
 Each has its reference in plain torch (pipeline.maths.sdf, pipeline.maths.tracing, pipeline.fields.encodings), and the
 tests hold them to it. A fit repeats bit by bit, for which two things are needed. Sums are done in an order that does
 not depend on timing: scatters run in parallel only over regions that can't touch (slabs of the grid, levels of the
-table). And arithmetic is strict, without `fastmath`: with it, a process that compiles a kernel and one that loads the same
-kernel from the cache round differently (seen in the first step of a fit). It costs a quarter of the kernels' speed.
+table). And arithmetic is strict, without `fastmath`: with it, a process that compiles a kernel and one that loads the
+same kernel from the cache round differently (seen in the first step of a fit). It costs a quarter of the kernels'
+speed.
 """
 
 # mypy: disable-error-code=no-untyped-def
