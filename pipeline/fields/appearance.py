@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from pipeline.fields.encodings import HashEncoding
 
-START_ALBEDO, START_RHO = 0.4, 0.05
+START_RHO = 0.05
 TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: skin's middle
 
 
@@ -33,7 +33,9 @@ class SpatialField(nn.Module):
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.
     """
 
-    def __init__(self, encoding: HashEncoding, rank: int, width: int, depth: int) -> None:
+    def __init__(
+        self, encoding: HashEncoding, rank: int, width: int, depth: int, albedo: tuple[float, float, float]
+    ) -> None:
         super().__init__()
         self.encoding, self.rank = encoding, rank
         self.net = mlp(encoding.width, width, depth, 5 + rank)
@@ -41,7 +43,7 @@ class SpatialField(nn.Module):
             last = self.net[-1]
             assert isinstance(last, nn.Linear)
             last.weight *= 0.1
-            last.bias[:3] = math.log(START_ALBEDO / (1 - START_ALBEDO))
+            last.bias[:3] = torch.logit(torch.tensor(albedo))
             last.bias[3] = math.log(START_RHO / (1 - START_RHO))
             last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
             last.bias[5:] = math.log(math.expm1(1.0))

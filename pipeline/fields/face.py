@@ -22,6 +22,7 @@ from pipeline.fields.encodings import HashEncoding
 from pipeline.fields.geometry import GridSdf
 from pipeline.fields.light import ShLight
 from pipeline.fields.protocol import F32, Material
+from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.maths import brdf
 from pipeline.maths.sdf import unit
 
@@ -39,10 +40,12 @@ class FaceSpec:
     rank: int = 3
     light_order: int = 10
     light_start: float = 1.0
+    albedo_start: tuple[float, float, float] = (0.4, 0.4, 0.4)
     attenuation: str = "exponential"
     basis_inputs: str = "cosine"
     density: str = "crossing"
     specular: bool = True
+    shadows: bool = False
     calibrated: bool = False
     levels: int = 10
     log2_size: int = 17
@@ -75,22 +78,34 @@ class FaceModel(nn.Module):
         encoding = HashEncoding(
             torch.tensor(spec.lo), torch.tensor(spec.hi), spec.coarse, spec.fine, spec.levels, spec.log2_size
         )
-        self.spatial = SpatialField(encoding, spec.rank, spec.width, spec.depth)
+        self.spatial = SpatialField(encoding, spec.rank, spec.width, spec.depth, spec.albedo_start)
         self.basis = IntegratedBasis(spec.rank, 64, 2, spec.basis_inputs == "cosine")
         self.light = ShLight(spec.light_order, spec.light_start)
         self.calibration = Calibration(spec.views)
+        self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
+        self.shading_bends = True  # whether the diffuse term may turn the normals
         self.register_buffer("beta", torch.tensor(cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
         albedo, rho, c, inv_kappa = self.spatial(x)
         light = self.light()
-        diffuse = brdf.diffuse(albedo, n, light)
+        diffuse = brdf.diffuse(albedo, n if self.shading_bends else n.detach(), light)
+        if self.shadowing is not None:
+            diffuse = diffuse * self.shadowing(x)
         if not self.spec.specular:
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
         incident = brdf.light_integral(brdf.reflect(wo, n), inv_kappa, light, self.spec.attenuation)
         specular = brdf.specular(rho, (c * self.basis(wo, n)).sum(-1), incident)
         return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
+
+    def solve_shadows(self) -> None:
+        """Bring the shadows up to date with the surface, the albedo and the light found so far."""
+        if self.shadowing is not None:
+            index, x, n = near_surface(self.shadowing, self.geometry)
+            with torch.no_grad():
+                albedo = torch.cat([self.spatial(part)[0] for part in x.split(CHUNK)])
+            solve(self.shadowing, self.geometry, Surface(index, x, n, albedo), self.light())
 
     def save(self, path: Path) -> None:
         """Write the file that `load_model` reads."""
@@ -113,7 +128,8 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
             remedy="run the fit again with this version",
         )
     cell = float(spec.pop("cell"))
-    spec["lo"], spec["hi"] = tuple(spec["lo"]), tuple(spec["hi"])
+    for name in ("lo", "hi", "albedo_start"):
+        spec[name] = tuple(spec[name])
     model = FaceModel(FaceSpec(**spec), arrays["geometry.values"], arrays["geometry.lo"], cell)
     model.load_state_dict(arrays)
     return model.to(device)
@@ -175,6 +191,14 @@ class FittedField:
         if not self.model.spec.specular:
             rho = np.zeros_like(rho)
         return Material(albedo, rho, c, inv_kappa)
+
+    def irradiance_ratio(self, points: F32) -> F32:
+        """(N, 3)."""
+        shadowing = self.model.shadowing
+        if shadowing is None:
+            return np.ones((len(points), 3), np.float32)
+        (s,) = self._map(lambda p: (shadowing(p),), points)
+        return s
 
     def basis(self, wo: F32, normal: F32) -> F32:
         """(N, k)."""

@@ -38,6 +38,7 @@ def objective(
     loss = loss + settings.rgb * losses.rgb_l1(colour, target).sum() / n_rays
     loss = loss + settings.white * losses.white_light(model.light()).sum()
     loss = loss + settings.specular_energy * losses.specular_energy(shaded.specular).mean()
+    loss = loss + settings.parsimony * losses.albedo_parsimony(shaded.albedo).mean()
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         loss = loss + settings.shininess * gauge.mean()

@@ -28,10 +28,13 @@ class FitSettings:
     basis_inputs: str = "cosine"
     density: str = "crossing"
     specular: bool = True
+    shadows: bool = True
     calibration: str = "auto"
     hash_levels: int = 10
     hash_log2_size: int = 17
     hash_fine: float = 0.0008
+    shading_from: float = 0.5
+    even_until: float = 0.08
     open_from: float = 0.4
     open_until: float = 0.5
     width: int = 64
@@ -41,6 +44,7 @@ class FitSettings:
     white: float = 5e-3
     specular_energy: float = 8e-3
     shininess: float = 1e-3
+    parsimony: float = 0.01
     eikonal: float = 0.1
     smooth: float = 0.03
     # learning
