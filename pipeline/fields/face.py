@@ -83,14 +83,16 @@ class FaceModel(nn.Module):
         self.light = ShLight(spec.light_order, spec.light_start)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
-        self.shading_bends = True  # whether the diffuse term may turn the normals
+        self.even = False  # one albedo for all, while the light is found
         self.register_buffer("beta", torch.tensor(cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
         albedo, rho, c, inv_kappa = self.spatial(x)
+        if self.even:
+            albedo = albedo.detach().median(0).values.expand_as(albedo)
         light = self.light()
-        diffuse = brdf.diffuse(albedo, n if self.shading_bends else n.detach(), light)
+        diffuse = brdf.diffuse(albedo, n, light)
         if self.shadowing is not None:
             diffuse = diffuse * self.shadowing(x)
         if not self.spec.specular:

@@ -26,8 +26,9 @@ OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
 ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'
-EVEN_LIGHT_ORDER = 3
-EVEN_LIGHT_RATE = 4.0  # times the rate, while the skin is even and the light explains all it can
+EVEN_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
+EVEN_LIGHT_RATE = 10.0  # times the light's rate
+SETTLING = 0.03  # share of the fit after it in which the surface rests
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
 SMOOTHING = 0.98  # of the running loss and error that are shown
@@ -97,11 +98,15 @@ class Trainer:
 
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
+
+        Between `even_from` and `even_until` everything rests but the light, and the skin is even: the light, which
+        began as the same from everywhere, explains what it can of the shading that the albedo had taken up until then.
+        Any earlier, and a surface that is still the hull bends to the wrong shading.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
-        even = p < s.even_until
+        self.model.even = even = s.even_from <= p < s.even_until
         for group in self.optimiser.param_groups:
             group["lr"] = group["start"] * decay * warm
             if even:
@@ -110,9 +115,9 @@ class Trainer:
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
         opened = s.open_from + (1 - s.open_from) * min(p / s.open_until, 1.0)
-        self.model.spatial.encoding.open_levels(0.0 if even else opened)
-        self.model.shading_bends = p >= s.shading_from
-        return 0.0 if even else s.lr_sdf * self.model.geometry.cell * decay * warm
+        self.model.spatial.encoding.open_levels(opened)
+        still = s.even_from <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
+        return 0.0 if still else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
@@ -128,7 +133,7 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         loss, error = objective(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
         loss.backward()
-        if self.share() < self.settings.even_until:
+        if self.model.even:
             self._grey_light()
         self.optimiser.step()
         self.model.geometry.step(rate)

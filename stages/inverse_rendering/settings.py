@@ -33,8 +33,8 @@ class FitSettings:
     hash_levels: int = 10
     hash_log2_size: int = 17
     hash_fine: float = 0.0008
-    shading_from: float = 0.5
-    even_until: float = 0.08
+    even_from: float = 0.3
+    even_until: float = 0.36
     open_from: float = 0.4
     open_until: float = 0.5
     width: int = 64

@@ -49,7 +49,7 @@ class Config(StageConfig):
     hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
     hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
     hash_fine: float = Field(description="finest cell of the appearance encoding, asset units", gt=0, le=0.1)
-    shading_from: float = Field(description="share of the steps after which diffuse shading turns normals", ge=0)
+    even_from: float = Field(description="share of the steps after which only the light is found for a while", ge=0)
     even_until: float = Field(description="share of the steps in which only the light is found", ge=0, lt=1)
     open_from: float = Field(description="share of the encoding's levels, coarse first, open at the start", ge=0, le=1)
     open_until: float = Field(description="share of the steps after which all levels are open", gt=0, le=1)
