@@ -24,9 +24,10 @@ F32 = npt.NDArray[np.float32]
 class ExportedAsset:
     """Everything that the model's equations need.
 
-    albedo (H, W, 3) linear reflectance; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1); normal (H, W, 3) unit,
-    tangent space, +y along v; irradiance_ratio (H, W, 3), see pipeline.fields.shadowing; basis (N, k) = B_j at
-    n.v = (i + 0.5) / N; light ((L + 1)^2, 3).
+    albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) the share of the captured light that arrives, so that
+    albedo * occlusion is the fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
+    normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
+    light ((L + 1)^2, 3).
     """
 
     mesh: UvSurface
@@ -38,6 +39,7 @@ class ExportedAsset:
     basis: F32
     light: F32
     attenuation: str
+    occlusion: F32 | None = None
 
 
 def load_exported(root: Path) -> ExportedAsset:
@@ -49,7 +51,8 @@ def load_exported(root: Path) -> ExportedAsset:
     light = read_light(light_file)
     attenuation = str(json.loads(light_file.read_text()).get("attenuation", "exponential"))
     albedo, inv_kappa = (_map(folder, name, m) for m in ("albedo", "inv_kappa"))
-    coefficients, basis = _numbered(folder, name, "specular_coefficients"), _numbered(folder, name, "basis_lut").mean(0)
+    coefficients = numbered(_file(folder, name, "specular_coefficients"))
+    basis = numbered(_file(folder, name, "basis_lut")).mean(0)
     if coefficients.shape[2] != basis.shape[1]:
         raise StageError(
             "the specular maps do not fit each other",
@@ -68,10 +71,15 @@ def load_exported(root: Path) -> ExportedAsset:
         basis,
         light,
         attenuation,
+        _occlusion(folder, name),
     )
 
 
 def _map(folder: Path, name: str, which: str) -> F32:
+    return read_exr(_file(folder, name, which))[0]
+
+
+def _file(folder: Path, name: str, which: str) -> Path:
     path = folder / "textures" / f"{name}_{which}.exr"
     if not path.is_file():
         raise StageError(
@@ -81,22 +89,19 @@ def _map(folder: Path, name: str, which: str) -> F32:
             limit="the maps that the usd stage wrote",
             remedy="keep the asset's folder together",
         )
-    return read_exr(path)[0]
+    return path
 
 
-def _numbered(folder: Path, name: str, which: str) -> F32:
+def numbered(path: Path) -> F32:
     """A map whose channels are numbered, in the order of the numbers ("c10" after "c9")."""
-    path = folder / "textures" / f"{name}_{which}.exr"
-    values = _map(folder, name, which)
-    names = read_exr(path)[1]
+    values, names = read_exr(path)
     if all(re.search(r"\d+$", n) for n in names):
         values = values[..., np.argsort([int(re.findall(r"\d+", n)[-1]) for n in names])]
     return values
 
 
-def _ratio(folder: Path, name: str) -> F32 | None:
-    """Shadows and bounces under the captured light, if the asset carries them."""
-    path = folder / "textures" / f"{name}_irradiance_ratio.exr"
+def _occlusion(folder: Path, name: str) -> F32 | None:
+    path = folder / "textures" / f"{name}_occlusion.exr"
     return read_exr(path)[0][..., :3] if path.is_file() else None
 
 

@@ -15,8 +15,8 @@ from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.transforms import inverse_rigid, matrix, project
-from stages.usd.component import ior_from_f0
 from stages.usd.naming import check_name, name_from
+from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 
 
@@ -155,6 +155,7 @@ import pickle, sys
 from pathlib import Path
 sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
 from pipeline.contract import Context
+from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
 named = {n: getattr(made, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
