@@ -17,10 +17,10 @@ from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd import component
 from stages.usd.gltf import write_glb
-from stages.usd.light import environment, light_json, read_light
+from stages.usd.light import environment, environment_figures, light_json, read_light
 from stages.usd.lookdev import lookdev_layer
 from stages.usd.maps import write_maps
-from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
+from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from, without_overlap
 from stages.usd.obj import write_obj
 from stages.usd.package import bounded_png, write_package
 from stages.usd.shading import Look
@@ -85,7 +85,9 @@ def export(
     }
     for file, (layer, form) in layers.items():
         _write_layer(layer, folder / file, form)
-    write_exr(folder / "environment.exr", environment(light, settings.environment_width))
+    dome = environment(light, settings.environment_width)
+    write_exr(folder / "environment.exr", dome)
+    figures = maps.figures | environment_figures(light, dome)
     (folder / "light.json").write_text(light_json(light, attenuation_of(face.artifact)))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
@@ -99,7 +101,7 @@ def export(
     if settings.obj:
         written += write_obj(folder, name, mesh, look)
     check()
-    return Export(written, notes, maps.figures, look)
+    return Export(written, notes, figures, look)
 
 
 def _write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
@@ -130,7 +132,7 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
     """The coarse mesh with the full mesh's texture coordinates, unless they would be misleading."""
     if uv.artifact.proxy is None:
         return None, []
-    proxy = with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh)
+    proxy = without_overlap(with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh))
     fault = uv_fault(proxy, mesh)
     return (None, [f"the proxy mesh was left out: {fault}"]) if fault else (proxy, [])
 

@@ -16,6 +16,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from stages.usd.light import read_light
 from stages.usd.mesh import UvSurface
+from stages.usd.view import View
 
 F32 = npt.NDArray[np.float32]
 
@@ -137,3 +138,47 @@ def read_usd_mesh(path: Path) -> UvSurface:
         limit="one",
         remedy="run the usd stage again",
     )
+
+
+def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
+    """The captured cameras of lookdev.usda by their photos' index, and whether the photo was held out.
+
+    The inverse of stages.usd.lookdev: K from apertures and offsets, the lens distortion from the metadata.
+    """
+    from pxr import Usd, UsdGeom
+
+    from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM
+
+    if not lookdev.is_file():
+        raise StageError(
+            "the asset's cameras are missing",
+            where=lookdev.name,
+            value="no such file",
+            limit="lookdev.usda beside the asset",
+            remedy="keep the asset's folder together, or give --cameras params.json",
+        )
+    stage = Usd.Stage.Open(str(lookdev))
+    out = {}
+    for prim in stage.Traverse():
+        said = prim.GetCustomDataByKey("capture") or {}
+        if not prim.IsA(UsdGeom.Camera) or not prim.GetName().startswith("view_"):
+            continue
+        camera = UsdGeom.Camera(prim)
+        width, height = int(said["width"]), int(said["height"])
+        focal, across, down, shift_x, shift_y = (
+            float(a.Get())
+            for a in (
+                camera.GetFocalLengthAttr(),
+                camera.GetHorizontalApertureAttr(),
+                camera.GetVerticalApertureAttr(),
+                camera.GetHorizontalApertureOffsetAttr(),
+                camera.GetVerticalApertureOffsetAttr(),
+            )
+        )
+        fx, fy = width * focal / across, height * focal / down
+        K = np.array([[fx, 0, width / 2 - shift_x * fx / focal], [0, fy, height / 2 + shift_y * fy / focal], [0, 0, 1]])
+        pose = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+        distortion = np.array([float(x) for x in said["distortion_k1_k2_p1_p2_k3"].split()])
+        view = View(K, pose @ USD_CAM_FROM_OPENCV_CAM, width, height, distortion)
+        out[int(prim.GetName().removeprefix("view_"))] = (view, bool(said["heldOut"]))
+    return out

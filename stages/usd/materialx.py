@@ -89,7 +89,7 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
     connect(surface.CreateInput("specular_roughness", T.Float), roughness)
     surface.CreateInput("specular_ior", T.Float).Set(REFERENCE_IOR)
     normal = _normal(nodes, look)
-    connect(surface.CreateInput("geometry_normal", T.Vector3f), normal)
+    connect(surface.CreateInput("geometry_normal", T.Float3), normal)
     if basis:
         surface.CreateInput("specular_weight", T.Float).Set(1.0)
         connect(surface.CreateInput("specular_color", T.Color3f), _tint(nodes, look, normal))
@@ -104,26 +104,26 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
 
 
 def _normal(nodes: _Nodes, look: Look) -> UsdShade.Output:
-    smooth = nodes.node("mesh_normal", "ND_normal_vector3", T.Vector3f, space=(T.String, "world"))
+    smooth = nodes.node("mesh_normal", "ND_normal_vector3", T.Float3, space=(T.String, "world"))
     if not look.normal:
         return smooth
-    stored = nodes.image("normal", "vector3", T.Vector3f, look.normal, DATA)
-    tangent = nodes.node("tangent", "ND_tangent_vector3", T.Vector3f, space=(T.String, "world"))
+    stored = nodes.image("normal", "vector3", T.Float3, look.normal, DATA)
+    tangent = nodes.node("tangent", "ND_tangent_vector3", T.Float3, space=(T.String, "world"))
     return nodes.node(
-        "bent_normal", "ND_normalmap_float", T.Vector3f, **{"in": stored, "normal": smooth, "tangent": tangent}
+        "bent_normal", "ND_normalmap_float", T.Float3, **{"in": stored, "normal": smooth, "tangent": tangent}
     )
 
 
 def _tint(nodes: _Nodes, look: Look, normal: UsdShade.Output) -> UsdShade.Output:
-    view = nodes.node("view", "ND_viewdirection_vector3", T.Vector3f, space=(T.String, "world"))
+    view = nodes.node("view", "ND_viewdirection_vector3", T.Float3, space=(T.String, "world"))
     cosine = nodes.node("cosine", "ND_facingratio_float", T.Float, viewdirection=view, normal=normal)
     inv_kappa = nodes.image("inv_kappa", "float", T.Float, str(look.inv_kappa), DATA)
     row = nodes.node("row", "ND_multiply_float", T.Float, in1=inv_kappa, in2=(T.Float, INV_KAPPA_SCALE))
     at = nodes.node("place", "ND_combine2_vector2", T.Float2, in1=cosine, in2=row)
     total: UsdShade.Output | None = None
     for i, (c, b) in enumerate(zip(look.coefficients, look.basis, strict=True)):
-        coefficients = nodes.image(f"coefficients_{i}", "vector3", T.Vector3f, c, DATA)
-        table = nodes.image_at(f"basis_{i}", "vector3", T.Vector3f, b, DATA, at)
+        coefficients = nodes.image(f"coefficients_{i}", "vector3", T.Float3, c, DATA)
+        table = nodes.image_at(f"basis_{i}", "vector3", T.Float3, b, DATA, at)
         dot = nodes.node(f"dot_{i}", "ND_dotproduct_vector3", T.Float, in1=coefficients, in2=table)
         total = dot if total is None else nodes.node(f"sum_{i}", "ND_add_float", T.Float, in1=total, in2=dot)
     assert total is not None

@@ -14,7 +14,8 @@ from pipeline.contract import Context
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import matrix
 from stages.usd.exported import load_exported
-from stages.usd.render import Renderer, View, orbit_view
+from stages.usd.render import Renderer
+from stages.usd.view import View, orbit_view
 
 F32 = npt.NDArray[np.float32]
 FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side

@@ -32,6 +32,8 @@ class Environment:
     ) -> None:
         mesh = renderer.asset.mesh
         self._lit = lamps(checked_environment(image, name), count)
+        columns = (self._lit.directions.T, self._lit.flux.T, self._lit.spread[None])
+        self._lamp = np.ascontiguousarray(np.concatenate(columns), np.float32)
         transport = Transport(mesh.vertices, mesh.normals, mesh.faces)
         self._seen = transport.visibility(self._lit.directions, check)
         direct = transport.direct(self._seen, self._lit.directions, self._lit.flux)
@@ -44,8 +46,7 @@ class Environment:
         mirror = (2 * facing * points.normal - points.wo).astype(np.float32)
         s = bilinear(renderer.asset.inv_kappa, points.uv)[:, 0].clip(1 / KAPPA_RANGE[1], 1 / KAPPA_RANGE[0])
         direct, glossy = np.empty((len(n), 3), np.float32), np.empty((len(n), 3), np.float32)
-        lit = (self._seen, self._lit.directions, self._lit.flux, self._lit.spread)
-        kernels.under_lamps(n, mirror, s, points.corner, points.weights, *lit, direct, glossy)
+        kernels.under_lamps(n, mirror, s, points.corner, points.weights, self._seen, self._lamp, direct, glossy)
         bounced = np.einsum("nic,ni->nc", self._indirect[points.corner], points.weights)
         albedo = bilinear(renderer.asset.albedo, points.uv)
         return np.asarray(albedo / np.pi * (direct + bounced) + renderer.strength(points)[:, None] * glossy, np.float64)

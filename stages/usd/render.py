@@ -9,7 +9,7 @@ Under any other light (stages.usd.relight) both are traced.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -17,9 +17,10 @@ import numpy.typing as npt
 import torch
 
 from pipeline.maths import brdf
-from pipeline.transforms import rays
+from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd import kernels
 from stages.usd.exported import ExportedAsset
+from stages.usd.view import View
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -28,17 +29,6 @@ I32 = npt.NDArray[np.int32]
 CHUNK = 1 << 18  # rays at once
 EDGE_SAMPLES = 4  # along each side of a pixel on the silhouette
 EMBREE_SIZE = 100.0  # embree works in float32 with absolute tolerances: the mesh is scaled to about this size
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A camera as the renderer needs it; K in pixels with the first pixel's centre at (0.5, 0.5)."""
-
-    K: F64
-    world_from_cam: F64
-    width: int
-    height: int
-    distortion: F64 = field(default_factory=lambda: np.zeros(5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +118,25 @@ class Renderer:
         if light is None or isinstance(light, np.ndarray):
             light = Harmonics(self.asset.light if light is None else light, plain)
         h, w = view.height // factor, view.width // factor
-        every = np.arange(h * w)
-        out = self._pixels(view, every, w, factor, max(samples, 1), light)
+        out = np.zeros((h * w, 4), np.float32)
+        reached = self._reached(view, w, h, factor)
+        out[reached] = self._pixels(view, reached, w, factor, max(samples, 1), light)
         if samples == 0:
             edge = np.flatnonzero(_borders(out[:, 3].reshape(h, w)).ravel())
             out[edge] = self._pixels(view, edge, w, factor, EDGE_SAMPLES, light)
         return out.reshape(h, w, 4)
+
+    def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
+        """Pixels in the rectangle around the mesh's picture; all where part of it lies beside or behind the camera."""
+        points = self._corners.reshape(-1, 3)
+        distances = points @ view.world_from_cam[:3, 2] - view.world_from_cam[:3, 2] @ view.world_from_cam[:3, 3]
+        if distances.min() <= 0 or np.any(view.distortion):
+            return np.arange(width * height)
+        uv = project(view.K, inverse_rigid(view.world_from_cam), view.distortion, points)[0] / factor
+        first = np.floor(uv.min(0)).astype(int).clip(0, [width, height])
+        last = np.ceil(uv.max(0)).astype(int).clip(0, [width, height])
+        rows, columns = np.arange(first[1], last[1]), np.arange(first[0], last[0])
+        return np.asarray((rows[:, None] * width + columns).ravel(), np.int64)
 
     def _pixels(
         self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, samples: int, light: Light
@@ -225,19 +228,6 @@ def lookup(table: F32, cosine: F64) -> F32:
     low = np.floor(x).astype(np.int64)
     f = (x - low)[:, None].astype(np.float32)
     return np.asarray(table[low] * (1 - f) + table[np.minimum(low + 1, width - 1)] * f, np.float32)
-
-
-def orbit_view(radius: float, azimuth: float, size: int, centre: F64 | None = None, elevation: float = 0.0) -> View:
-    """A camera that looks at `centre` (default the origin) and frames a sphere of `radius`; azimuth 0 is +Z."""
-    back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
-    distance = 6 * radius
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, -np.cross(back, right), -back], 1)
-    pose[:3, 3] = (np.zeros(3) if centre is None else centre) + back * distance
-    focal = 0.5 * size / np.tan(np.arcsin(1 / 6)) / 1.02
-    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return View(K, pose, size, size)
 
 
 def _sample_positions(pixel: npt.NDArray[np.int64], width: int, samples: int) -> F64:
