@@ -94,9 +94,7 @@ def _render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
     render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
     render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
-    render.add_argument(
-        "--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side"
-    )
+    render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
     render.set_defaults(run=commands.render_command)
 
 

@@ -92,7 +92,7 @@ def export(
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
     if settings.usdz:
-        plain = replace(look, f0=None, inv_kappa=None, coefficients=(), basis=())  # viewers on phones read no MaterialX
+        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())  # viewers on phones read no MaterialX
         single = component.package_layer(who, mesh, plain)
         written.append(_package(single, folder, name, plain))
     if settings.glb:
@@ -150,7 +150,7 @@ def _package(content: Sdf.Layer, folder: Path, name: str, look: Look) -> Path:
         layer = Path(scratch) / f"{name}.usdc"
         _write_layer(content, layer, "usdc")
         members = [(layer.name, layer.read_bytes())]
-    for file in (look.albedo, look.roughness, look.normal, look.specular):
+    for file in (look.albedo, look.roughness, look.normal):
         if file:
             members.append((file.removeprefix("./"), bounded_png(folder / file)))
     path = folder / f"{name}.usdz"

@@ -91,8 +91,10 @@ def _swapped(path: str, found: str, colour: bool, where: str) -> Finding:
 
 
 # ------------------------------------------------------------------ MaterialX
-def materialx_findings(stage: Usd.Stage) -> list[Finding]:
+def materialx_findings(stage: Usd.Stage, known: frozenset[Sdf.Path] = frozenset()) -> list[Finding]:
     """Each material's `mtlx` surface as a MaterialX document: definitions, types, validity, and generated shaders.
+
+    Surfaces among the `known` ones are passed over.
 
     Without the MaterialX package the networks are left unchecked, which is said.
     """
@@ -107,8 +109,17 @@ def materialx_findings(stage: Usd.Stage) -> list[Finding]:
         except ImportError:
             return [Finding("info", "materialx", "the MaterialX package is not installed: networks were not checked")]
         root = output.GetConnectedSources()[0][0].source.GetPrim()
+        if root.GetPath() in known:
+            continue
         out += _document_findings(root, str(prim.GetPath()))
     return out
+
+
+def materialx_surfaces(stage: Usd.Stage) -> frozenset[Sdf.Path]:
+    """The shaders that are some material's `mtlx` surface."""
+    outputs = [UsdShade.Material(p).GetSurfaceOutput("mtlx") for p in stage.Traverse() if p.IsA(UsdShade.Material)]
+    sources = [s for o in outputs if o for s in o.GetConnectedSources()[0]]
+    return frozenset(s.source.GetPrim().GetPath() for s in sources)
 
 
 def _document_findings(root: Usd.Prim, where: str) -> list[Finding]:
@@ -116,7 +127,7 @@ def _document_findings(root: Usd.Prim, where: str) -> list[Finding]:
 
     document = mx.createDocument()
     document.importLibrary(_library())
-    graph = document.addNodeGraph("network")
+    graph = document.addNodeGraph("captured_network")
     prims = _closure(root)
     names = {path: mx.createValidName(str(path).strip("/").replace("/", "_")) for path in prims}
     faults: list[Finding] = []
@@ -137,7 +148,7 @@ def _document_findings(root: Usd.Prim, where: str) -> list[Finding]:
     surface = document.getNode(names[root.GetPath()])
     if surface is None or surface.getType() != "surfaceshader":
         return [Finding("error", "materialx", "the surface is no surface shader", where)]
-    material = document.addNode("surfacematerial", "material", "material")
+    material = document.addNode("surfacematerial", "captured_material", "material")
     material.addInput("surfaceshader", "surfaceshader").setNodeName(surface.getName())
     valid, message = document.validate()
     if not valid:

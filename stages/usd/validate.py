@@ -21,7 +21,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 from pipeline.errors import StageError
 from stages.usd.findings import Finding, errors
 from stages.usd.geometry_checks import mesh_findings
-from stages.usd.material_checks import colour_findings, material_findings, materialx_findings
+from stages.usd.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
 
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
@@ -163,8 +163,9 @@ def materials(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """The same, and the meshes, in every other variant of the default prim. The stage is left as it was."""
+    """The same in every other variant of the default prim, as far as it differs. The stage is left as it was."""
     prim, out = stage.GetDefaultPrim(), []
+    known = materialx_surfaces(stage)
     for name in prim.GetVariantSets().GetNames() if prim else ():
         selected = prim.GetVariantSet(name)
         chosen = selected.GetVariantSelection()
@@ -173,7 +174,10 @@ def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
                 continue
             with Usd.EditContext(stage, stage.GetSessionLayer()):
                 selected.SetVariantSelection(variant)
-            found = [*meshes(stage, path), *materials(stage, path), *textures(stage, path)]
+            found = [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage, known)]
+            if not any(p.IsA(UsdGeom.Mesh) for p in stage.Traverse()):
+                found.append(Finding("error", "mesh", "no mesh is left", path.name))
+            known |= materialx_surfaces(stage)
             out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found]
             with Usd.EditContext(stage, stage.GetSessionLayer()):
                 selected.ClearVariantSelection()

@@ -116,7 +116,7 @@ def grey_normal_map(stage: Usd.Stage) -> None:
 FAULTS = [
     (drop_last_index, "topology"),
     (index_too_large, "topology"),
-    (nan_point, "topology"),
+    (nan_point, "points"),
     (lambda s: mesh(s).GetPrim().RemoveProperty("extent"), "extent"),
     (lambda s: mesh(s).GetExtentAttr().Set([(-1, -1, -1), (1, 1, 1)]), "extent"),
     (lambda s: mesh(s).GetPrim().RemoveProperty("subdivisionScheme"), "subdivisionScheme"),

@@ -1,0 +1,47 @@
+"""Renders a look-dev scene in Blender from a captured camera, under the captured light, with Cycles.
+
+    python blender_view.py ASSET/lookdev.usda INDEX OUT.exr [SAMPLES [SIDE]]
+
+For a Python that has Blender's module (`bpy`); nothing of this project is needed. `compare_views.py` says how close the
+picture is to the photo.
+"""
+
+import os
+import sys
+import tempfile
+
+import bpy
+
+path, index, out = sys.argv[1:4]
+samples, side = (int(x) for x in (sys.argv[4:] + ["64", "0"][len(sys.argv) - 4 :]))
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.world = bpy.data.worlds.new("World")  # without one the importer drops the dome
+bpy.ops.wm.usd_import(
+    filepath=os.path.abspath(path),
+    import_cameras=True,
+    import_lights=True,
+    create_world_material=True,
+    import_usd_preview=True,
+    import_textures_mode="IMPORT_NONE",
+    import_proxy=False,
+    import_render=True,
+)
+named = {o.name: o for o in bpy.data.objects if o.type == "CAMERA"}
+scene.camera = named[f"view_{index}"]
+scene.render.engine = "CYCLES"
+scene.cycles.device = "CPU"
+scene.cycles.samples = samples
+scene.cycles.use_denoising = True
+scene.render.film_transparent = True
+width = side or 1024
+data = scene.camera.data
+print("camera", scene.camera.name, "focal", data.lens, "sensor", data.sensor_width, data.sensor_height, data.shift_x, data.shift_y)
+print("meshes", [o.name for o in bpy.data.objects if o.type == "MESH"])
+scene.render.resolution_x = scene.render.resolution_y = width
+scene.render.image_settings.file_format = "OPEN_EXR"
+scene.render.image_settings.color_depth = "32"
+scene.render.image_settings.color_mode = "RGBA"
+scene.render.filepath = os.path.join(tempfile.mkdtemp(), "view.exr")
+bpy.ops.render.render(write_still=True)
+os.replace(scene.render.filepath, out)
