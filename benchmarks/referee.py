@@ -89,7 +89,11 @@ def main() -> None:
                 },
             },
             "light": {"type": "envmap", "filename": str(options.env or asset / "environment.exr")},
-            "head": {"type": "obj", "filename": str(asset / f"{name}.obj"), "bsdf": {"type": "twosided", "bsdf": normal}},
+            "head": {
+                "type": "obj",
+                "filename": str(asset / f"{name}.obj"),
+                "bsdf": {"type": "twosided", "bsdf": normal},
+            },
         }
     )
     image = np.array(mi.render(scene))

@@ -264,7 +264,7 @@ class TextureSet(Artifact):
 class UsdAsset(Artifact):
     """The exported component. `root` is the file to open; `files` are all of it, relative paths kept.
 
-    figures: what the export measured on its maps, by name.
+    figures: what the export measured on its maps, by name. stated: author, licence, consent, as the user gave them.
     """
 
     name: str
@@ -272,6 +272,7 @@ class UsdAsset(Artifact):
     files: tuple[FileRef, ...]
     views: tuple[HeldOutView, ...] = ()
     figures: dict[str, float] = {}
+    stated: dict[str, str] = {}
     checks: int
     warnings: tuple[str, ...] = ()
 

@@ -47,12 +47,12 @@ class Settings(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The files written, notes on what was left out, figures for the report, and what the material reads."""
+    """The files written, notes on what was left out, and for the report: figures, and what the user stated."""
 
     written: list[Path]
     notes: list[str]
     figures: dict[str, float]
-    look: Look
+    stated: dict[str, str]
 
 
 def export(
@@ -92,7 +92,8 @@ def export(
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
     if settings.usdz:
-        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())  # viewers on phones read no MaterialX
+        # viewers on phones read no MaterialX, and some take any preview surface that they find
+        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
         single = component.package_layer(who, mesh, plain)
         written.append(_package(single, folder, name, plain))
     if settings.glb:
@@ -101,7 +102,7 @@ def export(
     if settings.obj:
         written += write_obj(folder, name, mesh, look)
     check()
-    return Export(written, notes, figures, look)
+    return Export(written, notes, figures, who.stated())
 
 
 def _write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:

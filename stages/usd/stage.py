@@ -98,6 +98,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         files=files,
         views=views,
         figures=made.figures,
+        stated=made.stated,
         checks=checks_run(),
         warnings=tuple(dict.fromkeys(warnings)),
     )
