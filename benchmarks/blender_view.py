@@ -6,19 +6,21 @@ For a Python that has Blender's module (`bpy`); nothing of this project is neede
 picture is to the photo.
 """
 
-import os
+import shutil
 import sys
 import tempfile
+from pathlib import Path
 
 import bpy
 
 path, index, out = sys.argv[1:4]
-samples, side = (int(x) for x in (sys.argv[4:] + ["64", "0"][len(sys.argv) - 4 :]))
+samples = int(sys.argv[4]) if len(sys.argv) > 4 else 64
+side = int(sys.argv[5]) if len(sys.argv) > 5 else 1024
 bpy.ops.wm.read_factory_settings(use_empty=True)
 scene = bpy.context.scene
 scene.world = bpy.data.worlds.new("World")  # without one the importer drops the dome
 bpy.ops.wm.usd_import(
-    filepath=os.path.abspath(path),
+    filepath=str(Path(path).resolve()),
     import_cameras=True,
     import_lights=True,
     create_world_material=True,
@@ -52,6 +54,6 @@ scene.render.resolution_x = scene.render.resolution_y = width
 scene.render.image_settings.file_format = "OPEN_EXR"
 scene.render.image_settings.color_depth = "32"
 scene.render.image_settings.color_mode = "RGBA"
-scene.render.filepath = os.path.join(tempfile.mkdtemp(), "view.exr")
+scene.render.filepath = str(Path(tempfile.mkdtemp()) / "view.exr")
 bpy.ops.render.render(write_still=True)
-os.replace(scene.render.filepath, out)
+shutil.move(scene.render.filepath, out)

@@ -2,9 +2,10 @@
 
     python benchmarks/referee.py RUN INDEX OUT [--look standard|openpbr] [--env FILE.exr] [--side 256] [--spp 64]
 
-Reads what any tool would: NAME.obj, the textures, environment.exr and the camera of lookdev.usda. Mitsuba knows neither
-UsdPreviewSurface nor OpenPBR: both stand for its `principled` (a GGX dielectric over a diffuse base). `standard` has one
-index of refraction; `openpbr` has F0 as a map: a blend, texel by texel, of two such surfaces with F0 0 and 0.16.
+Reads what any tool would: NAME.obj, the textures, environment.exr and the camera of lookdev.usda. Mitsuba knows
+neither UsdPreviewSurface nor OpenPBR: its `principled` (a GGX dielectric over a diffuse base) stands for both.
+`standard` has one index of refraction; `openpbr` has F0 as a map: a blend, texel by texel, of two such surfaces with F0
+0 and 0.16.
 Writes OUT.exr.
 """
 
@@ -31,13 +32,12 @@ def bitmap(path: Path, raw: bool) -> dict[str, Any]:
 
 def surface(textures: Path, name: str, **specular: float) -> dict[str, Any]:
     """One layer over a diffuse base, bent by the normal map."""
-    principled = {
+    return {
         "type": "principled",
         "base_color": bitmap(textures / f"{name}_albedo.png", False),
         "roughness": bitmap(textures / f"{name}_roughness.png", True),
         **specular,
     }
-    return principled
 
 
 def main() -> None:

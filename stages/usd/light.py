@@ -60,8 +60,8 @@ def environment(light: F32, width: int) -> F32:
 
     A sum of harmonics rings below 0 beside bright lamps. Cutting that off alone would add light; q takes it back out,
     so that the picture's own harmonics up to order KEPT_ORDER are the light's: its energy, and through the clamped
-    cosine 99.7 % of any surface's irradiance. Where no positive picture can have them (a light that was fitted to be
-    dark somewhere), the nearest that the steps find; the energy is then kept by a factor per colour.
+    cosine nearly all that a surface's irradiance depends on. Where no positive picture can have them (a light that
+    was fitted to be dark somewhere), the nearest that the steps find; the energy is then kept by a factor per colour.
     """
     height = width // 2
     small = _picture(light, SOLVE_WIDTH)
