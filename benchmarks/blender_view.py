@@ -36,21 +36,9 @@ scene.cycles.device = "CPU"
 scene.cycles.samples = samples
 scene.cycles.use_denoising = True
 scene.render.film_transparent = True
-width = side or 1024
-data = scene.camera.data
-print(
-    "camera",
-    scene.camera.name,
-    "focal",
-    data.lens,
-    "sensor",
-    data.sensor_width,
-    data.sensor_height,
-    data.shift_x,
-    data.shift_y,
-)
-print("meshes", [o.name for o in bpy.data.objects if o.type == "MESH"])
-scene.render.resolution_x = scene.render.resolution_y = width
+sensor = scene.camera.data
+scene.render.resolution_x = side
+scene.render.resolution_y = round(side * sensor.sensor_height / sensor.sensor_width)
 scene.render.image_settings.file_format = "OPEN_EXR"
 scene.render.image_settings.color_depth = "32"
 scene.render.image_settings.color_mode = "RGBA"
