@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipeline.maths.microfacet import KAPPA_RANGE
 from stages.usd import kernels
-from stages.usd.lamps import checked_environment, lamps
+from stages.usd.lamps import Lamps, checked_environment, lamps
 from stages.usd.render import Points, Renderer, bilinear
 from stages.usd.transport import Transport
 
@@ -31,12 +31,11 @@ class Environment:
         self, renderer: Renderer, image: F32, name: str, count: int = COUNT, check: Callable[[], None] = lambda: None
     ) -> None:
         mesh = renderer.asset.mesh
-        self._lit = lamps(checked_environment(image, name), count)
-        columns = (self._lit.directions.T, self._lit.flux.T, self._lit.spread[None])
-        self._lamp = np.ascontiguousarray(np.concatenate(columns), np.float32)
+        lit = lamps(checked_environment(image, name), count)
         transport = Transport(mesh.vertices, mesh.normals, mesh.faces)
-        self._seen = transport.visibility(self._lit.directions, check)
-        direct = transport.direct(self._seen, self._lit.directions, self._lit.flux)
+        seen = transport.visibility(lit.directions, check)
+        direct = transport.direct(seen, lit.directions, lit.flux)
+        self._seen, self._lamp = in_lanes(seen, lit)
         self._indirect = transport.indirect(direct, vertex_values(renderer.asset.albedo, renderer)).astype(np.float32)
 
     def shade(self, renderer: Renderer, points: Points) -> F64:
@@ -50,6 +49,15 @@ class Environment:
         bounced = np.einsum("nic,ni->nc", self._indirect[points.corner], points.weights)
         albedo = bilinear(renderer.asset.albedo, points.uv)
         return np.asarray(albedo / np.pi * (direct + bounced) + renderer.strength(points)[:, None] * glossy, np.float64)
+
+
+def in_lanes(seen: npt.NDArray[np.uint8], lit: Lamps) -> tuple[npt.NDArray[np.uint8], F32]:
+    """seen (V, N) and the lamps (7, N) as the kernel takes them: N filled up to whole lanes with lamps without light."""
+    lamp = np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
+    missing = -lamp.shape[1] % kernels.LANES
+    filled = np.pad(lamp, ((0, 0), (0, missing)))
+    filled[6, lamp.shape[1] :] = 1
+    return np.pad(seen, ((0, 0), (0, missing))), filled
 
 
 def vertex_values(image: F32, renderer: Renderer) -> F64:

@@ -178,7 +178,7 @@ def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
             if not any(p.IsA(UsdGeom.Mesh) for p in stage.Traverse()):
                 found.append(Finding("error", "mesh", "no mesh is left", path.name))
             known |= materialx_surfaces(stage)
-            out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found]
+            out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found if f.level != "info"]
             with Usd.EditContext(stage, stage.GetSessionLayer()):
                 selected.ClearVariantSelection()
     return out

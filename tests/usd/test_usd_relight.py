@@ -10,10 +10,10 @@ from support.synthetic_asset import RADIUS, ball
 from pipeline.errors import StageError
 from pipeline.maths.microfacet import KAPPA_RANGE
 from stages.usd import kernels
-from stages.usd.lamps import checked_environment, lamps
+from stages.usd.lamps import Lamps, checked_environment, lamps
 from stages.usd.light import latlong_directions, latlong_weights
 from stages.usd.maps import vertex_image
-from stages.usd.relight import Environment
+from stages.usd.relight import Environment, in_lanes
 from stages.usd.render import Renderer
 from stages.usd.transport import DARKEST, Transport, occlusion
 from stages.usd.view import orbit_view
@@ -115,9 +115,9 @@ def test_compiled_lamps_are_the_formula() -> None:
     w = rng.dirichlet(np.ones(3), 50).astype(np.float32)
     seen = rng.integers(0, 2, (9, 30)).astype(np.uint8)
     d, flux, spread = unit(rng.normal(size=(30, 3))), rng.uniform(0, 1, (30, 3)), rng.uniform(0, 0.02, 30)
-    lamp = np.concatenate([d.T, flux.T, spread[None]]).astype(np.float32)
     diffuse, specular = np.empty((50, 3), np.float32), np.empty((50, 3), np.float32)
-    kernels.under_lamps(n, m, s, corner, w, seen, lamp, diffuse, specular)
+    lit = Lamps(d, flux.astype(np.float32), spread.astype(np.float32))
+    kernels.under_lamps(n, m, s, corner, w, *in_lanes(seen, lit), diffuse, specular)
     share = (w[:, :, None] * seen[corner]).sum(1)
     np.testing.assert_allclose(diffuse, (share * np.maximum(n @ d.T, 0)) @ flux, rtol=1e-3, atol=1e-5)
     kappa = 1 / (s[:, None] + spread)
