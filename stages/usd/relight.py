@@ -21,7 +21,7 @@ from stages.usd.transport import Transport
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 
-COUNT = 384
+COUNT = 256
 
 
 class Environment:
@@ -35,7 +35,7 @@ class Environment:
         transport = Transport(mesh.vertices, mesh.normals, mesh.faces)
         seen = transport.visibility(lit.directions, check)
         direct = transport.direct(seen, lit.directions, lit.flux)
-        self._seen, self._lamp = in_lanes(seen, lit)
+        self._seen, self._lamp = seen, table_of(lit)
         self._indirect = transport.indirect(direct, vertex_values(renderer.asset.albedo, renderer)).astype(np.float32)
 
     def shade(self, renderer: Renderer, points: Points) -> F64:
@@ -51,13 +51,9 @@ class Environment:
         return np.asarray(albedo / np.pi * (direct + bounced) + renderer.strength(points)[:, None] * glossy, np.float64)
 
 
-def in_lanes(seen: npt.NDArray[np.uint8], lit: Lamps) -> tuple[npt.NDArray[np.uint8], F32]:
-    """seen (V, N) and the lamps (7, N) as the kernel takes them: N filled up to whole lanes with lamps without light."""
-    lamp = np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
-    missing = -lamp.shape[1] % kernels.LANES
-    filled = np.pad(lamp, ((0, 0), (0, missing)))
-    filled[6, lamp.shape[1] :] = 1
-    return np.pad(seen, ((0, 0), (0, missing))), filled
+def table_of(lit: Lamps) -> F32:
+    """(7, N) direction, flux and spread, as the kernel takes them."""
+    return np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
 
 
 def vertex_values(image: F32, renderer: Renderer) -> F64:

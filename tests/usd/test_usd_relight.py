@@ -13,7 +13,7 @@ from stages.usd import kernels
 from stages.usd.lamps import Lamps, checked_environment, lamps
 from stages.usd.light import latlong_directions, latlong_weights
 from stages.usd.maps import vertex_image
-from stages.usd.relight import Environment, in_lanes
+from stages.usd.relight import Environment, table_of
 from stages.usd.render import Renderer
 from stages.usd.transport import DARKEST, Transport, occlusion
 from stages.usd.view import orbit_view
@@ -117,7 +117,7 @@ def test_compiled_lamps_are_the_formula() -> None:
     d, flux, spread = unit(rng.normal(size=(30, 3))), rng.uniform(0, 1, (30, 3)), rng.uniform(0, 0.02, 30)
     diffuse, specular = np.empty((50, 3), np.float32), np.empty((50, 3), np.float32)
     lit = Lamps(d, flux.astype(np.float32), spread.astype(np.float32))
-    kernels.under_lamps(n, m, s, corner, w, *in_lanes(seen, lit), diffuse, specular)
+    kernels.under_lamps(n, m, s, corner, w, seen, table_of(lit), diffuse, specular)
     share = (w[:, :, None] * seen[corner]).sum(1)
     np.testing.assert_allclose(diffuse, (share * np.maximum(n @ d.T, 0)) @ flux, rtol=1e-3, atol=1e-5)
     kappa = 1 / (s[:, None] + spread)
