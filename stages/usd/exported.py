@@ -36,7 +36,6 @@ class ExportedAsset:
     coefficients: F32
     inv_kappa: F32
     normal: F32 | None
-    irradiance_ratio: F32 | None
     basis: F32
     light: F32
     attenuation: str
@@ -68,7 +67,6 @@ def load_exported(root: Path) -> ExportedAsset:
         coefficients,
         inv_kappa[..., :1],
         _normal(folder, name),
-        _ratio(folder, name),
         basis,
         light,
         attenuation,
@@ -102,8 +100,12 @@ def numbered(path: Path) -> F32:
 
 
 def _occlusion(folder: Path, name: str) -> F32 | None:
-    path = folder / "textures" / f"{name}_occlusion.exr"
-    return read_exr(path)[0][..., :3] if path.is_file() else None
+    """What the export divided out of the albedo, or the same as the fit modelled it (pipeline.fields.shadowing)."""
+    for which in ("occlusion", "irradiance_ratio"):
+        path = folder / "textures" / f"{name}_{which}.exr"
+        if path.is_file():
+            return read_exr(path)[0][..., :3]
+    return None
 
 
 def _normal(folder: Path, name: str) -> F32 | None:

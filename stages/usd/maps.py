@@ -62,7 +62,7 @@ def write_maps(
     written = copy_maps(bake, name, folder)
     covered = covered_texels(bake)
     figures: dict[str, float] = {}
-    if divide:
+    if divide and not shadows_fitted(bake):
         shown, found = divided_albedo(bake, mesh, light, name, folder, covered, check)
         written += shown
         figures |= found
@@ -83,6 +83,12 @@ def write_maps(
         figures |= fit.figures
     check()
     return Maps(written, look_of(bake, name, asset), figures)
+
+
+def shadows_fitted(bake: Located[TextureSet]) -> bool:
+    """Whether the fit modelled shadows and bounces itself, so that its albedo is free of them."""
+    ratio = bake.artifact.maps.get("irradiance_ratio")
+    return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
 def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:

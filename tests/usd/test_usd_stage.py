@@ -451,3 +451,17 @@ def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
     read = cv2.imdecode(np.frombuffer(bounded_png(tmp_path / "x.png"), np.uint8), -1)
     assert read.shape == (AR_SIDE, AR_SIDE, 3) and read.dtype == np.uint8
     assert read[5, 5].tolist() == [0, 0, 0] and read[5, 2000].tolist() == [64, 128, 255]
+
+
+def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path) -> None:
+    """The fit's own share of the light stands where the export's would."""
+    from stages.usd.exported import load_exported
+
+    arrays = texture_arrays()
+    ratio = np.full_like(arrays["albedo"], 0.8)
+    ratio[:64] = 0.6
+    run(write_inputs(tmp_path / "in", arrays={**arrays, "irradiance_ratio": ratio}), tmp_path / "work", usdz=False)
+    read = load_exported(tmp_path / "work/asset/head.usd")
+    np.testing.assert_allclose(read.albedo, arrays["albedo"], atol=1e-6)
+    np.testing.assert_allclose(read.occlusion, ratio, atol=1e-6)
+    assert not (tmp_path / "work/asset/textures/head_occlusion.exr").exists()
