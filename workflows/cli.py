@@ -20,6 +20,7 @@ EXAMPLES = """examples:
   neuface demo                                        a made-up head, start to end, checked against the truth
   neuface run photos/ --out runs/anna                 photos of a head -> asset and report
   neuface run photos/ --out runs/anna --preset draft --holdout every:5:2 --set bake.size=2048
+  neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
 """
 
 
@@ -43,7 +44,9 @@ def parser() -> argparse.ArgumentParser:
     demo.set_defaults(run=commands.demo_command)
     validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
     validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
+    validate.add_argument("--json", metavar="FILE", help="write every finding as JSON; - for standard output")
     validate.set_defaults(run=commands.validate_command)
+    _render_options(commands_of.add_parser("render", help="render the exported asset: photos' views, or a turntable"))
     for name, text, run in (
         ("report", "(re)build the report of a run", commands.report_command),
         ("view", "open the report of a run in a browser", commands.view_command),
@@ -70,6 +73,9 @@ def _run_options(run: argparse.ArgumentParser) -> None:
         "(index %% 5 == 2) or names:a.jpg,b.jpg; default none",
     )
     run.add_argument("--name", help="name of the asset")
+    run.add_argument("--author", help="who made the capture; recorded in the asset")
+    run.add_argument("--license", help="licence of the capture; recorded in the asset")
+    run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
     run.add_argument("--seed", type=int, default=0, help="of every random draw (%(default)s)")
     run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
     run.add_argument("--until", metavar="S", help="stop after this stage")
@@ -78,6 +84,18 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
     _where(run)
     run.set_defaults(run=commands.run_command)
+
+
+def _render_options(render: argparse.ArgumentParser) -> None:
+    render.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
+    render.add_argument("--out", required=True, metavar="OUT", help="folder for the pictures")
+    render.add_argument("--env", default="captured", help="captured, or a lat-long .hdr or .exr (%(default)s)")
+    render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
+    render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
+    render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
+    render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
+    render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
+    render.set_defaults(run=commands.render_command)
 
 
 def _where(sub: argparse.ArgumentParser) -> None:

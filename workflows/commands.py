@@ -141,14 +141,38 @@ def validate_command(options: argparse.Namespace, console: Console) -> int:
     from stages.usd.validate import checks_run, validate
 
     found = validate(Path(options.asset))
+    counts = {level: sum(f.level == level for f in found) for level in ("error", "warning", "info")}
+    if options.json:
+        content = {"asset": options.asset, "accepted": not counts["error"], "checks": checks_run(), "counts": counts}
+        text = json.dumps({**content, "findings": [f.json() for f in found]}, indent=1)
+        if options.json == "-":
+            print(text)
+            return 1 if counts["error"] else 0
+        Path(options.json).write_text(text + "\n")
     for finding in found:
         if finding.level != "info" or options.verbose:
             print(finding)
-    faults = sum(f.level == "error" for f in found)
-    print(
-        f"{options.asset}: {checks_run()} checks, {faults} faults, {sum(f.level == 'warning' for f in found)} warnings"
+    print(f"{options.asset}: {checks_run()} checks, {counts['error']} faults, {counts['warning']} warnings")
+    return 1 if counts["error"] else 0
+
+
+def render_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface render"""
+    from workflows.pictures import RenderRequest, render_pictures
+
+    request = RenderRequest(
+        folder=Path(options.folder),
+        out=Path(options.out),
+        light=options.env,
+        cameras=Path(options.cameras) if options.cameras else None,
+        views=options.views,
+        turntable=options.turntable,
+        width=options.width,
+        samples=options.samples,
     )
-    return 1 if faults else 0
+    for path, seconds in render_pictures(request):
+        print(f"{path} ({seconds:.1f} s)")
+    return 0
 
 
 def report_command(options: argparse.Namespace, console: Console) -> int:
@@ -193,6 +217,10 @@ def request_from(options: argparse.Namespace) -> RunRequest:
     from stages.presets import read_config_file
 
     config = read_config_file(Path(options.config)) if options.config else {}
+    said = {"author": options.author, "license": options.license, "subject_consent": options.subject_consent}
+    stated = {k: v for k, v in said.items() if v is not None}
+    if stated:
+        config = {**config, "usd": {**config.get("usd", {}), **stated}}
     return RunRequest(
         capture=options.capture,
         out=options.out,

@@ -24,7 +24,7 @@ from stages.report.pictures import (
 )
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
-ENVIRONMENT = "asset/environment.exr"
+ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit.png"
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,19 @@ def _maps(r: Results, side: int) -> list[Picture]:
             step = max(1, values.shape[0] // (2 * side))
             picture = map_picture(values[::step, ::step], texture.space)
             out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}"))
-    return out
+    return out + _lobe_fit(r, side)
+
+
+def _lobe_fit(r: Results, side: int) -> list[Picture]:
+    """Where a GGX lobe does not stand for the fitted one, and where kappa is a guess."""
+    files = [f for f in r.usd.artifact.files if f.path.endswith(LOBE_FIT)]
+    if not files:
+        return []
+    picture = read_encoded(r.usd.path(files[0]))[..., :3]
+    step = max(1, picture.shape[0] // (2 * side))
+    mean = r.usd.artifact.figures.get("ggx_residual_mean", 0.0)
+    caption = f"GGX against the fitted lobe: red, residual (mean {mean:.1%}); green, kappa not resolved"
+    return [Picture(data_uri(picture[::step, ::step], side), caption)]
 
 
 def _light(r: Results, side: int) -> Picture | None:

@@ -91,6 +91,8 @@ def figures(r: Results) -> dict[str, Any]:
             "root": usd.root.rpartition("/")[2],
             "checks": usd.checks,
             "megabytes": round(sum(f.size for f in usd.files if f.path.startswith("asset/")) / 1e6, 2),
+            **{k: usd.stated.get(k, "not stated") for k in ("author", "license", "subjectConsent")},
+            **usd.figures,
         },
         "warnings": warnings(r),
     }

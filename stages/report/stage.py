@@ -64,4 +64,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     return Report(files=(context.file("index.html"), context.file("metrics.json")), warnings=tuple(unjudged(inputs)))
 
 
-STAGE = Stage(name="report", version=1, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=2, inputs=Inputs, config=Config, output=Report, run=run)

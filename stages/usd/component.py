@@ -1,8 +1,8 @@
 """The component's layers: root, payload, and the single layer of the preview package.
 
 Structure (ASWF asset-structure guidelines): root = Xform of kind component with assetInfo and a class to inherit;
-payload = geo/render, geo/proxy and mtl. Only UsdPreviewSurface in the metallic workflow is authored: importers agree
-on it, while they take `specularColor` for a tint of a 4 % lobe.
+payload = geo/render, geo/proxy and mtl. One material has three ways to the same look (shading.py, materialx.py); the
+variant sets `look` and `lod` on the root choose among them, and among the meshes.
 """
 
 from __future__ import annotations
@@ -10,31 +10,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
 
+from stages.usd.materialx import materialx_networks
 from stages.usd.mesh import UvSurface
+from stages.usd.shading import MATERIAL, Look, preview_networks
 
-MATERIAL = "captured"
+STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
+FULL, PROXY = "full", "proxy"
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """What the preview network shows. Paths are relative to the layer; None leaves the input out."""
+class Identity:
+    """Who and what the asset is. Only `name` and `version` are ours; the rest is what the user said, or nothing."""
 
-    albedo: str
-    roughness: str | None
-    normal: str | None
-    ior: float
-    mean_albedo: tuple[float, float, float]
+    name: str
+    version: str
+    author: str = ""
+    license: str = ""
+    subject_consent: str = ""
 
-
-def ior_from_f0(f0: float) -> float:
-    """Index of refraction whose reflectance at normal incidence is f0: (1 + sqrt(f0)) / (1 - sqrt(f0)).
-
-    Domain: clamped to [0.005, 0.2], beyond which a dielectric surface is implausible.
-    """
-    root = float(np.sqrt(np.clip(f0, 0.005, 0.2)))
-    return (1 + root) / (1 - root)
+    def stated(self) -> dict[str, str]:
+        """What the user said, by the names under which it is recorded."""
+        said = {"author": self.author, "license": self.license, "subjectConsent": self.subject_consent}
+        return {k: v for k, v in said.items() if v}
 
 
 def new_stage(comment: str, default: str) -> Usd.Stage:
@@ -54,27 +53,71 @@ def detached(stage: Usd.Stage) -> Sdf.Layer:
     return layer
 
 
-def _as_component(stage: Usd.Stage, name: str, version: str) -> Usd.Prim:
+def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
     """Kind, asset info and the class that lets a scene restyle every instance at once."""
     prim = stage.GetDefaultPrim()
-    stage.CreateClassPrim(f"/_class_{name}")
-    prim.GetInherits().AddInherit(f"/_class_{name}")
+    stage.CreateClassPrim(f"/_class_{who.name}")
+    prim.GetInherits().AddInherit(f"/_class_{who.name}")
     model = Usd.ModelAPI(prim)
     model.SetKind(Kind.Tokens.component)
-    model.SetAssetName(name)
-    model.SetAssetVersion(version)
+    model.SetAssetName(who.name)
+    model.SetAssetVersion(who.version)
+    if who.stated():
+        prim.SetAssetInfoByKey("capture", who.stated())
+        stage.GetRootLayer().customLayerData = {"capture": who.stated()}
+    stage.GetRootLayer().comment = "Made by NeuFace Asset."
     return prim
 
 
-def root_layer(name: str, version: str, extents: list[Gf.Vec3f]) -> Sdf.Layer:
+def root_layer(who: Identity, extents: list[Gf.Vec3f], look: Look, *, proxy: bool, thumbnail: str | None) -> Sdf.Layer:
     """NAME.usd: the file that others reference. `extents`: the box of each purpose present, for display unloaded."""
     stage = new_stage(
-        "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", name
+        "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
-    prim = _as_component(stage, name, version)
+    prim = _as_component(stage, who)
+    Usd.ModelAPI(prim).SetAssetIdentifier(Sdf.AssetPath(f"./{who.name}.usd"))
     prim.GetPayloads().AddPayload("./payload.usdc")
     UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(Vt.Vec3fArray(extents))
+    if thumbnail:
+        previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
+        previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
+    _variants(stage, prim, look, proxy=proxy)
     return detached(stage)
+
+
+def _variants(stage: Usd.Stage, prim: Usd.Prim, look: Look, *, proxy: bool) -> None:
+    """`look`: which network of the material is its surface. `lod`: the full mesh (with its proxy), or the proxy alone.
+
+    Each holds only what differs, so that the payload alone is what the first variants show.
+    """
+    path = prim.GetPath()
+    material = path.AppendPath(f"mtl/{MATERIAL}")
+    outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
+    if not look.specular:
+        del outputs[SPECULAR]
+    if look.coefficients and look.inv_kappa and look.roughness:
+        outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
+    looks = prim.GetVariantSets().AddVariantSet("look")
+    for variant, connections in outputs.items():
+        looks.AddVariant(variant)
+        looks.SetVariantSelection(variant)
+        with looks.GetVariantEditContext():
+            for output, source in connections.items():
+                over = stage.OverridePrim(material)
+                attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
+                attribute.SetConnections([material.AppendPath(source)])
+    looks.SetVariantSelection(STANDARD)
+    lods = prim.GetVariantSets().AddVariantSet("lod")
+    for variant in (FULL, PROXY) if proxy else (FULL,):
+        lods.AddVariant(variant)
+        lods.SetVariantSelection(variant)
+        if variant == PROXY:
+            with lods.GetVariantEditContext():
+                stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
+                shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
+                purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
+                purpose.Set(UsdGeom.Tokens.default_)
+    lods.SetVariantSelection(FULL)
 
 
 def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
@@ -84,18 +127,20 @@ def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Loo
     return detached(stage)
 
 
-def package_layer(name: str, version: str, mesh: UvSurface, look: Look) -> Sdf.Layer:
+def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
     """The one layer of NAME.usdz. No proxy: viewers on phones show every purpose at once."""
-    stage = new_stage("Preview of the captured head.", name)
-    _as_component(stage, name, version)
-    _fill(stage, name, mesh, None, look)
+    stage = new_stage("Preview of the captured head.", who.name)
+    _as_component(stage, who)
+    _fill(stage, who.name, mesh, None, look)
     return detached(stage)
 
 
 def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> None:
     UsdGeom.Scope.Define(stage, f"/{name}/geo")
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
-    material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
+    material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
+    preview_networks(stage, material, look)
+    materialx_networks(stage, material, look)
     render = _mesh(stage, f"/{name}/geo/render", mesh, material)
     render.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     if proxy is not None:
@@ -129,57 +174,3 @@ def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Mater
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))
     UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
     return out
-
-
-# ------------------------------------------------------------------ material
-def _material(stage: Usd.Stage, path: str, look: Look) -> UsdShade.Material:
-    """UsdPreviewSurface: diffuse albedo, roughness and normal maps over a dielectric of the measured mean F0."""
-    T = Sdf.ValueTypeNames
-    material = UsdShade.Material.Define(stage, path)
-    st_name = material.CreateInput("st_name", T.String)
-    st_name.Set("st")
-    reader = UsdShade.Shader.Define(stage, f"{path}/st_reader")
-    reader.CreateIdAttr("UsdPrimvarReader_float2")
-    reader.CreateInput("varname", T.String).ConnectToSource(st_name)
-    reader.CreateOutput("result", T.Float2)
-    surface = UsdShade.Shader.Define(stage, f"{path}/preview")
-    surface.CreateIdAttr("UsdPreviewSurface")
-    surface.CreateInput("useSpecularWorkflow", T.Int).Set(0)
-    surface.CreateInput("metallic", T.Float).Set(0.0)
-    surface.CreateInput("ior", T.Float).Set(look.ior)
-    _connect(
-        surface.CreateInput("diffuseColor", T.Color3f), _texture(stage, reader, path, "albedo", look.albedo, "sRGB")
-    )
-    roughness = surface.CreateInput("roughness", T.Float)
-    if look.roughness:
-        _connect(roughness, _texture(stage, reader, path, "roughness", look.roughness, "raw", "r"))
-    else:
-        roughness.Set(0.5)
-    if look.normal:
-        normal = _texture(stage, reader, path, "normal", look.normal, "raw")
-        shader = UsdShade.Shader(normal.GetPrim())
-        shader.CreateInput("scale", T.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
-        shader.CreateInput("bias", T.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
-        _connect(surface.CreateInput("normal", T.Normal3f), normal)
-    surface.CreateOutput("surface", T.Token)
-    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
-    return material
-
-
-def _texture(
-    stage: Usd.Stage, reader: UsdShade.Shader, path: str, name: str, file: str, space: str, channel: str = "rgb"
-) -> UsdShade.Output:
-    """A texture reader. Clamped: charts never wrap, and wrapping would mix opposite borders."""
-    T = Sdf.ValueTypeNames
-    shader = UsdShade.Shader.Define(stage, f"{path}/{name}")
-    shader.CreateIdAttr("UsdUVTexture")
-    shader.CreateInput("file", T.Asset).Set(Sdf.AssetPath(file))
-    shader.CreateInput("sourceColorSpace", T.Token).Set(space)
-    shader.CreateInput("wrapS", T.Token).Set("clamp")
-    shader.CreateInput("wrapT", T.Token).Set("clamp")
-    shader.CreateInput("st", T.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
-    return shader.CreateOutput(channel, T.Float if channel == "r" else T.Float3)
-
-
-def _connect(target: UsdShade.Input, source: UsdShade.Output) -> None:
-    target.ConnectToSource(UsdShade.ConnectableAPI(source.GetPrim()), source.GetBaseName())

@@ -16,6 +16,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from stages.usd.light import read_light
 from stages.usd.mesh import UvSurface
+from stages.usd.view import View
 
 F32 = npt.NDArray[np.float32]
 
@@ -24,9 +25,10 @@ F32 = npt.NDArray[np.float32]
 class ExportedAsset:
     """Everything that the model's equations need.
 
-    albedo (H, W, 3) linear reflectance; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1); normal (H, W, 3) unit,
-    tangent space, +y along v; irradiance_ratio (H, W, 3), see pipeline.fields.shadowing; basis (N, k) = B_j at
-    n.v = (i + 0.5) / N; light ((L + 1)^2, 3).
+    albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) the share of the captured light that arrives, so that
+    albedo * occlusion is the fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
+    normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
+    light ((L + 1)^2, 3).
     """
 
     mesh: UvSurface
@@ -34,10 +36,10 @@ class ExportedAsset:
     coefficients: F32
     inv_kappa: F32
     normal: F32 | None
-    irradiance_ratio: F32 | None
     basis: F32
     light: F32
     attenuation: str
+    occlusion: F32 | None = None
 
 
 def load_exported(root: Path) -> ExportedAsset:
@@ -49,7 +51,8 @@ def load_exported(root: Path) -> ExportedAsset:
     light = read_light(light_file)
     attenuation = str(json.loads(light_file.read_text()).get("attenuation", "exponential"))
     albedo, inv_kappa = (_map(folder, name, m) for m in ("albedo", "inv_kappa"))
-    coefficients, basis = _numbered(folder, name, "specular_coefficients"), _numbered(folder, name, "basis_lut").mean(0)
+    coefficients = numbered(_file(folder, name, "specular_coefficients"))
+    basis = numbered(_file(folder, name, "basis_lut")).mean(0)
     if coefficients.shape[2] != basis.shape[1]:
         raise StageError(
             "the specular maps do not fit each other",
@@ -64,14 +67,18 @@ def load_exported(root: Path) -> ExportedAsset:
         coefficients,
         inv_kappa[..., :1],
         _normal(folder, name),
-        _ratio(folder, name),
         basis,
         light,
         attenuation,
+        _occlusion(folder, name),
     )
 
 
 def _map(folder: Path, name: str, which: str) -> F32:
+    return read_exr(_file(folder, name, which))[0]
+
+
+def _file(folder: Path, name: str, which: str) -> Path:
     path = folder / "textures" / f"{name}_{which}.exr"
     if not path.is_file():
         raise StageError(
@@ -81,23 +88,24 @@ def _map(folder: Path, name: str, which: str) -> F32:
             limit="the maps that the usd stage wrote",
             remedy="keep the asset's folder together",
         )
-    return read_exr(path)[0]
+    return path
 
 
-def _numbered(folder: Path, name: str, which: str) -> F32:
+def numbered(path: Path) -> F32:
     """A map whose channels are numbered, in the order of the numbers ("c10" after "c9")."""
-    path = folder / "textures" / f"{name}_{which}.exr"
-    values = _map(folder, name, which)
-    names = read_exr(path)[1]
+    values, names = read_exr(path)
     if all(re.search(r"\d+$", n) for n in names):
         values = values[..., np.argsort([int(re.findall(r"\d+", n)[-1]) for n in names])]
     return values
 
 
-def _ratio(folder: Path, name: str) -> F32 | None:
-    """Shadows and bounces under the captured light, if the asset carries them."""
-    path = folder / "textures" / f"{name}_irradiance_ratio.exr"
-    return read_exr(path)[0][..., :3] if path.is_file() else None
+def _occlusion(folder: Path, name: str) -> F32 | None:
+    """What the export divided out of the albedo, or the same as the fit modelled it (pipeline.fields.shadowing)."""
+    for which in ("occlusion", "irradiance_ratio"):
+        path = folder / "textures" / f"{name}_{which}.exr"
+        if path.is_file():
+            return read_exr(path)[0][..., :3]
+    return None
 
 
 def _normal(folder: Path, name: str) -> F32 | None:
@@ -132,3 +140,47 @@ def read_usd_mesh(path: Path) -> UvSurface:
         limit="one",
         remedy="run the usd stage again",
     )
+
+
+def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
+    """The captured cameras of lookdev.usda by their photos' index, and whether the photo was held out.
+
+    The inverse of stages.usd.lookdev: K from apertures and offsets, the lens distortion from the metadata.
+    """
+    from pxr import Usd, UsdGeom
+
+    from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM
+
+    if not lookdev.is_file():
+        raise StageError(
+            "the asset's cameras are missing",
+            where=lookdev.name,
+            value="no such file",
+            limit="lookdev.usda beside the asset",
+            remedy="keep the asset's folder together, or give --cameras params.json",
+        )
+    stage = Usd.Stage.Open(str(lookdev))
+    out = {}
+    for prim in stage.Traverse():
+        said = prim.GetCustomDataByKey("capture") or {}
+        if not prim.IsA(UsdGeom.Camera) or not prim.GetName().startswith("view_"):
+            continue
+        camera = UsdGeom.Camera(prim)
+        width, height = int(said["width"]), int(said["height"])
+        focal, across, down, shift_x, shift_y = (
+            float(a.Get())
+            for a in (
+                camera.GetFocalLengthAttr(),
+                camera.GetHorizontalApertureAttr(),
+                camera.GetVerticalApertureAttr(),
+                camera.GetHorizontalApertureOffsetAttr(),
+                camera.GetVerticalApertureOffsetAttr(),
+            )
+        )
+        fx, fy = width * focal / across, height * focal / down
+        K = np.array([[fx, 0, width / 2 - shift_x * fx / focal], [0, fy, height / 2 + shift_y * fy / focal], [0, 0, 1]])
+        pose = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+        distortion = np.array([float(x) for x in said["distortion_k1_k2_p1_p2_k3"].split()])
+        view = View(K, pose @ USD_CAM_FROM_OPENCV_CAM, width, height, distortion)
+        out[int(prim.GetName().removeprefix("view_"))] = (view, bool(said["heldOut"]))
+    return out

@@ -22,7 +22,7 @@ def mesh_findings(mesh: UsdGeom.Mesh) -> list[Finding]:
     index = np.array(mesh.GetFaceVertexIndicesAttr().Get() or [], np.int64)
     fault = _topology(points, counts, index)
     if fault:
-        return [Finding("error", "topology", fault, where)]
+        return [Finding("error", "points" if "finite" in fault else "topology", fault, where)]
     sizes = {
         "vertex": len(points),
         "varying": len(points),

@@ -20,12 +20,14 @@ from pipeline.maths import sh
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 
+KEPT_ORDER, SOLVE_WIDTH, SOLVE_STEPS = 4, 128, 200  # of the positive picture's correction
+
 CONVENTION = (
     "Radiance L(d) = sum over l = 0..order, m = -l..l of coefficients[l * (l + 1) + m] * Y_lm(d), linear Rec.709, one "
     "column a colour. Y_lm are the real, orthonormal spherical harmonics without the Condon-Shortley phase "
     "(Y_00 = 0.28209, Y_1m = 0.48860 * (y, z, x)), with the polar axis along z of the asset coordinates (right-handed, "
     "Y up, metres). d is a unit vector from the surface towards the light. The raw sum may be slightly negative; "
-    "environment.exr is its positive part, scaled per colour to the same total."
+    "environment.exr is the positive picture with the same harmonics up to order 4."
 )
 
 
@@ -52,14 +54,62 @@ def latlong_weights(width: int, height: int) -> F64:
 
 
 def environment(light: F32, width: int) -> F32:
-    """(width / 2, width, 3) picture of the light: negative lobes cut off, total energy kept per colour."""
+    """(width / 2, width, 3) picture of the light that any renderer can take: nowhere negative.
+
+        max(L(d) + sum_{l <= 4} q_lm Y_lm(d), 0)
+
+    A sum of harmonics rings below 0 beside bright lamps. Cutting that off alone would add light; q takes it back out,
+    so that the picture's own harmonics up to order KEPT_ORDER are the light's: its energy, and through the clamped
+    cosine nearly all that a surface's irradiance depends on. Where no positive picture can have them (a light that
+    was fitted to be dark somewhere), the nearest that the steps find; the energy is then kept by a factor per colour.
+    """
     height = width // 2
-    directions = torch.from_numpy(latlong_directions(width, height).reshape(-1, 3))
-    raw = sh.radiance(torch.from_numpy(np.asarray(light, np.float64)), directions).numpy().reshape(height, width, 3)
-    weights = latlong_weights(width, height)[..., None]
-    image = raw.clip(min=0)
-    wanted, found = ((x * weights).sum((0, 1)) for x in (raw, image))
-    return np.asarray(image * (wanted.clip(min=0) / np.where(found > 0, found, 1)), np.float32)
+    small = _picture(light, SOLVE_WIDTH)
+    basis, weights = _kept_basis(SOLVE_WIDTH), latlong_weights(SOLVE_WIDTH, SOLVE_WIDTH // 2)
+    spread = np.broadcast_to(weights, small.shape[:2]).reshape(-1, 1)
+    wanted = basis.T @ (spread * small.reshape(-1, 3))
+    q = np.zeros_like(wanted)
+    for _ in range(SOLVE_STEPS):
+        image = (small.reshape(-1, 3) + basis @ q).clip(min=0)
+        q += wanted - basis.T @ (spread * image)
+    raw = _picture(light, width)
+    image = (raw + (_kept_basis(width) @ q).reshape(height, width, 3)).clip(min=0)
+    energy, found = ((x * latlong_weights(width, height)[..., None]).sum((0, 1)) for x in (raw, image))
+    return np.asarray(image * (energy.clip(min=0) / np.where(found > 0, found, 1)), np.float32)
+
+
+def _picture(light: F32, width: int) -> F64:
+    """(width / 2, width, 3) L(d), ringing and all."""
+    directions = torch.from_numpy(latlong_directions(width, width // 2).reshape(-1, 3))
+    found: F64 = sh.radiance(torch.from_numpy(np.asarray(light, np.float64)), directions).numpy()
+    return found.reshape(width // 2, width, 3)
+
+
+def _kept_basis(width: int) -> F64:
+    """(pixels, 25) Y_lm up to KEPT_ORDER."""
+    directions = torch.from_numpy(latlong_directions(width, width // 2).reshape(-1, 3))
+    found: F64 = sh.sh_basis(directions, KEPT_ORDER).numpy()
+    return found
+
+
+def environment_figures(light: F32, image: F32) -> dict[str, float]:
+    """For the report: how far the raw light is negative, and how well the picture stands for it.
+
+    light_negative_share: of the raw light's energy; light_peak_ratio: picture's over raw maximum;
+    light_irradiance_error: largest difference of E(n) over all n, relative to the mean of E.
+    """
+    raw = _picture(light, SOLVE_WIDTH)
+    weights = latlong_weights(SOLVE_WIDTH, SOLVE_WIDTH // 2)[..., None]
+    total = max(float((raw.clip(min=0) * weights).sum()), 1e-30)
+    n = torch.from_numpy(latlong_directions(64, 32).reshape(-1, 3).astype(np.float32))
+    wanted = sh.irradiance(torch.from_numpy(np.asarray(light, np.float32)), n).numpy()
+    found = sh.irradiance(torch.from_numpy(light_from_environment(image)), n).numpy()
+    figures = {
+        "light_negative_share": float((-raw.clip(max=0) * weights).sum()) / total,
+        "light_peak_ratio": float(image.max() / max(raw.max(), 1e-30)),
+        "light_irradiance_error": float(np.abs(found - wanted).max() / max(float(wanted.mean()), 1e-30)),
+    }
+    return {k: round(v, 5) for k, v in figures.items()}
 
 
 def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:

@@ -7,12 +7,13 @@ that the file has one root prim and references cleanly, while NAME.usd itself st
 from __future__ import annotations
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender
 
 from pipeline.artifacts import Camera
 from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM, matrix
 from stages.usd.component import detached
 
+MAIN_CAMERA = "main_cam"
 SENSOR_WIDTH = (
     0.36  # USD measures apertures in tenths of the scene's unit: 36 mm; only its ratio to focal length counts
 )
@@ -38,9 +39,29 @@ def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int
     UsdGeom.Scope.Define(stage, f"/{name}/lookdev/cameras")
     for camera in cameras:
         _camera(stage, f"/{name}/lookdev/cameras/view_{camera.index}", camera, camera.index in holdout, radius)
+    _shown_first(stage, name, cameras, holdout)
     out = detached(stage)
     out.subLayerPaths.append(f"./{name}.usd")  # only now: on a stage it would be looked for in the working folder
     return out
+
+
+def _shown_first(stage: Usd.Stage, name: str, cameras: tuple[Camera, ...], holdout: frozenset[int]) -> None:
+    """What opens first: the held-out photo taken most from the front (with none held out, any photo).
+
+    Viewers disagree on how a file says so: usdview takes a camera called main_cam, others the layer's cameraSettings,
+    renderers the stage's render settings.
+    """
+    if not cameras:
+        return
+    of = [c for c in cameras if c.index in holdout] or list(cameras)
+    first = max(of, key=lambda c: c.world_from_cam[2][3] / np.linalg.norm(np.array(c.world_from_cam)[:3, 3]))
+    main = UsdGeom.Camera.Define(stage, f"/{name}/lookdev/cameras/{MAIN_CAMERA}")
+    main.GetPrim().GetReferences().AddInternalReference(f"/{name}/lookdev/cameras/view_{first.index}")
+    settings = UsdRender.Settings.Define(stage, f"/{name}/lookdev/render_settings")
+    settings.CreateCameraRel().SetTargets([main.GetPath()])
+    settings.CreateResolutionAttr(Gf.Vec2i(first.width, first.height))
+    stage.SetMetadata("renderSettingsPrimPath", str(settings.GetPath()))
+    stage.GetRootLayer().customLayerData = {"cameraSettings": {"boundCamera": str(main.GetPath())}}
 
 
 def _camera(stage: Usd.Stage, path: str, camera: Camera, held_out: bool, radius: float) -> None:

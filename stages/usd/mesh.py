@@ -14,6 +14,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
+SHRINK, SHRINK_ROUNDS = 0.85, 6
 CANDIDATES = 12  # nearest triangles among which the exact nearest point is looked for
 
 
@@ -113,6 +114,32 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface) -> UvSurface:
         face, weights = _nearest(query[:, :3], corners[inside], near)
         uvs[rows] = (t[inside[face]] * weights[..., None]).sum(1).reshape(-1, 3, 2)
     values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
+    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
+
+
+def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
+    """The proxy with texture triangles drawn towards their centres where two lie on the same texels.
+
+    At a chart's edge corners are drawn onto the edge, so that neighbours may fold over each other. Baking onto the
+    proxy would then write texels twice. A stand-in can bear a little stretch instead.
+    """
+    from pipeline import raster
+    from pipeline.meshes import Charts
+
+    t = proxy.uvs[proxy.uv_faces].astype(np.float64)
+    inside = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 0.5], [2, 0.5, 2], [0.5, 2, 2]], np.float64)
+    inside /= inside.sum(1, keepdims=True)
+    for _ in range(SHRINK_ROUNDS):
+        flat = Charts(t.reshape(-1, 2).astype(np.float32), np.arange(t.size // 2, dtype=np.int32).reshape(-1, 3))
+        twice = raster.layers(raster.texel_corners(flat, size), size).reshape(size, size) > 1
+        if not twice.any():
+            break
+        places = np.einsum("sc,fcx->fsx", inside, t)
+        column = (places[..., 0] * size).astype(int).clip(0, size - 1)
+        row = ((1 - places[..., 1]) * size).astype(int).clip(0, size - 1)
+        folded = twice[row, column].any(1)
+        t[folded] += (1 - SHRINK) * (t[folded].mean(1, keepdims=True) - t[folded])
+    values, inverse = np.unique(t.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
 
 

@@ -10,6 +10,12 @@ import struct
 import zipfile
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.images import read_encoded
+
+AR_SIDE = 2048  # texels: phones hold no more
 ALIGNMENT = 64
 LOCAL_HEADER = 30
 PADDING_ID = 0x1986  # the extra-field id that USD's own writer uses for its padding
@@ -35,3 +41,28 @@ def _padding(offset: int) -> bytes:
     if missing < 4:
         missing += ALIGNMENT
     return struct.pack("<HH", PADDING_ID, missing - 4) + bytes(missing - 4)
+
+
+def bounded_png(source: Path | npt.NDArray[np.integer]) -> bytes:
+    """A PNG of at most AR_SIDE texels a side: the file as it is if it is that small, else shrunk by means over blocks.
+
+    `source`: a file, or (H, W, C) as stored. The means are of stored values, which is right for data and close for
+    colours. Every 8-bit picture keeps its channels.
+    """
+    import cv2
+
+    if isinstance(source, Path):
+        image = read_encoded(source)
+        if max(image.shape[:2]) <= AR_SIDE and image.dtype == np.uint8:
+            return source.read_bytes()
+    else:
+        image = source
+    if image.dtype != np.uint8:
+        image = np.round(image / 257.0).astype(np.uint8)
+    if max(image.shape[:2]) > AR_SIDE:
+        image = np.atleast_3d(cv2.resize(image, (AR_SIDE, AR_SIDE), interpolation=cv2.INTER_AREA))
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
+    done, content = cv2.imencode(".png", np.ascontiguousarray(image[..., order]))
+    if not done:
+        raise RuntimeError(f"PNG can't hold an array of {image.shape} {image.dtype}")
+    return bytes(content.tobytes())

@@ -14,11 +14,13 @@ from pipeline.contract import Context
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import matrix
 from stages.usd.exported import load_exported
-from stages.usd.render import Renderer, View, orbit_view
+from stages.usd.render import Renderer
+from stages.usd.view import View, orbit_view
 
 F32 = npt.NDArray[np.float32]
 FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side
 SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
+THUMBNAIL_SIDE, THUMBNAIL_TURN = 256, 25.0  # pixels, degrees
 GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
 """A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape alone."""
 
@@ -79,17 +81,30 @@ def factor_for(camera: Camera) -> int:
 def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
     """SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
     renderer = Renderer(load_exported(root))
-    vertices = renderer.asset.mesh.vertices
-    centre = (vertices.min(0) + vertices.max(0)).astype(np.float64) / 2
-    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
     written = []
     for side, degrees in SIDES.items():
-        view = orbit_view(radius, np.radians(degrees), size, centre)
+        view = framing(renderer, np.radians(degrees), size)
         for name, options in ((side, {}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
             check()
             written.append(folder / f"{name}.png")
             write_rgba_png(written[-1], renderer.render(view, **options))  # type: ignore[arg-type]
     return written
+
+
+def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
+    """The head from slightly beside the front, under the captured light."""
+    check()
+    renderer = Renderer(load_exported(root))
+    view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
+    write_rgba_png(path.resolve(), renderer.render(view))
+    return path.resolve()
+
+
+def framing(renderer: Renderer, azimuth: float, size: int) -> View:
+    """A square view of the whole asset from `azimuth` (radians from +Z towards +X)."""
+    vertices = renderer.asset.mesh.vertices
+    centre = (vertices.min(0) + vertices.max(0)).astype(np.float64) / 2
+    return orbit_view(float(np.linalg.norm(vertices - centre, axis=1).max()), azimuth, size, centre)
 
 
 def write_rgba_png(path: Path, rgba: F32) -> None:

@@ -2,38 +2,33 @@
 
     L(wo) = a / pi max(E(n), 0) + (sum_j rho c_j B_j(n.wo)) max(sum_l A_l(1/kappa) L_l(w_r), 0)     [NeuFace eq. 12, 16]
 
-Primary rays go through the exact cameras (distortion included). No shadows and no bounces: neither has the model.
+Primary rays go through the exact cameras (distortion included). Under spherical harmonics, the captured light above
+all, there are no shadows and no bounces, as in the model that was fitted, and a is the albedo times the occlusion.
+Under any other light (stages.usd.relight) both are traced.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from pipeline.maths import brdf
-from pipeline.transforms import rays
+from pipeline.transforms import inverse_rigid, project, rays
+from stages.usd import kernels
 from stages.usd.exported import ExportedAsset
+from stages.usd.view import View
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
-CHUNK = 1 << 16  # rays at once: 121 basis functions of 65,536 directions are 32 MB
+CHUNK = 1 << 18  # rays at once
+EDGE_SAMPLES = 4  # along each side of a pixel on the silhouette
 EMBREE_SIZE = 100.0  # embree works in float32 with absolute tolerances: the mesh is scaled to about this size
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A camera as the renderer needs it; K in pixels with the first pixel's centre at (0.5, 0.5)."""
-
-    K: F64
-    world_from_cam: F64
-    width: int
-    height: int
-    distortion: F64 = field(default_factory=lambda: np.zeros(5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +38,48 @@ class Hits:
     ray: npt.NDArray[np.int64]
     face: npt.NDArray[np.int64]
     weights: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Surface points to shade.
+
+    ray (M,); wo, normal (M, 3) unit; uv (M, 2); corner, weights (M, 3): vertices of their triangles.
+    """
+
+    ray: npt.NDArray[np.int64]
+    wo: F64
+    normal: F64
+    uv: F32
+    corner: I32
+    weights: F32
+
+
+class Light(Protocol):
+    """Turns points of one asset into radiance (M, 3) towards wo."""
+
+    def shade(self, renderer: Renderer, points: Points) -> F64: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Harmonics:
+    """The model's closed form. coefficients ((L + 1)^2, 3); `plain`: a grey diffuse surface, to see the shape alone."""
+
+    coefficients: F32
+    plain: bool = False
+
+    def shade(self, renderer: Renderer, points: Points) -> F64:
+        """[NeuFace eq. 12] + [NeuFace eq. 16]"""
+        asset, light = renderer.asset, torch.from_numpy(np.asarray(self.coefficients, np.float32))
+        n = torch.from_numpy(points.normal.astype(np.float32))
+        albedo = np.full((len(n), 3), 0.5, np.float32) if self.plain else bilinear(renderer.fitted_albedo, points.uv)
+        colour = brdf.diffuse(torch.from_numpy(albedo), n, light)
+        if not self.plain:
+            s = torch.from_numpy(bilinear(asset.inv_kappa, points.uv)[:, 0]).clamp(min=0)
+            toward = torch.from_numpy(points.wo.astype(np.float32))
+            incident = brdf.light_integral(brdf.reflect(toward, n), s, light, asset.attenuation)
+            colour = colour + torch.from_numpy(renderer.strength(points))[:, None] * incident
+        return np.asarray(colour.numpy(), np.float64)
 
 
 class Renderer:
@@ -58,80 +95,108 @@ class Renderer:
         self._scale = EMBREE_SIZE / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-9)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, (mesh.vertices * self._scale).astype(np.float32), mesh.faces)
-        self._tangents = tangents(asset)
+        self._tangents = tangents(asset).astype(np.float32)
+        self._normals = mesh.normals[mesh.faces].astype(np.float32)
+        self._uvs = mesh.uvs[mesh.uv_faces].astype(np.float32)
+        self.fitted_albedo = asset.albedo if asset.occlusion is None else asset.albedo * asset.occlusion
 
     def render(
-        self, view: View, *, factor: int = 1, samples: int = 2, light: F32 | None = None, plain: bool = False
+        self,
+        view: View,
+        *,
+        factor: int = 1,
+        samples: int = 2,
+        light: F32 | Light | None = None,
+        plain: bool = False,
     ) -> F32:
         """(height / factor, width / factor, 4) linear Rec.709 RGBA, premultiplied.
 
-        `factor`: one pixel for factor x factor photo pixels. `samples`: rays along each side of a pixel.
-        `light`: other SH coefficients than the captured ones. `plain`: grey diffuse surface, to see the shape alone.
+        `factor`: one pixel for factor x factor photo pixels. `samples`: rays along each side of a pixel; 0: one, and
+        more where the silhouette passes. `light`: other SH coefficients than the captured ones, or any Light.
+        `plain`: grey diffuse surface, to see the shape alone.
         """
+        if light is None or isinstance(light, np.ndarray):
+            light = Harmonics(self.asset.light if light is None else light, plain)
         h, w = view.height // factor, view.width // factor
-        out = np.zeros((h * w, 4), np.float64)
-        coefficients = torch.from_numpy(np.asarray(self.asset.light if light is None else light, np.float32))
-        rows = max(1, CHUNK // (w * samples * samples))
-        for top in range(0, h, rows):
-            ys = np.arange(top, min(top + rows, h))
-            uv = _sample_positions(ys, w, samples) * factor
+        out = np.zeros((h * w, 4), np.float32)
+        reached = self._reached(view, w, h, factor)
+        out[reached] = self._pixels(view, reached, w, factor, max(samples, 1), light)
+        if samples == 0:
+            edge = np.flatnonzero(_borders(out[:, 3].reshape(h, w)).ravel())
+            out[edge] = self._pixels(view, edge, w, factor, EDGE_SAMPLES, light)
+        return out.reshape(h, w, 4)
+
+    def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
+        """Pixels in the rectangle around the mesh's picture; all where part of it lies beside or behind the camera."""
+        points = self._corners.reshape(-1, 3)
+        distances = points @ view.world_from_cam[:3, 2] - view.world_from_cam[:3, 2] @ view.world_from_cam[:3, 3]
+        if distances.min() <= 0 or np.any(view.distortion):
+            return np.arange(width * height)
+        uv = project(view.K, inverse_rigid(view.world_from_cam), view.distortion, points)[0] / factor
+        first = np.floor(uv.min(0)).astype(int).clip(0, [width, height])
+        last = np.ceil(uv.max(0)).astype(int).clip(0, [width, height])
+        rows, columns = np.arange(first[1], last[1]), np.arange(first[0], last[0])
+        return np.asarray((rows[:, None] * width + columns).ravel(), np.int64)
+
+    def _pixels(
+        self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, samples: int, light: Light
+    ) -> F32:
+        """(N, 4) RGBA of some pixels, given by row * width + column."""
+        out = np.zeros((len(pixel), 4), np.float32)
+        step = max(1, CHUNK // (samples * samples))
+        for first in range(0, len(pixel), step):
+            some = pixel[first : first + step]
+            uv = _sample_positions(some, width, samples) * factor
             origin, directions = rays(view.K, view.world_from_cam, view.distortion, uv)
-            hits = self.trace(origin, directions)
-            rgba = np.zeros((len(uv), 4))
-            rgba[hits.ray, :3] = self.shade(hits, -directions[hits.ray], coefficients, plain)
-            rgba[hits.ray, 3] = 1
-            out[top * w : top * w + len(ys) * w] = rgba.reshape(-1, samples * samples, 4).mean(1)
-        return out.reshape(h, w, 4).astype(np.float32)
+            points = self.points(origin, directions)
+            rgba = np.zeros((len(uv), 4), np.float32)
+            if len(points.ray):
+                rgba[points.ray, :3] = light.shade(self, points)
+                rgba[points.ray, 3] = 1
+            out[first : first + len(some)] = rgba.reshape(-1, samples * samples, 4).mean(1)
+        return out
 
     def trace(self, origin: F64, directions: F64) -> Hits:
-        """First hits. The weights are calculated again in float64: embree's own are good to 1e-5 only."""
-        starts = np.broadcast_to(origin * self._scale, directions.shape)
-        face = np.asarray(
-            self._scene.run(np.ascontiguousarray(starts, np.float32), np.ascontiguousarray(directions, np.float32)),
-            np.int64,
-        )
+        """First hits."""
+        starts = np.broadcast_to((origin * self._scale).astype(np.float32), directions.shape)
+        found = self._scene.run(np.ascontiguousarray(starts), np.ascontiguousarray(directions, np.float32))
+        face = np.asarray(found, np.int64)
         ray = np.flatnonzero(face >= 0)
-        face = face[ray]
-        a, b, c = self._corners[face].transpose(1, 0, 2)
-        d = directions[ray]
-        e1, e2 = b - a, c - a
-        p, t = np.cross(d, e2), origin - a
-        determinant = (e1 * p).sum(1)
-        safe = np.where(np.abs(determinant) > 1e-30, determinant, 1.0)  # a ray in the triangle's plane: weights clipped
-        q = np.cross(t, e1)
-        u, v = (t * p).sum(1) / safe, (d * q).sum(1) / safe
-        weights = np.stack([1 - u - v, u, v], -1).clip(0, 1)
-        weights /= weights.sum(1, keepdims=True)
-        return Hits(ray, face, weights)
+        weights = np.empty((len(ray), 3))
+        kernels.hit_weights(self._corners, face[ray], origin, directions[ray], weights)
+        return Hits(ray, face[ray], weights)
 
-    def shade(self, hits: Hits, wo: F64, light: torch.Tensor, plain: bool = False) -> F64:
-        """(M, 3) radiance towards wo (M, 3)."""
-        mesh, asset = self.asset.mesh, self.asset
-        uv = (mesh.uvs[mesh.uv_faces[hits.face]] * hits.weights[..., None]).sum(1)
-        normal = _unit((mesh.normals[mesh.faces[hits.face]] * hits.weights[..., None]).sum(1))
-        if asset.normal is not None:
-            normal = self._bent(hits, normal, bilinear(asset.normal, uv))
-        n = torch.from_numpy(normal.astype(np.float32))
-        out = torch.from_numpy(np.full((len(n), 3), 0.5, np.float32) if plain else bilinear(asset.albedo, uv))
-        colour = brdf.diffuse(out, n, light)
-        if asset.irradiance_ratio is not None and not plain:
-            colour = colour * torch.from_numpy(bilinear(asset.irradiance_ratio, uv))
-        if not plain:
-            toward = torch.from_numpy(wo.astype(np.float32))
-            cosine = (normal * wo).sum(1).clip(0, 1)
-            strength = (bilinear(asset.coefficients, uv) * lookup(asset.basis, cosine)).sum(1).clip(min=0)
-            s = torch.from_numpy(bilinear(asset.inv_kappa, uv)[:, 0]).clamp(min=0)
-            incident = brdf.light_integral(brdf.reflect(toward, n), s, light, asset.attenuation)
-            colour = colour + torch.from_numpy(strength.astype(np.float32))[:, None] * incident
-        return np.asarray(colour.numpy(), np.float64)
+    def points(self, origin: F64, directions: F64) -> Points:
+        """What the rays meet, with the normal that the normal map gives it."""
+        hits, mesh = self.trace(origin, directions), self.asset.mesh
+        w = hits.weights.astype(np.float32)
+        uv, smooth = (np.einsum("nic,ni->nc", a[hits.face], w) for a in (self._uvs, self._normals))
+        normal = _unit(smooth)
+        if self.asset.normal is not None:
+            normal = self._bent(hits.face, w, normal, bilinear(self.asset.normal, uv))
+        return Points(hits.ray, -directions[hits.ray], normal, uv, mesh.faces[hits.face], w)
 
-    def _bent(self, hits: Hits, normal: F64, local: F32) -> F64:
+    def strength(self, points: Points) -> F32:
+        """(M,) rho c . B(n.wo): the lobe's share of the light in it."""
+        cosine = (points.normal * points.wo).sum(1).clip(0, 1)
+        table = lookup(self.asset.basis, cosine)
+        return np.asarray((bilinear(self.asset.coefficients, points.uv) * table).sum(1).clip(min=0), np.float32)
+
+    def _bent(self, face: npt.NDArray[np.int64], weights: F32, normal: F64, local: F32) -> F64:
         """The normal map's normal (tangent space) in asset coordinates."""
-        tangent = (self._tangents[hits.face] * hits.weights[..., None]).sum(1)
+        tangent = np.einsum("nic,ni->nc", self._tangents[face], weights)
         sign = np.where(tangent[:, 3:] < 0, -1.0, 1.0)
         t = _unit(tangent[:, :3] - normal * (normal * tangent[:, :3]).sum(1, keepdims=True))
         b = np.cross(normal, t) * sign
         return _unit(local[:, :1] * t + local[:, 1:2] * b + local[:, 2:] * normal)
+
+
+def _borders(alpha: F32) -> npt.NDArray[np.bool_]:
+    """(H, W) pixels with a neighbour (of eight) on the other side of the silhouette."""
+    import cv2
+
+    solid, ring = (alpha > 0).astype(np.uint8), np.ones((3, 3), np.uint8)
+    return np.asarray(cv2.dilate(solid, ring) != cv2.erode(solid, ring))
 
 
 def tangents(asset: ExportedAsset) -> F64:
@@ -151,15 +216,9 @@ def tangents(asset: ExportedAsset) -> F64:
 
 def bilinear(image: F32, uv: npt.NDArray[np.floating]) -> F32:
     """(N, C) values of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border."""
-    h, w = image.shape[:2]
-    x = (uv[:, 0] * w - 0.5).clip(0, w - 1)
-    y = ((1 - uv[:, 1]) * h - 0.5).clip(0, h - 1)
-    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
-    fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    bottom = image[y1, x0] * (1 - fx) + image[y1, x1] * fx
-    return np.asarray(top * (1 - fy) + bottom * fy, np.float32)
+    out = np.empty((len(uv), image.shape[2]), np.float32)
+    kernels.bilinear(np.ascontiguousarray(image, np.float32), uv, out)
+    return out
 
 
 def lookup(table: F32, cosine: F64) -> F32:
@@ -171,24 +230,12 @@ def lookup(table: F32, cosine: F64) -> F32:
     return np.asarray(table[low] * (1 - f) + table[np.minimum(low + 1, width - 1)] * f, np.float32)
 
 
-def orbit_view(radius: float, azimuth: float, size: int, centre: F64 | None = None, elevation: float = 0.0) -> View:
-    """A camera that looks at `centre` (default the origin) and frames a sphere of `radius`; azimuth 0 is +Z."""
-    back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
-    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
-    distance = 6 * radius
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, -np.cross(back, right), -back], 1)
-    pose[:3, 3] = (np.zeros(3) if centre is None else centre) + back * distance
-    focal = 0.5 * size / np.tan(np.arcsin(1 / 6)) / 1.02
-    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return View(K, pose, size, size)
-
-
-def _sample_positions(rows: npt.NDArray[np.int64], width: int, samples: int) -> F64:
-    """(rows * width * samples^2, 2) positions, all samples of a pixel one after the other."""
+def _sample_positions(pixel: npt.NDArray[np.int64], width: int, samples: int) -> F64:
+    """(N * samples^2, 2) image positions, all samples of a pixel one after the other."""
     inside = (np.arange(samples) + 0.5) / samples
-    v, u, dv, du = np.meshgrid(rows, np.arange(width), inside, inside, indexing="ij")
-    return np.stack([u + du, v + dv], -1).reshape(-1, 2).astype(np.float64)
+    du, dv = (a.ravel() for a in np.meshgrid(inside, inside))
+    u, v = (pixel % width)[:, None] + du, (pixel // width)[:, None] + dv
+    return np.stack([u, v], -1).reshape(-1, 2).astype(np.float64)
 
 
 def _unit(x: npt.NDArray[np.floating]) -> F64:

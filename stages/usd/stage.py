@@ -37,7 +37,15 @@ class Config(StageConfig):
 
     name: str = Field("head", description="name of the asset: prim, file and prefix of the textures")
     asset_version: str = Field("1.0.0", description="assetInfo:version of the component")
+    author: str = Field("", max_length=1000, description="who made the capture; recorded in the asset")
+    license: str = Field("", max_length=1000, description="licence of the capture; recorded in the asset")
+    subject_consent: str = Field("", max_length=1000, description="what the subject agreed to; recorded in the asset")
     usdz: bool = Field(True, description="also write a preview package NAME.usdz")
+    glb: bool = Field(True, description="also write NAME.glb")
+    obj: bool = Field(True, description="also write NAME.obj and NAME.mtl")
+    divide_shadows: bool = Field(
+        True, description="take the captured light's shadows and interreflections out of the albedo"
+    )
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
@@ -47,15 +55,15 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     """Write asset/, check it, then render from what was written."""
-    from stages.usd.export import export
+    from stages.usd.export import THUMBNAIL, export
     from stages.usd.naming import check_name
-    from stages.usd.previews import render_held_out, render_previews
+    from stages.usd.previews import render_held_out, render_previews, render_thumbnail
     from stages.usd.validate import checks_run, require_valid
 
     name = check_name(config.name)
     total = 4
     context.progress(0, total, "writing the component")
-    written, notes = export(
+    made = export(
         inputs.uv,
         inputs.bake,
         inputs.inverse_rendering,
@@ -65,8 +73,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         context.workdir / "asset",
         context.check,
     )
-    warnings = list(notes)
-    context.progress(1, total, "checking it")
+    written, warnings = made.written, list(made.notes)
+    root = context.workdir / "asset" / f"{name}.usd"
+    context.progress(1, total, "rendering previews")
+    written.append(render_thumbnail(root, root.parent / THUMBNAIL, context.check))
+    written += render_previews(root, config.preview_size, context.workdir / "previews", context.check)
+    context.progress(2, total, "checking it")
     for file in [f for f in written if f.parent == context.workdir / "asset" and f.name in _roots(name)]:
         context.check()
         warnings += [
@@ -74,9 +86,6 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
             for f in require_valid(file)
             if f.level == "warning"
         ]
-    context.progress(2, total, "rendering previews")
-    root = context.workdir / "asset" / f"{name}.usd"
-    written += render_previews(root, config.preview_size, context.workdir / "previews", context.check)
     context.progress(3, total, "rendering held-out views from the asset")
     views: tuple[HeldOutView, ...] = ()
     if config.render_views:
@@ -88,6 +97,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         root=f"asset/{name}.usd",
         files=files,
         views=views,
+        figures=made.figures,
+        stated=made.stated,
         checks=checks_run(),
         warnings=tuple(dict.fromkeys(warnings)),
     )
@@ -101,4 +112,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=1, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=2, inputs=Inputs, config=Config, output=UsdAsset, run=run)

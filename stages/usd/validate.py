@@ -1,8 +1,8 @@
 """Checks an asset as a client would: every validator of the USD library, and what those leave unseen.
 
-The library misses extents, face indices, primvar counts, dangling shader connections, absolute paths, kind, and
-whether an image can be decoded; these are checked here. Works on .usd, .usda, .usdc and .usdz alone, without the
-pipeline's manifests.
+The library misses extents, face indices, primvar counts, dangling shader connections, absolute paths, kind, whether an
+image can be decoded, colour spaces, MaterialX networks, and all variants but the selected; these are checked here.
+Works on .usd, .usda, .usdc and .usdz alone, without the pipeline's manifests.
 """
 
 from __future__ import annotations
@@ -13,13 +13,15 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
+from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from pipeline.errors import StageError
 from stages.usd.findings import Finding, errors
 from stages.usd.geometry_checks import mesh_findings
+from stages.usd.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
 
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
@@ -156,21 +158,29 @@ def meshes(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 # ------------------------------------------------------------------ materials
 def materials(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Every mesh bound to a material with a surface; every connection ends at an attribute that exists."""
-    out = []
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if prim.IsA(UsdGeom.Mesh):
-            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-            if not material:
-                out.append(Finding("error", "material", "no material is bound", str(prim.GetPath())))
-            elif not material.ComputeSurfaceSource()[0]:
-                out.append(Finding("error", "material", "it has no surface shader", str(material.GetPath())))
-        for attribute in prim.GetAttributes():
-            out += [
-                Finding("error", "connection", f"leads to {target}, which does not exist", str(attribute.GetPath()))
-                for target in attribute.GetConnections()
-                if not stage.GetAttributeAtPath(target)
-            ]
+    """Bindings, connections, colour spaces and MaterialX networks."""
+    return [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage)]
+
+
+def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """The same in every other variant of the default prim, as far as it differs. The stage is left as it was."""
+    prim, out = stage.GetDefaultPrim(), []
+    known = materialx_surfaces(stage)
+    for name in prim.GetVariantSets().GetNames() if prim else ():
+        selected = prim.GetVariantSet(name)
+        chosen = selected.GetVariantSelection()
+        for variant in selected.GetVariantNames():
+            if variant == chosen:
+                continue
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                selected.SetVariantSelection(variant)
+            found = [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage, known)]
+            if not any(p.IsA(UsdGeom.Mesh) for p in stage.Traverse()):
+                found.append(Finding("error", "mesh", "no mesh is left", path.name))
+            known |= materialx_surfaces(stage)
+            out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found if f.level != "info"]
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                selected.ClearVariantSelection()
     return out
 
 
@@ -246,5 +256,6 @@ CHECKS: tuple[Callable[[Usd.Stage, Path], list[Finding]], ...] = (
     meshes,
     materials,
     textures,
+    variants,
     package,
 )

@@ -52,3 +52,61 @@ def test_f0_gives_back_the_energy_along_the_normal() -> None:
     f0 = microfacet.f0_from_lobe(np.full(3, 0.028), inv_kappa)
     assert np.allclose(f0 * [ggx_energy(float(a)) for a in alpha], 0.028, rtol=5e-3)
     assert (f0 > 0.028).all() and microfacet.f0_from_lobe(-1.0, 0.1) == 0
+
+
+def hemisphere(steps: int = 700) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) half vectors and their solid angles, by the midpoint rule."""
+    polar = (np.arange(steps) + 0.5) / steps * np.pi / 2
+    turn = (np.arange(steps) + 0.5) / steps * 2 * np.pi
+    t, p = np.meshgrid(polar, turn, indexing="ij")
+    h = np.stack([np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)], -1).reshape(-1, 3)
+    return h, (np.sin(t) * np.pi / 2 * 2 * np.pi / steps**2).ravel()
+
+
+def reflected(cosine: float, alpha: float, f0: float) -> float:
+    """Integral of D F G2 / (4 n.l n.v) n.l over the directions l, written over half vectors (dl = 4 h.v dh)."""
+    h, weight = hemisphere()
+    v = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    hv = h @ v
+    out = 2 * hv * h[:, 2] - cosine
+    good = (hv > 0) & (out > 0)
+    hv, out, z, weight = hv[good], out[good], h[good, 2], weight[good]
+    d = alpha**2 / (np.pi * ((alpha**2 - 1) * z**2 + 1) ** 2)
+    smith = lambda c: 0.5 * (np.sqrt(1 + alpha**2 * (1 / c**2 - 1)) - 1)  # noqa: E731
+    fresnel = f0 + (1 - f0) * (1 - hv) ** 5
+    return float((d * fresnel / (1 + smith(cosine) + smith(out)) * hv / cosine * weight).sum())
+
+
+@pytest.mark.parametrize("cosine, alpha", [(1.0, 0.3), (0.7, 0.3), (0.3, 0.2), (0.1, 0.4), (0.2, 0.7), (1.0, 0.7)])
+@pytest.mark.parametrize("f0", [0.0, 0.04, 1.0])
+def test_split_albedo_against_quadrature_over_half_vectors(cosine: float, alpha: float, f0: float) -> None:
+    a, b = microfacet.split_albedo(cosine, alpha)
+    assert float(f0 * a + b) == pytest.approx(reflected(cosine, alpha, f0), rel=6e-3, abs=2e-4)
+
+
+def test_split_albedo_at_its_extremes() -> None:
+    a, b = microfacet.split_albedo(np.array([1e-6, 1.0]), np.array([[0.01], [1.0]]))
+    assert np.isfinite(a).all() and np.isfinite(b).all() and ((a + b) <= 1 + 1e-6).all()
+    assert a[0, 1] == pytest.approx(1, abs=1e-3) and b[0, 1] == pytest.approx(0, abs=1e-3)  # a mirror, seen straight on
+
+
+@pytest.mark.parametrize("kappa", [2.5, 5.0, 10.0, 20.0, 40.0, 80.0])
+def test_alpha_is_the_width_that_blurs_light_of_order_10_alike(kappa: float) -> None:
+    """A GGX lobe sampled by its visible normals at normal incidence, against the model's attenuation: the alpha with
+    the smallest squared difference under light whose bands hold power like 1 / (2 l + 1)."""
+    from scipy.special import eval_legendre
+
+    u = (np.arange(20_000) + 0.5) / 20_000
+    bands = np.arange(1, 11)
+    lobe = np.exp(-bands * (bands + 1) / 2 / kappa)
+
+    def attenuation(alpha: float) -> np.ndarray:
+        z = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))  # h.n of the distribution of normals, seen along n
+        out = 2 * z * z - 1
+        tangent = np.sqrt(np.maximum(1 / np.maximum(out, 1e-6) ** 2 - 1, 0))
+        weight = np.where(out > 0, 2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)), 0.0)
+        return np.array([(eval_legendre(band, out) * weight).sum() / weight.sum() for band in bands])
+
+    found = np.linspace(0.03, 0.9, 400)
+    misfit = [((attenuation(float(x)) - lobe) ** 2 / (2 * bands + 1)).sum() for x in found]
+    assert float(microfacet.alpha_from_kappa(kappa)) == pytest.approx(found[int(np.argmin(misfit))], abs=0.016)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.special import sph_harm_y
 from support.synthetic_asset import smooth_light
 
 from pipeline.errors import StageError
+from pipeline.maths.sh import sh_basis
 from stages.usd.light import (
     environment,
     latlong_directions,
@@ -94,3 +96,27 @@ def test_unreadable_lights(tmp_path: Path, name: str, content: bytes | None) -> 
         (tmp_path / name).write_bytes(content)
     with pytest.raises(StageError, match="light can't be used"):
         read_light(tmp_path / name)
+
+
+def test_the_dome_is_positive_and_lights_surfaces_as_the_raw_light_does() -> None:
+    """A bright lamp at order 10 rings to below zero; irradiance by summing over the picture's pixels."""
+    lamp = np.zeros((64, 128, 3), np.float32)
+    lamp[18:24, 40:50] = [40, 36, 30]
+    light = light_from_environment(lamp + 0.2)
+    image = environment(light, 256)
+    assert image.min() >= 0
+    directions, weights = latlong_directions(256, 128), latlong_weights(256, 128)
+    raw = (sh_basis(torch.from_numpy(directions.reshape(-1, 3)), 10).numpy() @ light).reshape(128, 256, 3)
+    assert raw.min() < -0.3
+    np.testing.assert_allclose(
+        (image * weights[..., None]).sum((0, 1)), (raw * weights[..., None]).sum((0, 1)), rtol=1e-4
+    )
+    n = latlong_directions(12, 6).reshape(-1, 3)
+    cosine = np.maximum(np.einsum("ni,hwi->nhw", n, directions), 0)
+    found, wanted = (np.einsum("nhw,hwc,h->nc", cosine, x, weights[:, 0]) for x in (image, raw))
+    assert np.abs(found - wanted).max() < 0.02 * wanted.mean()
+    cut = raw.clip(min=0)
+    cut *= (raw * weights[..., None]).sum((0, 1)) / (cut * weights[..., None]).sum((0, 1))
+    scaled = np.einsum("nhw,hwc,h->nc", cosine, cut, weights[:, 0])
+    assert np.abs(scaled - wanted).max() > 5 * np.abs(found - wanted).max()  # what cutting alone would do
+    assert image.max() < 1.3 * raw.max()

@@ -2,56 +2,17 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import pytest
-from support.synthetic_asset import RADIUS, ball, smooth_light, texture_arrays, write_inputs
+from support.render_stand_ins import asset, sphere_points
+from support.synthetic_asset import RADIUS, smooth_light, texture_arrays, write_inputs
 
 from pipeline.transforms import inverse_rigid, project
-from stages.usd.exported import ExportedAsset
 from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
-from stages.usd.render import Renderer, View, bilinear, lookup, orbit_view, tangents
+from stages.usd.render import Renderer, bilinear, lookup, tangents
+from stages.usd.view import View, orbit_view
 
 SIZE = 64
-
-
-@lru_cache(maxsize=1)
-def fine_ball() -> UvSurface:
-    """Fine enough that interpolated normals are the sphere's to 1e-4."""
-    mesh = ball(192, 96, height=1.0)
-    return UvSurface(*(mesh[k] for k in ("vertices", "normals", "faces", "uvs", "uv_faces")))
-
-
-def asset(**changes: object) -> ExportedAsset:
-    """A fine sphere, grey, without specular reflection, under a constant light of radiance 1."""
-    light = np.zeros((121, 3), np.float32)
-    light[0] = np.sqrt(4 * np.pi)
-    parts: dict[str, object] = {
-        "mesh": fine_ball(),
-        "albedo": np.full((8, 8, 3), 0.4, np.float32),
-        "coefficients": np.zeros((8, 8, 1), np.float32),
-        "inv_kappa": np.full((8, 8, 1), 1e-6, np.float32),
-        "normal": None,
-        "basis": np.ones((16, 1), np.float32),
-        "light": light,
-        "attenuation": "exact",
-    }
-    return ExportedAsset(**(parts | changes))  # type: ignore[arg-type]
-
-
-def sphere_points(view: View, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Normals (size, size, 3), wo, and which pixels lie well inside, by intersecting a sphere analytically."""
-    pixel = np.arange(size) + 0.5
-    x, y = np.meshgrid((pixel - view.K[0, 2]) / view.K[0, 0], (pixel - view.K[1, 2]) / view.K[1, 1])
-    d = np.stack([x, y, np.ones_like(x)], -1) @ view.world_from_cam[:3, :3].T
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    o = view.world_from_cam[:3, 3]
-    b = d @ o
-    root = b * b - (o @ o - RADIUS**2)
-    hit = root > 0.2 * RADIUS**2
-    points = o + (-b - np.sqrt(root.clip(0)))[..., None] * d
-    return points / RADIUS, -d, hit
 
 
 def test_constant_light_gives_the_albedo() -> None:
@@ -212,7 +173,8 @@ def test_exported_maps_are_read_back(exported) -> None:
     from stages.usd.exported import load_exported
 
     read, wanted = load_exported(exported[0] / "asset/head.usd"), texture_arrays()
-    np.testing.assert_allclose(read.albedo, wanted["albedo"], atol=1e-6)
+    assert read.occlusion is not None
+    np.testing.assert_allclose(read.albedo * read.occlusion, wanted["albedo"], atol=1e-6)
     np.testing.assert_allclose(read.basis, wanted["basis_lut"][0], atol=1e-6)
     np.testing.assert_allclose(read.normal, wanted["normal"], atol=1e-2)
     np.testing.assert_allclose(read.light, smooth_light(), rtol=1e-6)
@@ -221,11 +183,11 @@ def test_exported_maps_are_read_back(exported) -> None:
 def test_channels_are_in_the_order_of_their_numbers(tmp_path) -> None:
     """c10 comes after c9, not after c1."""
     from pipeline.images import write_exr
-    from stages.usd.exported import _numbered
+    from stages.usd.exported import numbered
 
     values = np.broadcast_to(np.arange(12, dtype=np.float32), (2, 2, 12))
     write_exr(tmp_path / "textures/x_specular_coefficients.exr", values, tuple(f"c{i}" for i in range(12)))
-    np.testing.assert_array_equal(_numbered(tmp_path, "x", "specular_coefficients")[0, 0], np.arange(12))
+    np.testing.assert_array_equal(numbered(tmp_path / "textures/x_specular_coefficients.exr")[0, 0], np.arange(12))
 
 
 def test_a_proxy_that_can_not_be_textured_is_reported(tmp_path) -> None:

@@ -113,10 +113,53 @@ def grey_normal_map(stage: Usd.Stage) -> None:
     shader(stage, "normal").GetPrim().RemoveProperty("inputs:scale")
 
 
+def albedo_as_data(stage: Usd.Stage) -> None:
+    shader(stage, "albedo").GetInput("sourceColorSpace").Set("raw")
+
+
+def roughness_as_colour(stage: Usd.Stage) -> None:
+    shader(stage, "roughness").GetInput("sourceColorSpace").Set("sRGB")
+
+
+def openpbr_albedo_as_data(stage: Usd.Stage) -> None:
+    shader(stage, "openpbr/albedo").GetInput("file").GetAttr().SetColorSpace("raw")
+
+
+def basis_table_as_colour(stage: Usd.Stage) -> None:
+    shader(stage, "neuface_basis/basis_0").GetInput("file").GetAttr().SetColorSpace("srgb_texture")
+
+
+def unknown_node(stage: Usd.Stage) -> None:
+    shader(stage, "openpbr/weight").CreateIdAttr("ND_wizardry_float")
+
+
+def unknown_input(stage: Usd.Stage) -> None:
+    shader(stage, "openpbr/surface").CreateInput("sparkle", Sdf.ValueTypeNames.Float).Set(1.0)
+
+
+def wrong_type(stage: Usd.Stage) -> None:
+    surface = shader(stage, "openpbr/surface")
+    surface.GetPrim().RemoveProperty("inputs:base_weight")
+    surface.CreateInput("base_weight", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(1))
+
+
+def dangling_in_a_variant(stage: Usd.Stage) -> None:
+    tint = shader(stage, "neuface_basis/dot_0").GetInput("in1")
+    tint.GetAttr().SetConnections(["/head/mtl/captured/neuface_basis/gone.outputs:out"])
+
+
 FAULTS = [
+    (albedo_as_data, "colour_space"),
+    (roughness_as_colour, "colour_space"),
+    (openpbr_albedo_as_data, "colour_space"),
+    (basis_table_as_colour, "colour_space"),
+    (unknown_node, "materialx_node"),
+    (unknown_input, "materialx_input"),
+    (wrong_type, "materialx_type"),
+    (dangling_in_a_variant, "connection"),
     (drop_last_index, "topology"),
     (index_too_large, "topology"),
-    (nan_point, "topology"),
+    (nan_point, "points"),
     (lambda s: mesh(s).GetPrim().RemoveProperty("extent"), "extent"),
     (lambda s: mesh(s).GetExtentAttr().Set([(-1, -1, -1), (1, 1, 1)]), "extent"),
     (lambda s: mesh(s).GetPrim().RemoveProperty("subdivisionScheme"), "subdivisionScheme"),
@@ -208,3 +251,25 @@ def test_findings_are_plain_json(asset: Path) -> None:
     (asset / "textures/head_roughness.png").unlink()
     text = json.dumps([f.json() for f in validate(asset / "head.usd")])
     assert json.loads(text)[0]["level"] == "error"
+
+
+def test_missing_map_of_another_look(asset: Path) -> None:
+    (asset / "textures/head_basis_rgb0.exr").unlink()
+    assert "missing_texture" in [f.check for f in validate(asset / "head.usd") if f.level == "error"]
+
+
+def test_a_variant_without_a_mesh(asset: Path) -> None:
+    edit(asset, lambda s: s.RemovePrim("/head/geo/proxy"))
+    found = [f for f in validate(asset / "head.usd") if f.level == "error"]
+    assert any(f.check == "mesh" and "lod=proxy" in f.message for f in found), found
+    stage = Usd.Stage.Open(str(asset / "head.usd"))  # validation leaves the file as it was
+    assert stage.GetDefaultPrim().GetVariantSet("lod").GetVariantSelection() == "full"
+
+
+def test_without_the_materialx_package_that_is_said(asset: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "MaterialX", None)
+    found = validate(asset / "head.usd")
+    assert [f.level for f in found if f.check == "materialx"] == ["info"]
+    assert not [f for f in found if f.level == "error"]

@@ -65,7 +65,7 @@ def test_unknown_words_are_exit_code_2_and_leave_nothing(
 
 
 def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("run", "demo", "validate", "report", "view", "doctor"):
+    for command in ("run", "demo", "validate", "render", "report", "view", "doctor"):
         with pytest.raises(SystemExit) as e:
             parser().parse_args([command, "--help"])
         assert e.value.code == 0
@@ -81,7 +81,8 @@ def test_dry_run_writes_nothing(photos: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_commands_on_folders_without_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in (["report", str(tmp_path)], ["view", str(tmp_path)], ["validate", str(tmp_path / "a.usd")]):
+    for arguments in (["report", str(tmp_path)], ["view", str(tmp_path)], ["validate", str(tmp_path / "a.usd")],
+                      ["render", str(tmp_path), "--out", str(tmp_path / "o")]):  # fmt: skip
         assert main(arguments) == 1
         assert capsys.readouterr().err.startswith("error: ")
     (tmp_path / "run.json").write_text("[]")

@@ -1,0 +1,227 @@
+"""The asset's textures: the baked maps, and what standard shaders need beside them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline import raster
+from pipeline.artifacts import Located, TextureSet
+from pipeline.errors import StageError
+from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
+from pipeline.maths import sh
+from pipeline.meshes import Charts
+from stages.usd.exported import numbered
+from stages.usd.lamps import lamps
+from stages.usd.light import environment
+from stages.usd.lobe import LobeFit, basis_table, in_groups, lobe_fit
+from stages.usd.mesh import UvSurface
+from stages.usd.render import bilinear
+from stages.usd.shading import Look, ior_from_f0
+from stages.usd.transport import BRIGHTEST_ALBEDO, Transport, occlusion
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
+SKIN_F0 = 0.028  # where no F0 was baked
+RAYS = 4_000_000  # about how many are spent on the lamps' visibility
+LAMPS = (96, 384)
+LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
+OCCLUSION_SIZE = 1024  # texels: it varies from vertex to vertex only
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """Files written, what the material reads of them, and figures for the report."""
+
+    written: list[Path]
+    look: Look
+    figures: dict[str, float]
+
+
+def write_maps(
+    bake: Located[TextureSet],
+    mesh: UvSurface,
+    light: F32,
+    name: str,
+    asset: Path,
+    check: Callable[[], None],
+    *,
+    divide: bool,
+) -> Maps:
+    """Everything in textures/. `divide`: take shadows and bounced light out of the albedo."""
+    folder = asset / "textures"
+    written = copy_maps(bake, name, folder)
+    covered = covered_texels(bake)
+    figures: dict[str, float] = {}
+    if divide and not shadows_fitted(bake):
+        shown, found = divided_albedo(bake, mesh, light, name, folder, covered, check)
+        written += shown
+        figures |= found
+    check()
+    basis = numbered(bake.path(bake.artifact.maps["basis_lut"].files["exr"]))
+    coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files["exr"]))
+    groups = {"coefficients": in_groups(coefficients), "basis": in_groups(basis_table(basis.mean(0)))}
+    for kind, pictures in groups.items():
+        for i, picture in enumerate(pictures):
+            written.append(folder / f"{name}_{kind}_rgb{i}.exr")
+            write_exr(written[-1], picture)
+    if "f0" in bake.artifact.maps:
+        f0 = _map(bake, "f0")[..., 0]
+        written.append(folder / f"{name}_specular_color.png")
+        write_png_from_linear(written[-1], np.repeat(f0[..., None].clip(0, 1), 3, -1))
+        fit = lobe_fit(coefficients, _map(bake, "inv_kappa")[..., 0], f0, basis.mean(0), covered)
+        written.append(_write_fit(fit, name, folder))
+        figures |= fit.figures
+    check()
+    return Maps(written, look_of(bake, name, asset), figures)
+
+
+def shadows_fitted(bake: Located[TextureSet]) -> bool:
+    """Whether the fit modelled shadows and bounces itself, so that its albedo is free of them."""
+    ratio = bake.artifact.maps.get("irradiance_ratio")
+    return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
+
+
+def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
+    """Every file of every map as NAME_map.format."""
+    missing = [m for m in NEEDED if "exr" not in getattr(bake.artifact.maps.get(m), "files", {})]
+    if missing or "png" not in bake.artifact.maps["albedo"].files:
+        raise StageError(
+            "maps are missing",
+            where="bake",
+            value=", ".join(sorted(bake.artifact.maps)) or "no maps",
+            limit=f"{', '.join(NEEDED)} as exr, albedo as png too",
+            remedy="run the bake stage again",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for which, texture in sorted(bake.artifact.maps.items()):
+        for form, ref in sorted(texture.files.items()):
+            target = folder / f"{name}_{which}.{form}"
+            shutil.copyfile(bake.path(ref), target)
+            written.append(target)
+    return written
+
+
+def divided_albedo(
+    bake: Located[TextureSet],
+    mesh: UvSurface,
+    light: F32,
+    name: str,
+    folder: Path,
+    covered: Mask,
+    check: Callable[[], None],
+) -> tuple[list[Path], dict[str, float]]:
+    """albedo without the light's shadows and bounces, over the baked one, and `occlusion`: albedo * occlusion = baked.
+
+    The closed form of the fit has neither, so that the photos' were fitted into the albedo. A path tracer has both:
+    with the albedo as fitted it would show them twice.
+    """
+    fitted = _map(bake, "albedo")[..., :3]
+    share = vertex_occlusion(mesh, light, fitted, check)
+    image = vertex_image(mesh, share, min(len(fitted), OCCLUSION_SIZE))
+    if len(image) != len(fitted):
+        import cv2
+
+        image = np.asarray(cv2.resize(image, fitted.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+    albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
+    image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
+    write_exr(folder / f"{name}_albedo.exr", albedo)
+    write_png_from_linear(folder / f"{name}_albedo.png", albedo)
+    write_exr(folder / f"{name}_occlusion.exr", image)
+    shown = image[covered]
+    figures = {
+        "occlusion_mean": round(float(shown.mean(dtype=np.float64)), 5),
+        "occlusion_p05": round(float(np.percentile(shown, 5)), 5),
+    }
+    return [folder / f"{name}_occlusion.exr"], figures
+
+
+def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F32, check: Callable[[], None]) -> F64:
+    """(V, 3) see transport.occlusion."""
+    count = int(np.clip(RAYS // max(len(mesh.vertices), 1), *LAMPS))
+    transport = Transport(mesh.vertices, mesh.normals, mesh.faces)
+    uv = np.zeros((len(mesh.vertices), 2), np.float32)
+    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
+    normals = torch.from_numpy(transport.normals.astype(np.float32))
+    unblocked = sh.irradiance(torch.from_numpy(np.asarray(light, np.float32)), normals).numpy().astype(np.float64)
+    lit = lamps(environment(light, LIGHT_WIDTH), count)
+    return occlusion(transport, lit, unblocked, bilinear(albedo, uv).astype(np.float64), check)
+
+
+def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
+    """(size, size, C) values (V, C) of the vertices on the texture, every texel filled from the nearest chart."""
+    from scipy.ndimage import distance_transform_edt
+
+    charts = Charts(mesh.uvs, mesh.uv_faces)
+    hits = raster.rasterise(raster.texel_corners(charts, size), size, 0, size)
+    image = np.zeros((size * size, values.shape[1]), np.float32)
+    corners = values[mesh.faces[hits.face]].astype(np.float32)
+    image[hits.texel] = np.einsum("nic,ni->nc", corners, hits.weights)
+    empty = np.ones(size * size, np.bool_)
+    empty[hits.texel] = False
+    nearest = distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True)
+    return np.ascontiguousarray(image.reshape(size, size, -1)[nearest[0], nearest[1]])
+
+
+def _write_fit(fit: LobeFit, name: str, folder: Path) -> Path:
+    """Red: the residual of the GGX lobe, 1 = 100 %; green: 1 where kappa can't be told; blue: nothing."""
+    path = folder / f"{name}_lobe_fit.png"
+    write_png(path, np.stack([fit.residual, fit.unresolved, np.zeros_like(fit.residual)], -1))
+    return path
+
+
+# ------------------------------------------------------------------ what the material reads
+def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
+    """The networks' files, and the index of refraction of the mean F0 over covered texels."""
+
+    def found(suffix: str) -> str | None:
+        return f"./textures/{name}_{suffix}" if (asset / "textures" / f"{name}_{suffix}").is_file() else None
+
+    def counted(kind: str) -> tuple[str, ...]:
+        return tuple(f for i in range(99) if (f := found(f"{kind}_rgb{i}.exr")))
+
+    covered = covered_texels(bake)
+    albedo = read_exr(asset / "textures" / f"{name}_albedo.exr")[0][..., :3][covered].mean(0, dtype=np.float64)
+    has_f0 = "exr" in getattr(bake.artifact.maps.get("f0"), "files", {})
+    f0 = float(_map(bake, "f0")[covered].mean(dtype=np.float64)) if has_f0 else SKIN_F0
+    red, green, blue = (round(float(x), 6) for x in albedo)
+    return Look(
+        str(found("albedo.png")),
+        found("roughness.png"),
+        found("normal.png"),
+        round(ior_from_f0(f0), 5),
+        (red, green, blue),
+        specular=found("specular_color.png"),
+        f0=found("f0.exr"),
+        inv_kappa=found("inv_kappa.exr"),
+        coefficients=counted("coefficients"),
+        basis=counted("basis"),
+    )
+
+
+def covered_texels(bake: Located[TextureSet]) -> Mask:
+    """(H, W) texels that a chart touches; all where that was not baked."""
+    size = bake.artifact.size
+    files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
+    found: Mask | None = None
+    if "exr" in files:
+        found = np.asarray(read_exr(bake.path(files["exr"]))[0][..., 0] > 0.5)
+    elif "png" in files:
+        found = np.asarray(read_alpha(bake.path(files["png"])) > 0.5)
+    if found is None or found.shape != (size, size) or not found.any():
+        return np.ones((size, size), np.bool_)
+    return found
+
+
+def _map(bake: Located[TextureSet], which: str) -> F32:
+    return read_exr(bake.path(bake.artifact.maps[which].files["exr"]))[0]

@@ -1,0 +1,109 @@
+"""What the asset's material reads, and helpers to author shader prims."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdShade
+
+T = Sdf.ValueTypeNames
+MATERIAL = "captured"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What the material's networks show. Paths are relative to the layer; None leaves a map out.
+
+    coefficients, basis: pictures of three coefficients c_j(x), and three tables B_j / R, each; () where there are none.
+    """
+
+    albedo: str
+    roughness: str | None
+    normal: str | None
+    ior: float
+    mean_albedo: tuple[float, float, float]
+    specular: str | None = None
+    f0: str | None = None
+    inv_kappa: str | None = None
+    coefficients: tuple[str, ...] = ()
+    basis: tuple[str, ...] = ()
+
+
+def ior_from_f0(f0: float) -> float:
+    """Index of refraction whose reflectance at normal incidence is f0: (1 + sqrt(f0)) / (1 - sqrt(f0)).
+
+    Domain: clamped to [0.005, 0.2], beyond which a dielectric surface is implausible.
+    """
+    root = float(np.sqrt(np.clip(f0, 0.005, 0.2)))
+    return (1 + root) / (1 - root)
+
+
+def shader(stage: Usd.Stage, path: str, identifier: str) -> UsdShade.Shader:
+    """A shader prim of a registered kind."""
+    out = UsdShade.Shader.Define(stage, path)
+    out.CreateIdAttr(identifier)
+    return out
+
+
+def connect(target: UsdShade.Input, source: UsdShade.Output) -> None:
+    """target <- source."""
+    target.ConnectToSource(UsdShade.ConnectableAPI(source.GetPrim()), source.GetBaseName())
+
+
+# ------------------------------------------------------------------ UsdPreviewSurface
+def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) -> None:
+    """`preview` in the metallic workflow, which every importer reads the same way, as the material's surface, and
+    `preview_specular` beside it, which is F0 as a map: a variant, because many importers take it for something else.
+    """
+    path = str(material.GetPath())
+    name = material.CreateInput("st_name", T.String)
+    name.Set("st")
+    reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", T.String).ConnectToSource(name)
+    st = reader.CreateOutput("result", T.Float2)
+    albedo = _texture(stage, st, f"{path}/albedo", look.albedo, "sRGB")
+    roughness = _texture(stage, st, f"{path}/roughness", look.roughness, "raw", "r") if look.roughness else None
+    normal = _normal_texture(stage, st, f"{path}/normal", look.normal) if look.normal else None
+    for which in ("preview", "preview_specular") if look.specular else ("preview",):
+        surface = shader(stage, f"{path}/{which}", "UsdPreviewSurface")
+        surface.CreateInput("useSpecularWorkflow", T.Int).Set(int(which != "preview"))
+        if which == "preview":
+            surface.CreateInput("metallic", T.Float).Set(0.0)
+        else:
+            specular = _texture(stage, st, f"{path}/specular_color", str(look.specular), "sRGB")
+            connect(surface.CreateInput("specularColor", T.Color3f), specular)
+        surface.CreateInput("ior", T.Float).Set(look.ior)
+        connect(surface.CreateInput("diffuseColor", T.Color3f), albedo)
+        if roughness is not None:
+            connect(surface.CreateInput("roughness", T.Float), roughness)
+        else:
+            surface.CreateInput("roughness", T.Float).Set(0.5)
+        if normal is not None:
+            connect(surface.CreateInput("normal", T.Normal3f), normal)
+        surface.CreateOutput("surface", T.Token)
+    material.CreateSurfaceOutput().ConnectToSource(
+        UsdShade.Shader.Get(stage, f"{path}/preview").ConnectableAPI(), "surface"
+    )
+
+
+def _texture(
+    stage: Usd.Stage, st: UsdShade.Output, path: str, file: str, space: str, channel: str = "rgb"
+) -> UsdShade.Output:
+    """A texture reader. Clamped: charts never wrap, and wrapping would mix opposite borders."""
+    out = shader(stage, path, "UsdUVTexture")
+    out.CreateInput("file", T.Asset).Set(Sdf.AssetPath(file))
+    out.CreateInput("sourceColorSpace", T.Token).Set(space)
+    out.CreateInput("wrapS", T.Token).Set("clamp")
+    out.CreateInput("wrapT", T.Token).Set("clamp")
+    connect(out.CreateInput("st", T.Float2), st)
+    return out.CreateOutput(channel, T.Float if channel == "r" else T.Float3)
+
+
+def _normal_texture(stage: Usd.Stage, st: UsdShade.Output, path: str, file: str) -> UsdShade.Output:
+    """Eight bits hold (n + 1) / 2."""
+    output = _texture(stage, st, path, file, "raw")
+    out = UsdShade.Shader(output.GetPrim())
+    out.CreateInput("scale", T.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
+    out.CreateInput("bias", T.Float4).Set(Gf.Vec4f(-1, -1, -1, 0))
+    return output

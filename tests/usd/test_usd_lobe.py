@@ -1,0 +1,58 @@
+"""The learned lobe as a table and as GGX: exact where it can be, and honest about the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.maths import microfacet
+from stages.usd.lobe import COSINES, INV_KAPPA_SCALE, REFERENCE_F0, ROWS, basis_table, in_groups, lobe_fit
+
+
+def test_table_times_the_layers_reflectance_is_the_basis() -> None:
+    """sum_j c_j T_j(c, s) R(c, alpha(s)) = F(c), for every row, with R sampled anew at other places."""
+    basis = np.random.default_rng(1).uniform(0.05, 1, (64, 3)).astype(np.float32)
+    coefficients = np.array([0.02, 0.3, 0.1])
+    table = basis_table(basis)
+    assert table.shape == (ROWS, 64, 3)
+    for row in (0, 10, 40, ROWS - 1):
+        s = (1 - (row + 0.5) / ROWS) / INV_KAPPA_SCALE
+        for column in (3, 20, 63):
+            a, b = microfacet.split_albedo((column + 0.5) / 64, microfacet.alpha_from_kappa(1 / s))
+            tint = table[row, column] @ coefficients
+            assert tint * (REFERENCE_F0 * a + b) == pytest.approx(basis[column] @ coefficients, rel=1e-4)
+
+
+def test_groups_hold_every_coefficient_and_nothing_else() -> None:
+    image = np.arange(2 * 2 * 5, dtype=np.float32).reshape(2, 2, 5)
+    groups = in_groups(image)
+    assert [g.shape for g in groups] == [(2, 2, 3)] * 2
+    np.testing.assert_array_equal(np.concatenate(groups, -1)[..., :5], image)
+    assert not groups[1][..., 2].any()
+
+
+def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
+    """One basis function that is the reflectance of GGX at kappa = 12 and F0 = 0.03; then twice that."""
+    alpha = microfacet.alpha_from_kappa(12.0)
+    c = (np.arange(512) + 0.5) / 512
+    a, b = microfacet.split_albedo(c, alpha)
+    basis = (0.03 * a + b)[:, None].astype(np.float32)
+    one, s = np.ones((4, 4, 1), np.float32), np.full((4, 4), 1 / 12, np.float32)
+    f0, covered = np.full((4, 4), 0.03, np.float32), np.ones((4, 4), bool)
+    assert lobe_fit(one, s, f0, basis, covered).residual.max() < 0.01
+    wrong = lobe_fit(one, s, f0, basis * 2, covered)
+    np.testing.assert_allclose(wrong.residual, 0.5, atol=0.01)  # |2 R - R| / |2 R|
+    assert wrong.figures["ggx_residual_mean"] == pytest.approx(0.5, abs=0.01)
+    assert len(COSINES) >= 8
+
+
+def test_texels_whose_kappa_the_light_can_not_tell_are_flagged() -> None:
+    s = np.array([[1e-6, 0.01], [0.03, 0.1]], np.float32)
+    covered = np.array([[True, False], [True, True]])
+    shape = (2, 2)
+    fit = lobe_fit(
+        np.ones((*shape, 1), np.float32), s, np.full(shape, 0.03, np.float32), np.ones((8, 1), np.float32), covered
+    )
+    np.testing.assert_array_equal(fit.unresolved, [[True, False], [False, False]])
+    assert fit.figures["kappa_unresolved_share"] == pytest.approx(1 / 3, abs=1e-4)
+    assert not fit.residual[0, 1]
