@@ -13,19 +13,23 @@ import torch
 from torch import Tensor
 
 from pipeline.maths import sh
+from pipeline.maths.precision import full_precision
 from pipeline.maths.vmf import ATTENUATIONS
 
 
+@full_precision
 def reflect(wo: Tensor, n: Tensor) -> Tensor:
     """Mirror direction w_r = 2 (n . wo) n - wo, (N, 3). Unit if both are."""
     return 2 * (n * wo).sum(-1, keepdim=True) * n - wo
 
 
+@full_precision
 def diffuse(albedo: Tensor, n: Tensor, light: Tensor) -> Tensor:
     """L_d = a / pi * max(E(n), 0), (N, 3). [NeuFace eq. 16]; the clamp is the supplement's (section B)."""
     return albedo / math.pi * sh.irradiance(light, n).clamp(min=0)
 
 
+@full_precision
 def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: str = "exponential") -> Tensor:
     """max(sum_l A_l(s) sum_m c_lm Y_lm(w_r), 0), (N, 3). [NeuFace eq. 11]; clamp: supplement, section B."""
     bands = sh.band_radiance(light, w_r)
@@ -33,6 +37,7 @@ def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: s
     return torch.einsum("nl,nlc->nc", a, bands).clamp(min=0)
 
 
+@full_precision
 def specular(rho: Tensor, cb: Tensor, incident: Tensor) -> Tensor:
     """L_s = rho (c . B) L(w_r), (N, 3). [NeuFace eq. 12], `incident` from `light_integral`."""
     return (rho * cb)[:, None] * incident

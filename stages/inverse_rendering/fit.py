@@ -18,9 +18,10 @@ import torch
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel, FaceSpec
-from stages.inverse_rendering.objective import objective
+from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
+from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.settings import FitSettings
-from stages.inverse_rendering.views import PhotoView, PixelTable
+from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
@@ -61,9 +62,11 @@ class Trainer:
     error: float = float("nan")
     table: PixelTable | None = None
     optimiser: torch.optim.Optimizer = field(init=False)
+    guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
         self.optimiser = make_optimiser(self.model, self.settings, self.device)
+        self.guard = Guard(self.settings.max_dropped)
 
     @property
     def psnr(self) -> float:
@@ -114,10 +117,13 @@ class Trainer:
         rate = self.set_rates()
         seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
         batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
-        generator = torch.Generator().manual_seed(seed + 1)
         self.optimiser.zero_grad(set_to_none=True)
-        loss, error = objective(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+        found = self._terms(batch, seed)
+        loss, error = found.total, found.error
         loss.backward()
+        if not self._is_finite(loss):
+            self._drop(batch, seed)
+            return
         self.optimiser.step()
         self.model.geometry.step(rate)
         self.step += 1
@@ -125,16 +131,24 @@ class Trainer:
             self.model.geometry.find_band()
         self._note(float(loss.detach()), error)
 
+    def _terms(self, batch: Batch, seed: int) -> Terms:
+        generator = torch.Generator().manual_seed(seed + 1)
+        return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+
+    def _is_finite(self, loss: torch.Tensor) -> bool:
+        finite = math.isfinite(float(loss.detach())) and self.model.geometry.gradient_is_finite()
+        return finite and gradients_are_finite(self.optimiser)
+
+    def _drop(self, batch: Batch, seed: int) -> None:
+        """Leave everything as it was before this step, say why, and go on with the next one."""
+        parameters = [(n, p) for n, p in self.model.named_parameters() if n != "geometry.values"]
+        cause = cause_of(self._terms(batch, seed), batch, [v.index for v in self.views], lambda: parameters)
+        self.optimiser.zero_grad(set_to_none=True)
+        self.model.geometry.drop_gradient()
+        self.step += 1
+        self.guard.drop(self.step, cause)
+
     def _note(self, loss: float, error: float) -> None:
-        if not math.isfinite(loss):
-            raise StageError(
-                "the fit diverged",
-                where=f"inverse_rendering, step {self.step}",
-                value=f"loss {loss}",
-                limit="a finite loss",
-                remedy="lower --set inverse_rendering.lr_sdf or lr_appearance by "
-                "half, and check cameras and masks in the report of the stages before",
-            )
         self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         if math.isfinite(error):
             known = math.isfinite(self.error)
@@ -151,6 +165,7 @@ class Trainer:
                 "level": self.level,
                 "loss": self.loss,
                 "error": self.error,
+                "dropped": self.guard.dropped,
                 "cell": g.cell,
                 "model": self.model.state_dict(),
                 "band": g.optimiser_state(),
@@ -176,6 +191,7 @@ class Trainer:
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
+        self.guard.dropped = int(state["dropped"])
         return True
 
 
@@ -231,7 +247,12 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
     saved = shown = time.monotonic()
     writing = 0.1  # seconds a checkpoint takes, until one was written
     while trainer.step < trainer.settings.steps:
-        trainer.advance()
+        try:
+            trainer.advance()
+        except StageError:
+            if hooks.checkpoint is not None:
+                trainer.save(hooks.checkpoint)
+            raise
         now = time.monotonic()
         if hooks.cancelled():
             if hooks.checkpoint is not None:

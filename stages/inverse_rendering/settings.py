@@ -48,6 +48,8 @@ class FitSettings:
     lr_appearance: float = 1e-2
     lr_light: float = 1e-2
     beta_end: float = 0.15
+    # faults
+    max_dropped: int = 20
 
 
 PRESETS: dict[str, dict[str, Any]] = {

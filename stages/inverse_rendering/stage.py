@@ -62,6 +62,7 @@ class Config(StageConfig):
     lr_appearance: float = Field(description="learning rate of the hash table; networks take 0.3 of it", gt=0, le=1)
     lr_light: float = Field(description="learning rate of the light's coefficients", gt=0, le=1)
     beta_end: float = Field(description="final width of the soft surface, finest cells", gt=0, le=10)
+    max_dropped: int = Field(description="steps that are not finite after which the fit stops", ge=1, le=1_000_000)
 
     @field_validator("preset")
     @classmethod
