@@ -26,7 +26,13 @@ def reflect(wo: Tensor, n: Tensor) -> Tensor:
 @full_precision
 def diffuse(albedo: Tensor, n: Tensor, light: Tensor) -> Tensor:
     """L_d = a / pi * max(E(n), 0), (N, 3). [NeuFace eq. 16]; the clamp is the supplement's (section B)."""
-    return albedo / math.pi * sh.irradiance(light, n).clamp(min=0)
+    return lambertian(albedo, sh.irradiance(light, n))
+
+
+@full_precision
+def lambertian(albedo: Tensor, irradiance: Tensor) -> Tensor:
+    """a / pi * max(E, 0): (N, 3), (N, 3) -> (N, 3). The factor in front of [NeuFace eq. 13]."""
+    return albedo / math.pi * irradiance.clamp(min=0)
 
 
 @full_precision

@@ -49,4 +49,18 @@ def attenuation_exact(inv_kappa: Tensor, order: int) -> Tensor:
     return torch.stack(a, -1)
 
 
-ATTENUATIONS = {"exponential": attenuation_exponential, "exact": attenuation_exact}
+@full_precision
+def attenuation_phong(inv_shininess: Tensor, order: int) -> Tensor:
+    """A_l = exp(-l^2 / 2 p) of a Phong lobe cos^p, p = 1 / inv_shininess: (N,) -> (N, order + 1).
+
+    [Ramamoorthi and Hanrahan 2001, section 3.3]; the paper's comparison [NeuFace section 5.2] uses it.
+    """
+    l = torch.arange(order + 1, dtype=inv_shininess.dtype, device=inv_shininess.device)  # noqa: E741
+    return torch.exp(-0.5 * l * l * inv_shininess[:, None])
+
+
+ATTENUATIONS = {
+    "exponential": attenuation_exponential,
+    "exact": attenuation_exact,
+    "phong": attenuation_phong,
+}

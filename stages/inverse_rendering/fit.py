@@ -65,8 +65,12 @@ class Trainer:
     guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
-        self.optimiser = make_optimiser(self.model, self.settings, self.device)
+        self.optimiser = self.make_optimiser()
         self.guard = Guard(self.settings.max_dropped)
+
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """Of everything that has not its own."""
+        return make_optimiser(self.model, self.settings, self.device)
 
     @property
     def psnr(self) -> float:
@@ -124,29 +128,55 @@ class Trainer:
         if not self._is_finite(loss):
             self._drop(batch, seed)
             return
-        self.optimiser.step()
-        self.model.geometry.step(rate)
+        self.move(rate)
         self.step += 1
         if self.step % BAND_EVERY == 0:
-            self.model.geometry.find_band()
+            self.tend()
         self._note(float(loss.detach()), error)
+
+    def move(self, rate: float) -> None:
+        """Take the step."""
+        self.optimiser.step()
+        self.model.geometry.step(rate)
+
+    def tend(self) -> None:
+        """What is due every BAND_EVERY steps."""
+        self.model.geometry.find_band()
+
+    def finish(self) -> None:
+        """What is due after the last step."""
+        self.model.geometry.redistance()
 
     def _terms(self, batch: Batch, seed: int) -> Terms:
         generator = torch.Generator().manual_seed(seed + 1)
+        return self.compute_terms(batch, generator)
+
+    def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
+        """The parts of the loss."""
         return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
 
+    def geometry_is_finite(self) -> bool:
+        """Whether the gradients that the optimiser does not know of are finite."""
+        return self.model.geometry.gradient_is_finite()
+
     def _is_finite(self, loss: torch.Tensor) -> bool:
-        finite = math.isfinite(float(loss.detach())) and self.model.geometry.gradient_is_finite()
+        finite = math.isfinite(float(loss.detach())) and self.geometry_is_finite()
         return finite and gradients_are_finite(self.optimiser)
 
     def _drop(self, batch: Batch, seed: int) -> None:
         """Leave everything as it was before this step, say why, and go on with the next one."""
-        parameters = [(n, p) for n, p in self.model.named_parameters() if n != "geometry.values"]
-        cause = cause_of(self._terms(batch, seed), batch, [v.index for v in self.views], lambda: parameters)
+        parameters: list[tuple[str, torch.Tensor]] = [
+            (n, p) for n, p in self.model.named_parameters() if n != "geometry.values"
+        ]
+        cause = cause_of(self._terms(batch, seed), batch, [v.index for v in self.views], parameters)
         self.optimiser.zero_grad(set_to_none=True)
-        self.model.geometry.drop_gradient()
+        self.forget()
         self.step += 1
         self.guard.drop(self.step, cause)
+
+    def forget(self) -> None:
+        """Drop gradients that the optimiser does not know of."""
+        self.model.geometry.drop_gradient()
 
     def _note(self, loss: float, error: float) -> None:
         self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
@@ -201,7 +231,7 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
     groups = [
         {"params": [model.spatial.encoding.table], "start": settings.lr_appearance},
         {"params": [*model.spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
-        {"params": [model.light.coefficients], "start": settings.lr_light},
+        {"params": list(model.light.parameters()), "start": settings.lr_light},
         {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
     ]
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
@@ -210,15 +240,24 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
 def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> Trainer:
     """A fit that has not begun: geometry from the hull, an even white light, grey skin."""
     torch.manual_seed(settings.seed)
-    coarse_table = PixelTable(views, 256, device)
+    spec = spec_for(views, start, settings, calibrated, device)
+    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    model.to(device)
+    model.geometry.to_device(device)
+    return Trainer(views, settings, device, model)
+
+
+def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
+    """What the settings make of these photos and this start."""
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
-    spec = FaceSpec(
+    coarse = float((hi - lo).max()) / 16
+    return FaceSpec(
         lo=_triple(lo),
         hi=_triple(hi),
         views=len(views),
         rank=settings.rank,
         light_order=settings.light_order,
-        light_start=coarse_table.mean_colour() / 0.4,
+        light_start=PixelTable(views, 256, device).mean_colour() / 0.4,
         attenuation=settings.attenuation,
         basis_inputs=settings.basis_inputs,
         density=settings.density,
@@ -226,14 +265,20 @@ def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, cal
         calibrated=calibrated,
         levels=settings.hash_levels,
         log2_size=settings.hash_log2_size,
-        coarse=float((hi - lo).max()) / 16,
-        fine=settings.hash_fine,
+        coarse=coarse,
+        fine=settings.hash_fine if coarse / 1024 < settings.hash_fine < coarse / 2 else coarse / 20,
         width=settings.width,
+        depth=settings.depth,
+        appearance=settings.appearance,
+        shading=settings.shading,
+        light=settings.light,
+        integral=settings.integral,
+        basis_width=settings.basis_width,
+        basis_depth=settings.basis_depth,
+        prior=settings.prior,
+        prior_scale=settings.prior_scale,
+        prior_centre=settings.prior_centre,
     )
-    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(lo.astype(np.float32)), start.cell)
-    model.to(device)
-    model.geometry.to_device(device)
-    return Trainer(views, settings, device, model)
 
 
 def _triple(v: npt.NDArray[np.floating]) -> tuple[float, float, float]:
@@ -265,5 +310,5 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
             trainer.save(hooks.checkpoint)
             saved = time.monotonic()
             writing = saved - now
-    trainer.model.geometry.redistance()
+    trainer.finish()
     return trainer.model

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
@@ -56,9 +56,9 @@ def gradients_are_finite(optimiser: torch.optim.Optimizer) -> bool:
     return math.isfinite(float(torch.stack([n.float() for n in norms]).sum()))
 
 
-def cause_of(found: Terms, batch: Batch, names: list[int], parameters: Callable[[], list[tuple[str, Tensor]]]) -> str:
+def cause_of(found: Terms, batch: Batch, names: list[int], parameters: list[tuple[str, Tensor]]) -> str:
     """Which term failed and on which rays. `names`: the photos' indices by their place in the fit; `parameters`: what
-    the terms are differentiated by, asked for only if every value is finite.
+    the terms are differentiated by if every value is finite.
 
     The terms must still carry their graph.
     """
@@ -69,9 +69,8 @@ def cause_of(found: Terms, batch: Batch, names: list[int], parameters: Callable[
     for name, scalar in found.scalars.items():
         if not scalar.requires_grad:
             continue
-        known = parameters()
-        grads = torch.autograd.grad(scalar, [p for _, p in known], retain_graph=True, allow_unused=True)
-        bad = [n for (n, _), g in zip(known, grads, strict=True) if g is not None and not torch.isfinite(g).all()]
+        grads = torch.autograd.grad(scalar, [p for _, p in parameters], retain_graph=True, allow_unused=True)
+        bad = [n for (n, _), g in zip(parameters, grads, strict=True) if g is not None and not torch.isfinite(g).all()]
         if bad:
             guilty.append(f"term {name} has a gradient that is not finite in {', '.join(bad[:SHOWN])}")
     return "; ".join(guilty) or "a gradient of the geometry is not finite"

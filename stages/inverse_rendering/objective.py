@@ -75,7 +75,7 @@ def terms(
     shaded = shade_shell(model, shell, batch.rays, pick)
     colour, target = shaded.total, batch.target[rays]
     if model.spec.calibrated:
-        colour = _calibrated(model.calibration(), batch.view[rays], colour)
+        colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
     rgb = losses.rgb_l1(colour, target)
     out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, rays)
     out.add("white", settings.white * losses.white_light(model.light()).sum())
@@ -90,7 +90,7 @@ def terms(
     return out
 
 
-def _calibrated(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
+def calibrated_colours(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
     """I_n = A_n I: (V, 3, 3), (N,), (N, 3) -> (N, 3). [NeuFace eq. 19]
 
     The matrices are picked by a product with 0 and 1: the gradient of an indexed pick adds up in an order that depends

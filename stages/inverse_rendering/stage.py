@@ -51,6 +51,23 @@ class Config(StageConfig):
     open_from: float = Field(description="share of the encoding's levels, coarse first, open at the start", ge=0, le=1)
     open_until: float = Field(description="share of the steps after which all levels are open", gt=0, le=1)
     width: int = Field(description="width of the appearance networks", ge=8, le=512)
+    depth: int = Field(description="hidden layers of the appearance network", ge=1, le=16)
+    method: Literal["fast", "paper"] = Field(
+        description="fast: a grid, shaded once a ray; paper: networks, every sample"
+    )
+    appearance: Literal["hash", "sinusoidal"] = Field(description="the Spatial MLP's kind")
+    shading: Literal["neural", "phong", "disney"] = Field(description="the specular term; the last two to compare")
+    light: Literal["sh", "cubemap"] = Field(description="the captured light; cubemap to compare")
+    integral: Literal["low_rank", "direct", "feature"] = Field(description="the material integral [NeuFace eq. 6]")
+    basis_width: int = Field(description="width of the Integrated Basis MLP", ge=8, le=512)
+    basis_depth: int = Field(description="hidden layers of the Integrated Basis MLP", ge=1, le=16)
+    prior: Literal["hull", "sphere", "imface"] = Field(
+        description="what the geometry starts from [NeuFace section 4.3]"
+    )
+    prior_file: str = Field(description="checkpoint of ImFace, for prior imface (docs/imface.md)", exclude=True)
+    prior_digest: str = Field(description="sha256 of that file; filled in")
+    prior_scale: float = Field(description="asset units (metres) per unit of ImFace", gt=0, le=1e6)
+    prior_centre: tuple[float, float, float] = Field(description="ImFace's origin in asset coordinates")
     rgb: float = Field(description="lambda 1 [NeuFace eq. 21]", ge=0)
     mask: float = Field(description="weight of the opacity's cross-entropy against the masks", ge=0)
     white: float = Field(description="lambda 2 [NeuFace eq. 22]", ge=0)
@@ -58,6 +75,8 @@ class Config(StageConfig):
     shininess: float = Field(description="weight of the gauge that holds 1 / kappa near skin's", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
+    embedding: float = Field(description="lambda 4 [NeuFace eq. 24], for prior imface", ge=0)
+    displacement: float = Field(description="lambda 6 [NeuFace eq. 24], for method paper", ge=0)
     lr_sdf: float = Field(description="learning rate of the SDF, cells a step", gt=0, le=1)
     lr_appearance: float = Field(description="learning rate of the hash table; networks take 0.3 of it", gt=0, le=1)
     lr_light: float = Field(description="learning rate of the light's coefficients", gt=0, le=1)
@@ -76,7 +95,12 @@ class Config(StageConfig):
     def _filled(cls, data: Any) -> Any:
         given = dict(data) if isinstance(data, dict) else {}
         preset = PRESETS.get(str(given.get("preset", "draft")), {})
-        return {**asdict(FitSettings()), **preset, **given}
+        filled = {**asdict(FitSettings()), **preset, **given}
+        if filled.get("prior_file"):
+            from pipeline.fields.imface_layout import digest
+
+            filled["prior_digest"] = digest(str(filled["prior_file"]))
+        return filled
 
     def settings(self) -> FitSettings:
         """What the fit reads."""
@@ -88,7 +112,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
     from stages.inverse_rendering.gather import read_views
-    from stages.inverse_rendering.start import hull_start
+    from stages.inverse_rendering.paper import new_paper_trainer
+    from stages.inverse_rendering.start import hull_start, sphere_start
 
     settings = config.settings()
     dropped = set(inputs.masks.artifact.dropped)
@@ -106,10 +131,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
-    start = hull_start(
-        cameras, [v.alpha for v in views], inputs.poses.artifact.roi_radius, settings.grid_cells, settings.levels
-    )
-    trainer = new_trainer(views, start, settings, calibrated(inputs, usable, config), context.device)
+    radius = inputs.poses.artifact.roi_radius
+    if settings.prior == "sphere":
+        start = sphere_start(radius, settings.grid_cells, settings.levels)
+    else:
+        start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+    make = new_paper_trainer if settings.method == "paper" else new_trainer
+    trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
