@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pipeline.maths
-from pipeline.maths import brdf, density, losses, sdf, sh, vmf
+from pipeline.maths import brdf, cubemap, density, losses, relight, sdf, sh, split_sum, vmf
 
 
 def draw(*shape: int, seed: int = 0, low: float = 0.1, high: float = 0.9) -> torch.Tensor:
@@ -37,8 +37,13 @@ LO = torch.zeros(3, dtype=torch.float64)
 CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "brdf.reflect": (brdf.reflect, (unit(4), unit(4, 1))),
     "brdf.diffuse": (brdf.diffuse, (draw(4, 3), unit(4), lit())),
+    "brdf.lambertian": (brdf.lambertian, (draw(4, 3), draw(4, 3, seed=1))),
     "brdf.light_integral": (lambda d, s, c: brdf.light_integral(d, s, c, "exact"), (unit(4), draw(4), lit())),
     "brdf.specular": (brdf.specular, (draw(4), draw(4, seed=1), draw(4, 3, seed=2))),
+    "cubemap.project": (lambda d: cubemap.project(d)[1:], (unit(6),)),
+    "cubemap.corners": (lambda d: cubemap.corners(d, 3)[1], (unit(6),)),
+    "cubemap.lookup": (cubemap.lookup, (draw(3, 54, 3), unit(6), draw(6, low=0.1, high=1.9))),
+    "cubemap.blur": (lambda k: cubemap.blur(2, k), (draw(24, 24),)),
     "density.laplace_density": (density.laplace_density, (draw(3, 5, low=-0.9), BETA)),
     "density.laplace_survival": (density.laplace_survival, (draw(3, 5, low=-0.9), BETA)),
     "density.ray_weights": (density.ray_weights, (draw(3, 5), draw(3, 5, seed=1))),
@@ -52,6 +57,16 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "losses.displacement": (losses.displacement, (draw(4),)),
     "losses.embedding": (losses.embedding, (draw(2, 8),)),
     "losses.normal_consistency": (losses.normal_consistency, (unit(4), unit(4, 1))),
+    "relight.project_lat_long": (lambda p: relight.project_lat_long(p, 2, "hanning"), (draw(4, 8, 3),)),
+    "relight.rotate": (lambda c: relight.rotate(c, torch.eye(3).roll(1, 0)), (lit(3),)),
+    "relight.directional": (
+        lambda d, e: relight.directional(torch.nn.functional.normalize(d, dim=0), e, 3),
+        (draw(3), draw(3, seed=1)),
+    ),
+    "relight.point": (
+        lambda p, i: relight.point(p, i, torch.zeros(3, dtype=torch.float64), 3),
+        (draw(3), draw(3, seed=1)),
+    ),
     "sdf.axis_weights": (sdf.axis_weights, (draw(4, low=-0.4, high=0.4),)),
     "sdf.spline_sdf": (lambda v, x: sdf.spline_sdf(v, x, LO, 0.25), (draw(6, 6, 6), draw(4, 3, low=0.4, high=0.8))),
     "sdf.spline_stencil": (
@@ -65,6 +80,14 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "sh.radiance": (sh.radiance, (lit(4), unit(4))),
     "sh.band_radiance": (sh.band_radiance, (lit(4), unit(4))),
     "sh.band_radiance_reference": (lambda c, d: sh.band_radiance_reference(c, d, 4), (lit(4), unit(4))),
+    "split_sum.ggx_kernel": (lambda c: split_sum.ggx_kernel(c, 0.3), (draw(5),)),
+    "split_sum.smith": (split_sum.smith, (draw(5), draw(5, seed=1))),
+    "split_sum.environment_brdf": (
+        split_sum.environment_brdf,
+        (draw(5, 3), draw(5, seed=1, low=0.2, high=0.8), draw(5, seed=2, low=0.2, high=0.8)),
+    ),
+    "split_sum.alpha_from_inv_kappa": (split_sum.alpha_from_inv_kappa, (draw(5),)),
+    "vmf.attenuation_phong": (lambda s: vmf.attenuation_phong(s, 6), (draw(5),)),
     "vmf.attenuation_exponential": (lambda s: vmf.attenuation_exponential(s, 6), (draw(5),)),
     "vmf.attenuation_exact": (lambda s: vmf.attenuation_exact(s, 6), (draw(5),)),
 }
@@ -72,7 +95,13 @@ WITHOUT = {
     "density": set(),
     "sdf": {"locate", "neighbour_offsets"},  # indices
     "sh": {"count", "order_of", "clamped_cosine", "band_selector"},  # constants
-    "tracing": {"box_interval", "sphere_trace"},  # a search: the fit takes no gradient through it
+    "tracing": {"box_interval", "sphere_interval", "sphere_trace", "aggressive_trace"},  # searches, without gradients
+    "cubemap": {"texel_directions", "solid_angles", "padded"},
+    "split_sum": {"table"},
+    "relight": {
+        *("lat_long_directions", "lat_long_solid_angles", "window_of", "product_rule", "order_for"),  # constants
+        "energy_of",  # a report
+    },
     "precision": {"full_precision", "raise_half"},
     "sh_recurrence": {"recurrence"},
     "sh_compiled": {"tables"},  # float32 alone; held to its twin in test_sh
