@@ -37,7 +37,9 @@ class Config(StageConfig):
     levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
     rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
     light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
-    attenuation: Literal["exponential", "exact", "phong"] = Field(description="of the light under the lobe [NeuFace eq. 11]")
+    attenuation: Literal["exponential", "exact", "phong"] = Field(
+        description="of the light under the lobe [NeuFace eq. 11]"
+    )
     basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
     density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
     specular: bool = Field(description="model a specular term at all")
