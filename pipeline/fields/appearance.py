@@ -47,7 +47,7 @@ def heads(raw: Tensor, positive: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 class SpatialField(nn.Module):
-    """x (N, 3) -> albedo (N, 3), rho (N,), c (N, k), 1/kappa (N,).
+    """x (N, 3) -> albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], 1/kappa (N,).
 
     Differs: a hash encoding and a small ReLU network stand for the paper's sinusoidal MLP (about 10 times faster a
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.

@@ -69,7 +69,8 @@ class FaceSpec:
 
 @dataclass(frozen=True, slots=True)
 class Shaded:
-    """Radiance at N surface points: total = diffuse + specular, (N, 3) each, linear, before the calibration."""
+    """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
+    calibration."""
 
     total: Tensor
     diffuse: Tensor
@@ -79,7 +80,10 @@ class Shaded:
 
 
 class FaceModel(nn.Module):
-    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width."""
+    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width.
+
+    `shade` is the rendering equation [NeuFace eq. 1] in closed form: one bounce, no shadows.
+    """
 
     beta: Tensor
 

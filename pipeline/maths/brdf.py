@@ -31,13 +31,15 @@ def diffuse(albedo: Tensor, n: Tensor, light: Tensor) -> Tensor:
 
 @full_precision
 def lambertian(albedo: Tensor, irradiance: Tensor) -> Tensor:
-    """a / pi * max(E, 0): (N, 3), (N, 3) -> (N, 3). The factor in front of [NeuFace eq. 13]."""
+    """a / pi * max(E, 0): (N, 3), (N, 3) -> (N, 3). The a / pi of [NeuFace eq. 3] times the
+    integral of [NeuFace eq. 13]."""
     return albedo / math.pi * irradiance.clamp(min=0)
 
 
 @full_precision
 def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: str = "exponential") -> Tensor:
-    """max(sum_l A_l(s) sum_m c_lm Y_lm(w_r), 0), (N, 3). [NeuFace eq. 11]; clamp: supplement, section B."""
+    """max(sum_l A_l(s) sum_m c_lm Y_lm(w_r), 0), (N, 3). [NeuFace eq. 11], [NeuFace eq. 28];
+    clamp: supplement, section B."""
     bands = sh.band_radiance(light, w_r)
     a = ATTENUATIONS[attenuation](inv_kappa, bands.shape[1] - 1)
     return torch.einsum("nl,nlc->nc", a, bands).clamp(min=0)
@@ -45,5 +47,6 @@ def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: s
 
 @full_precision
 def specular(rho: Tensor, cb: Tensor, incident: Tensor) -> Tensor:
-    """L_s = rho (c . B) L(w_r), (N, 3). [NeuFace eq. 12], `incident` from `light_integral`."""
+    """L_s = rho (c . B) L(w_r), (N, 3). [NeuFace eq. 12], `incident` from `light_integral`. The material's
+    and the light's integrals taken apart: [NeuFace eq. 5]."""
     return (rho * cb)[:, None] * incident

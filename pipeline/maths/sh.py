@@ -102,7 +102,8 @@ def clamped_cosine(order: int = ORDER) -> Tensor:
 
 @full_precision
 def irradiance(c: Tensor, n: Tensor) -> Tensor:
-    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16]; may be slightly negative."""
+    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16], by [NeuFace eq. 14]; may be
+    slightly negative."""
     return band_radiance(clamped_cosine(order_of(c)).to(c)[:, None] * c, n).sum(1)
 
 

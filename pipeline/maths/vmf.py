@@ -1,4 +1,4 @@
-"""Attenuation of spherical harmonics under a von Mises-Fisher lobe.
+"""Attenuation of spherical harmonics under a von Mises-Fisher lobe: D of [NeuFace eq. 10], [NeuFace eq. 25].
 
 Symbols: kappa > 0 concentration; s = 1 / kappa >= 0 its inverse, which is what the field predicts (s = 0: mirror).
 A_l(s) is the factor of E over vMF(w; w_r, kappa) of Y_lm(w), relative to Y_lm(w_r). A_0 = 1, A_l falls with l and s.
@@ -28,6 +28,8 @@ def attenuation_exponential(inv_kappa: Tensor, order: int) -> Tensor:
 @full_precision
 def attenuation_exact(inv_kappa: Tensor, order: int) -> Tensor:
     """A_l = I_{l+1/2}(kappa) / I_{1/2}(kappa): (N,) -> (N, order + 1). Domain: all s >= 0.
+
+    The expectation of [NeuFace eq. 26] under the lobe of [NeuFace eq. 25], without [NeuFace eq. 27]'s approximation.
 
         r_l = A_l / A_{l-1} = 1 / ((2 l + 1) s + r_{l+1}),    A_l = r_1 ... r_l
 
