@@ -72,15 +72,3 @@ def normal_consistency(n: Tensor, n_near: Tensor) -> Tensor:
     """1 - n . n' at a point and a jittered neighbour: (N, 3), (N, 3) -> (N,). Not in the paper: it stands for the
     smoothness that the paper's MLP has by itself and a grid has not."""
     return 1 - (n * n_near).sum(-1)
-
-
-@full_precision
-def uneven_albedo(albedo: Tensor) -> Tensor:
-    """|ln a - mean of ln a|, a the mean of RGB: (N, 3) -> (N,). Not in the paper.
-
-    Differs: where no highlight tells, the photos fix only albedo times irradiance, so that shading can hide in the
-    albedo for good. Of all lights that fit, this asks for the one that leaves the skin most even; the absolute value
-    lets brows and hair be what they are.
-    """
-    tone = torch.log(albedo.mean(-1).clamp(min=1e-4))
-    return (tone - tone.detach().mean()).abs()

@@ -84,9 +84,6 @@ def terms(
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
-    if settings.even > 0:
-        uneven = losses.uneven_albedo(shaded.albedo)
-        out.add("even", settings.even * uneven.mean(), uneven, rays)
     out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
         out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())

@@ -57,7 +57,6 @@ class FitSettings:
     shininess: float = 1e-3
     eikonal: float = 0.1
     smooth: float = 0.03
-    even: float = 0.0
     embedding: float = 1e3
     displacement: float = 1e-3
     # learning

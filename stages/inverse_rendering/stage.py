@@ -77,7 +77,6 @@ class Config(StageConfig):
     shininess: float = Field(description="weight of the gauge that holds 1 / kappa near skin's", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
-    even: float = Field(description="weight of the albedo's evenness, against shading that hides in it", ge=0)
     embedding: float = Field(description="lambda 4 [NeuFace eq. 24], for prior imface", ge=0)
     displacement: float = Field(description="lambda 6 [NeuFace eq. 24], for method paper", ge=0)
     lr_sdf: float = Field(description="learning rate of the SDF, cells a step", gt=0, le=1)

@@ -67,7 +67,6 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
         lambda p, i: relight.point(p, i, torch.zeros(3, dtype=torch.float64), 3),
         (draw(3), draw(3, seed=1)),
     ),
-    "losses.uneven_albedo": (losses.uneven_albedo, (draw(4, 3),)),
     "sdf.axis_weights": (sdf.axis_weights, (draw(4, low=-0.4, high=0.4),)),
     "sdf.spline_sdf": (lambda v, x: sdf.spline_sdf(v, x, LO, 0.25), (draw(6, 6, 6), draw(4, 3, low=0.4, high=0.8))),
     "sdf.spline_stencil": (
