@@ -62,7 +62,7 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
     run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
     run.add_argument(
-        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio or film (%(default)s)"
+        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio, film; or paper (%(default)s)"
     )
     run.add_argument(
         "--holdout",

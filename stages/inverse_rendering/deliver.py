@@ -66,9 +66,16 @@ def model_facts(settings: FitSettings, model: FaceModel) -> dict[str, dict[str, 
             else "setting",
         },
         "geometry": {
-            "prior": "visual hull",
+            "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
             "cell_mm": round(model.geometry.cell * 1e3, 4),
-            "why": "no licensed prior",
+            "why": "no licensed prior" if settings.prior == "hull" else "setting",
         },
         "density": {"kind": settings.density, "why": "setting"},
+        "system": {
+            "method": settings.method,
+            "shading": settings.shading,
+            "light": settings.light,
+            "integral": settings.integral,
+            "why": "setting",
+        },
     }

@@ -203,6 +203,17 @@ def test_calibration_near_singular() -> None:
     assert t.guard.dropped == 0
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-30, 1e-7, 1e5])
+def test_colours_through_singular_matrices(size: float) -> None:
+    """A_n of rank 1 and of any size: colour, loss and every gradient are finite."""
+    row = torch.tensor([1.0, -0.5, 0.25])
+    a = (size * torch.outer(row, row)).expand(2, 3, 3).clone().requires_grad_()
+    colour = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1e5, 0, 1e-8]], requires_grad=True)
+    out = objective.calibrated_colours(a, torch.tensor([0, 1, 1]), colour)
+    objective.losses.rgb_l1(out, torch.full((3, 3), 0.5)).sum().backward()
+    assert all(bool(torch.isfinite(x).all()) for x in (out, a.grad, colour.grad) if x is not None)
+
+
 def test_shading_under_bfloat16_autocast() -> None:
     t = trainer()
     n = torch.nn.functional.normalize(torch.randn(64, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
