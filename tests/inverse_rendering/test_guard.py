@@ -96,7 +96,7 @@ def test_a_bad_gradient_names_its_term() -> None:
     found = Terms()
     found.add("fine", t.model.light.coefficients.sum())
     found.add("steep", torch.sqrt((t.model.light.coefficients[5:] ** 2).sum()))
-    cause = cause_of(found, batch, [0] * 4, lambda: [("light.coefficients", t.model.light.coefficients)])
+    cause = cause_of(found, batch, [0] * 4, [("light.coefficients", t.model.light.coefficients)])
     assert cause == "term steep has a gradient that is not finite in light.coefficients"
 
 
