@@ -55,6 +55,9 @@ def test_report_shows_what_there_is() -> None:
     assert "3 steps of 32 rays, photos of 64 px, capture ball" in text
     assert "| SH + Phong | 30.00 | 31.00 | 0.9000 | 0.1000 | 0.500 | 10 | 29.31, 0.556 |" in text
     assert "Agrees with the paper's order in 1 of 1 pairs." in text and "direct fitting" not in text
+    assert "Two seeds" not in text
+    noisy = "\n".join(report(BUDGET, {FULL.name: result(31), "another seed": result(30.75)}))
+    assert "Two seeds of the same system differ by 0.25 dB" in noisy
 
 
 def test_a_bench_goes_on_and_a_changed_budget_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
