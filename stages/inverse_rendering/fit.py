@@ -195,7 +195,7 @@ class Trainer:
                 "level": self.level,
                 "loss": self.loss,
                 "error": self.error,
-                "dropped": self.guard.dropped,
+                "dropped": self.guard.causes,
                 "cell": g.cell,
                 "model": self.model.state_dict(),
                 "band": g.optimiser_state(),
@@ -221,7 +221,7 @@ class Trainer:
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
-        self.guard.dropped = int(state["dropped"])
+        self.guard.causes = list(state["dropped"])
         return True
 
 

@@ -27,12 +27,15 @@ class Guard:
     """How many steps were dropped, and why."""
 
     limit: int
-    dropped: int = 0
     causes: list[str] = field(default_factory=list)
+
+    @property
+    def dropped(self) -> int:
+        """Steps dropped so far."""
+        return len(self.causes)
 
     def drop(self, step: int, cause: str) -> None:
         """Count a dropped step. Raises StageError at the limit."""
-        self.dropped += 1
         self.causes.append(f"step {step}: {cause}")
         log.warning("step %d dropped (%d of %d): %s", step, self.dropped, self.limit, cause)
         if self.dropped >= self.limit:

@@ -117,7 +117,7 @@ class PaperTrainer(Trainer):
             "step": self.step,
             "loss": self.loss,
             "error": self.error,
-            "dropped": self.guard.dropped,
+            "dropped": self.guard.causes,
             "model": self.model.state_dict(),
             "optimiser": self.optimiser.state_dict(),
         }
@@ -135,7 +135,7 @@ class PaperTrainer(Trainer):
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.loss, self.error = (state[k] for k in ("step", "loss", "error"))
-        self.guard.dropped = int(state["dropped"])
+        self.guard.causes = list(state["dropped"])
         return True
 
 

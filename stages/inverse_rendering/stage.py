@@ -158,7 +158,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(settings, model),
+        model=model_facts(settings, model, trainer.guard),
     )
 
 
