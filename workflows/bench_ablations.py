@@ -155,7 +155,7 @@ def _known(path: Path, budget: dict[str, Any]) -> dict[str, Result]:
 
 
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
-    """What `--set` would say for a row: the budget, the paper's inputs of the bases and calibration, the row's own."""
+    """What `--set` would say for a row: the budget, the paper's model where the fast one adds to it, the row's own."""
     base = {
         "steps": given.steps,
         "image_side": given.side,
@@ -163,6 +163,10 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
         "grid_cells": 192,
         "basis_inputs": "paper",
         "calibration": "on",
+        "shadows": False,
+        "parsimony": 0.0,
+        "even_until": 0.0,
+        "shading_from": 0.0,
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}
     return tuple(f"{k}={v}" for k, v in {**values, "surface.resolution": 160}.items())

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from pipeline.fields.encodings import HashEncoding
 
-START_ALBEDO, START_RHO = 0.4, 0.05
+START_RHO = 0.05
 TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: skin's middle
 
 
@@ -26,11 +26,11 @@ def mlp(width_in: int, width: int, depth: int, width_out: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(width if depth else width_in, width_out))
 
 
-def start_heads(last: nn.Linear) -> None:
-    """Set the last layer so that the field starts as grey skin of ordinary gloss."""
+def start_heads(last: nn.Linear, albedo: tuple[float, float, float]) -> None:
+    """Set the last layer so that the field starts as skin of one colour and ordinary gloss."""
     with torch.no_grad():
         last.weight *= 0.1
-        last.bias[:3] = math.log(START_ALBEDO / (1 - START_ALBEDO))
+        last.bias[:3] = torch.logit(torch.tensor(albedo))
         last.bias[3] = math.log(START_RHO / (1 - START_RHO))
         last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
         last.bias[5:] = math.log(math.expm1(1.0))
@@ -53,13 +53,21 @@ class SpatialField(nn.Module):
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.
     """
 
-    def __init__(self, encoding: HashEncoding, rank: int, width: int, depth: int, positive: bool = True) -> None:
+    def __init__(
+        self,
+        encoding: HashEncoding,
+        rank: int,
+        width: int,
+        depth: int,
+        albedo: tuple[float, float, float],
+        positive: bool = True,
+    ) -> None:
         super().__init__()
         self.encoding, self.rank, self.positive = encoding, rank, positive
         self.net = mlp(encoding.width, width, depth, 5 + rank)
         last = self.net[-1]
         assert isinstance(last, nn.Linear)
-        start_heads(last)
+        start_heads(last, albedo)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Material at x."""

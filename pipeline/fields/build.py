@@ -40,10 +40,10 @@ def spatial(spec: FaceSpec) -> nn.Module:
     positive = spec.integral == "low_rank"
     if spec.appearance == "sinusoidal":
         centre, radius = middle(spec)
-        return SinusoidalField(centre, radius, columns, positive, spec.width, spec.depth)
+        return SinusoidalField(centre, radius, columns, positive, spec.albedo_start, spec.width, spec.depth)
     lo, hi = torch.tensor(spec.lo), torch.tensor(spec.hi)
     encoding = HashEncoding(lo, hi, spec.coarse, spec.fine, spec.levels, spec.log2_size)
-    return SpatialField(encoding, columns, spec.width, spec.depth, positive)
+    return SpatialField(encoding, columns, spec.width, spec.depth, spec.albedo_start, positive)
 
 
 def material_integral(spec: FaceSpec) -> nn.Module:

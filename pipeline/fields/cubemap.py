@@ -48,6 +48,11 @@ class CubemapLight(nn.Module):
         out: Tensor = self.harmonics @ self.texels()
         return out
 
+    def even_gradient(self, order: int) -> None:
+        """While nothing but the light moves: the same for all colours. A map has no order to keep to."""
+        if self.raw.grad is not None:
+            self.raw.grad.copy_(self.raw.grad.mean(-1, keepdim=True).expand_as(self.raw.grad))
+
     def irradiance(self, n: Tensor) -> Tensor:
         """E(n), (N, 3)."""
         return cubemap.lookup((self.cosine @ self.texels())[None], n, torch.zeros_like(n[:, 0]))

@@ -23,6 +23,7 @@ from pipeline.fields.displaced import DisplacedSdf
 from pipeline.fields.geometry import GridSdf
 from pipeline.fields.light import ShLight
 from pipeline.fields.protocol import F32, Material
+from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.maths import brdf, split_sum
 from pipeline.maths.sdf import unit
 
@@ -41,10 +42,12 @@ class FaceSpec:
     rank: int = 3
     light_order: int = 10
     light_start: float = 1.0
+    albedo_start: tuple[float, float, float] = (0.4, 0.4, 0.4)
     attenuation: str = "exponential"
     basis_inputs: str = "cosine"
     density: str = "crossing"
     specular: bool = True
+    shadows: bool = False
     calibrated: bool = False
     levels: int = 10
     log2_size: int = 17
@@ -82,7 +85,7 @@ class Shaded:
 class FaceModel(nn.Module):
     """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width.
 
-    `shade` is the rendering equation [NeuFace eq. 1] in closed form: one bounce, no shadows.
+    `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and bounces only where `shadowing` is on.
     """
 
     beta: Tensor
@@ -98,14 +101,16 @@ class FaceModel(nn.Module):
         self.basis = cast(IntegratedBasis, build.material_integral(spec))
         self.light = cast(ShLight, build.light(spec))
         self.calibration = Calibration(spec.views)
+        self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
+        self.shading_bends = True  # whether the diffuse term may turn the normals
         self.register_buffer("beta", torch.tensor(cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
         albedo, rho, c, inv_kappa = self.spatial(x)
         if self.spec.shading == "disney" and self.spec.specular:
-            return self._disney(n, wo, albedo, rho, inv_kappa)
-        diffuse = brdf.lambertian(albedo, self.light.irradiance(n))
+            return self._disney(x, n, wo, albedo, rho, inv_kappa)
+        diffuse = self._diffuse(albedo, x, n)
         if not self.spec.specular:
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
         incident = self.light.reflected(brdf.reflect(wo, n), inv_kappa, self.spec.attenuation)
@@ -113,16 +118,29 @@ class FaceModel(nn.Module):
         specular = brdf.specular(rho, bound, incident)
         return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
 
-    def _disney(self, n: Tensor, wo: Tensor, albedo: Tensor, metallic: Tensor, inv_kappa: Tensor) -> Shaded:
+    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
+        """L_d under what arrives of the light, (N, 3)."""
+        open_light = brdf.lambertian(albedo, self.light.irradiance(n if self.shading_bends else n.detach()))
+        return open_light if self.shadowing is None else open_light * self.shadowing(x)
+
+    def _disney(self, x: Tensor, n: Tensor, wo: Tensor, albedo: Tensor, metallic: Tensor, inv_kappa: Tensor) -> Shaded:
         """Split-sum GGX with a metallic parameter, which rho's output stands for. [NeuFace section 5.2]"""
         m, alpha = metallic[:, None], split_sum.alpha_from_inv_kappa(inv_kappa)
         base = albedo * (1 - m)
-        diffuse = brdf.lambertian(base, self.light.irradiance(n))
+        diffuse = self._diffuse(base, x, n)
         f0 = DIELECTRIC * (1 - m) + albedo * m
         width = alpha if self.spec.light == "cubemap" else inv_kappa
         incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)
         specular = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha) * incident
         return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
+
+    def solve_shadows(self) -> None:
+        """Bring the shadows up to date with the surface, the albedo and the light found so far."""
+        if self.shadowing is not None:
+            index, x, n = near_surface(self.shadowing, self.geometry)
+            with torch.no_grad():
+                albedo = torch.cat([self.spatial(part)[0] for part in x.split(CHUNK)])
+            solve(self.shadowing, self.geometry, Surface(index, x, n, albedo), self.light())
 
     def save(self, path: Path) -> None:
         """Write the file that `load_model` reads."""
@@ -145,7 +163,7 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
             remedy="run the fit again with this version",
         )
     cell = float(spec.pop("cell"))
-    for k in ("lo", "hi", "prior_centre"):
+    for k in ("lo", "hi", "albedo_start", "prior_centre"):
         if k in spec:
             spec[k] = tuple(spec[k])
     model = build.model_from_arrays(FaceSpec(**spec), arrays, cell)
@@ -211,6 +229,14 @@ class FittedField:
         if self.model.spec.shading == "phong":
             c = np.ones((len(rho), 1), np.float32)
         return Material(albedo, rho, c, inv_kappa)
+
+    def irradiance_ratio(self, points: F32) -> F32:
+        """(N, 3)."""
+        shadowing = self.model.shadowing
+        if shadowing is None:
+            return np.ones((len(points), 3), np.float32)
+        (s,) = self._map(lambda p: (shadowing(p),), points)
+        return s
 
     def basis(self, wo: F32, normal: F32) -> F32:
         """(N, k). Raises StageError for a model without bases."""

@@ -24,6 +24,13 @@ class ShLight(nn.Module):
         """The coefficients."""
         return self.coefficients
 
+    def even_gradient(self, order: int) -> None:
+        """While nothing but the light moves: the same for all colours, and no more of it than skin can show."""
+        grad = self.coefficients.grad
+        if grad is not None:
+            grad.copy_(grad.mean(-1, keepdim=True).expand_as(grad))
+            grad[count(order) :] = 0
+
     def irradiance(self, n: Tensor) -> Tensor:
         """E(n), (N, 3)."""
         return irradiance(self.coefficients, n)

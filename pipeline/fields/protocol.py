@@ -63,6 +63,11 @@ class Field(Protocol):
         """Appearance; meaningful within a few cells of the surface."""
         ...
 
+    def irradiance_ratio(self, points: F32) -> F32:
+        """(N, 3) what arrives at the surface of what would without shadows and bounces; 1 where they are not modelled.
+        Holds under the captured light."""
+        ...
+
     def basis(self, wo: F32, normal: F32) -> F32:
         """(N, k) integrated bases B_j(wo, n) >= 0 of [NeuFace eq. 9]; both (N, 3), unit; wo leaves the surface."""
         ...

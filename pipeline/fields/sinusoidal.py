@@ -45,7 +45,14 @@ class SinusoidalField(nn.Module):
     centre: Tensor
 
     def __init__(
-        self, centre: Tensor, radius: float, columns: int, positive: bool, width: int = 256, depth: int = 8
+        self,
+        centre: Tensor,
+        radius: float,
+        columns: int,
+        positive: bool,
+        albedo: tuple[float, float, float] = (0.4, 0.4, 0.4),
+        width: int = 256,
+        depth: int = 8,
     ) -> None:
         super().__init__()
         self.columns, self.positive, self.radius = columns, positive, radius
@@ -53,7 +60,7 @@ class SinusoidalField(nn.Module):
         sizes = [3 if i == 0 else width + 3 if i == SKIP else width for i in range(depth)]
         self.layers = nn.ModuleList(SineLayer(n, width, first=i == 0) for i, n in enumerate(sizes))
         self.last = nn.Linear(width, 5 + columns)
-        start_heads(self.last)
+        start_heads(self.last, albedo)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Material at x."""

@@ -46,6 +46,18 @@ def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
 
 
 @full_precision
+def albedo_parsimony(albedo: Tensor) -> Tensor:
+    """|ln a - median of ln a|, mean over channels: (N, 3) in [0, 1] -> (N,). Not in the paper.
+
+    Differs: the photos fix only the product a E(n), and on a still head under still light any shading can hide in the
+    albedo. Of all splits this prefers the one where skin is as even as it can be, so that the light explains what
+    depends on the normal. By the median and without a square: lips, brows and beard may differ as much as they like.
+    """
+    log = torch.log(albedo.clamp(min=1e-3))
+    return (log - log.detach().median(0).values).abs().mean(-1)
+
+
+@full_precision
 def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
     """| |grad SDF| - 1 | or its square: (N, 3) -> (N,). The second term of [NeuFace eq. 24].
 

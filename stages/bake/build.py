@@ -103,7 +103,7 @@ def _rows(size: int) -> Iterator[tuple[int, int]]:
 
 def _empty(rank: int) -> Samples:
     one, three, k = (np.zeros(s, np.float32) for s in ((0,), (0, 3), (0, rank)))
-    return Samples(three, one, k, one, one, three, one, np.zeros(0, np.bool_))
+    return Samples(three, one, k, one, three, one, three, one, np.zeros(0, np.bool_))
 
 
 def _warnings(s: Samples, residual: float, views: int) -> tuple[str, ...]:

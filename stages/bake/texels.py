@@ -34,14 +34,16 @@ LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look
 class Samples:
     """One row a texel, in the order of its Hits. All float32.
 
-    albedo (N, 3); rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); f0 (N,); normal (N, 3) in
-    tangent space, unit; displacement (N,) metres. landed (N,): False where the mesh has no zero set near it (the cap).
+    albedo (N, 3); rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); irradiance_ratio (N, 3); f0 (N,);
+    normal (N, 3) in tangent space, unit; displacement (N,) metres. landed (N,): False where the mesh has no zero set
+    near it (the cap).
     """
 
     albedo: F32
     rho: F32
     coefficients: F32
     inv_kappa: F32
+    irradiance_ratio: F32
     f0: F32
     normal: F32
     displacement: F32
@@ -65,6 +67,7 @@ def sample(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Samples:
         np.asarray(material.rho, np.float32),
         np.asarray(material.coefficients, np.float32),
         np.asarray(material.inv_kappa, np.float32),
+        np.asarray(field.irradiance_ratio(x), np.float32),
         f0.astype(np.float32),
         in_frame(world, t, b, n),
         moved.astype(np.float32),
@@ -113,7 +116,7 @@ def _unit(v: npt.NDArray[np.floating]) -> F64:
 
 
 def _check(s: Samples) -> None:
-    for name in ("albedo", "rho", "coefficients", "inv_kappa", "normal"):
+    for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
         values = getattr(s, name)
         if not np.isfinite(values).all():
             raise StageError(

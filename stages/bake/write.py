@@ -44,6 +44,7 @@ KINDS: dict[str, MapKind] = {
     "roughness": MapKind(lambda s: microfacet.roughness_from_inv_kappa(s.inv_kappa).astype(np.float32), png=8),
     "f0": MapKind(lambda s: s.f0, png=16),  # about 0.03: 8 bits would leave 8 steps
     "normal": MapKind(lambda s: s.normal, png=8, encoded=True),
+    "irradiance_ratio": MapKind(lambda s: s.irradiance_ratio, png=8),
     "displacement": MapKind(lambda s: s.displacement * np.float32(MM)),
 }
 

@@ -26,6 +26,10 @@ from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
+ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'
+EVEN_LIGHT_ORDER = 3
+EVEN_LIGHT_RATE = 4.0  # times the rate, while the skin is even and the light explains all it can
+SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
 SMOOTHING = 0.98  # of the running loss and error that are shown
 
@@ -104,14 +108,18 @@ class Trainer:
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
+        even = p < s.even_until
         for group in self.optimiser.param_groups:
             group["lr"] = group["start"] * decay * warm
+            if even:
+                group["lr"] *= EVEN_LIGHT_RATE if group["params"][0] is next(self.model.light.parameters()) else 0.0
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
-        opened = min(p / s.open_until, 1.0)
-        self.model.spatial.encoding.open_levels(s.open_from + (1 - s.open_from) * opened)
-        return s.lr_sdf * self.model.geometry.cell * decay * warm
+        opened = s.open_from + (1 - s.open_from) * min(p / s.open_until, 1.0)
+        self.model.spatial.encoding.open_levels(0.0 if even else opened)
+        self.model.shading_bends = p >= s.shading_from
+        return 0.0 if even else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
@@ -119,6 +127,8 @@ class Trainer:
         self.enter_level()
         assert self.table is not None
         rate = self.set_rates()
+        if self.step in {round(s * self.settings.steps) for s in SHADOWS_AT}:
+            self.model.solve_shadows()
         seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
         batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
         self.optimiser.zero_grad(set_to_none=True)
@@ -128,6 +138,8 @@ class Trainer:
         if not self._is_finite(loss):
             self._drop(batch, seed)
             return
+        if self.share() < self.settings.even_until:
+            self.model.light.even_gradient(EVEN_LIGHT_ORDER)
         self.move(rate)
         self.step += 1
         if self.step % BAND_EVERY == 0:
@@ -249,6 +261,8 @@ def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, cal
 
 def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
     """What the settings make of these photos and this start."""
+    colour = PixelTable(views, 256, device).mean_colour()
+    grey = float(colour.mean().clamp(min=1e-4))
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
     coarse = float((hi - lo).max()) / 16
     return FaceSpec(
@@ -257,11 +271,13 @@ def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibr
         views=len(views),
         rank=settings.rank,
         light_order=settings.light_order,
-        light_start=PixelTable(views, 256, device).mean_colour() / 0.4,
+        light_start=grey / ALBEDO_START,
+        albedo_start=_triple((colour / grey * ALBEDO_START).clamp(0.02, 0.95).cpu().numpy()),
         attenuation=settings.attenuation,
         basis_inputs=settings.basis_inputs,
         density=settings.density,
         specular=settings.specular,
+        shadows=settings.shadows,
         calibrated=calibrated,
         levels=settings.hash_levels,
         log2_size=settings.hash_log2_size,

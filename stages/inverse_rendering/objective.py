@@ -81,6 +81,8 @@ def terms(
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     energy = losses.specular_energy(shaded.specular)
     out.add("specular_energy", settings.specular_energy * energy.mean(), energy, rays)
+    uneven = losses.albedo_parsimony(shaded.albedo)
+    out.add("parsimony", settings.parsimony * uneven.mean(), uneven, rays)
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)

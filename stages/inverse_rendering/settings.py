@@ -28,10 +28,13 @@ class FitSettings:
     basis_inputs: str = "cosine"
     density: str = "crossing"
     specular: bool = True
+    shadows: bool = True
     calibration: str = "auto"
     hash_levels: int = 10
     hash_log2_size: int = 17
     hash_fine: float = 0.0008
+    shading_from: float = 0.5
+    even_until: float = 0.08
     open_from: float = 0.4
     open_until: float = 0.5
     width: int = 64
@@ -55,6 +58,7 @@ class FitSettings:
     white: float = 5e-3
     specular_energy: float = 8e-3
     shininess: float = 1e-3
+    parsimony: float = 0.01
     eikonal: float = 0.1
     smooth: float = 0.03
     embedding: float = 1e3
@@ -92,6 +96,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Measured in short runs alone: on a CPU it would take weeks.
     "paper": {
         "method": "paper",
+        "shadows": False,
+        "parsimony": 0.0,
+        "even_until": 0.0,
         "image_side": 1024,
         "steps": 129_000,
         "batch": 2048,

@@ -43,6 +43,7 @@ class Config(StageConfig):
     basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
     density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
     specular: bool = Field(description="model a specular term at all")
+    shadows: bool = Field(description="model what the surface itself hides and reflects of the light")
     calibration: Literal["auto", "on", "off"] = Field(
         description="per-image colour matrices [NeuFace eq. 19]; auto: "
         "where the capture has more than one kind of camera"
@@ -50,6 +51,8 @@ class Config(StageConfig):
     hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
     hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
     hash_fine: float = Field(description="finest cell of the appearance encoding, asset units", gt=0, le=0.1)
+    shading_from: float = Field(description="share of the steps after which diffuse shading turns normals", ge=0)
+    even_until: float = Field(description="share of the steps in which only the light is found", ge=0, lt=1)
     open_from: float = Field(description="share of the encoding's levels, coarse first, open at the start", ge=0, le=1)
     open_until: float = Field(description="share of the steps after which all levels are open", gt=0, le=1)
     width: int = Field(description="width of the appearance networks", ge=8, le=512)
@@ -75,6 +78,7 @@ class Config(StageConfig):
     white: float = Field(description="lambda 2 [NeuFace eq. 22]", ge=0)
     specular_energy: float = Field(description="lambda 3 [NeuFace eq. 23]", ge=0)
     shininess: float = Field(description="weight of the gauge that holds 1 / kappa near skin's", ge=0)
+    parsimony: float = Field(description="weight of the gauge that gives shading to the light and not to albedo", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
     embedding: float = Field(description="lambda 4 [NeuFace eq. 24], for prior imface", ge=0)

@@ -105,13 +105,13 @@ class PixelTable:
         self.R = torch.from_numpy(np.stack([v.world_from_cam[:3, :3] for v in views]).astype(np.float32)).to(device)
         self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
 
-    def mean_colour(self) -> float:
-        """Mean linear radiance of the subject over all photos, at least DARKEST: black photos still need a light that
-        can grow."""
+    def mean_colour(self) -> Tensor:
+        """(3,) mean linear radiance of the subject over all photos, at least DARKEST: black photos still need a light
+        that can grow."""
         if not len(self.inside):
-            return DARKEST
+            return torch.full((3,), DARKEST, device=self.target.device)
         s = self.target[self.inside[:: max(len(self.inside) // 100_000, 1)]].float()
-        return max(float((((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean()), DARKEST)
+        return (((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean(0).clamp(min=DARKEST)
 
     def draw(self, n: int, outside_share: float, seed: int) -> Batch:
         """A random batch that depends on the seed alone."""

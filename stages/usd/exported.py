@@ -25,7 +25,8 @@ class ExportedAsset:
     """Everything that the model's equations need.
 
     albedo (H, W, 3) linear reflectance; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1); normal (H, W, 3) unit,
-    tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N; light ((L + 1)^2, 3).
+    tangent space, +y along v; irradiance_ratio (H, W, 3), see pipeline.fields.shadowing; basis (N, k) = B_j at
+    n.v = (i + 0.5) / N; light ((L + 1)^2, 3).
     """
 
     mesh: UvSurface
@@ -33,6 +34,7 @@ class ExportedAsset:
     coefficients: F32
     inv_kappa: F32
     normal: F32 | None
+    irradiance_ratio: F32 | None
     basis: F32
     light: F32
     attenuation: str
@@ -62,6 +64,7 @@ def load_exported(root: Path) -> ExportedAsset:
         coefficients,
         inv_kappa[..., :1],
         _normal(folder, name),
+        _ratio(folder, name),
         basis,
         light,
         attenuation,
@@ -89,6 +92,12 @@ def _numbered(folder: Path, name: str, which: str) -> F32:
     if all(re.search(r"\d+$", n) for n in names):
         values = values[..., np.argsort([int(re.findall(r"\d+", n)[-1]) for n in names])]
     return values
+
+
+def _ratio(folder: Path, name: str) -> F32 | None:
+    """Shadows and bounces under the captured light, if the asset carries them."""
+    path = folder / "textures" / f"{name}_irradiance_ratio.exr"
+    return read_exr(path)[0][..., :3] if path.is_file() else None
 
 
 def _normal(folder: Path, name: str) -> F32 | None:

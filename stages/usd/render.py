@@ -114,6 +114,8 @@ class Renderer:
         n = torch.from_numpy(normal.astype(np.float32))
         out = torch.from_numpy(np.full((len(n), 3), 0.5, np.float32) if plain else bilinear(asset.albedo, uv))
         colour = brdf.diffuse(out, n, light)
+        if asset.irradiance_ratio is not None and not plain:
+            colour = colour * torch.from_numpy(bilinear(asset.irradiance_ratio, uv))
         if not plain:
             toward = torch.from_numpy(wo.astype(np.float32))
             cosine = (normal * wo).sum(1).clip(0, 1)

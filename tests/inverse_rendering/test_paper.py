@@ -174,7 +174,7 @@ def test_the_ball_gets_its_colours() -> None:
 def test_the_sinusoidal_field_is_not_odd_and_keeps_its_spread() -> None:
     """With zero biases f(-x) = 2 f(0) - f(x) at the start; and deep layers neither die nor saturate."""
     torch.manual_seed(0)
-    f = SinusoidalField(torch.zeros(3), 1.0, 3, True, 64, 8)
+    f = SinusoidalField(torch.zeros(3), 1.0, 3, True, width=64, depth=8)
     x = torch.rand(2000, 3) * 2 - 1
     raw = lambda p: torch.logit(f(p)[0])  # noqa: E731
     assert (raw(x) + raw(-x) - 2 * raw(torch.zeros(1, 3))).abs().mean() > 0.01

@@ -53,6 +53,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "losses.white_light": (losses.white_light, (draw(9, 3),)),
     "losses.specular_energy": (losses.specular_energy, (draw(4, 3),)),
     "losses.shininess_gauge": (lambda s: losses.shininess_gauge(s, 0.1), (draw(4, low=0.2),)),
+    "losses.albedo_parsimony": (losses.albedo_parsimony, (draw(5, 3),)),
     "losses.eikonal": (lambda g: (losses.eikonal(g), losses.eikonal(g, False)), (draw(4, 3, high=0.4),)),
     "losses.displacement": (losses.displacement, (draw(4),)),
     "losses.embedding": (losses.embedding, (draw(2, 8),)),

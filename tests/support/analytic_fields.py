@@ -145,6 +145,10 @@ class AnalyticField:
             linear_inv_kappa(p).astype(np.float32),
         )
 
+    def irradiance_ratio(self, points: F32) -> F32:
+        """No shadows."""
+        return np.ones((len(points), 3), np.float32)
+
     def basis(self, wo: F32, normal: F32) -> F32:
         """B_j = (j + 1) / 20 * (1 + (1 - n.v)^2): a function of n.v alone, so that its marginal is exact."""
         cosine = np.clip((wo * normal).sum(1), 0, 1)
