@@ -17,7 +17,7 @@ from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import PhotoView
 from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
 
-SHORT = replace(SMALL, steps=8, batch=256, levels=1, max_dropped=3)
+SHORT = replace(SMALL, steps=8, batch=256, levels=1, shadows=False, max_dropped=3)
 
 
 def trainer(settings: FitSettings = SHORT, views: list[PhotoView] | None = None, start: Start | None = None) -> Trainer:
