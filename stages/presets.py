@@ -41,6 +41,13 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "uv": {"target_faces": 60_000},
         "bake": {"size": 4096},
     },
+    # Not a point on that curve: the paper's own model and schedule, for comparison (docs/model.md). For a GPU.
+    "paper": {
+        "inverse_rendering": {"preset": "paper"},
+        "surface": {"resolution": 320},
+        "uv": {"target_faces": 40_000},
+        "bake": {"size": 2048},
+    },
 }
 DEFAULT_PRESET = "draft"
 

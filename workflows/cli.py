@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
-from workflows import commands
+from workflows import bench, commands
 from workflows.console import Console
 
 EXAMPLES = """examples:
@@ -54,6 +54,7 @@ def parser() -> argparse.ArgumentParser:
         sub = commands_of.add_parser(name, help=text)
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
         sub.set_defaults(run=run)
+    bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)
@@ -64,7 +65,7 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
     run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
     run.add_argument(
-        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio or film (%(default)s)"
+        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio, film; or paper (%(default)s)"
     )
     run.add_argument(
         "--holdout",

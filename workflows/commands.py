@@ -132,8 +132,23 @@ def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: Ru
     figures = measure(out, capture, found.artifact)
     (out / "truth.json").write_text(json.dumps(dataclasses.asdict(figures), indent=1))
     print("against the truth that the demo knows:")
-    for line in figures.lines():
+    for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact)]:
         print(f"  {line}")
+
+
+def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], capture: Any) -> list[str]:
+    """Whether the split into diffuse and specular is right; figures and a picture into OUT/truth."""
+    from pipeline.artifacts import FittedFace
+    from pipeline.store import Store
+    from pipeline.transforms import matrix
+    from workflows.truth_material import compare
+
+    store = Store(Path(record["store"]))
+    fitted = store.load("inverse_rendering", record["stages"]["inverse_rendering"]["key"], FittedFace)
+    if fitted is None:
+        return []
+    place = matrix(record["capture_from_asset"])
+    return compare(fitted.path(fitted.artifact.field), folder, capture, place, out / "truth").lines()
 
 
 def validate_command(options: argparse.Namespace, console: Console) -> int:

@@ -26,37 +26,52 @@ def mlp(width_in: int, width: int, depth: int, width_out: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(width if depth else width_in, width_out))
 
 
+def start_heads(last: nn.Linear, albedo: tuple[float, float, float]) -> None:
+    """Set the last layer so that the field starts as skin of one colour and ordinary gloss."""
+    with torch.no_grad():
+        last.weight *= 0.1
+        last.bias[:3] = torch.logit(torch.tensor(albedo))
+        last.bias[3] = math.log(START_RHO / (1 - START_RHO))
+        last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
+        last.bias[5:] = math.log(math.expm1(1.0))
+
+
+def heads(raw: Tensor, positive: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """albedo, rho, c, 1/kappa from the last layer's outputs: sigmoid, sigmoid, softplus (or as it is), softplus."""
+    return (
+        torch.sigmoid(raw[:, :3]),
+        torch.sigmoid(raw[:, 3]),
+        functional.softplus(raw[:, 5:]) if positive else raw[:, 5:],
+        functional.softplus(raw[:, 4]),
+    )
+
+
 class SpatialField(nn.Module):
-    """x (N, 3) -> albedo (N, 3), rho (N,), c (N, k), 1/kappa (N,).
+    """x (N, 3) -> albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], 1/kappa (N,).
 
     Differs: a hash encoding and a small ReLU network stand for the paper's sinusoidal MLP (about 10 times faster a
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.
     """
 
     def __init__(
-        self, encoding: HashEncoding, rank: int, width: int, depth: int, albedo: tuple[float, float, float]
+        self,
+        encoding: HashEncoding,
+        rank: int,
+        width: int,
+        depth: int,
+        albedo: tuple[float, float, float],
+        positive: bool = True,
     ) -> None:
         super().__init__()
-        self.encoding, self.rank = encoding, rank
+        self.encoding, self.rank, self.positive = encoding, rank, positive
         self.net = mlp(encoding.width, width, depth, 5 + rank)
-        with torch.no_grad():
-            last = self.net[-1]
-            assert isinstance(last, nn.Linear)
-            last.weight *= 0.1
-            last.bias[:3] = torch.logit(torch.tensor(albedo))
-            last.bias[3] = math.log(START_RHO / (1 - START_RHO))
-            last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
-            last.bias[5:] = math.log(math.expm1(1.0))
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
+        start_heads(last, albedo)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Material at x."""
-        raw = self.net(self.encoding(x))
-        return (
-            torch.sigmoid(raw[:, :3]),
-            torch.sigmoid(raw[:, 3]),
-            functional.softplus(raw[:, 5:]),
-            functional.softplus(raw[:, 4]),
-        )
+        return heads(self.net(self.encoding(x)), self.positive)
 
 
 class IntegratedBasis(nn.Module):
@@ -79,4 +94,9 @@ class IntegratedBasis(nn.Module):
         """B at unit directions, (N, 3) each; wo . n is taken as >= 0, which visible points have."""
         cosine = (wo * n).sum(-1, keepdim=True).clamp(min=0)
         out: Tensor = functional.softplus(self.net(cosine if self.cosine_only else torch.cat([wo, n, cosine], -1)))
+        return out
+
+    def integral(self, x: Tensor, c: Tensor, wo: Tensor, n: Tensor) -> Tensor:
+        """c(x) . B(wo, n): the material integral under the low-rank prior, (N,). [NeuFace eq. 8]"""
+        out: Tensor = (c * self(wo, n)).sum(-1)
         return out

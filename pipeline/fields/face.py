@@ -9,25 +9,27 @@ import json
 import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from pipeline.errors import StageError
+from pipeline.fields import build
 from pipeline.fields.appearance import IntegratedBasis, SpatialField
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.encodings import HashEncoding
+from pipeline.fields.displaced import DisplacedSdf
 from pipeline.fields.geometry import GridSdf
 from pipeline.fields.light import ShLight
 from pipeline.fields.protocol import F32, Material
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
-from pipeline.maths import brdf
+from pipeline.maths import brdf, split_sum
 from pipeline.maths.sdf import unit
 
 FORMAT = 1
 CHUNK = 131_072
+DIELECTRIC = 0.04  # F0 of what is no metal
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +55,25 @@ class FaceSpec:
     fine: float = 0.0006
     width: int = 64
     depth: int = 2
+    # which of the paper's systems; see pipeline.fields.build
+    appearance: str = "hash"
+    shading: str = "neural"
+    light: str = "sh"
+    integral: str = "low_rank"
+    cubemap_size: int = 12
+    basis_width: int = 64
+    basis_depth: int = 2
+    geometry: str = "grid"
+    prior: str = "hull"
+    prior_scale: float = 0.1
+    prior_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    displacement_width: int = 256
 
 
 @dataclass(frozen=True, slots=True)
 class Shaded:
-    """Radiance at N surface points: total = diffuse + specular, (N, 3) each, linear, before the calibration."""
+    """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
+    calibration."""
 
     total: Tensor
     diffuse: Tensor
@@ -67,20 +83,23 @@ class Shaded:
 
 
 class FaceModel(nn.Module):
-    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width."""
+    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width.
+
+    `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and bounces only where `shadowing` is on.
+    """
 
     beta: Tensor
 
-    def __init__(self, spec: FaceSpec, values: Tensor, lo: Tensor, cell: float) -> None:
+    def __init__(
+        self, spec: FaceSpec, values: Tensor, lo: Tensor, cell: float, geometry: DisplacedSdf | None = None
+    ) -> None:
         super().__init__()
         self.spec = spec
-        self.geometry = GridSdf(values, lo, cell)
-        encoding = HashEncoding(
-            torch.tensor(spec.lo), torch.tensor(spec.hi), spec.coarse, spec.fine, spec.levels, spec.log2_size
-        )
-        self.spatial = SpatialField(encoding, spec.rank, spec.width, spec.depth, spec.albedo_start)
-        self.basis = IntegratedBasis(spec.rank, 64, 2, spec.basis_inputs == "cosine")
-        self.light = ShLight(spec.light_order, spec.light_start)
+        # DisplacedSdf answers what is asked after the fit; what a grid alone can do is asked by the grid's own trainer
+        self.geometry = GridSdf(values, lo, cell) if geometry is None else cast(GridSdf, geometry)
+        self.spatial = cast(SpatialField, build.spatial(spec))
+        self.basis = cast(IntegratedBasis, build.material_integral(spec))
+        self.light = cast(ShLight, build.light(spec))
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
         self.even = False  # one albedo for all, while the light is found
@@ -91,15 +110,31 @@ class FaceModel(nn.Module):
         albedo, rho, c, inv_kappa = self.spatial(x)
         if self.even:
             albedo = albedo.detach().median(0).values.expand_as(albedo)
-        light = self.light()
-        diffuse = brdf.diffuse(albedo, n, light)
-        if self.shadowing is not None:
-            diffuse = diffuse * self.shadowing(x)
+        if self.spec.shading == "disney" and self.spec.specular:
+            return self._disney(x, n, wo, albedo, rho, inv_kappa)
+        diffuse = self._diffuse(albedo, x, n)
         if not self.spec.specular:
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
-        incident = brdf.light_integral(brdf.reflect(wo, n), inv_kappa, light, self.spec.attenuation)
-        specular = brdf.specular(rho, (c * self.basis(wo, n)).sum(-1), incident)
+        incident = self.light.reflected(brdf.reflect(wo, n), inv_kappa, self.spec.attenuation)
+        bound = torch.ones_like(rho) if self.spec.shading == "phong" else self.basis.integral(x, c, wo, n)
+        specular = brdf.specular(rho, bound, incident)
         return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
+
+    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
+        """L_d under what arrives of the light, (N, 3)."""
+        open_light = brdf.lambertian(albedo, self.light.irradiance(n))
+        return open_light if self.shadowing is None else open_light * self.shadowing(x)
+
+    def _disney(self, x: Tensor, n: Tensor, wo: Tensor, albedo: Tensor, metallic: Tensor, inv_kappa: Tensor) -> Shaded:
+        """Split-sum GGX with a metallic parameter, which rho's output stands for. [NeuFace section 5.2]"""
+        m, alpha = metallic[:, None], split_sum.alpha_from_inv_kappa(inv_kappa)
+        base = albedo * (1 - m)
+        diffuse = self._diffuse(base, x, n)
+        f0 = DIELECTRIC * (1 - m) + albedo * m
+        width = alpha if self.spec.light == "cubemap" else inv_kappa
+        incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)
+        specular = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha) * incident
+        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
 
     def solve_shadows(self) -> None:
         """Bring the shadows up to date with the surface, the albedo and the light found so far."""
@@ -130,9 +165,10 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
             remedy="run the fit again with this version",
         )
     cell = float(spec.pop("cell"))
-    for name in ("lo", "hi", "albedo_start"):
-        spec[name] = tuple(spec[name])
-    model = FaceModel(FaceSpec(**spec), arrays["geometry.values"], arrays["geometry.lo"], cell)
+    for k in ("lo", "hi", "albedo_start", "prior_centre"):
+        if k in spec:
+            spec[k] = tuple(spec[k])
+    model = build.model_from_arrays(FaceSpec(**spec), arrays, cell)
     model.load_state_dict(arrays)
     return model.to(device)
 
@@ -158,7 +194,7 @@ class FittedField:
     @property
     def rank(self) -> int:
         """Number of specular bases."""
-        return self.model.spec.rank
+        return 1 if self.model.spec.shading == "phong" else self.model.spec.rank
 
     @property
     def light(self) -> F32:
@@ -192,6 +228,8 @@ class FittedField:
         albedo, rho, c, inv_kappa = self._map(self.model.spatial, points)
         if not self.model.spec.specular:
             rho = np.zeros_like(rho)
+        if self.model.spec.shading == "phong":
+            c = np.ones((len(rho), 1), np.float32)
         return Material(albedo, rho, c, inv_kappa)
 
     def irradiance_ratio(self, points: F32) -> F32:
@@ -203,7 +241,17 @@ class FittedField:
         return s
 
     def basis(self, wo: F32, normal: F32) -> F32:
-        """(N, k)."""
+        """(N, k). Raises StageError for a model without bases."""
+        if self.model.spec.integral != "low_rank" or self.model.spec.shading == "disney":
+            raise StageError(
+                "this model has no specular bases to bake",
+                where="inverse_rendering.shading, inverse_rendering.integral",
+                value=f"{self.model.spec.shading}, {self.model.spec.integral}",
+                limit="shading neural or phong, and integral low_rank",
+                remedy="such models are for comparisons (neuface bench ablations); fit one with bases for an asset",
+            )
+        if self.model.spec.shading == "phong":
+            return np.ones((len(wo), 1), np.float32)
         (b,) = self._map(lambda w, n: (self.model.basis(w, n),), wo, normal)
         return b
 

@@ -84,6 +84,14 @@ class GridSdf(nn.Module):
         self.steps += 1
         kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS)
 
+    def gradient_is_finite(self) -> bool:
+        """Whether the gradients gathered since the last step are. See kernels.SplineSdf for how a fault is marked."""
+        return bool(torch.isfinite(self.sink[0, 0, 0]))
+
+    def drop_gradient(self) -> None:
+        """Forget the gradients gathered since the last step."""
+        self.sink.zero_()
+
     def redistance(self) -> None:
         """Keep the zero set's largest piece, fill its cavities, and make the far field a distance again."""
         values = self.values.detach().cpu().numpy()

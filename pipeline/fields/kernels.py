@@ -42,6 +42,8 @@ class SplineSdf(torch.autograd.Function):
     """SDF and gradient of a spline grid; the gradient of the coefficients is added to `sink` (X, Y, Z).
 
     The sink spares a dense gradient tensor a call. Positions get no gradient: samples are placed, not learnt.
+    A gradient that is not finite is not added: it marks the sink's first node, on the border where nothing is learnt,
+    with NaN, so that whoever takes the step can tell at the cost of one number.
     """
 
     @staticmethod
@@ -59,7 +61,9 @@ class SplineSdf(torch.autograd.Function):
         (x,) = ctx.saved_tensors
         shape, sink, lo, cell = ctx.grid
         gs, gg = grads
-        if compiled(x):
+        if not bool(torch.isfinite(gs.sum() + gg.sum())):
+            sink[0, 0, 0] = float("nan")
+        elif compiled(x):
             nb.spline_backward(sink.numpy(), _np(lo), np.float32(1 / cell), _np(x), _np(gs), _np(gg))
         else:
             index, w, dw = spline_stencil(x, lo, cell, shape)

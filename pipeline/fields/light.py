@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from pipeline.maths.sh import count
+from pipeline.maths.brdf import light_integral
+from pipeline.maths.sh import count, irradiance
 
 
 class ShLight(nn.Module):
@@ -22,3 +23,18 @@ class ShLight(nn.Module):
     def forward(self) -> Tensor:
         """The coefficients."""
         return self.coefficients
+
+    def even_gradient(self, order: int) -> None:
+        """While nothing but the light moves: the same for all colours, and no more of it than skin can show."""
+        grad = self.coefficients.grad
+        if grad is not None:
+            grad.copy_(grad.mean(-1, keepdim=True).expand_as(grad))
+            grad[count(order) :] = 0
+
+    def irradiance(self, n: Tensor) -> Tensor:
+        """E(n), (N, 3)."""
+        return irradiance(self.coefficients, n)
+
+    def reflected(self, w_r: Tensor, width: Tensor, attenuation: str) -> Tensor:
+        """Radiance averaged over a lobe of 1/kappa = `width` (N,) around w_r, (N, 3). [NeuFace eq. 11]"""
+        return light_integral(w_r, width, self.coefficients, attenuation)

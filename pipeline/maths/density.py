@@ -9,7 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pipeline.maths.precision import full_precision
 
+
+@full_precision
 def laplace_density(s: Tensor, beta: Tensor) -> Tensor:
     """sigma = Psi_beta(-s) / beta, Psi the CDF of the zero-mean Laplace distribution. [NeuFace section 4.4]
 
@@ -19,22 +22,26 @@ def laplace_density(s: Tensor, beta: Tensor) -> Tensor:
     return torch.where(s >= 0, tail, 1 - tail) / beta
 
 
+@full_precision
 def ray_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and total optical depth: (N, S), (N, S) -> (N, S), (N,).
 
-    The quadrature of [NeuFace eq. 18]; opacity is 1 - exp(-tau) = sum w.
+    The quadrature of [NeuFace eq. 18]; opacity is 1 - exp(-tau) = sum w. The depth before a sample is summed without
+    it: sum less itself would be 0 instead of 1e-3 before an interval of depth 1e10, and the weights would exceed 1.
     """
     depth = sigma * delta
-    before = torch.cumsum(depth, -1) - depth
+    before = torch.cumsum(torch.nn.functional.pad(depth[..., :-1], (1, 0)), -1)
     return torch.exp(-before) * -torch.expm1(-depth), depth.sum(-1)
 
 
+@full_precision
 def laplace_survival(s: Tensor, beta: Tensor) -> Tensor:
     """1 - Psi_beta(-s): the transmittance of a ray that came no closer than s. 1 far outside, 1/2 at s = 0."""
     tail = 0.5 * torch.exp(-s.abs() / beta)
     return torch.where(s >= 0, 1 - tail, tail)
 
 
+@full_precision
 def crossing_weights(s: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
     """Weights and optical depth of a surface without bias: (N, S) front to back -> (N, S), (N,).
 
@@ -59,6 +66,7 @@ def crossing_weights(s: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
 OPAQUE = 3.5  # optical depth from which a ray counts as covered: opacity 0.97
 
 
+@full_precision
 def opacity_cross_entropy(tau: Tensor, alpha: Tensor) -> Tensor:
     """Binary cross-entropy of opacity 1 - e^-tau against alpha in [0, 1], unreduced.
 

@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 
 from pipeline.colour import srgb_from_linear
+from pipeline.maths.precision import full_precision
 
 
+@full_precision
 def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
     """|I - I_bar|, mean over channels: (N, 3) linear, (N, 3) encoded -> (N,). [NeuFace eq. 21]
 
@@ -17,6 +19,7 @@ def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
     return (srgb_from_linear(predicted) - target_srgb).abs().mean(-1)
 
 
+@full_precision
 def white_light(coefficients: Tensor) -> Tensor:
     """|L_i - mean over RGB of L_i|, on the SH coefficients: (K, 3) -> (K,). [NeuFace eq. 22]
 
@@ -25,11 +28,13 @@ def white_light(coefficients: Tensor) -> Tensor:
     return (coefficients - coefficients.mean(-1, keepdim=True)).abs().mean(-1)
 
 
+@full_precision
 def specular_energy(specular: Tensor) -> Tensor:
     """L_s, mean over channels: (N, 3) -> (N,). [NeuFace eq. 23]; L_s >= 0 by construction."""
     return specular.mean(-1)
 
 
+@full_precision
 def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
     """ln^2(s / s_0): (N,) -> (N,), s = 1 / kappa. Not in the paper.
 
@@ -40,6 +45,7 @@ def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
     return torch.log(inv_kappa.clamp(min=1e-6) / typical) ** 2
 
 
+@full_precision
 def albedo_parsimony(albedo: Tensor) -> Tensor:
     """|ln a - median of ln a|, mean over channels: (N, 3) in [0, 1] -> (N,). Not in the paper.
 
@@ -51,6 +57,7 @@ def albedo_parsimony(albedo: Tensor) -> Tensor:
     return (log - log.detach().median(0).values).abs().mean(-1)
 
 
+@full_precision
 def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
     """| |grad SDF| - 1 | or its square: (N, 3) -> (N,). The second term of [NeuFace eq. 24].
 
@@ -60,16 +67,19 @@ def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
     return residual * residual if squared else residual.abs()
 
 
+@full_precision
 def displacement(d: Tensor) -> Tensor:
     """|D(x)|: the third term of [NeuFace eq. 24]."""
     return d.abs()
 
 
+@full_precision
 def embedding(z: Tensor) -> Tensor:
     """|z|^2 of the prior's embedding: the first term of [NeuFace eq. 24]."""
     return (z * z).sum(-1)
 
 
+@full_precision
 def normal_consistency(n: Tensor, n_near: Tensor) -> Tensor:
     """1 - n . n' at a point and a jittered neighbour: (N, 3), (N, 3) -> (N,). Not in the paper: it stands for the
     smoothness that the paper's MLP has by itself and a grid has not."""

@@ -10,7 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pipeline.maths.precision import full_precision
 
+
+@full_precision
 def axis_weights(f: Tensor) -> tuple[Tensor, Tensor]:
     """Weights and their derivatives by u: (...) -> (..., 3), (..., 3)."""
     w = torch.stack([0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2], -1)
@@ -48,6 +51,7 @@ def spline_stencil(x: Tensor, lo: Tensor, cell: float, shape: tuple[int, int, in
     return flat[:, None] + neighbour_offsets(shape, x.device), outer(wx, wy, wz), gradient
 
 
+@full_precision
 def spline_sdf(values: Tensor, x: Tensor, lo: Tensor, cell: float) -> tuple[Tensor, Tensor]:
     """SDF (N,) and gradient (N, 3) at x (N, 3); differentiable in `values` (X, Y, Z)."""
     shape = (values.shape[0], values.shape[1], values.shape[2])
@@ -56,6 +60,7 @@ def spline_sdf(values: Tensor, x: Tensor, lo: Tensor, cell: float) -> tuple[Tens
     return (v * w).sum(-1), torch.einsum("nk,nkc->nc", v, dw)
 
 
+@full_precision
 def refine(values: Tensor) -> Tensor:
     """Coefficients of the same function at half the spacing: (X, Y, Z) -> (2X, 2Y, 2Z), first node at lo - h / 4.
 
@@ -69,6 +74,7 @@ def refine(values: Tensor) -> Tensor:
     return values
 
 
+@full_precision
 def unit(g: Tensor) -> Tensor:
     """n = g / |g| as g rsqrt(|g|^2 + 1e-12): value and derivative finite at g = 0. [NeuFace section 4.3]"""
     return g * torch.rsqrt((g * g).sum(-1, keepdim=True) + 1e-12)

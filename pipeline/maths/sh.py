@@ -13,6 +13,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from pipeline.maths.precision import full_precision
 from pipeline.maths.sh_recurrence import recurrence
 
 try:
@@ -36,6 +37,7 @@ def order_of(coefficients: Tensor) -> int:
     return order
 
 
+@full_precision
 def sh_basis(d: Tensor, order: int = ORDER) -> Tensor:
     """All Y_lm up to `order`: (N, 3) -> (N, (order + 1)^2).
 
@@ -98,16 +100,20 @@ def clamped_cosine(order: int = ORDER) -> Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
+@full_precision
 def irradiance(c: Tensor, n: Tensor) -> Tensor:
-    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16]; may be slightly negative."""
+    """E(n) = sum_lm Lambda_l c_lm Y_lm(n): (N, 3). The sum in [NeuFace eq. 16], by [NeuFace eq. 14]; may be
+    slightly negative."""
     return band_radiance(clamped_cosine(order_of(c)).to(c)[:, None] * c, n).sum(1)
 
 
+@full_precision
 def radiance(c: Tensor, d: Tensor) -> Tensor:
     """L(d) = sum_lm c_lm Y_lm(d): (N, 3). [NeuFace eq. 2]"""
     return sh_basis(d, order_of(c)) @ c
 
 
+@full_precision
 def band_radiance(c: Tensor, d: Tensor) -> Tensor:
     """Each band's share of L(d): (N, L + 1, 3). Compiled for float32 on the CPU where numba is installed; else one
     matrix product for all bands."""
@@ -118,6 +124,7 @@ def band_radiance(c: Tensor, d: Tensor) -> Tensor:
     return band_radiance_reference(c, d, order)
 
 
+@full_precision
 def band_radiance_reference(c: Tensor, d: Tensor, order: int) -> Tensor:
     """`band_radiance` in plain torch."""
     spread = (c[:, None, :] * band_selector(order).to(c)[:, :, None]).reshape(c.shape[0], -1)

@@ -9,6 +9,7 @@ from pipeline.contract import Context
 from pipeline.fields.face import FaceModel
 from pipeline.images import write_exr, write_png_from_linear
 from stages.inverse_rendering.gather import camera_only
+from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.predict import predict_view
 from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import factor_for
@@ -51,7 +52,7 @@ def predict_held_out(
     return tuple(out)
 
 
-def model_facts(settings: FitSettings, model: FaceModel) -> dict[str, dict[str, str | float | bool]]:
+def model_facts(settings: FitSettings, model: FaceModel, guard: Guard) -> dict[str, dict[str, str | float | bool]]:
     """What was modelled and what was left out, for the report."""
     return {
         "specular": {"modelled": settings.specular, "attenuation": settings.attenuation, "why": "setting"},
@@ -66,9 +67,17 @@ def model_facts(settings: FitSettings, model: FaceModel) -> dict[str, dict[str, 
             else "setting",
         },
         "geometry": {
-            "prior": "visual hull",
+            "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
             "cell_mm": round(model.geometry.cell * 1e3, 4),
-            "why": "no licensed prior",
+            "why": "no licensed prior" if settings.prior == "hull" else "setting",
         },
         "density": {"kind": settings.density, "why": "setting"},
+        "system": {
+            "method": settings.method,
+            "shading": settings.shading,
+            "light": settings.light,
+            "integral": settings.integral,
+            "why": "setting",
+        },
+        "faults": {"dropped_steps": guard.dropped, "why": guard.causes[-1] if guard.causes else "none"},
     }

@@ -18,9 +18,10 @@ import torch
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel, FaceSpec
-from stages.inverse_rendering.objective import objective
+from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
+from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.settings import FitSettings
-from stages.inverse_rendering.views import PhotoView, PixelTable
+from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
@@ -66,9 +67,15 @@ class Trainer:
     error: float = float("nan")
     table: PixelTable | None = None
     optimiser: torch.optim.Optimizer = field(init=False)
+    guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
-        self.optimiser = make_optimiser(self.model, self.settings, self.device)
+        self.optimiser = self.make_optimiser()
+        self.guard = Guard(self.settings.max_dropped)
+
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """Of everything that has not its own."""
+        return make_optimiser(self.model, self.settings, self.device)
 
     @property
     def psnr(self) -> float:
@@ -110,7 +117,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = group["start"] * decay * warm
             if even:
-                group["lr"] *= EVEN_LIGHT_RATE if group["params"][0] is self.model.light.coefficients else 0.0
+                group["lr"] *= EVEN_LIGHT_RATE if group["params"][0] is next(self.model.light.parameters()) else 0.0
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
@@ -129,36 +136,66 @@ class Trainer:
             self.model.solve_shadows()
         seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
         batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
-        generator = torch.Generator().manual_seed(seed + 1)
         self.optimiser.zero_grad(set_to_none=True)
-        loss, error = objective(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+        found = self._terms(batch, seed)
+        loss, error = found.total, found.error
         loss.backward()
+        if not self._is_finite(loss):
+            self._drop(batch, seed)
+            return
         if self.model.even:
-            self._grey_light()
-        self.optimiser.step()
-        self.model.geometry.step(rate)
+            self.model.light.even_gradient(EVEN_LIGHT_ORDER)
+        self.move(rate)
         self.step += 1
         if self.step % BAND_EVERY == 0:
-            self.model.geometry.find_band()
+            self.tend()
         self._note(float(loss.detach()), error)
 
-    def _grey_light(self) -> None:
-        """While nothing but the light moves: the same for all colours, and no more of it than skin can show."""
-        grad = self.model.light.coefficients.grad
-        if grad is not None:
-            grad.copy_(grad.mean(-1, keepdim=True).expand_as(grad))
-            grad[(EVEN_LIGHT_ORDER + 1) ** 2 :] = 0
+    def move(self, rate: float) -> None:
+        """Take the step."""
+        self.optimiser.step()
+        self.model.geometry.step(rate)
+
+    def tend(self) -> None:
+        """What is due every BAND_EVERY steps."""
+        self.model.geometry.find_band()
+
+    def finish(self) -> None:
+        """What is due after the last step."""
+        self.model.geometry.redistance()
+
+    def _terms(self, batch: Batch, seed: int) -> Terms:
+        generator = torch.Generator().manual_seed(seed + 1)
+        return self.compute_terms(batch, generator)
+
+    def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
+        """The parts of the loss."""
+        return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+
+    def geometry_is_finite(self) -> bool:
+        """Whether the gradients that the optimiser does not know of are finite."""
+        return self.model.geometry.gradient_is_finite()
+
+    def _is_finite(self, loss: torch.Tensor) -> bool:
+        finite = math.isfinite(float(loss.detach())) and self.geometry_is_finite()
+        return finite and gradients_are_finite(self.optimiser)
+
+    def _drop(self, batch: Batch, seed: int) -> None:
+        """Leave everything as it was before this step, say why, and go on with the next one."""
+        parameters: list[tuple[str, torch.Tensor]] = [
+            (n, p) for n, p in self.model.named_parameters() if n != "geometry.values"
+        ]
+        cause = cause_of(self._terms(batch, seed), batch, [v.index for v in self.views], parameters)
+        self.optimiser.zero_grad(set_to_none=True)
+        self.forget()
+        self.step += 1
+        self.guard.drop(self.step, cause)
+
+    def forget(self) -> None:
+        """Drop gradients that the optimiser does not know of."""
+        self.model.geometry.drop_gradient()
 
     def _note(self, loss: float, error: float) -> None:
-        if not math.isfinite(loss):
-            raise StageError(
-                "the fit diverged",
-                where=f"inverse_rendering, step {self.step}",
-                value=f"loss {loss}",
-                limit="a finite loss",
-                remedy="lower --set inverse_rendering.lr_sdf or lr_appearance by "
-                "half, and check cameras and masks in the report of the stages before",
-            )
         self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
         if math.isfinite(error):
             known = math.isfinite(self.error)
@@ -175,6 +212,7 @@ class Trainer:
                 "level": self.level,
                 "loss": self.loss,
                 "error": self.error,
+                "dropped": self.guard.causes,
                 "cell": g.cell,
                 "model": self.model.state_dict(),
                 "band": g.optimiser_state(),
@@ -200,6 +238,7 @@ class Trainer:
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
+        self.guard.causes = list(state["dropped"])
         return True
 
 
@@ -209,7 +248,7 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
     groups = [
         {"params": [model.spatial.encoding.table], "start": settings.lr_appearance},
         {"params": [*model.spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
-        {"params": [model.light.coefficients], "start": settings.lr_light},
+        {"params": list(model.light.parameters()), "start": settings.lr_light},
         {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
     ]
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
@@ -218,10 +257,20 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
 def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> Trainer:
     """A fit that has not begun: geometry from the hull, an even white light, grey skin."""
     torch.manual_seed(settings.seed)
+    spec = spec_for(views, start, settings, calibrated, device)
+    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    model.to(device)
+    model.geometry.to_device(device)
+    return Trainer(views, settings, device, model)
+
+
+def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
+    """What the settings make of these photos and this start."""
     colour = PixelTable(views, 256, device).mean_colour()
     grey = float(colour.mean().clamp(min=1e-4))
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
-    spec = FaceSpec(
+    coarse = float((hi - lo).max()) / 16
+    return FaceSpec(
         lo=_triple(lo),
         hi=_triple(hi),
         views=len(views),
@@ -237,14 +286,20 @@ def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, cal
         calibrated=calibrated,
         levels=settings.hash_levels,
         log2_size=settings.hash_log2_size,
-        coarse=float((hi - lo).max()) / 16,
-        fine=settings.hash_fine,
+        coarse=coarse,
+        fine=settings.hash_fine if coarse / 1024 < settings.hash_fine < coarse / 2 else coarse / 20,
         width=settings.width,
+        depth=settings.depth,
+        appearance=settings.appearance,
+        shading=settings.shading,
+        light=settings.light,
+        integral=settings.integral,
+        basis_width=settings.basis_width,
+        basis_depth=settings.basis_depth,
+        prior=settings.prior,
+        prior_scale=settings.prior_scale,
+        prior_centre=settings.prior_centre,
     )
-    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(lo.astype(np.float32)), start.cell)
-    model.to(device)
-    model.geometry.to_device(device)
-    return Trainer(views, settings, device, model)
 
 
 def _triple(v: npt.NDArray[np.floating]) -> tuple[float, float, float]:
@@ -258,7 +313,12 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
     saved = shown = time.monotonic()
     writing = 0.1  # seconds a checkpoint takes, until one was written
     while trainer.step < trainer.settings.steps:
-        trainer.advance()
+        try:
+            trainer.advance()
+        except StageError:
+            if hooks.checkpoint is not None:
+                trainer.save(hooks.checkpoint)
+            raise
         now = time.monotonic()
         if hooks.cancelled():
             if hooks.checkpoint is not None:
@@ -271,5 +331,5 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
             trainer.save(hooks.checkpoint)
             saved = time.monotonic()
             writing = saved - now
-    trainer.model.geometry.redistance()
+    trainer.finish()
     return trainer.model

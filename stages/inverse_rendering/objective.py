@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import torch
 from torch import Tensor
 
@@ -15,40 +17,82 @@ from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import WHOLE, Batch
 
 
+@dataclass(slots=True)
+class Terms:
+    """The loss in parts. scalars: weighted, by name, in the order in which they are summed. values: what single rays
+    gave, detached, with the rays' places in the batch, so that a fault can be traced. error: mean squared error over
+    whole subject pixels as people see it (sRGB), NaN where the batch has none."""
+
+    scalars: dict[str, Tensor] = field(default_factory=dict)
+    values: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
+    error: float = float("nan")
+
+    def add(self, name: str, scalar: Tensor, values: Tensor | None = None, rays: Tensor | None = None) -> None:
+        """Take in a part of the loss."""
+        self.scalars[name] = scalar
+        if values is not None and rays is not None:
+            self.values[name] = (values.detach(), rays)
+
+    @property
+    def total(self) -> Tensor:
+        """The sum. [NeuFace eq. 20]"""
+        parts = list(self.scalars.values())
+        total = parts[0]
+        for part in parts[1:]:
+            total = total + part
+        return total
+
+
 def objective(
     model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator, smooth_scale: float
 ) -> tuple[Tensor, float]:
-    """Loss of a batch, and its mean squared error over whole subject pixels as people see it (sRGB)."""
+    """Loss of a batch, the sum of [NeuFace eq. 20], and its mean squared error (sRGB)."""
+    found = terms(model, batch, settings, generator, smooth_scale)
+    return found.total, found.error
+
+
+def terms(
+    model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator, smooth_scale: float
+) -> Terms:
+    """All parts of the loss. A batch without rays near the subject gives zeros."""
     device = batch.alpha.device
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
     alpha = batch.alpha[shell.kept]
-    n_rays = len(batch.alpha)
+    n_rays = max(len(batch.alpha), 1)
+    out = Terms()
     tau = shell.tau + solid_behind(model, shell, batch.rays)
     silhouette = density.opacity_cross_entropy(tau, alpha).clamp(max=20) * batch.share[shell.kept]
-    loss = settings.mask * silhouette.sum() / n_rays
-    loss = loss + settings.eikonal * losses.eikonal(shell.gradient).mean()
+    out.add("mask", settings.mask * silhouette.sum() / n_rays, silhouette, shell.kept)
+    if not len(shell.kept):
+        return out
+    steep = losses.eikonal(shell.gradient)
+    out.add("eikonal", settings.eikonal * steep.mean(), steep, shell.kept.repeat_interleave(settings.samples))
     pick = torch.nonzero(shell.hit & (alpha > WHOLE)).squeeze(-1)
     if not len(pick):
-        return loss, float("nan")
+        return out
+    rays = shell.kept[pick]
     shaded = shade_shell(model, shell, batch.rays, pick)
-    colour, target = shaded.total, batch.target[shell.kept[pick]]
+    colour, target = shaded.total, batch.target[rays]
     if model.spec.calibrated:
-        colour = _calibrated(model.calibration(), batch.view[shell.kept[pick]], colour)
-    loss = loss + settings.rgb * losses.rgb_l1(colour, target).sum() / n_rays
-    loss = loss + settings.white * losses.white_light(model.light()).sum()
-    loss = loss + settings.specular_energy * losses.specular_energy(shaded.specular).mean()
-    loss = loss + settings.parsimony * losses.albedo_parsimony(shaded.albedo).mean()
+        colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
+    rgb = losses.rgb_l1(colour, target)
+    out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, rays)
+    out.add("white", settings.white * losses.white_light(model.light()).sum())
+    energy = losses.specular_energy(shaded.specular)
+    out.add("specular_energy", settings.specular_energy * energy.mean(), energy, rays)
+    uneven = losses.albedo_parsimony(shaded.albedo)
+    out.add("parsimony", settings.parsimony * uneven.mean(), uneven, rays)
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
-        loss = loss + settings.shininess * gauge.mean()
-    loss = loss + settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator)
+        out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
+    out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
-        error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
-    return loss, error
+        out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
+    return out
 
 
-def _calibrated(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
+def calibrated_colours(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
     """I_n = A_n I: (V, 3, 3), (N,), (N, 3) -> (N, 3). [NeuFace eq. 19]
 
     The matrices are picked by a product with 0 and 1: the gradient of an indexed pick adds up in an order that depends

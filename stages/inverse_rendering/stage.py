@@ -37,7 +37,9 @@ class Config(StageConfig):
     levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
     rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
     light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
-    attenuation: Literal["exponential", "exact"] = Field(description="of the light under the lobe [NeuFace eq. 11]")
+    attenuation: Literal["exponential", "exact", "phong"] = Field(
+        description="of the light under the lobe [NeuFace eq. 11]"
+    )
     basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
     density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
     specular: bool = Field(description="model a specular term at all")
@@ -54,6 +56,23 @@ class Config(StageConfig):
     open_from: float = Field(description="share of the encoding's levels, coarse first, open at the start", ge=0, le=1)
     open_until: float = Field(description="share of the steps after which all levels are open", gt=0, le=1)
     width: int = Field(description="width of the appearance networks", ge=8, le=512)
+    depth: int = Field(description="hidden layers of the appearance network", ge=1, le=16)
+    method: Literal["fast", "paper"] = Field(
+        description="fast: a grid, shaded once a ray; paper: networks, every sample"
+    )
+    appearance: Literal["hash", "sinusoidal"] = Field(description="the Spatial MLP's kind")
+    shading: Literal["neural", "phong", "disney"] = Field(description="the specular term; the last two to compare")
+    light: Literal["sh", "cubemap"] = Field(description="the captured light; cubemap to compare")
+    integral: Literal["low_rank", "direct", "feature"] = Field(description="the material integral [NeuFace eq. 6]")
+    basis_width: int = Field(description="width of the Integrated Basis MLP", ge=8, le=512)
+    basis_depth: int = Field(description="hidden layers of the Integrated Basis MLP", ge=1, le=16)
+    prior: Literal["hull", "sphere", "imface"] = Field(
+        description="what the geometry starts from [NeuFace section 4.3]"
+    )
+    prior_file: str = Field(description="checkpoint of ImFace, for prior imface (docs/imface.md)", exclude=True)
+    prior_digest: str = Field(description="sha256 of that file; filled in")
+    prior_scale: float = Field(description="asset units (metres) per unit of ImFace", gt=0, le=1e6)
+    prior_centre: tuple[float, float, float] = Field(description="ImFace's origin in asset coordinates")
     rgb: float = Field(description="lambda 1 [NeuFace eq. 21]", ge=0)
     mask: float = Field(description="weight of the opacity's cross-entropy against the masks", ge=0)
     white: float = Field(description="lambda 2 [NeuFace eq. 22]", ge=0)
@@ -62,10 +81,13 @@ class Config(StageConfig):
     parsimony: float = Field(description="weight of the gauge that gives shading to the light and not to albedo", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
+    embedding: float = Field(description="lambda 4 [NeuFace eq. 24], for prior imface", ge=0)
+    displacement: float = Field(description="lambda 6 [NeuFace eq. 24], for method paper", ge=0)
     lr_sdf: float = Field(description="learning rate of the SDF, cells a step", gt=0, le=1)
     lr_appearance: float = Field(description="learning rate of the hash table; networks take 0.3 of it", gt=0, le=1)
     lr_light: float = Field(description="learning rate of the light's coefficients", gt=0, le=1)
     beta_end: float = Field(description="final width of the soft surface, finest cells", gt=0, le=10)
+    max_dropped: int = Field(description="steps that are not finite after which the fit stops", ge=1, le=1_000_000)
 
     @field_validator("preset")
     @classmethod
@@ -79,7 +101,12 @@ class Config(StageConfig):
     def _filled(cls, data: Any) -> Any:
         given = dict(data) if isinstance(data, dict) else {}
         preset = PRESETS.get(str(given.get("preset", "draft")), {})
-        return {**asdict(FitSettings()), **preset, **given}
+        filled = {**asdict(FitSettings()), **preset, **given}
+        if filled.get("prior_file"):
+            from pipeline.fields.imface_layout import digest
+
+            filled["prior_digest"] = digest(str(filled["prior_file"]))
+        return filled
 
     def settings(self) -> FitSettings:
         """What the fit reads."""
@@ -91,7 +118,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
     from stages.inverse_rendering.gather import read_views
-    from stages.inverse_rendering.start import hull_start
+    from stages.inverse_rendering.paper import new_paper_trainer
+    from stages.inverse_rendering.start import hull_start, sphere_start
 
     settings = config.settings()
     dropped = set(inputs.masks.artifact.dropped)
@@ -109,10 +137,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
-    start = hull_start(
-        cameras, [v.alpha for v in views], inputs.poses.artifact.roi_radius, settings.grid_cells, settings.levels
-    )
-    trainer = new_trainer(views, start, settings, calibrated(inputs, usable, config), context.device)
+    radius = inputs.poses.artifact.roi_radius
+    if settings.prior == "sphere":
+        start = sphere_start(radius, settings.grid_cells, settings.levels)
+    else:
+        start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+    make = new_paper_trainer if settings.method == "paper" else new_trainer
+    trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
@@ -131,7 +162,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(settings, model),
+        model=model_facts(settings, model, trainer.guard),
     )
 
 

@@ -11,6 +11,7 @@ from pipeline.hull import hull_bounds, hull_sdf, visual_hull
 from stages.inverse_rendering.fit import Start
 
 F32 = npt.NDArray[np.float32]
+SPHERE = 0.6  # share of the region of interest's radius
 MARGIN_CELLS = 4  # room for the band and the spline's border around the hull
 
 
@@ -32,3 +33,13 @@ def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cell
             remedy="look at the masks and the cameras: one of them is wrong, or views show different subjects",
         )
     return Start(hull_sdf(hull).astype(np.float32), (hull.lo + 0.5 * cell).astype(np.float32), cell)
+
+
+def sphere_start(radius: float, cells: int, levels: int) -> Start:
+    """A sphere of SPHERE of the region of interest: what a fit starts from that knows nothing of the subject."""
+    cell = 2 * radius / cells * 2 ** (levels - 1)
+    n = int(np.ceil(radius / cell)) + MARGIN_CELLS
+    axis = (np.arange(-n, n + 1) * cell).astype(np.float32)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
+    values = np.sqrt(x * x + y * y + z * z) - SPHERE * radius
+    return Start(values.astype(np.float32), np.full(3, axis[0], np.float32), cell)

@@ -22,6 +22,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 NEAR_BAND = 0.05  # background pixels within this share of the image side of the subject are worth rays
 FAR_EVERY = 16  # of the background beyond, one pixel in so many keeps stray matter away
+DARKEST = 1e-4  # mean radiance that a light starts from at least
 WHOLE = 0.99  # alpha from which a pixel shows the subject alone
 
 
@@ -105,9 +106,12 @@ class PixelTable:
         self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
 
     def mean_colour(self) -> Tensor:
-        """(3,) mean linear radiance of the subject over all photos."""
+        """(3,) mean linear radiance of the subject over all photos, at least DARKEST: black photos still need a light
+        that can grow."""
+        if not len(self.inside):
+            return torch.full((3,), DARKEST, device=self.target.device)
         s = self.target[self.inside[:: max(len(self.inside) // 100_000, 1)]].float()
-        return (((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean(0)
+        return (((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean(0).clamp(min=DARKEST)
 
     def draw(self, n: int, outside_share: float, seed: int) -> Batch:
         """A random batch that depends on the seed alone."""
@@ -115,9 +119,11 @@ class PixelTable:
         n_out = int(n * outside_share) if len(self.outside) else 0
         picks, shares = [], []
         for pool, k in ((self.inside, n - n_out), (self.outside, n_out)):
-            if k:
+            if k and len(pool):
                 picks.append(pool[torch.randint(len(pool), (k,), generator=generator).to(pool.device)])
                 shares.append(torch.full((k,), len(pool) / k, device=pool.device))
+        if not picks:  # photos of nothing
+            picks, shares = [torch.zeros(0, dtype=torch.int64, device=self.view.device)], [self.alpha[:0]]
         i, share = torch.cat(picks), torch.cat(shares)
         view = self.view[i].long()
         return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share / share.mean())

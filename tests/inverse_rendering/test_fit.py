@@ -117,12 +117,12 @@ def test_a_calibrated_fit_repeats_bit_by_bit() -> None:
 
 
 def test_calibration_applies_each_views_matrix() -> None:
-    from stages.inverse_rendering.objective import _calibrated
+    from stages.inverse_rendering.objective import calibrated_colours
 
     a, colour = torch.randn(3, 3, 3), torch.rand(5, 3)
     view = torch.tensor([2, 0, 0, 1, 2])
     expected = torch.stack([a[v] @ c for v, c in zip(view, colour, strict=True)])
-    assert torch.allclose(_calibrated(a, view, colour), expected, atol=1e-6)
+    assert torch.allclose(calibrated_colours(a, view, colour), expected, atol=1e-6)
 
 
 def test_three_interruptions_change_nothing(fitted: Trainer, tmp_path: Path) -> None:

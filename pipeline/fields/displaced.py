@@ -1,0 +1,104 @@
+"""SDF(x) = I(x) + D(x): a prior and a learnt displacement. [NeuFace eq. 17]
+
+Answers what `pipeline.fields.geometry.GridSdf` answers to the stages after the fit. Values and normals come from one
+pass and automatic differentiation.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pipeline.fields.appearance import mlp
+from pipeline.fields.priors import Prior
+from pipeline.fields.sinusoidal import positional_encoding
+from pipeline.maths.tracing import aggressive_trace
+
+OCTAVES = 6  # L of [NeuFace section B]
+THRESHOLD, TRUNCATION, FACTOR = 5e-5, 0.05, 1.2  # metres, metres: [NeuFace section 4.4, B]
+CELLS = 160  # nominal cells across Omega, for those who ask how fine the surface is
+
+
+class Displacement(nn.Module):
+    """D(u): positional encoding of 6 octaves, ReLU layers, one output. [NeuFace eq. 17]
+
+    The last layer starts at zero, so that the prior is what is traced at the first step.
+    """
+
+    def __init__(self, width: int = 256, depth: int = 3) -> None:
+        super().__init__()
+        self.net = mlp(6 * OCTAVES, width, depth, 1)
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight.zero_()
+            last.bias.zero_()
+
+    def forward(self, u: Tensor) -> Tensor:
+        """(N, 3) in Omega's units -> (N,) in Omega's units."""
+        out: Tensor = self.net(positional_encoding(u, OCTAVES)).squeeze(-1)
+        return out
+
+
+class DisplacedSdf(nn.Module):
+    """A prior, its displacement, and the learnt width beta of the Laplace density.
+
+    Lengths are kept in units of Omega's radius, so that a learning rate means the same for a face and a statue.
+    """
+
+    BETA_START, BETA_MIN = 0.01, 1e-4
+
+    def __init__(self, prior: nn.Module, width: int = 256, depth: int = 3) -> None:
+        super().__init__()
+        self.prior = prior
+        self.displacement = Displacement(width, depth)
+        self.beta_raw = nn.Parameter(torch.tensor(self.BETA_START))
+
+    @property
+    def known(self) -> Prior:
+        """The prior with its questions typed."""
+        return self.prior  # type: ignore[return-value]
+
+    @property
+    def cell(self) -> float:
+        """Nominal edge of the finest cell."""
+        return 2 * self.known.sphere()[1] / CELLS
+
+    def beta(self) -> Tensor:
+        """Width of the Laplace density, asset units, > 0. [NeuFace section 4.4]"""
+        return (self.beta_raw.abs() + self.BETA_MIN) * self.known.sphere()[1]
+
+    def box(self) -> tuple[Tensor, Tensor]:
+        """The cube around Omega."""
+        centre, radius = self.known.sphere()
+        return centre - radius, centre + radius
+
+    def parts(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """I(x) and D(x), (N,) each, asset units. [NeuFace eq. 17]"""
+        centre, radius = self.known.sphere()
+        return self.known.sdf(x), self.displacement((x - centre) / radius) * radius
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """SDF (N,) and gradient (N, 3); both carry gradients to the parameters where gradients are on."""
+        s, g, _ = self.with_displacement(x)
+        return s, g
+
+    def with_displacement(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """SDF (N,), its gradient (N, 3) and the displacement's share D(x) (N,)."""
+        wanted = torch.is_grad_enabled()
+        with torch.enable_grad():
+            at = x.detach().requires_grad_()
+            known, moved = self.parts(at)
+            s = known + moved
+            (g,) = torch.autograd.grad(s.sum(), at, create_graph=wanted)
+        return (s, g, moved) if wanted else (s.detach(), g.detach(), moved.detach())
+
+    def trace(self, o: Tensor, d: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """t, hit and SDF by aggressive sphere tracing inside Omega. [NeuFace section 4.4]"""
+
+        def sdf(p: Tensor) -> Tensor:
+            known, moved = self.parts(p)
+            return known + moved
+
+        with torch.no_grad():
+            return aggressive_trace(sdf, o, d, near, far, threshold=THRESHOLD, truncation=TRUNCATION, factor=FACTOR)

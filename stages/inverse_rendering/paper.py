@@ -1,0 +1,189 @@
+"""The fit as the paper does it: its networks, its sampling, all its losses, its schedule. [NeuFace section B]
+
+Differs: sums over pixels are means over the batch, so that the weights do not depend on its size. Pixels that show
+the subject in part are left out, and the background is black: the masks stand for the paper's ground-truth model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from pipeline.colour import srgb_from_linear
+from pipeline.errors import StageError
+from pipeline.fields import build
+from pipeline.fields.face import FaceModel, FaceSpec
+from pipeline.fields.prior_imface import ImFacePrior
+from pipeline.fields.priors import HullPrior
+from pipeline.maths import losses
+from stages.inverse_rendering.fit import Start, Trainer, spec_for
+from stages.inverse_rendering.objective import Terms, calibrated_colours
+from stages.inverse_rendering.paper_render import geometry_of, render_samples
+from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable
+
+HALVED_EVERY, HALVED_UNTIL = 0.125, 0.75  # shares of the run: every 375 of 3,000 epochs, until 75 %
+EMPTY = 0.01  # alpha below which a pixel shows nothing of the subject
+
+
+def rate_factor(share: float) -> float:
+    """Learning rate at a share of the run, of its start: 0.5 ^ (halvings due). [NeuFace section B]"""
+    return float(0.5 ** int(min(share, HALVED_UNTIL) / HALVED_EVERY + 1e-9))
+
+
+def paper_terms(model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator) -> Terms:
+    """All parts of [NeuFace eq. 20] with the paper's samples."""
+    jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(batch.alpha.device)
+    got = render_samples(model, batch.rays, settings.samples, jitter)
+    colour = got.colour
+    if model.spec.calibrated:
+        colour = calibrated_colours(model.calibration(), batch.view, colour)
+    whole = batch.alpha > WHOLE
+    target = torch.where(whole[:, None], batch.target, torch.zeros_like(batch.target))
+    sure = torch.nonzero(whole | (batch.alpha < EMPTY)).squeeze(-1)
+    out = Terms()
+    n_rays = max(len(batch.alpha), 1)
+    rgb = losses.rgb_l1(colour[sure], target[sure])
+    out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, sure)
+    out.add("white", settings.white * losses.white_light(model.light()).sum())
+    energy = losses.specular_energy(got.specular)
+    everyone = torch.arange(len(energy), device=energy.device)
+    out.add("specular_energy", settings.specular_energy * energy.sum() / n_rays, energy, everyone)
+    z = geometry_of(model).known.embeddings()
+    if z is not None:
+        out.add("embedding", settings.embedding * losses.embedding(z[None]).sum())
+    if len(got.kept):
+        places = got.kept.repeat_interleave(settings.samples)
+        steep = losses.eikonal(got.gradient, squared=False)
+        out.add("eikonal", settings.eikonal * steep.mean(), steep, places)
+        moved = losses.displacement(got.moved) / geometry_of(model).known.sphere()[1]
+        out.add("displacement", settings.displacement * moved.mean(), moved, places)
+    if whole.any():
+        with torch.no_grad():
+            out.error = float(((srgb_from_linear(colour[whole].clamp(0, 1)) - target[whole]) ** 2).mean())
+    return out
+
+
+class PaperTrainer(Trainer):
+    """A fit of the paper's kind; the loop, the guard and the draws are the fast one's."""
+
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """Adam with betas of its defaults."""
+        return paper_optimiser(self.model, self.settings)
+
+    def enter_level(self) -> None:
+        """Read the photos once, at full size."""
+        if self.table is None:
+            self.table = PixelTable(self.views, self.settings.image_side, self.device)
+
+    def set_rates(self) -> float:
+        """The schedule; beta is learnt, and copied for those who read it."""
+        factor = rate_factor(self.share())
+        for group in self.optimiser.param_groups:
+            group["lr"] = group["start"] * factor
+        self.model.beta.copy_(geometry_of(self.model).beta().detach())
+        return 0.0
+
+    def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
+        """The paper's terms."""
+        return paper_terms(self.model, batch, self.settings, generator)
+
+    def geometry_is_finite(self) -> bool:
+        """All of the geometry is in the optimiser."""
+        return True
+
+    def move(self, rate: float) -> None:
+        """Take the step."""
+        self.optimiser.step()
+
+    def tend(self) -> None:
+        """Nothing is due."""
+
+    def forget(self) -> None:
+        """All gradients are the optimiser's."""
+
+    def finish(self) -> None:
+        """The width that was learnt last."""
+        self.model.beta.copy_(geometry_of(self.model).beta().detach())
+
+    def save(self, path: Path) -> None:
+        """Write everything that the rest of the fit depends on."""
+        state = {
+            "settings": repr(self.settings),
+            "step": self.step,
+            "loss": self.loss,
+            "error": self.error,
+            "dropped": self.guard.causes,
+            "model": self.model.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+        torch.save(state, path.with_suffix(".new"))
+        path.with_suffix(".new").rename(path)
+
+    def load(self, path: Path) -> bool:
+        """Go on from a checkpoint. False if there is none that can be read, or it is of other settings."""
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+        except Exception:  # a torn or foreign file: begin anew
+            return False
+        if state["settings"] != repr(self.settings):
+            return False
+        self.model.load_state_dict(state["model"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.step, self.loss, self.error = (state[k] for k in ("step", "loss", "error"))
+        self.guard.causes = list(state["dropped"])
+        return True
+
+
+def paper_optimiser(model: FaceModel, settings: FitSettings) -> torch.optim.Optimizer:
+    """Adam; a prior's networks at its share of the rate, its codes and everything else at the full one."""
+    prior = geometry_of(model).known
+    codes = {id(p) for n, p in model.named_parameters() if n.startswith("geometry.prior.z_")}
+    slow = [p for n, p in model.named_parameters() if n.startswith("geometry.prior.") and id(p) not in codes]
+    slow_ids = {id(p) for p in slow}
+    lamp = {id(p) for p in model.light.parameters()}
+    rest = [p for p in model.parameters() if id(p) not in slow_ids | lamp]
+    groups = [
+        {"params": rest, "start": settings.lr_appearance},
+        {"params": list(model.light.parameters()), "start": settings.lr_light},
+    ]
+    if slow and prior.share > 0:
+        groups.append({"params": slow, "start": settings.lr_appearance * prior.share})
+    return torch.optim.Adam(groups, lr=settings.lr_appearance)
+
+
+def new_paper_trainer(
+    views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str
+) -> PaperTrainer:
+    """A fit of the paper's kind that has not begun. Raises StageError if ImFace is asked for and can't be read."""
+    torch.manual_seed(settings.seed)
+    spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced")
+    prior = prior_for(spec, start, settings)
+    none = torch.zeros(0)
+    model = FaceModel(spec, none, none, start.cell, build.displaced(spec, prior))
+    model.to(device)
+    return PaperTrainer(views, settings, device, model)
+
+
+def prior_for(spec: FaceSpec, start: Start, settings: FitSettings) -> nn.Module:
+    """The prior that the settings name."""
+    if settings.prior == "sphere":
+        return build.sphere_prior(spec)
+    if settings.prior == "hull":
+        return HullPrior(torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    if not settings.prior_file:
+        raise StageError(
+            "the prior ImFace needs its weights, which are licensed and not part of this project",
+            where="--set inverse_rendering.prior",
+            value="imface without inverse_rendering.prior_file",
+            limit="the path of a published checkpoint",
+            remedy="see docs/imface.md for how to get one, or take the prior hull",
+        )
+    from pipeline.fields.imface_layout import load_imface_state
+
+    state = load_imface_state(Path(settings.prior_file))
+    return ImFacePrior(state, torch.tensor(spec.prior_centre), spec.prior_scale)

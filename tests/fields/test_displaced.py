@@ -1,0 +1,91 @@
+"""I(x) + D(x): values, normals by finite differences, units, and what the rest of the code asks of a geometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.fields.displaced import DisplacedSdf
+from pipeline.fields.priors import HullPrior, SpherePrior
+
+
+def hull(scale: float = 1.0) -> HullPrior:
+    axis = torch.linspace(-0.2, 0.2, 41)
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
+    return HullPrior((grid.norm(dim=-1) - 0.1) * scale, torch.full((3,), -0.2) * scale, 0.01 * scale)
+
+
+def moved(prior: HullPrior | SpherePrior) -> DisplacedSdf:
+    torch.manual_seed(0)
+    g = DisplacedSdf(prior, 32, 2)
+    with torch.no_grad():
+        g.displacement.net[-1].weight.normal_(std=0.02)  # type: ignore[operator,union-attr]
+    return g
+
+
+def test_the_sum_and_its_normal() -> None:
+    g = moved(hull()).double()
+    x = 0.1 * torch.nn.functional.normalize(torch.randn(20, 3, dtype=torch.float64), dim=-1) + 0.01
+    known, away = g.parts(x)
+    s, n, d = g.with_displacement(x)
+    assert torch.equal(s, known + away) and torch.equal(d, away) and away.abs().max() > 1e-5
+    h = 1e-7
+    for axis in range(3):
+        step = torch.zeros(3, dtype=torch.float64)
+        step[axis] = h
+        slope = (sum(g.parts(x + step)) - sum(g.parts(x - step))) / (2 * h)  # type: ignore[operator]
+        assert torch.allclose(slope, n[:, axis], atol=1e-4)
+
+
+def test_a_new_displacement_is_zero() -> None:
+    g = DisplacedSdf(hull())
+    x = torch.randn(50, 3) * 0.1
+    assert torch.equal(g.parts(x)[1], torch.zeros(50))
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+def test_lengths_follow_the_scene(scale: float) -> None:
+    """beta, cells and displacements are shares of Omega's radius, so that a statue is a large face."""
+    one, other = moved(hull()), moved(hull(scale))
+    x = torch.randn(30, 3) * 0.1
+    assert torch.allclose(other.parts(x * scale)[1], one.parts(x)[1] * scale, rtol=1e-3, atol=1e-6 * scale)
+    assert float(other.beta() / one.beta()) == pytest.approx(scale, rel=1e-4)
+    assert other.cell / one.cell == pytest.approx(scale, rel=1e-4)
+    s, g = other(x * scale)
+    assert bool(torch.isfinite(s).all()) and bool(torch.isfinite(g).all())
+
+
+def test_beta_stays_positive() -> None:
+    g = DisplacedSdf(hull())
+    for raw in (-1.0, 0.0, 1e-9, 5.0):
+        with torch.no_grad():
+            g.beta_raw.fill_(raw)
+        assert float(g.beta()) > 0
+
+
+def test_the_hull_goes_on_beyond_its_grid() -> None:
+    p = hull()
+    x = torch.tensor([[0.5, 0.0, 0.0], [0.2, 0.2, 0.9], [0.0, 0.0, 0.0], [0.21, 0.0, 0.0]], requires_grad=True)
+    s = p.sdf(x)
+    s.sum().backward()
+    assert s[0].item() == pytest.approx(0.4, abs=0.01) and s[2] < -0.09 and bool(torch.isfinite(x.grad).all())
+    centre, radius = p.sphere()
+    assert float(centre.norm()) < 0.01 and 0.1 < radius < 0.25
+
+
+def test_an_empty_hull_has_a_sphere() -> None:
+    p = HullPrior(torch.ones(5, 5, 5), torch.zeros(3), 0.1)
+    centre, radius = p.sphere()
+    assert np.isfinite(radius) and radius > 0 and bool(torch.isfinite(centre).all())
+
+
+def test_normals_can_be_learnt_through() -> None:
+    """The Eikonal term needs the derivative of the gradient by the parameters."""
+    torch.manual_seed(0)
+    g = DisplacedSdf(SpherePrior(torch.zeros(3), 0.2, 16, 2), 16, 2)
+    _, n = g(torch.randn(10, 3) * 0.1)
+    ((n.norm(dim=-1) - 1).abs()).mean().backward()
+    assert all(p.grad is not None for name, p in g.named_parameters() if name.endswith("weight"))
+    with torch.no_grad():
+        assert not g(torch.zeros(1, 3))[0].requires_grad

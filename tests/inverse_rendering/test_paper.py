@@ -1,0 +1,285 @@
+"""The paper's preset, its priors, and the systems that it is compared with, on a ball whose every property is known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.errors import Cancelled, StageError
+from pipeline.fields.face import FaceModel, FittedField, load_model
+from pipeline.fields.sinusoidal import SinusoidalField, positional_encoding
+from pipeline.maths.density import laplace_density, ray_weights
+from stages.inverse_rendering import paper
+from stages.inverse_rendering.fit import new_trainer, run_fit
+from stages.inverse_rendering.objective import Terms
+from stages.inverse_rendering.paper_render import geometry_of, render_samples
+from stages.inverse_rendering.predict import predict_view
+from stages.inverse_rendering.settings import PRESETS, FitSettings
+from stages.inverse_rendering.stage import Config
+from stages.inverse_rendering.start import sphere_start
+from stages.inverse_rendering.views import Rays
+from tests.inverse_rendering.test_fit import RADIUS, SMALL, ball_start, ball_view, hooks
+from tests.support.imface_checkpoint import ours, published
+
+PAPER = replace(FitSettings(), **PRESETS["paper"])
+TINY = replace(
+    PAPER, image_side=64, steps=6, batch=64, samples=8, width=24, depth=5, basis_width=16, basis_depth=2,
+    lr_appearance=2e-3, lr_light=1e-2,
+)  # fmt: skip
+
+
+def trainer(settings: FitSettings = TINY, **changes: Any) -> paper.PaperTrainer:
+    views = [ball_view(i) for i in range(0, 12, 2)]
+    return paper.new_paper_trainer(views, ball_start(0.1), replace(settings, **changes), True, "cpu")
+
+
+def test_the_preset_is_the_papers() -> None:
+    """The numbers of the supplement, section B."""
+    assert (PAPER.rgb, PAPER.white, PAPER.specular_energy) == (1.0, 5e-3, 8e-3)
+    assert (PAPER.embedding, PAPER.eikonal, PAPER.displacement) == (1e3, 0.1, 1e-3)
+    assert (PAPER.batch, PAPER.samples, PAPER.rank, PAPER.light_order) == (2048, 32, 3, 10)
+    assert (PAPER.lr_appearance, PAPER.lr_light) == (1e-4, 1e-4)
+    assert (PAPER.appearance, PAPER.basis_inputs, PAPER.density) == ("sinusoidal", "paper", "laplace")
+    assert PAPER.attenuation == "exponential" and PAPER.calibration == "on"
+    assert PAPER.steps == 3000 * 43 and PAPER.image_side == 1024
+    config = Config(preset="paper")
+    assert asdict(config.settings()) == asdict(PAPER)
+
+
+def test_schedule() -> None:
+    """Halved at 375, 750, ..., 2,250 of 3,000 epochs, and then no more."""
+    found = [paper.rate_factor(e / 3000) for e in (0, 374, 375, 749, 750, 2249, 2250, 2999)]
+    assert found == [1, 1, 0.5, 0.5, 0.25, 1 / 32, 1 / 64, 1 / 64]
+
+
+def test_rates_of_the_parts(tmp_path: Path) -> None:
+    """ImFace's networks at 1 %, its codes and all else at the full rate; the hull's samples are no parameters."""
+    torch.save({"decoder": published(ours(False), "2022")}, tmp_path / "envs_last.pth")
+    t = trainer(prior="imface", prior_file=str(tmp_path / "envs_last.pth"))
+    rate = {id(p): g["start"] for g in t.optimiser.param_groups for p in g["params"]}
+    for name, p in t.model.named_parameters():
+        slow = name.startswith("geometry.prior.") and ".z_" not in name
+        assert rate[id(p)] == pytest.approx(2e-5 if slow else 1e-2 if name.startswith("light") else 2e-3), name
+    names = [n for n, _ in trainer().model.named_parameters() if n.startswith("geometry.prior")]
+    assert names == []
+
+
+@pytest.mark.parametrize("prior", ["hull", "sphere", "imface"])
+def test_every_prior_fits_saves_and_loads(prior: str, tmp_path: Path) -> None:
+    """Steps move every parameter, the file gives the same field back, and the stages after the fit can ask it."""
+    torch.save({"decoder": published(ours(True), "2022")}, tmp_path / "envs_last.pth")
+    t = trainer(prior=prior, prior_file=str(tmp_path / "envs_last.pth"), prior_scale=0.12)
+    before = {n: p.detach().clone() for n, p in t.model.named_parameters()}
+    run_fit(t, hooks())
+    assert t.guard.dropped == 0
+    still = [n for n, p in t.model.named_parameters() if torch.equal(p, before[n])]
+    allowed = ("calibration.embedding", "calibration.net.0")  # its last layer starts at zero and moves first
+    sleeping = ("deform.net", "reference.net")  # replaced by what the hyper-networks give
+    assert [n for n in still if not n.startswith(allowed) and not any(s in n for s in sleeping)] == []
+    t.model.save(tmp_path / "field.npz")
+    again = load_model(tmp_path / "field.npz")
+    x = 0.1 * torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
+    for a, b in zip(t.model.geometry(x), again.geometry(x), strict=True):
+        assert torch.equal(a, b)
+    field = FittedField(again)
+    s, g = field.sdf_and_gradient(x.numpy())
+    assert np.isfinite(s).all() and np.isfinite(g).all() and field.cell > 0
+    assert field.material(x.numpy()).albedo.shape == (50, 3) and field.light.shape == (121, 3)
+
+
+def test_a_prior_without_its_file_is_told() -> None:
+    with pytest.raises(StageError, match=r"licensed(.|\n)*docs/imface.md"):
+        trainer(prior="imface")
+
+
+def test_what_is_rendered_is_eq_18_by_hand() -> None:
+    """One ray at a time, in float64, from the same model: samples, density, weights and shading written out again."""
+    t = trainer()
+    geometry = geometry_of(t.model)
+    o = torch.tensor([[0.0, 0, 0.5], [0.05, 0, 0.5], [0.12, 0, 0.5], [0.5, 0, 0.5]])
+    rays = Rays(o, torch.tensor([[0.0, 0, -1]]).expand(4, 3).contiguous())
+    with torch.no_grad():
+        got = render_samples(t.model, rays, 8, None)
+    assert got.kept.tolist() == [0, 1, 2]
+    centre, radius = geometry.known.sphere()
+    for i in range(3):
+        to = o[i] - centre
+        half = float((radius**2 - to[:2].square().sum()).sqrt())
+        near, far = float(to[2]) - half, float(to[2]) + half
+        hit = i < 2
+        if hit:
+            depth = torch.linspace(near, far, 20_001)
+            s = torch.cat([geometry(o[i] + d[:, None] * rays.d[i])[0] for d in depth.split(5_000)])
+            t0 = float(depth[(s < 0).nonzero()[0, 0]])
+            first, step = t0 - 5e-4, 1e-3 / 8
+        else:
+            first, step = near, (far - near) / 8
+        at = first + step * (torch.arange(8) + 0.5)
+        s, g = geometry(o[i] + at[:, None] * rays.d[i])
+        delta = torch.full((1, 8), step)
+        delta[0, -1] += (far - t0 - 5e-4) if hit else 0.0
+        w, tau = ray_weights(laplace_density(s[None], geometry.beta()), delta)
+        n = torch.nn.functional.normalize(g, dim=-1)
+        colour = t.model.shade(o[i] + at[:, None] * rays.d[i], n, -rays.d[i].expand(8, 3)).total
+        expected = (w[0, :, None] * colour).sum(0)
+        assert torch.allclose(got.colour[i], expected, rtol=0.03, atol=1e-4), i
+        assert float(got.opacity[i]) == pytest.approx(float(-torch.expm1(-tau)), abs=0.02)
+    assert got.opacity[0] > 0.99 and got.opacity[2] < 0.3 and got.opacity[3] == 0
+
+
+def test_the_terms_are_the_papers() -> None:
+    """Each of eq. 20 to 24 is there with its weight; a prior without codes has no embedding term."""
+    t = trainer()
+    t.enter_level()
+    assert t.table is not None
+    found: Terms = paper.paper_terms(t.model, t.table.draw(64, 0.25, 0), t.settings, torch.Generator().manual_seed(0))
+    assert list(found.scalars) == ["rgb", "white", "specular_energy", "eikonal", "displacement"]
+    assert float(found.scalars["displacement"].detach()) == 0, "the displacement starts at zero"
+    doubled = replace(t.settings, eikonal=2 * t.settings.eikonal)
+    again = paper.paper_terms(t.model, t.table.draw(64, 0.25, 0), doubled, torch.Generator().manual_seed(0))
+    assert float(again.scalars["eikonal"].detach()) == pytest.approx(2 * float(found.scalars["eikonal"].detach()))
+
+
+def test_interruptions_change_nothing(tmp_path: Path) -> None:
+    whole = trainer()
+    run_fit(whole, hooks())
+    path = tmp_path / "checkpoint.pt"
+    first = trainer()
+    with pytest.raises(Cancelled):
+        run_fit(first, hooks(path, lambda: first.step >= 3))
+    last = trainer()
+    run_fit(last, hooks(path))
+    for (name, a), (_, b) in zip(whole.model.state_dict().items(), last.model.state_dict().items(), strict=True):
+        assert torch.equal(a, b), name
+
+
+@pytest.mark.slow
+def test_the_ball_gets_its_colours() -> None:
+    t = trainer(steps=60, batch=192, width=48)
+    run_fit(t, hooks())
+    view = ball_view(5)
+    rgba = predict_view(t.model, view, 2, 8, "cpu")
+    small = view.rgb.reshape(32, 2, 32, 2, 3).mean((1, 3))
+    inside = view.alpha.reshape(32, 2, 32, 2).mean((1, 3)) > 0.99
+    assert np.abs(rgba[..., :3][inside] - small[inside]).mean() < 0.06
+    assert t.guard.dropped == 0 and float(t.model.beta) > 0
+
+
+# ------------------------------------------------------------------ networks
+def test_the_sinusoidal_field_is_not_odd_and_keeps_its_spread() -> None:
+    """With zero biases f(-x) = 2 f(0) - f(x) at the start; and deep layers neither die nor saturate."""
+    torch.manual_seed(0)
+    f = SinusoidalField(torch.zeros(3), 1.0, 3, True, width=64, depth=8)
+    x = torch.rand(2000, 3) * 2 - 1
+    raw = lambda p: torch.logit(f(p)[0])  # noqa: E731
+    assert (raw(x) + raw(-x) - 2 * raw(torch.zeros(1, 3))).abs().mean() > 0.01
+    h = x
+    for i, layer in enumerate(f.layers):
+        h = layer(torch.cat([h, x], -1) if i == 4 else h)
+        assert 0.4 < float(h.detach().std()) < 0.9, i
+    a, rho, c, s = f(x)
+    assert a.min() > 0 and a.max() < 1 and c.min() >= 0 and s.min() > 0 and rho.shape == (2000,)
+
+
+def test_positional_encoding_is_gamma() -> None:
+    u = torch.tensor([[0.1, -0.3, 0.7]])
+    found = positional_encoding(u, 6)[0]
+    assert found.shape == (36,)
+    for k in range(6):
+        expected = torch.cat([torch.sin(2.0**k * torch.pi * u[0]), torch.cos(2.0**k * torch.pi * u[0])])
+        assert torch.allclose(found[6 * k : 6 * k + 6], expected, atol=1e-5)
+
+
+def test_the_sphere_prior_starts_as_a_sphere() -> None:
+    torch.manual_seed(0)
+    t = trainer(prior="sphere")
+    centre, radius = geometry_of(t.model).known.sphere()
+    d = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    s, g = t.model.geometry(centre + 0.6 * radius * d)
+    assert float(s.detach().abs().max()) < 0.15 * radius
+    assert float((torch.nn.functional.normalize(g.detach(), dim=-1) * d).sum(-1).min()) > 0.9
+
+
+# ------------------------------------------------------------------ the other systems
+SYSTEMS: dict[str, dict[str, Any]] = {
+    "phong": {"shading": "phong", "attenuation": "phong"},
+    "disney": {"shading": "disney", "light": "cubemap"},
+    "disney under harmonics": {"shading": "disney"},
+    "cubemap": {"light": "cubemap"},
+    "direct": {"integral": "direct"},
+    "feature": {"integral": "feature"},
+    "k = 8": {"rank": 8},
+    "the bases' inputs of the paper": {"basis_inputs": "paper", "basis_width": 32},
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_every_system_fits_saves_and_loads(name: str, tmp_path: Path) -> None:
+    """One code, other settings: each learns the ball, every parameter of it moves, and its file gives it back."""
+    views = [ball_view(i) for i in range(0, 12, 2)]
+    t = new_trainer(views, ball_start(), replace(SMALL, steps=40, batch=512, levels=1, **SYSTEMS[name]), True, "cpu")
+    t.advance()
+    first = t.error
+    before = {n: p.detach().clone() for n, p in t.model.named_parameters()}
+    run_fit(t, hooks())
+    assert t.error < first and t.guard.dropped == 0
+    idle = ("calibration", "geometry")
+    unused = {"phong": ("basis",), "disney": ("basis",), "disney under harmonics": ("basis",)}.get(name, ())
+    still = [n for n, p in t.model.named_parameters() if torch.equal(p, before[n])]
+    assert [n for n in still if not n.startswith((*idle, *unused))] == []
+    t.model.save(tmp_path / "field.npz")
+    again = load_model(tmp_path / "field.npz")
+    n = torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
+    assert torch.equal(t.model.shade(RADIUS * n, n, n).total, again.shade(RADIUS * n, n, n).total)
+    field = FittedField(again)
+    if name in ("direct", "feature", "disney", "disney under harmonics"):
+        with pytest.raises(StageError, match="no specular bases"):
+            field.basis(n.numpy(), n.numpy())
+    else:
+        b, m = field.basis(n.numpy(), n.numpy()), field.material(RADIUS * n.numpy())
+        assert b.shape == m.coefficients.shape == (30, field.rank)
+
+
+def model_of(**changes: Any) -> FaceModel:
+    return new_trainer([ball_view(0)], ball_start(), replace(SMALL, **changes), False, "cpu").model
+
+
+def test_disney_splits_energy_by_metal() -> None:
+    """A metal has no diffuse part, a dielectric reflects at least 4 % of an even light along the normal."""
+    model = model_of(shading="disney")
+    n = torch.nn.functional.normalize(torch.randn(20, 3), dim=-1)
+    last = model.spatial.net[-1]
+    assert isinstance(last, torch.nn.Linear)
+    with torch.no_grad():
+        model.light.coefficients.zero_()
+        model.light.coefficients[0] = (4 * torch.pi) ** 0.5
+        for bias, metal in ((-30.0, False), (30.0, True)):
+            last.weight[3], last.bias[3] = 0, bias
+            got = model.shade(RADIUS * n, n, n)
+            if metal:
+                assert got.diffuse.abs().max() < 1e-6 and torch.allclose(got.specular, 0.35 + 0 * n, atol=0.12)
+            else:
+                assert torch.allclose(got.specular, 0.036 + 0 * n, atol=0.006)
+            assert got.total.max() <= 1 + 1e-5
+
+
+def test_phong_is_one_lobe_times_rho() -> None:
+    model = model_of(shading="phong", attenuation="phong")
+    n = torch.nn.functional.normalize(torch.randn(20, 3), dim=-1)
+    got = model.shade(RADIUS * n, n, n)
+    _, rho, _, _ = model.spatial(RADIUS * n)
+    even = float(model.light.coefficients[0, 0].detach()) / (4 * torch.pi) ** 0.5
+    assert torch.allclose(got.specular, (rho * even)[:, None].expand(-1, 3), rtol=1e-4)
+
+
+def test_without_a_prior_the_grid_starts_as_a_sphere() -> None:
+    start = sphere_start(0.2, 48, 2)
+    i = np.stack(np.meshgrid(*[np.arange(n) for n in start.values.shape], indexing="ij"), -1)
+    x = start.lo + start.cell * i
+    assert np.allclose(start.values, np.linalg.norm(x, axis=-1) - 0.12, atol=1e-6)
+    assert start.lo.max() < -0.2 and start.cell == pytest.approx(0.4 / 48 * 2)
