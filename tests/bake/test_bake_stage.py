@@ -21,7 +21,7 @@ from stages.uv.unwrap import Options, unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.field_artifacts import fitted, poses
 
-PNG = {"albedo", "specular_intensity", "roughness", "f0", "normal", "confidence", "coverage"}
+PNG = {"albedo", "irradiance_ratio", "specular_intensity", "roughness", "f0", "normal", "confidence", "coverage"}
 ALL = PNG | {"specular_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
 
 

@@ -97,6 +97,22 @@ def test_the_ball_is_found(fitted: Trainer) -> None:
     assert np.abs(rgba[..., 3] - view.alpha).mean() < 0.02
 
 
+def test_shading_goes_to_the_light(fitted: Trainer) -> None:
+    """The ball's radiance is a (0.7 + 0.3 n_y), for which E = pi c_0 Y_0 + 2 pi / 3 c_1 Y_1 y: c_1 / c_0 = 0.371. Left
+    to itself the fit keeps its even light and paints the shading onto the ball."""
+
+    def slope(t: Trainer) -> tuple[float, float]:
+        c = t.model.light().detach().mean(-1)
+        return float(c[1] / c[0]), float(c[2:4].abs().max() / c[0])
+
+    up, aside = slope(fitted)
+    print(up, aside)
+    free = trainer(replace(SMALL, parsimony=0.0, even_until=0.0))
+    run_fit(free, hooks())
+    print(slope(free))
+    assert 0
+
+
 def test_a_fit_repeats_bit_by_bit(fitted: Trainer) -> None:
     again = trainer()
     run_fit(again, hooks())

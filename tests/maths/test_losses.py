@@ -45,3 +45,16 @@ def test_shininess_gauge_is_even_and_finite_at_a_mirror() -> None:
     assert found[0].item() == 0 and found[1].item() == pytest.approx(found[2].item(), rel=1e-5)
     found.sum().backward()
     assert torch.isfinite(found).all() and torch.isfinite(s.grad).all()
+
+
+def test_parsimony_counts_departures_from_the_usual_skin() -> None:
+    even = torch.full((9, 3), 0.3)
+    assert losses.albedo_parsimony(even).abs().max().item() == 0
+    spotted = even.clone()
+    spotted[0] *= 0.5
+    found = losses.albedo_parsimony(spotted)
+    assert found[0].item() == pytest.approx(0.6931, abs=1e-4) and found[1:].abs().max().item() == 0
+    assert torch.allclose(losses.albedo_parsimony(spotted * 0.7), found, atol=1e-6)  # blind to the light's strength
+    black = torch.zeros(3, 3, requires_grad=True)
+    losses.albedo_parsimony(black).sum().backward()
+    assert torch.isfinite(black.grad).all()
