@@ -55,8 +55,8 @@ class FitSettings:
     # weights
     rgb: float = 1.0
     mask: float = 0.1
-    white: float = 5e-3
-    specular_energy: float = 8e-3
+    white: float = 0.02
+    specular_energy: float = 0.02
     shininess: float = 1e-3
     parsimony: float = 0.01
     eikonal: float = 0.1
