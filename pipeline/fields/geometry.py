@@ -96,9 +96,7 @@ class GridSdf(nn.Module):
         """Keep the zero set's largest piece, fill its cavities, and make the far field a distance again."""
         values = self.values.detach().cpu().numpy()
         solid = largest_solid(values < 0)
-        inside = ndimage.distance_transform_edt(solid)
-        outside = ndimage.distance_transform_edt(~solid)
-        far = np.where(solid, 0.5 - inside, outside - 0.5).astype(np.float32) * np.float32(self.cell)
+        far = np.where(solid, -coarse_distance(solid), coarse_distance(~solid)) * np.float32(self.cell)
         keep = (np.abs(far) < (BAND - 1) * self.cell) & (solid == (values < 0))
         merged = np.where(keep, values, far)
         with torch.no_grad():
@@ -140,6 +138,20 @@ class GridSdf(nn.Module):
         self.m.view(-1)[active] = torch.as_tensor(state["m"]).to(self.m)
         self.v.view(-1)[active] = torch.as_tensor(state["v"]).to(self.v)
         self.steps = int(state["steps"])
+
+
+def coarse_distance(free: np.ndarray) -> np.ndarray:
+    """(X, Y, Z) distance in cells from free nodes to the next that is not, at least 0.5; never more than the true one.
+
+    Found on every other node, which is eight times faster and at most 4 cells short: it only serves to step over empty
+    space, and too short a step costs little where too long a one would miss the surface.
+    """
+    padded = np.pad(free, [(0, n % 2) for n in free.shape], mode="edge")
+    x, y, z = (n // 2 for n in padded.shape)
+    blocks = padded.reshape(x, 2, y, 2, z, 2).all((1, 3, 5))
+    distance = 2 * ndimage.distance_transform_edt(blocks).astype(np.float32) - 2
+    full = distance.repeat(2, 0).repeat(2, 1).repeat(2, 2)[: free.shape[0], : free.shape[1], : free.shape[2]]
+    return np.asarray(np.maximum(full, np.float32(0.5)))
 
 
 def largest_solid(inside: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ class FitSettings:
     seed: int = 0
     # size
     image_side: int = 512
-    steps: int = 1800
+    steps: int = 1300
     batch: int = 4096
     samples: int = 10
     grid_cells: int = 288
@@ -97,6 +97,8 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "method": "paper",
         "shadows": False,
+        "white": 5e-3,
+        "specular_energy": 8e-3,
         "parsimony": 0.0,
         "even_until": 0.0,
         "image_side": 1024,
