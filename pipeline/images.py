@@ -133,5 +133,5 @@ def shrink(image: F32, factor: int) -> F32:
     h, w = image.shape[0] // factor, image.shape[1] // factor
     if (h * factor, w * factor) != image.shape[:2]:
         raise ValueError(f"{image.shape[1]} x {image.shape[0]} is not a multiple of {factor}")
-    blocks = image.reshape(h, factor, w, factor, *image.shape[2:])
-    return np.asarray(blocks.mean((1, 3)), np.float32)
+    small = cv2.resize(np.asarray(image, np.float32), (w, h), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.float32).reshape(h, w, *image.shape[2:])

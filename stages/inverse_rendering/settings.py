@@ -20,7 +20,8 @@ class FitSettings:
     batch: int = 4096
     samples: int = 10
     grid_cells: int = 288
-    levels: int = 3
+    levels: int = 2
+    stereo: bool = True
     # model
     rank: int = 3
     light_order: int = 10
@@ -79,6 +80,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "steps": 12000,
         "batch": 8192,
         "grid_cells": 448,
+        "levels": 3,
         "hash_fine": 0.0005,
         "hash_log2_size": 18,
     },
@@ -96,6 +98,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Measured in short runs alone: on a CPU it would take weeks.
     "paper": {
         "method": "paper",
+        "stereo": False,
         "shadows": False,
         "white": 5e-3,
         "specular_energy": 8e-3,

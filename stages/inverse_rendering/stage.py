@@ -35,6 +35,7 @@ class Config(StageConfig):
     samples: int = Field(description="samples a ray in the shell around the surface", ge=4, le=128)
     grid_cells: int = Field(description="cells of the final SDF grid along the subject's longest side", ge=16, le=2048)
     levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
+    stereo: bool = Field(description="move the hull to where the photos agree before the fit begins")
     rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
     light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
     attenuation: Literal["exponential", "exact", "phong"] = Field(
@@ -120,6 +121,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.gather import read_views
     from stages.inverse_rendering.paper import new_paper_trainer
     from stages.inverse_rendering.start import hull_start, sphere_start
+    from stages.inverse_rendering.stereo import start_from_photos
 
     settings = config.settings()
     dropped = set(inputs.masks.artifact.dropped)
@@ -142,6 +144,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         start = sphere_start(radius, settings.grid_cells, settings.levels)
     else:
         start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+        if settings.stereo:
+            context.progress(0, settings.steps, "stereo")
+            start = start_from_photos(start, views, context.device)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
     trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))

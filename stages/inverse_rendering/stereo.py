@@ -1,0 +1,262 @@
+"""The geometry's start, moved from the visual hull to where the photos agree: a plane sweep along the hull's normals.
+
+A hull fills every hollow that no silhouette shows: beside the neck, behind the ears, above the collar bones. Rendering
+losses pull only on what is near a surface, and stay with such a fill for ever. A patch of skin, carried inwards along
+the normal and compared between the photos that see it, finds the true depth at once (measured in docs/benchmarks.md).
+
+Symbols: points P (N, 3) on the start's zero set with unit normals (N, 3), asset units; a sweep's offsets (J,) along the
+normals, positive outwards; scores (N, J) of pipeline.maths.correlation.agreement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from pipeline import transforms
+from pipeline.fields.geometry import GridSdf, largest_solid
+from pipeline.images import shrink
+from pipeline.maths.correlation import agreement
+from pipeline.maths.tracing import box_interval
+from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.views import PhotoView, factor_for, whole_blocks
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+SIDE = 512  # pixels of the photos' longest side: a patch then spans some 4 mm of a head
+HALF, SPACING = 2, 2.0  # a patch is (2 HALF + 1)^2 samples, so many pixels apart
+VIEWS = 6  # that look at a point most squarely are compared
+LEAST_COSINE = 0.25  # between a normal and the way to a camera
+POINTS = 12_000  # of the surface that one sweep takes
+CERTAIN = 5e-4  # squared confidence, mean over what lies around, at which a point moves half way
+GREY = np.array([0.3, 0.6, 0.1], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Reach outwards and inwards as shares of the subject's longest side; a step in pixels; points that vote on one."""
+
+    outward: float
+    inward: float
+    step: float
+    voters: int
+
+
+SWEEPS = (Sweep(0.006, 0.04, 1.1, 14), Sweep(0.012, 0.016, 0.75, 12), Sweep(0.006, 0.006, 0.5, 8))
+
+
+@dataclass(frozen=True, slots=True)
+class Photos:
+    """Grey photos without distortion, one after the other in `grey`; `first`, `width` and `height` (V,) say where.
+
+    image_from_world (V, 3, 4); centre (V, 3).
+    """
+
+    grey: Tensor
+    first: Tensor
+    width: Tensor
+    height: Tensor
+    image_from_world: Tensor
+    centre: Tensor
+
+
+def start_from_photos(hull: Start, views: list[PhotoView], device: str) -> Start:
+    """The hull's SDF moved to where the photos agree; unchanged where they do not tell, as on skin without a mark."""
+    photos = photos_of(views, device)
+    values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
+    for sweep in SWEEPS:
+        points, normals = surface_points(values, hull.lo, hull.cell)
+        order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
+        offsets = np.arange(sweep.outward * side, -sweep.inward * side, -sweep.step * pixel)
+        scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos)
+        kept = scores.max(1) > -1
+        if kept.sum() < sweep.voters:
+            break
+        points, normals, scores = points[kept], normals[kept], scores[kept]
+        offset, confidence = vote(points, normals, scores, offsets, sweep.voters)
+        reach = max(sweep.outward, sweep.inward) * side
+        values = moved(Start(values, hull.lo, hull.cell), points, offset, confidence, reach)
+    return Start(values, hull.lo, hull.cell)
+
+
+def photos_of(views: list[PhotoView], device: str) -> Photos:
+    """Photos of at most SIDE pixels, encoded so that a step of brightness means as much in shade as in light."""
+    grey, matrices, sizes = [], [], []
+    for view in views:
+        f = factor_for(view.size, SIDE)
+        image = np.clip(shrink(whole_blocks(view.rgb, f), f) @ GREY, 0, None) ** np.float32(1 / 2.2)
+        K = view.K.copy()
+        K[:2] /= f
+        grey.append(without_distortion(image, K, view.distortion).ravel())
+        sizes.append(image.shape)
+        matrices.append(K @ transforms.inverse_rigid(view.world_from_cam)[:3])
+    height, width = np.array(sizes).T
+    first = np.concatenate([[0], np.cumsum(height * width)[:-1]])
+    centre = np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)
+    tensors = (np.concatenate(grey), first, width, height, np.stack(matrices).astype(np.float32), centre)
+    return Photos(*(torch.from_numpy(x).to(device) for x in tensors))
+
+
+def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
+    """A photo (H, W) as a lens without distortion shows it, bilinear. Good enough to find a start with; the fit itself
+    reads the photos as they are."""
+    if not np.any(distortion):
+        return image
+    h, w = image.shape
+    xy = np.linalg.solve(K[:2, :2], (transforms.pixel_centres(w, h) - K[:2, 2]).T).T
+    uv = transforms.distort(xy, distortion) @ K[:2, :2].T + K[:2, 2] - 0.5
+    x, y = (uv[:, i].reshape(h, w).astype(np.float32) for i in (0, 1))
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
+
+
+def surface_points(values: F32, lo: F32, cell: float) -> tuple[F64, F64]:
+    """Up to POINTS points of the zero set, evenly spread, and their normals, of the SDF smoothed over one cell."""
+    smooth = ndimage.gaussian_filter(values, 1.0)
+    node = np.argwhere(np.abs(smooth[1:-1, 1:-1, 1:-1]) < 0.6 * cell) + 1
+    at = tuple(node.T)
+    gradient = np.stack([_difference(smooth, at, axis) / (2 * cell) for axis in range(3)], -1).astype(np.float64)
+    square = (gradient**2).sum(1)
+    keep = np.flatnonzero(square > 0.04)
+    if len(keep) > POINTS:
+        keep = np.sort(np.random.default_rng(0).choice(keep, POINTS, replace=False))
+    g = gradient[keep]
+    points = lo + cell * node[keep] - (smooth[at][keep] / square[keep])[:, None] * g
+    return points, g / np.sqrt(square[keep])[:, None]
+
+
+def _difference(values: F32, at: tuple[npt.NDArray[np.intp], ...], axis: int) -> F32:
+    ahead, behind = list(at), list(at)
+    ahead[axis], behind[axis] = at[axis] + 1, at[axis] - 1
+    return np.asarray(values[tuple(ahead)] - values[tuple(behind)])
+
+
+def best_views(points: F64, normals: F64, start: Start, photos: Photos) -> tuple[Tensor, Tensor, float]:
+    """Views (N, VIEWS) that look at each point most squarely and are not hidden from it, which of them do (N, VIEWS),
+    and a pixel's size on the surface (median)."""
+    device = photos.grey.device
+    p, n = (torch.from_numpy(x.astype(np.float32)).to(device) for x in (points, normals))
+    geometry = GridSdf(torch.from_numpy(start.values), torch.from_numpy(start.lo), start.cell).to(device)
+    cosines, sizes = [], []
+    for k in range(len(photos.centre)):
+        way = photos.centre[k] - p
+        distance = way.norm(dim=-1)
+        way = way / distance[:, None]
+        cosine = (way * n).sum(-1)
+        q = p @ photos.image_from_world[k, :, :3].T + photos.image_from_world[k, :, 3]
+        uv = q[:, :2] / q[:, 2:].clamp(min=1e-9)
+        room = torch.minimum(uv.amin(-1), torch.minimum(photos.width[k] - uv[:, 0], photos.height[k] - uv[:, 1]))
+        ok = (cosine > LEAST_COSINE) & (q[:, 2] > 0) & (room > 2 * HALF * SPACING)
+        candidate = torch.nonzero(ok).squeeze(-1)
+        hidden = _hidden(geometry, p[candidate], distance[candidate], photos.centre[k])
+        ok[candidate[hidden]] = False
+        cosines.append(torch.where(ok, cosine, torch.full_like(cosine, -1.0)))
+        sizes.append(torch.where(ok, distance / photos.image_from_world[k, :2, :3].norm(dim=-1).amax(), torch.nan))
+    table = torch.stack(cosines, 1)
+    order = table.argsort(dim=1, descending=True, stable=True)[:, :VIEWS]
+    pixel = float(torch.stack(sizes).nanmedian())
+    return order, table.gather(1, order) > 0, pixel if np.isfinite(pixel) else start.cell
+
+
+def _hidden(geometry: GridSdf, p: Tensor, distance: Tensor, centre: Tensor) -> Tensor:
+    """Whether a ray from the camera meets the surface more than two cells before it gets to the point."""
+    d = (p - centre) / distance[:, None]
+    o = centre.expand_as(d).contiguous()
+    near, far = box_interval(o, d, *geometry.box())
+    t, hit, _ = geometry.trace(o, d, near, far)
+    return hit & (t < distance - 2 * geometry.cell)
+
+
+def sweep_scores(
+    points: F64, normals: F64, offsets: F64, order: Tensor, seen: Tensor, pixel: float, photos: Photos
+) -> F32:
+    """(N, J) how well the photos agree on the patch around each point, moved along its normal by each offset."""
+    device = photos.grey.device
+    n = torch.from_numpy(normals.astype(np.float32)).to(device)
+    p = torch.from_numpy(points.astype(np.float32)).to(device)
+    u, v = _tangents(n)
+    m = photos.image_from_world[order]
+    turn = m[..., :3]
+    steps = torch.arange(-HALF, HALF + 1, device=device, dtype=torch.float32) * SPACING * pixel
+    along_u, along_v, along_n = ((turn @ x[:, None, :, None]).squeeze(-1) for x in (u, v, n))
+    centre = (turn @ p[:, None, :, None]).squeeze(-1) + m[..., 3]
+    grid = along_u[..., None, None] * steps[:, None] + along_v[..., None, None] * steps  # (N, V, 3, 5, 5)
+    grid = grid.flatten(3)
+    out = []
+    for offset in offsets:
+        q = grid + (centre + float(offset) * along_n)[..., None]
+        patches = _look_up(photos, order, q[..., 0, :] / q[..., 2, :], q[..., 1, :] / q[..., 2, :])
+        out.append(agreement(patches, seen))
+    return torch.stack(out, 1).cpu().numpy()
+
+
+def _tangents(n: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors (N, 3) across each unit normal."""
+    helper = torch.zeros_like(n)
+    helper.scatter_(1, n.abs().argmin(1, keepdim=True), 1.0)
+    u = torch.nn.functional.normalize(torch.linalg.cross(n, helper), dim=-1)
+    return u, torch.linalg.cross(n, u)
+
+
+def _look_up(photos: Photos, view: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Bilinear samples (N, V, K) of the photos `view` (N, V) at image positions u, v (N, V, K), held at the border."""
+    width = photos.width[view][..., None]
+    x = (u - 0.5).clamp(min=torch.zeros((), device=u.device), max=width - 1.001)
+    y = (v - 0.5).clamp(min=torch.zeros((), device=u.device), max=photos.height[view][..., None] - 1.001)
+    column, row = x.long(), y.long()
+    at = photos.first[view][..., None] + row * width + column
+    fx, fy = x - column, y - row
+    upper = torch.lerp(photos.grey[at], photos.grey[at + 1], fx)
+    lower = torch.lerp(photos.grey[at + width], photos.grey[at + width + 1], fx)
+    return torch.lerp(upper, lower, fy)
+
+
+def vote(points: F64, normals: F64, scores: F32, offsets: F64, voters: int) -> tuple[F64, F64]:
+    """Offset (N,) on which a point and its neighbours that face the same way agree, and the confidence in it, >= 0.
+
+    A peak is refined by a parabola. One at either end of the sweep says only that the truth lies beyond: confidence 0.
+    """
+    distance, near = cKDTree(points).query(points, voters)
+    facing = np.clip((normals[near] * normals[:, None]).sum(2), 0, None) ** 2
+    weight = facing * np.exp(-((distance / np.maximum(distance[:, -1:], 1e-12)) ** 2))
+    score = np.einsum("nk,nkj->nj", weight, scores[near]) / weight.sum(1, keepdims=True)
+    best = score.argmax(1)
+    inner = best.clip(1, len(offsets) - 2)
+    before, peak, after = (score[np.arange(len(score)), inner + i] for i in (-1, 0, 1))
+    bend = np.minimum(before - 2 * peak + after, -1e-9)
+    whole = best == inner
+    shift = np.where(whole, np.clip(0.5 * (before - after) / bend, -0.5, 0.5), 0.0)
+    confidence = np.where(whole, score.max(1) - np.median(score, 1), 0.0)
+    return offsets[best] + shift * (offsets[1] - offsets[0]), np.clip(confidence, 0, None)
+
+
+def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float) -> F32:
+    """The SDF with its zero set moved along the normals: its values grow by what nearby points say they lie too far
+    out, then are scaled to distances; far from the surface they are distances anew."""
+    cell = start.cell
+    node = np.argwhere(np.abs(start.values) < reach + 3 * cell)
+    distance, near = cKDTree(points).query(start.lo + cell * node, min(24, len(points)))
+    width = np.maximum(1.2 * cell, distance[:, :1] + 0.5 * cell)
+    kernel = np.exp(-0.5 * (distance / width) ** 2)
+    weight = kernel * confidence[near] ** 2
+    shift = -(weight * offset[near]).sum(1) / np.maximum(weight.sum(1) + CERTAIN * kernel.sum(1), 1e-12)
+    values = start.values.astype(np.float64)
+    values[tuple(node.T)] += shift
+    return distances(values, cell)
+
+
+def distances(values: F64, cell: float) -> F32:
+    """The zero set's largest piece as a signed distance: to first order nearby, by a transform further out."""
+    slope = np.sqrt(sum(g**2 for g in np.gradient(ndimage.gaussian_filter(values, 1.0), cell)))
+    near = values / np.clip(slope, 0.5, 2.0)
+    solid = largest_solid(values < 0)
+    inside, outside = ndimage.distance_transform_edt(solid), ndimage.distance_transform_edt(~solid)
+    far = np.where(solid, 0.5 - inside, outside - 0.5) * cell
+    keep = (np.abs(far) < 2 * cell) & (solid == (values < 0))
+    return np.where(keep, near, far).astype(np.float32)

@@ -1,0 +1,116 @@
+"""The start from photos: a marked ball's hull is moved onto it, a blank one's stays, hidden views do not vote."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline import transforms
+from stages.inverse_rendering import stereo
+from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.views import PhotoView
+
+RADIUS, SIDE = 0.1, 192
+LENS = np.array([0.08, -0.02, 0.002, -0.001, 0.0])
+
+
+def camera(index: int) -> tuple[np.ndarray, np.ndarray]:
+    """K and world_from_cam of one of 24 cameras in two rings around the ball."""
+    angle, height = 2 * math.pi * index / 12 + (0.2 if index >= 12 else 0), 0.22 if index >= 12 else -0.12
+    centre = np.array([0.5 * math.sin(angle), height, 0.5 * math.cos(angle)])
+    z = -centre / np.linalg.norm(centre)
+    x = np.cross(z, [0, 1, 0])
+    x /= np.linalg.norm(x)
+    f = 1.9 * SIDE
+    K = np.array([[f, 0, SIDE / 2], [0, f, SIDE / 2], [0, 0, 1]])
+    return K, transforms.rigid(np.stack([x, np.cross(z, x), z], 1), centre)
+
+
+def marks(p: np.ndarray) -> np.ndarray:
+    """A pattern of many sizes on the ball."""
+    rng = np.random.default_rng(3)
+    out = np.full(len(p), 0.5)
+    for scale in (60, 120, 240, 420):
+        for _ in range(3):
+            direction = rng.normal(size=3)
+            out += 0.05 * np.sin(scale * p @ (direction / np.linalg.norm(direction)) + rng.uniform(0, 6))
+    return out
+
+
+def photo(index: int, blank: bool = False, lens: np.ndarray | None = None) -> PhotoView:
+    """The ball from one camera, 3 x 3 samples a pixel, each camera with its own exposure."""
+    K, pose = camera(index)
+    lens = np.zeros(5) if lens is None else lens
+    o, d = transforms.rays(K, pose, lens, transforms.pixel_centres(3 * SIDE, 3 * SIDE) / 3)
+    b = d @ o
+    under = b * b - (o @ o - RADIUS**2)
+    hit = under > 0
+    p = o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d
+    value = np.where(hit, 0.4 if blank else marks(p), 0) * (0.8 + 0.05 * (index % 5))
+    image = value.reshape(SIDE, 3, SIDE, 3).mean((1, 3)).astype(np.float32)
+    alpha = hit.reshape(SIDE, 3, SIDE, 3).mean((1, 3)).astype(np.float32)
+    return PhotoView(index, np.repeat(image[..., None], 3, -1), alpha, K, pose, lens)
+
+
+def too_large(by: float) -> Start:
+    """A ball that has, like a hull, a fill on one side: up to `by` outside of the true one."""
+    lo, cell, n = -0.15, 0.005, 61
+    x = lo + cell * np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1)
+    r = np.linalg.norm(x, axis=-1)
+    bump = by * np.exp(-(np.linalg.norm(x - [0.0, 0.02, 0.1], axis=-1) ** 2) / 0.05**2)
+    return Start((r - RADIUS - bump).astype(np.float32), np.full(3, lo, np.float32), cell)
+
+
+def misses(start: Start) -> np.ndarray:
+    """|radius - true| of the zero set's points, within 60 degrees of the equator, where many views look."""
+    p, _ = stereo.surface_points(start.values, start.lo, start.cell)
+    r = np.linalg.norm(p, axis=1)
+    return np.abs(r - RADIUS)[np.abs(p[:, 1]) < 0.8 * r]
+
+
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_a_fill_is_carved_away(lens: np.ndarray | None) -> None:
+    start = too_large(0.007)
+    found = stereo.start_from_photos(start, [photo(i, lens=lens) for i in range(24)], "cpu")
+    assert misses(start).max() > 5e-3
+    assert np.percentile(misses(found), 99) < 1.5e-3 and misses(found).mean() < 4e-4
+
+
+def test_blank_skin_stays_where_it_is() -> None:
+    start = too_large(0.004)
+    found = stereo.start_from_photos(start, [photo(i, blank=True) for i in range(24)], "cpu")
+    assert abs(misses(found).max() - misses(start).max()) < 1.5e-3
+
+
+def test_two_views_change_nothing() -> None:
+    start = too_large(0.004)
+    found = stereo.start_from_photos(start, [photo(i) for i in range(2)], "cpu")
+    assert np.array_equal(found.values, start.values)
+
+
+def test_twice_the_same() -> None:
+    views = [photo(i) for i in range(12)]
+    a, b = (stereo.start_from_photos(too_large(0.004), views, "cpu") for _ in range(2))
+    assert np.array_equal(a.values, b.values)
+
+
+def test_views_behind_do_not_see() -> None:
+    """Every view that is kept faces the point; the order is by how squarely."""
+    start = too_large(0.0)
+    p, n = stereo.surface_points(start.values, start.lo, start.cell)
+    photos = stereo.photos_of([photo(i) for i in range(24)], "cpu")
+    order, seen, pixel = stereo.best_views(p, n, start, photos)
+    way = torch.nn.functional.normalize(photos.centre[order] - torch.from_numpy(p)[:, None].float(), dim=-1)
+    cosine = (way * torch.from_numpy(n)[:, None].float()).sum(-1)
+    assert (cosine[seen] > stereo.LEAST_COSINE - 1e-4).all()
+    assert (cosine.diff(dim=1)[seen[:, 1:]] <= 1e-4).all()
+    assert pixel == pytest.approx(0.4 / (1.9 * SIDE), rel=0.15)
+
+
+def test_normals_of_a_ball() -> None:
+    p, n = stereo.surface_points(*[getattr(too_large(0.0), k) for k in ("values", "lo", "cell")])
+    assert np.abs(np.linalg.norm(p, axis=1) - RADIUS).max() < 1e-3
+    assert ((p / np.linalg.norm(p, axis=1, keepdims=True) * n).sum(1) > 0.999).all()
