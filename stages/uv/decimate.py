@@ -6,6 +6,8 @@ ring of crowded edges; cutting the mesh along those edges and keeping the larges
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +20,7 @@ LOOP = 8  # edges of the largest hole that is closed
 ROUNDS = 4  # of taking bubbles away
 UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
 SAMPLE_SEED = 0
-NEAR = 12  # triangles that a sample is measured against
+NEAR = 24  # triangles that a sample is measured against
 NEARLY = 1.05  # of the target: near enough to stop trying
 
 
@@ -127,15 +129,21 @@ def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -
     return np.where(agree[:, None], found, own).astype(np.float32)
 
 
-def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> float:
-    """Mean distance between two surfaces, sampled by area both ways, in the meshes' unit.
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Distances between two surfaces, sampled by area both ways, in the meshes' unit."""
 
-    The distance is exact to the NEAR faces with the nearest centres, so it can only be too large.
-    """
-    return 0.5 * (_one_way(a, b, samples) + _one_way(b, a, samples))
+    mean: float
+    rms: float
 
 
-def _one_way(start: Mesh, goal: Mesh, samples: int) -> float:
+def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> Deviation:
+    """The distance is exact to the NEAR faces with the nearest centres, so it can only be too large."""
+    d = np.concatenate([_one_way(a, b, samples), _one_way(b, a, samples)])
+    return Deviation(float(d.mean()), float(np.sqrt((d * d).mean())))
+
+
+def _one_way(start: Mesh, goal: Mesh, samples: int) -> F64:
     from scipy.spatial import cKDTree
 
     points = sampled(start, samples)
@@ -145,7 +153,7 @@ def _one_way(start: Mesh, goal: Mesh, samples: int) -> float:
     best = np.full(len(points), np.inf)
     for column in near.T:
         best = np.minimum(best, distance_to_triangles(points, corners[column]))
-    return float(best.mean())
+    return best
 
 
 def distance_to_triangles(p: F64, corners: F64) -> F64:
