@@ -46,6 +46,7 @@ class Config(StageConfig):
     divide_shadows: bool = Field(
         True, description="take the captured light's shadows and interreflections out of the albedo"
     )
+    acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
