@@ -23,8 +23,7 @@ TRIES = 5  # packings
 ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
 WORTH = 0.005  # of the square: a packing that gains less is not looked for
 MOST_CHARTS = 40
-CHECK = 512  # texels: where two layers of one chart would show
-TWICE = 2e-4  # of the covered texels under two faces: rounding at borders
+CHECK = 1024  # texels: where two layers of one chart would show
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +64,9 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
                     best = share, charts
             if best is not None and best[0] >= ENOUGH:
                 break
+            if twice is not None and flats[twice].before is not None:
+                known[flats[twice].member.tobytes()] = _as_before(flats[twice])
+                continue
             part = twice if twice is not None else _worth_parting(surface, flats)
         label = _parted(surface, label, flats[part])
     return None if best is None else best[1]
@@ -87,8 +89,13 @@ def _on_true_surface(surface: _Surface, flat: Flat) -> Flat:
     faces = flat.faces.astype(np.int64)
     uv = unfolded(faces, rigid(surface.true[flat.vertex], faces, flat.uv, TRUE_STEPS))
     if bool((signed(uv, faces) > 0).all()):
-        return replace(flat, uv=uv, good=True)
+        return replace(flat, uv=uv, good=True, before=flat.uv if flat.good else None)
     return flat
+
+
+def _as_before(flat: Flat) -> Flat:
+    """A chart whose jagged border came to lie over itself in the last steps, as it was without them."""
+    return flat if flat.before is None else replace(flat, uv=flat.before, before=None)
 
 
 def _must_part(surface: _Surface, flats: list[Flat]) -> int | None:
@@ -153,8 +160,9 @@ def _layers(charts: Charts, label: Indices) -> tuple[float, int | None]:
     corners = raster.texel_corners(charts, CHECK)
     layers = raster.layers(corners, CHECK)
     covered = int((layers > 0).sum())
-    if int((layers > 1).sum()) <= TWICE * covered:
+    double = layers > 1
+    if not double.any():
         return covered / CHECK**2, None
-    middle = corners.mean(1).astype(np.int64).clip(0, CHECK - 1)
-    double = layers[middle[:, 1], middle[:, 0]] > 1
-    return covered / CHECK**2, int(np.bincount(label, double).argmax())
+    hits = raster.rasterise(corners, CHECK, 0, CHECK)
+    under = label[hits.face[double.ravel()[hits.texel]]]
+    return covered / CHECK**2, int(np.bincount(under).argmax())
