@@ -85,6 +85,7 @@ def figures(r: Results) -> dict[str, Any]:
         "maps": {
             "size": bake.size,
             "covered_share": bake.coverage,
+            "zero_set_rms_mm": bake.zero_set_rms_mm,
             **{
                 n: {"channels": m.channels, "minimum": m.minimum, "mean": m.mean, "maximum": m.maximum}
                 for n, m in sorted(bake.maps.items())

@@ -23,7 +23,7 @@ TRIES = 5  # packings
 ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
 WORTH = 0.005  # of the square: a packing that gains less is not looked for
 MOST_CHARTS = 40
-CHECK = 1024  # texels: where two layers of one chart would show
+CHECK = 768  # texels along a chart's longest side: where two layers of it would show
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,17 +57,11 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
         if part is None:
             packed += 1
             charts = _packed(mesh, flats, padding, LOOSEST if best is None else best[0] + WORTH)
-            twice = None
             if charts is not None:
-                share, twice = _layers(charts, label)
-                if twice is None:
-                    best = share, charts
+                best = _share(charts), charts
             if best is not None and best[0] >= ENOUGH:
                 break
-            if twice is not None and flats[twice].before is not None:
-                known[flats[twice].member.tobytes()] = _as_before(flats[twice])
-                continue
-            part = twice if twice is not None else _worth_parting(surface, flats)
+            part = _worth_parting(surface, flats)
         label = _parted(surface, label, flats[part])
     return None if best is None else best[1]
 
@@ -84,18 +78,22 @@ def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[
 
 
 def _on_true_surface(surface: _Surface, flat: Flat) -> Flat:
+    """The last steps on the true surface, unless the chart's jagged border came to lie over itself by them."""
     if not len(flat.uv):
         return flat
     faces = flat.faces.astype(np.int64)
     uv = unfolded(faces, rigid(surface.true[flat.vertex], faces, flat.uv, TRUE_STEPS))
-    if bool((signed(uv, faces) > 0).all()):
-        return replace(flat, uv=uv, good=True, before=flat.uv if flat.good else None)
-    return flat
+    for choice in (uv, flat.uv):
+        if bool((signed(choice, faces) > 0).all()) and not lies_over_itself(choice, flat.faces):
+            return replace(flat, uv=choice, good=True)
+    return replace(flat, good=False)
 
 
-def _as_before(flat: Flat) -> Flat:
-    """A chart whose jagged border came to lie over itself in the last steps, as it was without them."""
-    return flat if flat.before is None else replace(flat, uv=flat.before, before=None)
+def lies_over_itself(uv: F64, faces: Faces) -> bool:
+    """Whether any of CHECK x CHECK texels across a chart is under two of its faces."""
+    low = uv.min(0)
+    square = ((uv - low) / max(float((uv.max(0) - low).max()), 1e-30)).astype(np.float32)
+    return bool((raster.layers(raster.texel_corners(Charts(square, faces), CHECK), CHECK) > 1).any())
 
 
 def _must_part(surface: _Surface, flats: list[Flat]) -> int | None:
@@ -155,14 +153,6 @@ def _packed(mesh: Mesh, flats: list[Flat], padding: float, least: float) -> Char
     return None if placed is None else Charts(placed, faces)
 
 
-def _layers(charts: Charts, label: Indices) -> tuple[float, int | None]:
-    """Share of the square under charts, and the chart with most texels under two of its faces if they are many."""
-    corners = raster.texel_corners(charts, CHECK)
-    layers = raster.layers(corners, CHECK)
-    covered = int((layers > 0).sum())
-    double = layers > 1
-    if not double.any():
-        return covered / CHECK**2, None
-    hits = raster.rasterise(corners, CHECK, 0, CHECK)
-    under = label[hits.face[double.ravel()[hits.texel]]]
-    return covered / CHECK**2, int(np.bincount(under).argmax())
+def _share(charts: Charts) -> float:
+    """Share of the square under charts."""
+    return float(0.5 * signed(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)).sum())

@@ -27,15 +27,13 @@ PATHS = 24  # cuts that one piece may need until it is a disc
 @dataclass(frozen=True, slots=True)
 class Flat:
     """One chart laid flat: its faces (m,) in the mesh, faces (m, 3) into its own vertices, uv (n, 2) and the mesh's
-    vertex (n,) of each. `good`: a disc without mirrored triangles. before: (n, 2) its uv without the last steps on the
-    true surface."""
+    vertex (n,) of each. `good`: a disc without mirrored triangles."""
 
     member: Indices
     faces: Faces
     uv: F64
     vertex: Indices
     good: bool
-    before: F64 | None = None
 
 
 def flattened(vertices: F64, faces: Faces, pairs: Dual, label: Indices, wanted: Mask) -> list[Flat]:
