@@ -56,6 +56,7 @@ ZOO = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ZOO)
 def test_charts_of_awkward_shapes_are_valid(name: str) -> None:
     mesh = ZOO[name]()
@@ -65,10 +66,12 @@ def test_charts_of_awkward_shapes_are_valid(name: str) -> None:
     assert found.charts <= 40 and found.utilisation > 0.45
     assert found.overlap < 1e-3 and found.flipped < 1e-3 and found.empty < 1e-3
     assert found.stretch < 1.3
-    again = unwrap.unwrap(mesh, unwrap.Options(512, 3))
-    assert again.uvs.tobytes() == charts.uvs.tobytes()
+    if name == "noisy":
+        again = unwrap.unwrap(mesh, unwrap.Options(512, 3))
+        assert again.uvs.tobytes() == charts.uvs.tobytes()
 
 
+@pytest.mark.slow
 def test_seams_keep_off_the_front_of_a_head(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left is the ring around the neck, under the chin; an even cost cuts through the face."""
     mesh = surface_build(AnalyticField(bumpy_head(0.0, 60.0)), 56, quiet).mesh
@@ -159,7 +162,7 @@ def test_pixel_filters_have_their_moments() -> None:
         np.testing.assert_allclose(w @ (made.offsets - 0.5) ** 2, variance, rtol=2e-3)
 
 
-def test_closed_pieces_are_refused_by_name_of_none() -> None:
+def test_closed_pieces_are_no_discs() -> None:
     """A piece without a border has no disc; the stage then goes on to part it."""
     made = trimesh.creation.icosphere(2, 1.0)
     faces = made.faces.astype(np.int64)
@@ -189,7 +192,7 @@ def test_least_cut_parts_a_dumbbell_at_its_waist() -> None:
 
 
 def test_charts_hold_their_faces() -> None:
-    mesh = ZOO["torus"]()
+    mesh = mesh_of(trimesh.creation.icosphere(2, 0.1))
     charts: Charts = unwrap.unwrap(mesh, unwrap.Options(512, 3))
     position: dict[int, int] = {}
     for uv, vertex in zip(charts.faces.ravel().tolist(), mesh.faces.ravel().tolist(), strict=True):
