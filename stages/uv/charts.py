@@ -62,7 +62,10 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
             if best is not None and best[0] >= ENOUGH:
                 break
             part = _worth_parting(surface, flats)
+        pieces = int(label.max())
         label = _parted(surface, label, flats[part])
+        if int(label.max()) <= pieces:  # a piece of one face
+            break
     return None if best is None else best[1]
 
 

@@ -63,8 +63,10 @@ def _one(vertices: F64, faces: Faces, member: Indices, pairs: Dual) -> Flat:
     if cut is None:
         return Flat(member, own.astype(np.int32), np.zeros((0, 2)), np.zeros(0, np.int64), False)
     local, vertex = joined_corners(own, pairs, cut)
-    uv = conformal(vertices[vertex], local)
-    uv = rigid(vertices[vertex], local, uv)
+    try:
+        uv = rigid(vertices[vertex], local, conformal(vertices[vertex], local))
+    except RuntimeError:  # a singular matrix: triangles without area
+        return Flat(member, own.astype(np.int32), np.zeros((0, 2)), np.zeros(0, np.int64), False)
     uv = unfolded(local, uv)
     return Flat(member, local.astype(np.int32), uv, vertex, bool((signed(uv, local) > 0).all()))
 
