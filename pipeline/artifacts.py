@@ -222,7 +222,9 @@ class Surface(Artifact):
 class UvMesh(Artifact):
     """A mesh with charts. npz: vertices (V, 3), normals (V, 3), faces (F, 3), uvs (U, 2) float32, uv_faces (F, 3).
 
-    UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs.
+    UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs. stretch: L2, stretch_max:
+    Linf of [Sander 2001]. seam_front_mm: length of seams where the surface looks to the front. deviation: of the mesh
+    and of the proxy from the dense mesh.
     """
 
     mesh: FileRef
@@ -233,7 +235,11 @@ class UvMesh(Artifact):
     utilisation: float
     stretch: float
     overlap: float
+    stretch_max: float = 0.0
+    seam_front_mm: float = 0.0
     deviation_mm: float
+    deviation_rms_mm: float = 0.0
+    proxy_deviation_rms_mm: float = 0.0
     warnings: tuple[str, ...] = ()
 
 
@@ -251,12 +257,14 @@ class TextureMap(Artifact):
 
 
 class TextureSet(Artifact):
-    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1)."""
+    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1). zero_set_rms_mm: root mean square distance of the
+    mesh from the SDF's zero set, over the texels that have one near them."""
 
     size: int
     padding: int
     maps: dict[str, TextureMap]
     coverage: float
+    zero_set_rms_mm: float = 0.0
     warnings: tuple[str, ...] = ()
 
 

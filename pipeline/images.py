@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.colour import linear_from_srgb, srgb_from_linear
+from pipeline.colour import REC709, Chromaticities, linear_from_srgb, srgb_from_linear
 from pipeline.errors import StageError
 
 F32 = npt.NDArray[np.float32]
+SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
 MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
 
 
@@ -99,8 +100,20 @@ def _encode(path: Path, kind: str, data: npt.NDArray[Any]) -> None:
     path.write_bytes(buffer.tobytes())
 
 
-def write_exr(path: Path, image: F32, channels: tuple[str, ...] | None = None, *, half: bool = False) -> None:
-    """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ..."""
+def write_exr(
+    path: Path,
+    image: F32,
+    channels: tuple[str, ...] | None = None,
+    *,
+    half: bool = False,
+    primaries: Chromaticities | None = REC709,
+    units: str = "",
+) -> None:
+    """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ...
+
+    primaries: recorded in pictures with channels R, G, B; None where these are no colour (normals). units: recorded if
+    given ("mm").
+    """
     import OpenEXR
 
     data = np.atleast_3d(np.asarray(image, np.float16 if half else np.float32))
@@ -111,7 +124,15 @@ def write_exr(path: Path, image: F32, channels: tuple[str, ...] | None = None, *
     if len(names) != count:
         raise ValueError(f"{len(names)} channel names for {count} channels")
     planes = {n: np.ascontiguousarray(data[..., i]) for i, n in enumerate(names)}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header: dict[str, Any] = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "software": SOFTWARE,
+    }
+    if primaries is not None and {"R", "G", "B"} <= set(names):
+        header["chromaticities"] = primaries
+    if units:
+        header["units"] = units
     path.parent.mkdir(parents=True, exist_ok=True)
     OpenEXR.File(header, planes).write(str(path))
 

@@ -47,8 +47,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     maps = write_maps(baked, context)
     # every texel between the charts is filled, so the padding reaches across the whole picture
     return TextureSet(
-        size=config.size, padding=config.size, maps=maps, coverage=baked.coverage, warnings=baked.warnings
+        size=config.size,
+        padding=config.size,
+        maps=maps,
+        coverage=baked.coverage,
+        zero_set_rms_mm=1000 * baked.samples.deviation(),
+        warnings=baked.warnings,
     )
 
 
-STAGE = Stage(name="bake", version=1, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=2, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -49,6 +49,11 @@ class Samples:
     displacement: F32
     landed: Mask
 
+    def deviation(self) -> float:
+        """Root mean square distance (m) of the mesh from the zero set, where there is one."""
+        d = self.displacement[self.landed].astype(np.float64)
+        return float(np.sqrt((d * d).mean())) if len(d) else 0.0
+
 
 def sample(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Samples:
     """Everything that the maps need. Raises StageError where the field is not finite."""

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 
 from pipeline.artifacts import FileRef, TextureMap
+from pipeline.colour import REC709
 from pipeline.contract import Context
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.maths import microfacet
@@ -26,17 +27,20 @@ LEAST_INV_KAPPA = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class MapKind:
-    """How a map is made from the samples (N, ...) and stored. png: bits, 0 for none; encoded: png holds v/2 + 1/2."""
+    """How a map is made from the samples (N, ...) and stored. png: bits, 0 for none; encoded: png holds v/2 + 1/2.
+    colour: its three channels are colours; units: of its values, for the EXR's header."""
 
     values: Callable[[Samples], F32]
     png: int = 0
     encoded: bool = False
     numbered: bool = False
     space: Literal["srgb_png", "raw"] = "raw"
+    colour: bool = False
+    units: str = ""
 
 
 KINDS: dict[str, MapKind] = {
-    "albedo": MapKind(lambda s: s.albedo, png=8, space="srgb_png"),
+    "albedo": MapKind(lambda s: s.albedo, png=8, space="srgb_png", colour=True),
     "specular_coefficients": MapKind(lambda s: s.rho[:, None] * s.coefficients, numbered=True),
     "specular_intensity": MapKind(lambda s: s.rho, png=8),
     "shininess": MapKind(lambda s: (1 / np.maximum(s.inv_kappa, LEAST_INV_KAPPA)).astype(np.float32)),
@@ -44,8 +48,8 @@ KINDS: dict[str, MapKind] = {
     "roughness": MapKind(lambda s: microfacet.roughness_from_inv_kappa(s.inv_kappa).astype(np.float32), png=8),
     "f0": MapKind(lambda s: s.f0, png=16),  # about 0.03: 8 bits would leave 8 steps
     "normal": MapKind(lambda s: s.normal, png=8, encoded=True),
-    "irradiance_ratio": MapKind(lambda s: s.irradiance_ratio, png=8),
-    "displacement": MapKind(lambda s: s.displacement * np.float32(MM)),
+    "irradiance_ratio": MapKind(lambda s: s.irradiance_ratio, png=8, colour=True),
+    "displacement": MapKind(lambda s: s.displacement * np.float32(MM), units="mm"),
 }
 
 
@@ -84,7 +88,8 @@ def _none(samples: Samples) -> F32:
 def _store(name: str, image: F32, values: F32, kind: MapKind, context: Context) -> TextureMap:
     folder = context.workdir / FOLDER
     channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
-    write_exr(folder / f"{name}.exr", image, channels)
+    primaries = REC709 if kind.colour else None
+    write_exr(folder / f"{name}.exr", image, channels, primaries=primaries, units=kind.units)
     files: dict[str, FileRef] = {"exr": context.file(f"{FOLDER}/{name}.exr")}
     if kind.png:
         path = folder / f"{name}.png"

@@ -76,11 +76,16 @@ def figures(r: Results) -> dict[str, Any]:
             "utilisation": uv.utilisation,
             "stretch": uv.stretch,
             "overlap": uv.overlap,
+            "stretch_max": uv.stretch_max,
+            "seam_front_mm": uv.seam_front_mm,
             "deviation_mm": uv.deviation_mm,
+            "deviation_rms_mm": uv.deviation_rms_mm,
+            "proxy_deviation_rms_mm": uv.proxy_deviation_rms_mm,
         },
         "maps": {
             "size": bake.size,
             "covered_share": bake.coverage,
+            "zero_set_rms_mm": bake.zero_set_rms_mm,
             **{
                 n: {"channels": m.channels, "minimum": m.minimum, "mean": m.mean, "maximum": m.maximum}
                 for n, m in sorted(bake.maps.items())

@@ -40,6 +40,7 @@ class Settings(Protocol):
     proxy: bool
     environment_width: int
     divide_shadows: bool
+    acescg: bool
     author: str
     license: str
     subject_consent: str
@@ -71,7 +72,7 @@ def export(
     proxy, notes = _proxy(uv, mesh) if settings.proxy else (None, [])
     check()
     light = read_light(face.path(face.artifact.light))
-    maps = write_maps(bake, mesh, light, name, folder, check, divide=settings.divide_shadows)
+    maps = write_maps(bake, mesh, light, name, folder, check, divide=settings.divide_shadows, acescg=settings.acescg)
     written, look = maps.written, maps.look
     who = component.Identity(name, settings.asset_version, settings.author, settings.license, settings.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]

@@ -13,6 +13,7 @@ import torch
 
 from pipeline import raster
 from pipeline.artifacts import Located, TextureSet
+from pipeline.colour import ACESCG, acescg_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
 from pipeline.maths import sh
@@ -56,8 +57,10 @@ def write_maps(
     check: Callable[[], None],
     *,
     divide: bool,
+    acescg: bool = False,
 ) -> Maps:
-    """Everything in textures/. `divide`: take shadows and bounced light out of the albedo."""
+    """Everything in textures/. `divide`: take shadows and bounced light out of the albedo. `acescg`: that albedo in
+    ACEScg too."""
     folder = asset / "textures"
     written = copy_maps(bake, name, folder)
     covered = covered_texels(bake)
@@ -66,6 +69,10 @@ def write_maps(
         shown, found = divided_albedo(bake, mesh, light, name, folder, covered, check)
         written += shown
         figures |= found
+    if acescg:
+        written.append(folder / f"{name}_albedo_acescg.exr")
+        albedo = read_exr(folder / f"{name}_albedo.exr")[0][..., :3]
+        write_exr(written[-1], acescg_from_linear(albedo), primaries=ACESCG)
     check()
     basis = numbered(bake.path(bake.artifact.maps["basis_lut"].files["exr"]))
     coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files["exr"]))
@@ -73,7 +80,7 @@ def write_maps(
     for kind, pictures in groups.items():
         for i, picture in enumerate(pictures):
             written.append(folder / f"{name}_{kind}_rgb{i}.exr")
-            write_exr(written[-1], picture)
+            write_exr(written[-1], picture, primaries=None)
     if "f0" in bake.artifact.maps:
         f0 = _map(bake, "f0")[..., 0]
         written.append(folder / f"{name}_specular_color.png")

@@ -27,7 +27,8 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
 CHUNK = 1 << 18  # rays at once
-EDGE_SAMPLES = 4  # along each side of a pixel on the silhouette
+EDGE_SAMPLES = 8  # along each side of what a pixel on the silhouette sees
+EDGE_REACH = 2.0  # pixels: the triangle filter of a pixel there; a photo's lens and sensor mix neighbours as much
 EMBREE_SIZE = 100.0  # embree works in float32 with absolute tolerances: the mesh is scaled to about this size
 
 
@@ -52,6 +53,14 @@ class Points:
     normal: F64
     uv: F32
     corner: I32
+    weights: F32
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """Where a pixel looks: offsets (S, 2) from its corner in pixels, and weights (S,) that sum to 1."""
+
+    offsets: F64
     weights: F32
 
 
@@ -112,7 +121,8 @@ class Renderer:
         """(height / factor, width / factor, 4) linear Rec.709 RGBA, premultiplied.
 
         `factor`: one pixel for factor x factor photo pixels. `samples`: rays along each side of a pixel; 0: one, and
-        more where the silhouette passes. `light`: other SH coefficients than the captured ones, or any Light.
+        where the silhouette passes the mean over a triangle filter, as soft as a photo's. `light`: other SH
+        coefficients than the captured ones, or any Light.
         `plain`: grey diffuse surface, to see the shape alone.
         """
         if light is None or isinstance(light, np.ndarray):
@@ -120,10 +130,10 @@ class Renderer:
         h, w = view.height // factor, view.width // factor
         out = np.zeros((h * w, 4), np.float32)
         reached = self._reached(view, w, h, factor)
-        out[reached] = self._pixels(view, reached, w, factor, max(samples, 1), light)
+        out[reached] = self._pixels(view, reached, w, factor, _square(max(samples, 1)), light)
         if samples == 0:
             edge = np.flatnonzero(_borders(out[:, 3].reshape(h, w)).ravel())
-            out[edge] = self._pixels(view, edge, w, factor, EDGE_SAMPLES, light)
+            out[edge] = self._pixels(view, edge, w, factor, _triangle(EDGE_SAMPLES, EDGE_REACH), light)
         return out.reshape(h, w, 4)
 
     def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
@@ -139,21 +149,22 @@ class Renderer:
         return np.asarray((rows[:, None] * width + columns).ravel(), np.int64)
 
     def _pixels(
-        self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, samples: int, light: Light
+        self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, filtered: Filter, light: Light
     ) -> F32:
         """(N, 4) RGBA of some pixels, given by row * width + column."""
         out = np.zeros((len(pixel), 4), np.float32)
-        step = max(1, CHUNK // (samples * samples))
+        count = len(filtered.weights)
+        step = max(1, CHUNK // count)
         for first in range(0, len(pixel), step):
             some = pixel[first : first + step]
-            uv = _sample_positions(some, width, samples) * factor
+            uv = _sample_positions(some, width, filtered) * factor
             origin, directions = rays(view.K, view.world_from_cam, view.distortion, uv)
             points = self.points(origin, directions)
             rgba = np.zeros((len(uv), 4), np.float32)
             if len(points.ray):
                 rgba[points.ray, :3] = light.shade(self, points)
                 rgba[points.ray, 3] = 1
-            out[first : first + len(some)] = rgba.reshape(-1, samples * samples, 4).mean(1)
+            out[first : first + len(some)] = np.einsum("nsc,s->nc", rgba.reshape(-1, count, 4), filtered.weights)
         return out
 
     def trace(self, origin: F64, directions: F64) -> Hits:
@@ -230,12 +241,28 @@ def lookup(table: F32, cosine: F64) -> F32:
     return np.asarray(table[low] * (1 - f) + table[np.minimum(low + 1, width - 1)] * f, np.float32)
 
 
-def _sample_positions(pixel: npt.NDArray[np.int64], width: int, samples: int) -> F64:
-    """(N * samples^2, 2) image positions, all samples of a pixel one after the other."""
+def _square(samples: int) -> Filter:
+    """A pixel's own square, samples x samples positions of equal weight."""
     inside = (np.arange(samples) + 0.5) / samples
-    du, dv = (a.ravel() for a in np.meshgrid(inside, inside))
-    u, v = (pixel % width)[:, None] + du, (pixel // width)[:, None] + dv
-    return np.stack([u, v], -1).reshape(-1, 2).astype(np.float64)
+    return _separable(inside, np.ones(samples))
+
+
+def _triangle(samples: int, reach: float) -> Filter:
+    """samples x samples positions over `reach` pixels around the middle, weights falling to 0 at its ends."""
+    away = ((np.arange(samples) + 0.5) / samples - 0.5) * reach
+    return _separable(0.5 + away, 1 - np.abs(away) / (0.5 * reach))
+
+
+def _separable(position: F64, weight: F64) -> Filter:
+    du, dv = (a.ravel() for a in np.meshgrid(position, position))
+    weights = np.outer(weight, weight).ravel() / weight.sum() ** 2
+    return Filter(np.stack([du, dv], -1), weights.astype(np.float32))
+
+
+def _sample_positions(pixel: npt.NDArray[np.int64], width: int, filtered: Filter) -> F64:
+    """(N * S, 2) image positions, all samples of a pixel one after the other."""
+    corner = np.stack([pixel % width, pixel // width], -1)
+    return (corner[:, None] + filtered.offsets).reshape(-1, 2).astype(np.float64)
 
 
 def _unit(x: npt.NDArray[np.floating]) -> F64:

@@ -46,10 +46,13 @@ class Config(StageConfig):
     divide_shadows: bool = Field(
         True, description="take the captured light's shadows and interreflections out of the albedo"
     )
+    acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
-    samples: int = Field(2, ge=1, le=8, description="rays along each side of a pixel of these renders")
+    samples: int = Field(
+        0, ge=0, le=8, description="rays along each side of a pixel of these renders; 0: one, and 64 on silhouettes"
+    )
     preview_size: int = Field(512, ge=64, le=4096, description="pixels of the preview pictures' side")
 
 
@@ -112,4 +115,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=2, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=3, inputs=Inputs, config=Config, output=UsdAsset, run=run)

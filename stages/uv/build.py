@@ -9,6 +9,7 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import Charts, Mesh
 from stages.uv import decimate
+from stages.uv.decimate import Deviation
 from stages.uv.measure import Quality, measure
 from stages.uv.unwrap import Options, unwrap
 
@@ -20,13 +21,15 @@ Step = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """The textured mesh, its charts, the proxy, the charts' figures, and the mean distance to the dense mesh (m)."""
+    """The textured mesh, its charts, the proxy, the charts' figures, and how far mesh and proxy are from the dense mesh
+    (m)."""
 
     mesh: Mesh
     charts: Charts
     proxy: Mesh
     quality: Quality
-    deviation: float
+    deviation: Deviation
+    proxy_deviation: Deviation
     warnings: tuple[str, ...]
 
 
@@ -53,10 +56,10 @@ def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, st
     step(2, 4, "measuring charts")
     quality = measure(mesh, charts)
     step(3, 4, "measuring the decimation")
-    deviation = decimate.deviation(dense, mesh)
+    deviation, rough = decimate.deviation(dense, mesh), decimate.deviation(dense, proxy)
     against = decimate.flipped_share(dense, mesh)
     step(4, 4, "done")
-    return Built(mesh, charts, proxy, quality, deviation, _warnings(quality, against))
+    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against))
 
 
 def _warnings(quality: Quality, against: float) -> tuple[str, ...]:

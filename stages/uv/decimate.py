@@ -6,6 +6,8 @@ ring of crowded edges; cutting the mesh along those edges and keeping the larges
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,7 +20,10 @@ LOOP = 8  # edges of the largest hole that is closed
 ROUNDS = 4  # of taking bubbles away
 UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
 SAMPLE_SEED = 0
-NEAR = 12  # triangles that a sample is measured against
+NEAR = (
+    12  # nearest points on the goal, and nearest centres of its triangles, whose triangles a sample is measured against
+)
+SPREAD = 10  # points on the goal for each sample
 NEARLY = 1.05  # of the target: near enough to stop trying
 
 
@@ -127,25 +132,34 @@ def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -
     return np.where(agree[:, None], found, own).astype(np.float32)
 
 
-def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> float:
-    """Mean distance between two surfaces, sampled by area both ways, in the meshes' unit.
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Distances between two surfaces, sampled by area both ways, in the meshes' unit."""
 
-    The distance is exact to the NEAR faces with the nearest centres, so it can only be too large.
-    """
-    return 0.5 * (_one_way(a, b, samples) + _one_way(b, a, samples))
+    mean: float
+    rms: float
 
 
-def _one_way(start: Mesh, goal: Mesh, samples: int) -> float:
+def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> Deviation:
+    """The distance is exact to the triangles that are tried, so it can only be too large: large triangles are found by
+    points spread over them, small ones by their centres."""
+    d = np.concatenate([_one_way(a, b, samples), _one_way(b, a, samples)])
+    return Deviation(float(d.mean()), float(np.sqrt((d * d).mean())))
+
+
+def _one_way(start: Mesh, goal: Mesh, samples: int) -> F64:
     from scipy.spatial import cKDTree
 
-    points = sampled(start, samples)
+    points, _ = sampled(start, samples)
     corners = goal.vertices.astype(np.float64)[goal.faces]
-    _, near = cKDTree(corners.mean(1)).query(points, k=min(NEAR, len(corners)))
-    near = np.asarray(near).reshape(len(points), -1)
+    on, face = sampled(goal, SPREAD * samples)
+    _, under = cKDTree(on).query(points, k=NEAR)
+    _, beside = cKDTree(corners.mean(1)).query(points, k=min(NEAR, len(corners)))
+    near = np.concatenate([face[under], np.asarray(beside).reshape(len(points), -1)], 1)
     best = np.full(len(points), np.inf)
     for column in near.T:
         best = np.minimum(best, distance_to_triangles(points, corners[column]))
-    return float(best.mean())
+    return best
 
 
 def distance_to_triangles(p: F64, corners: F64) -> F64:
@@ -164,15 +178,15 @@ def distance_to_triangles(p: F64, corners: F64) -> F64:
     return np.where(inside, plane, best)
 
 
-def sampled(mesh: Mesh, count: int) -> F64:
-    """(count, 3) points on the mesh, uniform by area, the same each time."""
+def sampled(mesh: Mesh, count: int) -> tuple[F64, Indices]:
+    """(count, 3) points on the mesh, uniform by area, the same each time, and the face (count,) of each."""
     rng = np.random.default_rng(SAMPLE_SEED)
     area = meshes.areas(mesh.vertices, mesh.faces)
     face = np.searchsorted(np.cumsum(area) / area.sum(), rng.random(count)).clip(0, len(area) - 1)
     r, s = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
     a, b, c = mesh.vertices.astype(np.float64)[mesh.faces[face]].transpose(1, 0, 2)
     out: F64 = (1 - r) * a + r * (1 - s) * b + r * s * c
-    return out
+    return out, np.asarray(face, np.int64)
 
 
 def flipped_share(dense: Mesh, mesh: Mesh) -> float:

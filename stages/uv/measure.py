@@ -3,6 +3,8 @@
 Symbols
     J       2 x 3 -> the map from texture to surface of one triangle; columns S_u, S_v
     L2      sqrt((S_u . S_u + S_v . S_v) / 2), root mean square stretch of a triangle [Sander 2001, section 3]
+    Linf    larger singular value of J, the most that any direction is stretched
+    front   where the normal is within 60 degrees of FRONT
 """
 
 from __future__ import annotations
@@ -13,24 +15,29 @@ import numpy as np
 
 from pipeline import meshes, raster
 from pipeline.meshes import F64, Charts, Mesh
+from stages.uv.segment import FRONT
 from stages.uv.unwrap import chart_of_face, signed_areas
 
 RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
+FACING = 0.5
 TINY_CHART = 5e-4  # of the area: smaller charts are crumbs
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
     """charts; crumbs: charts with next to no area; utilisation: share of texels under a chart; overlap: share of
-    those under two; stretch: L2, 1 is the best; flipped, empty: share of the area whose charts are mirrored or flat."""
+    those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty: share of the area whose
+    charts are mirrored or flat; seam_front: length (m) of the seams in front."""
 
     charts: int
     crumbs: int
     utilisation: float
     overlap: float
     stretch: float
+    stretch_max: float
     flipped: float
     empty: float
+    seam_front: float
 
 
 def measure(mesh: Mesh, charts: Charts) -> Quality:
@@ -42,19 +49,39 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     layers = raster.layers(raster.texel_corners(charts, RASTER), RASTER)
     covered = int((layers > 0).sum())
     flat = np.abs(uv_area) < 1e-12
+    mean, most = stretch(mesh, charts, ~flat)
     return Quality(
         charts=int(label.max()) + 1,
         crumbs=int((np.bincount(label, share) < TINY_CHART).sum()),
         utilisation=covered / RASTER**2,
         overlap=float((layers > 1).sum() / max(covered, 1)),
-        stretch=stretch(mesh, charts, ~flat),
+        stretch=mean,
+        stretch_max=most,
         flipped=float(share[(uv_area < 0) & ~flat].sum()),
         empty=float(share[flat].sum()),
+        seam_front=seam_length(mesh, charts),
     )
 
 
-def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> float:
-    """Area-weighted L2 over the mesh, with the texture scaled so that both areas agree; 1 for an isometry.
+def seam_length(mesh: Mesh, charts: Charts) -> float:
+    """Length of the edges in front whose two faces do not share them in the texture."""
+    f, t = mesh.faces, charts.faces
+    low, high = (pick(f, np.roll(f, -1, 1)).T.ravel() for pick in (np.minimum, np.maximum))
+    order = np.lexsort((high, low))
+    first, second = order[:-1], order[1:]
+    pair = (low[first] == low[second]) & (high[first] == high[second])
+    first, second = first[pair], second[pair]
+    ends = [np.concatenate([t[:, i] for i in turn]) for turn in ((0, 1, 2), (1, 2, 0))]
+    joined = (ends[0][first] == ends[1][second]) & (ends[1][first] == ends[0][second])
+    x = mesh.vertices.astype(np.float64)
+    normal = meshes.vertex_normals(x, f).astype(np.float64)
+    a, b = low[first], high[first]
+    facing = 0.5 * (normal[a] + normal[b]) @ FRONT > FACING
+    return float(np.linalg.norm(x[a] - x[b], axis=1)[~joined & facing].sum())
+
+
+def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple[float, float]:
+    """Area-weighted L2 and largest Linf, with the texture scaled so that both areas agree; 1 for an isometry.
 
     L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
     """
@@ -68,4 +95,7 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> float
     square = 0.5 * ((s_u * s_u).sum(1) + (s_v * s_v).sum(1))
     area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
     scale = 0.5 * np.abs(twice).sum() / area.sum()
-    return float(np.sqrt((square * area).sum() / area.sum() * scale))
+    # singular values of J: those of J^T J by its trace and determinant
+    determinant = (s_u * s_u).sum(1) * (s_v * s_v).sum(1) - (s_u * s_v).sum(1) ** 2
+    larger = square + np.sqrt(np.maximum(square * square - determinant, 0))
+    return float(np.sqrt((square * area).sum() / area.sum() * scale)), float(np.sqrt(larger.max() * scale))

@@ -22,14 +22,14 @@ class Inputs:
 class Config(StageConfig):
     """Size of the meshes and how they are cut into charts."""
 
-    target_faces: int = Field(30_000, ge=200, le=2_000_000, description="triangles of the mesh that is textured")
-    proxy_faces: int = Field(4_000, ge=100, le=200_000, description="triangles of the coarse stand-in")
+    target_faces: int = Field(50_000, ge=200, le=2_000_000, description="triangles of the mesh that is textured")
+    proxy_faces: int = Field(5_000, ge=100, le=200_000, description="triangles of the coarse stand-in")
     texture_size: int = Field(1024, ge=256, le=8192, description="texture that the padding is measured in")
     padding: int = Field(4, ge=1, le=64, description="texels of texture_size between two charts")
     max_cost: float = Field(
-        12.0, gt=0, le=64, description="how bent a chart may get: higher gives fewer, larger, more stretched charts"
+        12.0, gt=0, le=64, description="how bent a chart of xatlas may get; for meshes that our own charts do not suit"
     )
-    iterations: int = Field(1, ge=1, le=8, description="rounds of growing charts from better seeds; slow")
+    iterations: int = Field(1, ge=1, le=8, description="rounds in which xatlas grows charts from better seeds; slow")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
@@ -58,9 +58,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         utilisation=built.quality.utilisation,
         stretch=built.quality.stretch,
         overlap=built.quality.overlap,
-        deviation_mm=1000 * built.deviation,
+        stretch_max=built.quality.stretch_max,
+        seam_front_mm=1000 * built.quality.seam_front,
+        deviation_mm=1000 * built.deviation.mean,
+        deviation_rms_mm=1000 * built.deviation.rms,
+        proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
         warnings=built.warnings,
     )
 
 
-STAGE = Stage(name="uv", version=1, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=2, inputs=Inputs, config=Config, output=UvMesh, run=run)

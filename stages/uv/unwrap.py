@@ -1,11 +1,12 @@
-"""Charts: cut and flatten with xatlas (MIT), turn mirrored charts over, pack.
+"""Charts of our own (stages.uv.charts), and xatlas's (MIT) for what these can't lay flat.
 
-The mesh is cut and flattened with its bumps smoothed away, in the same connectivity: noise in the surface would
-otherwise break the charts into hundreds of crumbs. What that costs is in the measured stretch.
+xatlas too cuts and flattens the mesh with its bumps smoothed away, in the same connectivity: noise in the surface
+would otherwise break its charts into hundreds of crumbs. Its mirrored charts are turned over.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,10 @@ import numpy as np
 from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
+from stages.uv.charts import unwrapped
 from stages.uv.pack import pack
 
+log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
 SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
 PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
@@ -37,7 +40,14 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
     """
-    uvs, faces = _cut(mesh, options)
+    span = float(np.ptp(mesh.vertices, axis=0).max())
+    points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
+    scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
+    own = unwrapped(scaled, points, options.padding / options.texture_size)
+    if own is not None:
+        return own
+    log.info("uv: charts of our own do not lie flat; xatlas takes over")
+    uvs, faces = _cut(points, mesh.faces, options)
     even = evened(turned_over(uvs, faces), faces, meshes.areas(mesh.vertices, mesh.faces))
     label = chart_of_face(faces, len(even))
     if label.max() < MANY_CHARTS:
@@ -61,26 +71,23 @@ def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
     return v
 
 
-def _cut(mesh: Mesh, options: Options) -> tuple[F64, Faces]:
+def _cut(points: F64, triangles: Faces, options: Options) -> tuple[F64, Faces]:
     """uvs (U, 2) in a common scale, one vertex for each place in each chart, and faces (F, 3)."""
     import xatlas
 
-    span = float(np.ptp(mesh.vertices, axis=0).max())
-    points = mesh.vertices.astype(np.float64) * (UNIT / span)
-    points = smoothed(points, mesh.faces, SMOOTH_SHARE * UNIT)
     atlas = xatlas.Atlas()
     charts, quick = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost, charts.max_iterations = options.max_cost, options.iterations
     quick.resolution, quick.padding, quick.bilinear = 256, 0, False  # thrown away: the charts are packed again
-    normals = meshes.vertex_normals(points, mesh.faces)
+    normals = meshes.vertex_normals(points, triangles)
     try:
-        atlas.add_mesh(points.astype(np.float32), mesh.faces.astype(np.uint32), normals)
+        atlas.add_mesh(points.astype(np.float32), triangles.astype(np.uint32), normals)
         atlas.generate(charts, quick)
         _, faces, uvs = atlas[0]
     except (RuntimeError, ValueError, IndexError) as e:
         raise _failed(str(e)) from e
     texels: F64 = np.asarray(uvs, np.float64) * np.array([atlas.width, atlas.height], np.float64)
-    return texels, _whole(faces, len(mesh.faces))
+    return texels, _whole(faces, len(triangles))
 
 
 def _whole(faces: object, expected: int) -> Faces:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.colour import LUMA, linear_from_srgb, srgb_from_linear
+from pipeline.colour import ACESCG, LUMA, REC709, acescg_from_linear, linear_from_srgb, rgb_from_rgb, srgb_from_linear
 
 
 def definition(c: float) -> float:
@@ -64,3 +64,28 @@ def test_numpy_and_torch_agree_in_single_precision() -> None:
 
 def test_luma_is_of_white() -> None:
     assert sum(LUMA) == pytest.approx(1)
+
+
+def test_acescg_by_the_published_matrix() -> None:
+    """Rec.709 (D65) to AP1 (ACES white) with Bradford, as OpenColorIO's built-in ACES configuration has it."""
+    published = [
+        [0.61309740, 0.33952315, 0.04737945],
+        [0.07019372, 0.91635388, 0.01345240],
+        [0.02061559, 0.10956977, 0.86981463],
+    ]
+    np.testing.assert_allclose(rgb_from_rgb(ACESCG, REC709), published, atol=2e-6)
+
+
+def test_white_and_grey_stay_and_the_way_back_is_the_inverse() -> None:
+    np.testing.assert_allclose(
+        acescg_from_linear(np.array([[0.18] * 3, [1.0] * 3, [0.0] * 3])), [[0.18] * 3, [1] * 3, [0] * 3], atol=1e-6
+    )
+    there, back = rgb_from_rgb(ACESCG, REC709), rgb_from_rgb(REC709, ACESCG)
+    np.testing.assert_allclose(there @ back, np.eye(3), atol=1e-12)
+
+
+def test_luminance_weights_are_those_of_the_primaries() -> None:
+    """The middle row of the matrix to XYZ."""
+    from pipeline.colour import _xyz_from_rgb
+
+    np.testing.assert_allclose(_xyz_from_rgb(REC709)[1], LUMA, atol=1e-4)

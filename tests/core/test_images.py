@@ -143,3 +143,24 @@ def test_shrink_is_the_mean_over_blocks() -> None:
     assert images.shrink(data, 1) is data
     with pytest.raises(ValueError, match="not a multiple of 4"):
         images.shrink(data, 4)
+
+
+def test_exr_headers_say_what_the_numbers_are(tmp_path: Path) -> None:
+    import OpenEXR
+
+    from pipeline.colour import ACESCG, REC709
+
+    rgb = np.zeros((2, 2, 3), np.float32)
+    images.write_exr(tmp_path / "a.exr", rgb)
+    images.write_exr(tmp_path / "b.exr", rgb, primaries=ACESCG)
+    images.write_exr(tmp_path / "c.exr", rgb, primaries=None)
+    images.write_exr(tmp_path / "d.exr", rgb[..., :1], units="mm")
+    headers = {}
+    for name in "abcd":
+        with OpenEXR.File(str(tmp_path / f"{name}.exr")) as f:
+            headers[name] = dict(f.header())  # emptied when the file closes
+    np.testing.assert_allclose(headers["a"]["chromaticities"], REC709, atol=1e-6)
+    np.testing.assert_allclose(headers["b"]["chromaticities"], ACESCG, atol=1e-6)
+    assert "chromaticities" not in headers["c"] and "chromaticities" not in headers["d"]
+    assert headers["d"]["units"] == "mm" and "units" not in headers["a"]
+    assert all(h["software"] == images.SOFTWARE for h in headers.values())

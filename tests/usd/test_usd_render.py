@@ -32,6 +32,18 @@ def test_alpha_is_the_disc() -> None:
     np.testing.assert_allclose(image[..., 0], 0.4 * image[..., 3], atol=1e-4)  # premultiplied
 
 
+def test_soft_silhouettes_keep_the_disc_and_its_inside() -> None:
+    """samples = 0: a triangle filter on the edge moves no area and leaves the inside alone."""
+    view = orbit_view(RADIUS, 0.0, 128)
+    sharp, soft = (Renderer(asset()).render(view, samples=n) for n in (8, 0))
+    assert soft[..., 3].sum() == pytest.approx(sharp[..., 3].sum(), rel=5e-4)
+    within = (sharp[..., 3] > 0.02) & (sharp[..., 3] < 0.98)
+    mixed = (soft[..., 3] > 0.02) & (soft[..., 3] < 0.98)
+    assert mixed.sum() > 1.4 * within.sum()  # two pixels wide in place of one
+    np.testing.assert_allclose(soft[..., 0], 0.4 * soft[..., 3], atol=1e-4)
+    assert np.abs(soft - sharp)[40:88, 40:88].max() < 1e-6
+
+
 def test_first_order_light() -> None:
     """E(n) = pi L_0 + (2 pi / 3) L_1 . n with L(d) = L_0 + L_1 . d."""
     light = np.zeros((121, 3), np.float32)

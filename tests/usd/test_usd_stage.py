@@ -465,3 +465,19 @@ def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path)
     np.testing.assert_allclose(read.albedo, arrays["albedo"], atol=1e-6)
     np.testing.assert_allclose(read.occlusion, ratio, atol=1e-6)
     assert not (tmp_path / "work/asset/textures/head_occlusion.exr").exists()
+
+
+def test_acescg_albedo_on_request(exported, tmp_path: Path) -> None:
+    """The same colours in other primaries; what the networks read stays linear Rec.709."""
+    import OpenEXR
+
+    from pipeline.colour import ACESCG, REC709, rgb_from_rgb
+
+    assert not (exported[0] / "asset/textures/head_albedo_acescg.exr").exists()
+    made = run(write_inputs(tmp_path / "in"), tmp_path / "out", acescg=True, usdz=False, glb=False, obj=False)
+    assert "asset/textures/head_albedo_acescg.exr" in {f.path for f in made.files}
+    textures = tmp_path / "out/asset/textures"
+    plain, wide = (read_exr(textures / f"head_albedo{s}.exr")[0][..., :3] for s in ("", "_acescg"))
+    np.testing.assert_allclose(wide, plain @ rgb_from_rgb(ACESCG, REC709).T, atol=1e-5)
+    with OpenEXR.File(str(textures / "head_albedo_acescg.exr")) as f:
+        np.testing.assert_allclose(f.header()["chromaticities"], ACESCG, atol=1e-6)

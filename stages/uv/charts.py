@@ -1,0 +1,161 @@
+"""From a mesh to charts: pieces, laid flat, parted where that helps, packed.
+
+Pieces are found and first laid flat on the mesh with its bumps smoothed away, because noise would break them into
+crumbs; the last rigid steps are on the true surface, so that the stretch that counts is the true one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline import meshes, raster
+from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
+from stages.uv.flatten import Flat, flattened, rigid, signed, unfolded
+from stages.uv.pack import LOOSEST, boxed, pack
+from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment
+
+TRUE_STEPS = 6  # rigid steps on the true surface
+LARGE = 0.2  # of the area: such charts are parted when they fill too little of their rectangle
+FULL = 0.7  # of its rectangle that a large chart should fill
+TRIES = 5  # packings
+ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
+WORTH = 0.005  # of the square: a packing that gains less is not looked for
+MOST_CHARTS = 40
+CHECK = 768  # texels along a chart's longest side: where two layers of it would show
+
+
+@dataclass(frozen=True, slots=True)
+class _Surface:
+    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one."""
+
+    smooth: F64
+    true: F64
+    faces: Faces
+    area: F64
+    pairs: Dual
+    weight: F64
+
+
+def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
+    """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
+
+    smooth: (V, 3) vertices without bumps. padding: between charts, in uv.
+    """
+    weight = seam_weights(smooth, mesh.faces)
+    pairs = dual(smooth, mesh.faces, weight)
+    area = meshes.areas(smooth, mesh.faces)
+    surface = _Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight)
+    label = segment(smooth, mesh.faces, pairs)
+    known: dict[bytes, Flat] = {}
+    best: tuple[float, Charts] | None = None
+    packed = 0
+    while packed < TRIES and int(label.max()) < MOST_CHARTS:
+        flats = _flats(surface, label, known)
+        part = _must_part(surface, flats)
+        if part is None:
+            packed += 1
+            charts = _packed(mesh, flats, padding, LOOSEST if best is None else best[0] + WORTH)
+            if charts is not None:
+                best = _share(charts), charts
+            if best is not None and best[0] >= ENOUGH:
+                break
+            part = _worth_parting(surface, flats)
+        pieces = int(label.max())
+        label = _parted(surface, label, flats[part])
+        if int(label.max()) <= pieces:  # a piece of one face
+            break
+    return None if best is None else best[1]
+
+
+def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
+    """Every piece laid flat; pieces seen before are taken from `known`."""
+    count = int(label.max()) + 1
+    order = np.argsort(label, kind="stable")
+    keys = [m.tobytes() for m in np.split(order, np.searchsorted(label[order], np.arange(1, count)))]
+    new = np.array([k not in known for k in keys])
+    for flat in flattened(surface.smooth, surface.faces, surface.pairs, label, new):
+        known[flat.member.tobytes()] = _on_true_surface(surface, flat)
+    return [known[k] for k in keys]
+
+
+def _on_true_surface(surface: _Surface, flat: Flat) -> Flat:
+    """The last steps on the true surface, unless the chart's jagged border came to lie over itself by them."""
+    if not len(flat.uv):
+        return flat
+    faces = flat.faces.astype(np.int64)
+    uv = unfolded(faces, rigid(surface.true[flat.vertex], faces, flat.uv, TRUE_STEPS))
+    for choice in (uv, flat.uv):
+        if bool((signed(choice, faces) > 0).all()) and not lies_over_itself(choice, flat.faces):
+            return replace(flat, uv=choice, good=True)
+    return replace(flat, good=False)
+
+
+def lies_over_itself(uv: F64, faces: Faces) -> bool:
+    """Whether any of CHECK x CHECK texels across a chart is under two of its faces."""
+    low = uv.min(0)
+    square = ((uv - low) / max(float((uv.max(0) - low).max()), 1e-30)).astype(np.float32)
+    return bool((raster.layers(raster.texel_corners(Charts(square, faces), CHECK), CHECK) > 1).any())
+
+
+def _must_part(surface: _Surface, flats: list[Flat]) -> int | None:
+    """A piece that is no disc or folds over, else a large one that fills too little of its rectangle."""
+    for i, flat in enumerate(flats):
+        if not flat.good:
+            return i
+    total = surface.area.sum()
+    for i, flat in enumerate(flats):
+        if surface.area[flat.member].sum() > LARGE * total and _fill(flat) < FULL and not _front(surface, flat) > 0.5:
+            return i
+    return None
+
+
+def _fill(flat: Flat) -> float:
+    """Share of the smallest rectangle around a chart that it covers."""
+    width, height = np.ptp(boxed(flat.uv), axis=0)
+    return float(0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum() / max(width * height, 1e-30))
+
+
+def _front(surface: _Surface, flat: Flat) -> float:
+    """Mean over a chart of how costly its seams would be, 0 at the back, 1 in front."""
+    w = surface.weight[surface.faces[flat.member]].mean(1)
+    a = surface.area[flat.member]
+    return float((a * (w - 1)).sum() / (a.sum() * max(float(surface.weight.max()) - 1, 1e-30)))
+
+
+def _worth_parting(surface: _Surface, flats: list[Flat]) -> int:
+    """The chart that leaves most of its rectangle empty, those in front last."""
+    loss = [(1 - _fill(f)) * surface.area[f.member].sum() * (1 - _front(surface, f)) if f.good else 0.0 for f in flats]
+    return int(np.argmax(loss))
+
+
+def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
+    """One piece in two, across its longest direction (in the chart where there is one, else in space)."""
+    corners = flat.uv[flat.faces] if flat.good else surface.smooth[surface.faces[flat.member]]
+    centre = corners.mean(1) - corners.mean((0, 1))
+    along = centre @ np.linalg.svd(centre, full_matrices=False)[2][0]
+    place = np.zeros(len(label))
+    place[flat.member] = along
+    parted = halved(place, label, int(label[flat.member[0]]), surface.area, surface.pairs)
+    return connected(parted, surface.pairs)
+
+
+def _packed(mesh: Mesh, flats: list[Flat], padding: float, least: float) -> Charts | None:
+    """All charts in one square at one scale against the true surface, if `least` of it comes under charts."""
+    area = meshes.areas(mesh.vertices, mesh.faces)
+    faces = np.zeros((len(mesh.faces), 3), np.int32)
+    label = np.zeros(len(mesh.faces), np.int64)
+    parts, first = [], 0
+    for i, flat in enumerate(flats):
+        own = 0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum()
+        parts.append(flat.uv * np.sqrt(area[flat.member].sum() / max(own, 1e-30)))
+        faces[flat.member], label[flat.member] = flat.faces + first, i
+        first += len(flat.uv)
+    placed: F32 | None = pack(np.concatenate(parts), faces, label, padding, least)
+    return None if placed is None else Charts(placed, faces)
+
+
+def _share(charts: Charts) -> float:
+    """Share of the square under charts."""
+    return float(0.5 * signed(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)).sum())

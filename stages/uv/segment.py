@@ -1,0 +1,224 @@
+"""Where a mesh is cut into charts: pieces that bend little, with borders that keep off the front of the face.
+
+Symbols, for a set X of faces with areas a and unit normals n
+    N_X     sum of a n
+    D_X     sum of a less |N_X|: 0 for a flat set, half its area for a hemisphere, all of it for a closed one
+    bend    D_X over its area
+    w       what a metre of border costs, per edge (seam_weights)
+
+Pieces grow from single faces: in each round two neighbours that are each other's best merge, best being the smallest
+growth of D for the border that goes away (hierarchical clustering as Garland 2001 has it, with the border's cost in
+the place of his shape term). Borders are then straightened by moving single faces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.meshes import F64, Faces, Indices, Mask
+
+FRONT = np.array([0.0, 0.0, 1.0])  # asset coordinates: the subject looks along +Z
+FRONT_COST = 12.0  # times what a seam elsewhere costs
+FRONT_FROM, FRONT_TO = 0.1, 0.5  # cosines to FRONT between which the cost grows
+BEND = 0.4  # most bend of a chart: a little more than half a cylinder (0.36), less than half a sphere (0.5)
+FRONT_BEND = 0.6  # where the border that would go away lies in front: a face reaches from ear to ear
+LARGER_BEND = 0.5  # allowed when a crumb is taken up
+CRUMB = 0.012  # of the area: smaller pieces are given to a neighbour
+ROUNDS = 400
+ENDS = 0.3  # of a piece: where its ends are when it is parted
+FLOW = 20_000  # largest capacity of an edge, in whole numbers
+SWEEPS, STRAIGHTEN = 24, 0.06  # of the span: how much border length weighs against bending
+
+
+@dataclass(frozen=True, slots=True)
+class Dual:
+    """Neighbouring faces: a, b (E,), their edge's vertices (E, 2), its length (E,), and the length times w (E,)."""
+
+    a: Indices
+    b: Indices
+    edge: Indices
+    length: F64
+    cost: F64
+
+
+def seam_weights(vertices: F64, faces: Faces) -> F64:
+    """(V,) what a seam costs at each vertex: 1, up to 1 + FRONT_COST where the surface looks to the front."""
+    normals = meshes.vertex_normals(vertices, faces).astype(np.float64)
+    t = ((normals @ FRONT - FRONT_FROM) / (FRONT_TO - FRONT_FROM)).clip(0, 1)
+    return np.asarray(1 + FRONT_COST * t * t * (3 - 2 * t), np.float64)
+
+
+def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
+    """Pairs of faces across each edge of a closed manifold, in a fixed order."""
+    e = meshes.edges(faces)
+    low, high = e.min(1), e.max(1)
+    order = np.argsort(low * (len(vertices) + 1) + high, kind="stable")
+    first, second = order[::2], order[1::2]
+    edge = np.stack([low[first], high[first]], 1)
+    length = np.linalg.norm(vertices[edge[:, 0]] - vertices[edge[:, 1]], axis=1)
+    return Dual(first % len(faces), second % len(faces), edge, length, length * weights[edge].mean(1))
+
+
+def segment(vertices: F64, faces: Faces, pairs: Dual) -> Indices:
+    """(F,) piece of each face, numbered from 0; every piece hangs together."""
+    vectors = meshes.area_vectors(vertices, faces)
+    area = np.linalg.norm(vectors, axis=1)
+    label = _grown(vectors, area, pairs)
+    label = _straightened(label, vectors, area, pairs, float(np.ptp(vertices, axis=0).max()))
+    label = connected(label, pairs)
+    return _without_crumbs(label, vectors, area, pairs)
+
+
+def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
+    """(F,) labels split where a piece does not hang together (`cut` (E,): edges that part faces as well)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    same = label[pairs.a] == label[pairs.b]
+    same &= True if cut is None else ~cut
+    n = len(label)
+    graph = coo_array((np.ones(int(same.sum()), np.int8), (pairs.a[same], pairs.b[same])), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def _bent(normal: F64, area: F64) -> F64:
+    return np.asarray(area - np.linalg.norm(normal, axis=-1), np.float64)
+
+
+def _sums(label: Indices, vectors: F64, area: F64) -> tuple[F64, F64]:
+    count = int(label.max()) + 1
+    normal = np.stack([np.bincount(label, vectors[:, i], count) for i in range(3)], 1)
+    return np.asarray(normal, np.float64), np.asarray(np.bincount(label, area, count), np.float64)
+
+
+def _borders(label: Indices, pairs: Dual) -> tuple[Indices, Indices, F64, F64]:
+    """Neighbouring pieces a < b, the cost of the border between them, and how far in front it lies, in [0, 1]."""
+    count = int(label.max()) + 1
+    a, b = label[pairs.a], label[pairs.b]
+    across = a != b
+    code = np.minimum(a, b)[across] * count + np.maximum(a, b)[across]
+    found, inverse = np.unique(code, return_inverse=True)
+    cost, length = (np.bincount(inverse, x[across], len(found)) for x in (pairs.cost, pairs.length))
+    front = (cost / np.maximum(length, 1e-30) - 1) / FRONT_COST
+    a, b = found // count, found % count
+    return a, b, np.asarray(cost, np.float64), np.asarray(front.clip(0, 1), np.float64)
+
+
+def _grown(vectors: F64, area: F64, pairs: Dual) -> Indices:
+    """Merge mutual best neighbours until no two may merge."""
+    label = np.arange(len(area))
+    for _ in range(ROUNDS):
+        normal, size = _sums(label, vectors, area)
+        a, b, cost, front = _borders(label, pairs)
+        joint = _bent(normal[a] + normal[b], size[a] + size[b])
+        most = BEND + (FRONT_BEND - BEND) * front
+        growth = joint - _bent(normal[a], size[a]) - _bent(normal[b], size[b])
+        score = np.where(joint <= most * (size[a] + size[b]), (growth + 1e-9 * size.sum()) / cost, np.inf)
+        chosen = _mutual(a, b, score, len(size))
+        if not chosen.any():
+            break
+        into = np.arange(len(size))
+        into[b[chosen]] = a[chosen]
+        label = np.unique(into[label], return_inverse=True)[1].reshape(-1)
+    return np.asarray(label, np.int64)
+
+
+def _mutual(a: Indices, b: Indices, score: F64, count: int) -> Mask:
+    """Pairs that are the best of both their pieces (ties: the first pair)."""
+    order = np.lexsort((np.arange(len(score)), score))
+    order = order[np.isfinite(score[order])]
+    best = np.full(count, -1)
+    both, which = np.concatenate([a[order], b[order]]), np.concatenate([order, order])
+    rank = np.concatenate([np.arange(len(order))] * 2)
+    first = np.lexsort((rank, both))
+    keep = first[np.flatnonzero(np.diff(both[first], prepend=-1))]
+    best[both[keep]] = which[keep]
+    out = np.zeros(len(score), np.bool_)
+    out[order] = (best[a[order]] == order) & (best[b[order]] == order)
+    return out
+
+
+def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: float) -> Indices:
+    """Faces move to a neighbour's piece where that costs less: bending + STRAIGHTEN span * border.
+
+    Half of the faces may move in one sweep, so that two neighbours do not swap for ever.
+    """
+    n = len(area)
+    unit = vectors / np.maximum(area, 1e-30)[:, None]
+    near = np.full((n, 3), -1)
+    cost = np.zeros((n, 3))
+    faces, others = np.concatenate([pairs.a, pairs.b]), np.concatenate([pairs.b, pairs.a])
+    order = np.argsort(faces, kind="stable")
+    slot = np.arange(len(order)) - np.searchsorted(faces[order], faces[order])
+    near[faces[order], slot] = others[order]
+    cost[faces[order], slot] = np.concatenate([pairs.cost, pairs.cost])[order]
+    for sweep in range(SWEEPS):
+        normal, _ = _sums(label, vectors, area)
+        axis = meshes.unit(normal)
+        theirs = label[near]
+        options = np.concatenate([label[:, None], theirs], 1)
+        bending = area[:, None] * (1 - np.einsum("fc,foc->fo", unit, axis[options]))
+        border = (cost[:, None] * (theirs[:, None] != options[:, :, None])).sum(2)
+        best = (bending + STRAIGHTEN * span / len(axis) * border).argmin(1)
+        moving = (best > 0) & (np.arange(n) * 2654435761 % 4294967296 % 2 == sweep % 2)
+        if sweep > 1 and not moving.any():
+            break
+        label = np.where(moving, options[np.arange(n), best], label)
+    return label
+
+
+def _without_crumbs(label: Indices, vectors: F64, area: F64, pairs: Dual) -> Indices:
+    """Pieces below CRUMB of the area go to the neighbour with the costliest border that bears it."""
+    total = area.sum()
+    for _ in range(ROUNDS):
+        normal, size = _sums(label, vectors, area)
+        a, b, cost, _ = _borders(label, pairs)
+        joint = _bent(normal[a] + normal[b], size[a] + size[b])
+        least = np.minimum(size[a], size[b])
+        allowed = (least < CRUMB * total) & (joint <= LARGER_BEND * (size[a] + size[b]))
+        if not allowed.any():
+            break
+        pick = np.flatnonzero(allowed)
+        pick = pick[np.lexsort((-cost[pick], least[pick]))[0]]
+        label = np.where(label == b[pick], a[pick], label)
+        label = np.unique(label, return_inverse=True)[1].reshape(-1)
+    return np.asarray(label, np.int64)
+
+
+def halved(place: F64, label: Indices, which: int, area: F64, pairs: Dual) -> Indices:
+    """Piece `which` of `label` parted where the border is cheapest between its two ends: the least cut in the graph
+    of its faces.
+
+    place: (F,) how far along the piece each of its faces lies; the ends are the first and last ENDS of its area.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+    own = np.flatnonzero(label == which)
+    row = np.full(len(label), -1)
+    row[own] = np.arange(len(own))
+    inside = (row[pairs.a] >= 0) & (row[pairs.b] >= 0)
+    order = own[np.argsort(place[own], kind="stable")]
+    share = np.cumsum(area[order]) / area[order].sum()
+    first, last = row[order[share <= ENDS]], row[order[share >= 1 - ENDS]]
+    n = len(own)
+    scale = FLOW / pairs.cost[inside].max()
+    capacity = np.maximum(pairs.cost[inside] * scale, 1).astype(np.int32)
+    a, b = row[pairs.a[inside]], row[pairs.b[inside]]
+    endless = np.full(len(first) + len(last), 2**30, np.int32)
+    rows = np.concatenate([a, b, np.full(len(first), n), last])
+    columns = np.concatenate([b, a, first, np.full(len(last), n + 1)])
+    graph = coo_array((np.concatenate([capacity, capacity, endless]), (rows, columns)), shape=(n + 2, n + 2)).tocsr()
+    flow = maximum_flow(graph, n, n + 1).flow
+    left = (graph - flow).tocsr()
+    left.data[left.data < 0] = 0
+    left.eliminate_zeros()
+    reached = breadth_first_order(left, n, return_predecessors=False)
+    beyond = np.ones(n + 2, np.bool_)
+    beyond[reached] = False
+    out = label.copy()
+    out[own[beyond[:n]]] = int(label.max()) + 1
+    return out
