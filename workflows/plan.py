@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
@@ -19,22 +19,35 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 class RunRequest(BaseModel):
-    """A run as the user asks for it: plain data, the same from the command line and from a deployment."""
+    """A run as the user asks for it: plain data, the same from the command line and from a deployment.
+
+    The deployment's form is made of these fields (workflows/forms.py).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    capture: str
-    out: str
-    preset: str = DEFAULT_PRESET
-    holdout: str | None = None
-    name: str | None = None
-    seed: int = 0
-    device: str = "auto"
-    until: str | None = None
-    from_stage: str | None = None
-    sets: tuple[str, ...] = ()
-    config: dict[str, dict[str, Any]] = {}
-    store: str | None = None
+    capture: str = Field(min_length=1, description="folder with the photos; absolute, as the worker sees it")
+    out: str = Field(min_length=1, description="folder for the results; made if it is not there")
+    preset: str = Field(default=DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
+    holdout: str | None = Field(
+        default=None, description='views kept from the fit and used for the metrics: "every:5:2" or "names:a.jpg,b.jpg"'
+    )
+    name: str | None = Field(default=None, description="name of the asset")
+    seed: int = Field(default=0, ge=0, description="of every random draw")
+    device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
+    until: str | None = Field(default=None, description="last stage to run")
+    from_stage: str | None = Field(
+        default=None, description="this stage and those after it run even if the store has them"
+    )
+    sets: tuple[str, ...] = Field(default=(), description='single settings, "stage.key=value"')
+    config: dict[str, dict[str, Any]] = Field(default={}, description="settings by stage, then by key")
+    store: str | None = Field(default=None, description="folder of finished stages; OUT/.store by default")
+    stage_limit: float | None = Field(
+        default=None, gt=0, description="seconds that one stage may take; none by default"
+    )
+    fit_slots: str | None = Field(
+        default=None, description="name of a global concurrency limit; the fit holds one of its slots (a GPU, say)"
+    )
 
     @property
     def store_path(self) -> Path:

@@ -1,0 +1,153 @@
+"""A batch whose stages are the real capture, a toy that works in steps with checkpoints, and a toy asset.
+
+As a module it offers the flow to a Prefect worker; as a program it is `neuface` (or, with --child, one capture's
+process) with these stages. Every stage that comes to its end adds a line to the file $NEUFACE_TALLY.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pipeline.threads  # noqa: F401
+from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
+from pipeline.contract import Context, Stage, StageConfig
+from stages import registry
+from stages.capture.stage import STAGE as CAPTURE
+from workflows import batch_local
+
+
+class Worked(Artifact):
+    """What the toy made."""
+
+    file: FileRef
+
+
+@dataclass(frozen=True, slots=True)
+class WorkInputs:
+    capture: Located[Capture]
+
+
+@dataclass(frozen=True, slots=True)
+class UsdInputs:
+    work: Located[Worked]
+
+
+class WorkConfig(StageConfig):
+    steps: int = 4
+    pause: float = 0.05
+    batch: int = 1024
+    fault: str = ""
+
+
+class UsdConfig(StageConfig):
+    name: str = "head"
+
+
+def tally(stage: str, inputs: str) -> None:
+    path = os.environ.get("NEUFACE_TALLY")
+    if path:
+        with Path(path).open("a") as f:
+            f.write(f"{stage} {inputs}\n")
+
+
+def run_capture(inputs: Any, config: Any, context: Context) -> Capture:
+    made = CAPTURE.run(inputs, config, context)
+    tally("capture", inputs.source.artifact.digest()[:16])
+    return made
+
+
+def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked:
+    """As many steps as asked, a checkpoint after each; ends as its setting says."""
+    checkpoint = context.scratch / "step.txt"
+    begin = int(checkpoint.read_text()) if checkpoint.is_file() else 0
+    for step in range(begin, config.steps):
+        context.check()
+        context.progress(step, config.steps, "working")
+        time.sleep(config.pause)
+        checkpoint.write_text(str(step + 1))
+    if config.fault == "hangs":
+        while True:
+            time.sleep(0.05)
+    if config.fault == "hangs in C":  # with Python's lock held: no thread of Python runs any more
+        ctypes.PyDLL(None).sleep(600)
+    if config.fault == "hangs politely":
+        while True:
+            context.check()
+            time.sleep(0.05)
+    if config.fault == "memory" and config.batch > 600:
+        raise MemoryError("can't allocate memory: you tried to allocate 1 TB")
+    if config.fault == "killed once" and not (context.scratch / "killed").exists():
+        (context.scratch / "killed").write_text("")
+        os.kill(os.getpid(), 9)
+    (context.workdir / "w.bin").write_bytes(inputs.capture.artifact.digest().encode() * 1000)
+    tally("work", inputs.capture.artifact.digest()[:16])
+    return Worked(file=context.file("w.bin"))
+
+
+def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
+    """A folder that looks like an asset."""
+    root = context.workdir / "asset" / f"{config.name}.usd"
+    root.parent.mkdir()
+    root.write_text(f'#usda 1.0\ndef "x" {{}} # {inputs.work.artifact.file.sha256}\n')
+    tally("usd", inputs.work.artifact.digest()[:16])
+    return UsdAsset(name=config.name, root=f"asset/{config.name}.usd", files=(context.file(root),), checks=0)
+
+
+TOYS: tuple[Stage[Any, Any, Any], ...] = (
+    Stage("capture", CAPTURE.version, CAPTURE.inputs, CAPTURE.config, Capture, run_capture),
+    Stage("work", 1, WorkInputs, WorkConfig, Worked, run_work),
+    Stage("usd", 1, UsdInputs, UsdConfig, UsdAsset, run_usd),
+)
+registry.REGISTRY = TOYS
+batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
+
+
+def write_tree(root: Path, captures: dict[str, bool], side: int = 64) -> None:
+    """FaceScape's layout: ID/EXPRESSION/params.json and three photos; False: one photo is cut off."""
+    import cv2
+    import numpy as np
+
+    for number, (name, whole) in enumerate(captures.items()):
+        folder = root / name
+        folder.mkdir(parents=True)
+        params: dict[str, Any] = {}
+        for view in range(3):
+            rng = np.random.default_rng([number, view])
+            picture = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (side, side))
+            data = cv2.imencode(".jpg", picture)[1].tobytes()
+            if view == 1 and not whole:
+                data = data[: len(data) // 2]
+            (folder / f"{view}.jpg").write_bytes(data)
+            place = [[1.0, 0, 0, 0.1 * view], [0, 1.0, 0, 0], [0, 0, 1.0, 1.0]]
+            params |= {
+                f"{view}_K": [[100.0, 0, side / 2], [0, 100.0, side / 2], [0, 0, 1.0]],
+                f"{view}_Rt": place,
+                f"{view}_distortion": [0.0] * 5,
+                f"{view}_width": side,
+                f"{view}_height": side,
+                f"{view}_valid": True,
+                f"{view}_ori": 0,
+                f"{view}_sn": "1",
+            }
+        (folder / "params.json").write_text(json.dumps(params))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        from workflows.batch_child import main as child
+
+        sys.exit(child(sys.argv[2:]))
+    from workflows.cli import main
+
+    sys.exit(main())
+else:  # what a worker's entrypoint names
+    from workflows.flows import capture_to_asset, facescape_batch
+
+    __all__ = ["capture_to_asset", "facescape_batch", "tally", "write_tree"]
