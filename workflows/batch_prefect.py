@@ -141,7 +141,7 @@ class Pool:
                 value=self.request.deployment,
                 limit="a deployment of the flow capture-to-asset",
                 remedy="deploy it first: prefect --no-prompt deploy --prefect-file workflows/prefect.yaml "
-                f"-n {self.request.deployment}",
+                f"-n {self.request.deployment.rpartition('/')[2]}",
             ) from e
         if self.request.priority and deployment.work_pool_name:
             self._queue(deployment.work_pool_name, self.request.priority)

@@ -20,7 +20,7 @@ from pipeline.errors import StageError
 from workflows import environment
 from workflows.interrupt import deaf_children
 
-NAME = "local"
+NAME, BATCH = "local", "batch-local"  # as in prefect.yaml
 START = 180.0  # seconds that a server may take to start
 
 
@@ -35,10 +35,10 @@ def serve(host: str, port: int, limit: int, home: Path, said: Callable[[str], No
 
         from workflows.flows import capture_to_asset, facescape_batch
 
-        said(f"serving capture-to-asset/{NAME} and facescape-batch/{NAME} from {os.environ['PREFECT_API_URL']}")
+        said(f"serving capture-to-asset/{NAME} and facescape-batch/{BATCH} from {os.environ['PREFECT_API_URL']}")
         served: Any = (
             capture_to_asset.to_deployment(NAME, concurrency_limit=limit, tags=["neuface"]),
-            facescape_batch.to_deployment(NAME, concurrency_limit=1, tags=["neuface"]),
+            facescape_batch.to_deployment(BATCH, concurrency_limit=1, tags=["neuface"]),
         )
         serve_all(*served, limit=limit + 1)  # a batch waits for its captures: it must not hold the slot they need
     return 0

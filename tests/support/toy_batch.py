@@ -7,7 +7,6 @@ process) with these stages. Every stage that comes to its end adds a line to the
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import sys
 import time
@@ -109,36 +108,6 @@ registry.REGISTRY = TOYS
 batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
 
 
-def write_tree(root: Path, captures: dict[str, bool], side: int = 64) -> None:
-    """FaceScape's layout: ID/EXPRESSION/params.json and three photos; False: one photo is cut off."""
-    import cv2
-    import numpy as np
-
-    for number, (name, whole) in enumerate(captures.items()):
-        folder = root / name
-        folder.mkdir(parents=True)
-        params: dict[str, Any] = {}
-        for view in range(3):
-            rng = np.random.default_rng([number, view])
-            picture = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (side, side))
-            data = cv2.imencode(".jpg", picture)[1].tobytes()
-            if view == 1 and not whole:
-                data = data[: len(data) // 2]
-            (folder / f"{view}.jpg").write_bytes(data)
-            place = [[1.0, 0, 0, 0.1 * view], [0, 1.0, 0, 0], [0, 0, 1.0, 1.0]]
-            params |= {
-                f"{view}_K": [[100.0, 0, side / 2], [0, 100.0, side / 2], [0, 0, 1.0]],
-                f"{view}_Rt": place,
-                f"{view}_distortion": [0.0] * 5,
-                f"{view}_width": side,
-                f"{view}_height": side,
-                f"{view}_valid": True,
-                f"{view}_ori": 0,
-                f"{view}_sn": "1",
-            }
-        (folder / "params.json").write_text(json.dumps(params))
-
-
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         from workflows.batch_child import main as child
@@ -150,4 +119,4 @@ if __name__ == "__main__":
 else:  # what a worker's entrypoint names
     from workflows.flows import capture_to_asset, facescape_batch
 
-    __all__ = ["capture_to_asset", "facescape_batch", "tally", "write_tree"]
+    __all__ = ["capture_to_asset", "facescape_batch"]

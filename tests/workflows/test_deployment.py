@@ -81,8 +81,9 @@ def test_deployment_run_on_a_server_with_a_worker(
         environment, tmp_path / "server.log", "server", "start", "--host", "127.0.0.1", "--port", port, cwd=repo
     ):
         wait_healthy(url)
-        call(environment, "work-pool", "create", "heads", "--type", "process", cwd=repo)
-        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        for pool in ("heads", "batches"):
+            call(environment, "work-pool", "create", pool, "--type", "process", cwd=repo)
+        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "-n", "*local", cwd=repo)
         with running(
             environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
         ):
