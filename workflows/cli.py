@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
-from workflows import batch_commands, bench, commands, store_commands
+from workflows import batch_commands, bench, commands, schedule, store_commands
 from workflows.console import Console
 
 EXAMPLES = """examples:
@@ -57,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
     bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations"))
     batch_commands.add_commands(commands_of)
     store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
+    schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)

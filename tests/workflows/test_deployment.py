@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 
 from pipeline.images import write_png
+from workflows.batch_request import BatchRequest
+from workflows.plan import RunRequest
 
 PREFECT = Path(sys.executable).parent / "prefect"
 
@@ -81,9 +83,11 @@ def test_deployment_run_on_a_server_with_a_worker(
         environment, tmp_path / "server.log", "server", "start", "--host", "127.0.0.1", "--port", port, cwd=repo
     ):
         wait_healthy(url)
-        for pool in ("heads", "batches"):
-            call(environment, "work-pool", "create", pool, "--type", "process", cwd=repo)
-        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "-n", "*local", cwd=repo)
+        for kind, end in (("process", ""), ("docker", "-docker"), ("kubernetes", "-kubernetes")):
+            for pool in ("heads", "batches"):
+                call(environment, "work-pool", "create", f"{pool}{end}", "--type", kind, cwd=repo)
+        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        deployed = {d["name"]: d for d in ask(url, "/deployments/filter", {})}
         with running(
             environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
         ):
@@ -103,6 +107,16 @@ def test_deployment_run_on_a_server_with_a_worker(
     assert bad.returncode != 0
     assert not (tmp_path / "bad").exists()
     assert [(t["name"], t["state_type"]) for t in tasks] == [("capture", "COMPLETED")]
+    ends = ("local", "docker", "kubernetes")
+    assert set(deployed) == {*ends, *(f"batch-{e}" for e in ends)}
+    for name, deployment in deployed.items():
+        fields = deployment["parameter_openapi_schema"]["properties"]
+        model = BatchRequest if name.startswith("batch-") else RunRequest
+        assert list(fields) == list(model.model_fields)
+        assert all(fields[n]["description"] == f.description for n, f in model.model_fields.items())
+        assert fields["preset"]["default"] == "draft" and deployment["enforce_parameter_schema"]
+    assert deployed["docker"]["job_variables"]["volumes"] == ["/photos:/photos:ro", "/runs:/runs"]
+    assert deployed["kubernetes"]["work_pool_name"] == "heads-kubernetes"
     assert artifacts["progress-capture"]["data"] == 100
     assert "| capture |" in artifacts["run"]["data"]
     assert str(out) in artifacts["run"]["data"]
