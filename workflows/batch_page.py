@@ -82,7 +82,7 @@ def _find_odd(rows: Sequence[Row]) -> None:
             continue
         middle = statistics.median(values)
         spread = statistics.median(abs(v - middle) for v in values)
-        scale = max(spread, 1e-3 * abs(middle), 1e-12)  # equal figures: a thousandth of them is no outlier yet
+        scale = max(spread, 1e-2 * abs(middle), 1e-12)  # where all are alike, a few hundredths are no outlier yet
         for row in rows:
             score = MAD * abs(row.figures[name] - middle) / scale if name in row.figures else 0.0
             if score > row.odd:
@@ -152,4 +152,10 @@ def _replace(path: Path, text: str) -> None:
 def _template() -> Template:
     source = (files("workflows") / "templates" / "batch.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["figure"] = _figure
     return environment.from_string(source)
+
+
+def _figure(value: float) -> str:
+    """Four digits, and whole numbers in full."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"

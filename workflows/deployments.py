@@ -32,13 +32,15 @@ def serve(host: str, port: int, limit: int, home: Path, said: Callable[[str], No
         if own:
             os.environ["PREFECT_API_URL"] = f"http://{_reachable(host)}:{port}/api"
         from prefect import serve as serve_all
+        from prefect.types.entrypoint import EntrypointType
 
         from workflows.flows import capture_to_asset, facescape_batch
 
         said(f"serving capture-to-asset/{NAME} and facescape-batch/{BATCH} from {os.environ['PREFECT_API_URL']}")
+        shared: Any = {"tags": ["neuface"], "entrypoint_type": EntrypointType.MODULE_PATH}  # from any working folder
         served: Any = (
-            capture_to_asset.to_deployment(NAME, concurrency_limit=limit, tags=["neuface"]),
-            facescape_batch.to_deployment(BATCH, concurrency_limit=1, tags=["neuface"]),
+            capture_to_asset.to_deployment(NAME, concurrency_limit=limit, **shared),
+            facescape_batch.to_deployment(BATCH, concurrency_limit=1, **shared),
         )
         serve_all(*served, limit=limit + 1)  # a batch waits for its captures: it must not hold the slot they need
     return 0

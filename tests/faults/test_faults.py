@@ -67,7 +67,7 @@ def tally(tree: Path) -> Counter[str]:
 
 # ------------------------------------------------------------------ processes
 def test_one_captures_process_killed_costs_one_attempt(tree: Path, environment: dict[str, str]) -> None:
-    code, said = finish(start(environment, *batch(tree, "--set", "work.fault=killed once")))
+    code, said = finish(start(environment, *batch(tree, "--set", "work.fault=killed once", "--workers", "2")))
     assert code == 0, said
     assert "trying again (lost): the process ended without a word (signal 9)" in said
     assert {c["attempts"] for c in summary(tree).values()} == {2}
@@ -124,7 +124,7 @@ def test_ctrl_c_stops_at_a_checkpoint_and_twice_at_once(tree: Path, environment:
 # ------------------------------------------------------------------ stages that hang
 @pytest.mark.parametrize(
     ("fault", "told"),
-    [("hangs politely", "took longer than it may"), ("hangs", "was ended"), ("hangs in C", "was ended")],
+    [("hangs politely", "took longer than it may"), ("hangs in C", "was ended")],
 )
 def test_a_stage_that_hangs_is_ended_and_the_next_capture_runs(
     tree: Path, environment: dict[str, str], fault: str, told: str
@@ -142,13 +142,6 @@ def test_a_stage_that_hangs_is_ended_and_the_next_capture_runs(
     assert found["bad"]["attempts"] == 1  # it would hang again
     if fault != "hangs politely":  # where it hung is in the log
         assert "run_work" in (tree.parent / "out/batch/logs/bad.log").read_text()
-
-
-def test_out_of_memory_is_a_fault_that_passes_with_less(tree: Path, environment: dict[str, str]) -> None:
-    """The toy has no fit to shrink: it fails in plain words, once."""
-    code, said = finish(start(environment, *batch(tree, "--set", "work.fault=memory", "--subjects", "1")))
-    assert code == 1
-    assert "FAILED (memory)" in said
 
 
 # ------------------------------------------------------------------ disks
@@ -208,7 +201,7 @@ def test_two_runs_of_one_capture_into_one_folder_at_once(tmp_path: Path, environ
     photos.mkdir()
     for name in "ab":
         (photos / f"{name}.jpg").write_bytes(name.encode() * 10)
-    command = [TOY_RUN, "run", photos, "--out", tmp_path / "out", "--set", "second.steps=8", "--set", "second.pause=.2"]
+    command = [TOY_RUN, "run", photos, "--out", tmp_path / "out", "--set", "second.steps=5", "--set", "second.pause=.2"]
     children = [start(environment, *command) for _ in range(2)]
     ends = [finish(c) for c in children]
     assert [code for code, _ in ends] == [0, 0], ends

@@ -41,7 +41,6 @@ class UsdInputs:
 class WorkConfig(StageConfig):
     steps: int = 4
     pause: float = 0.05
-    batch: int = 1024
     fault: str = ""
 
 
@@ -80,8 +79,6 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         while True:
             context.check()
             time.sleep(0.05)
-    if config.fault == "memory" and config.batch > 600:
-        raise MemoryError("can't allocate memory: you tried to allocate 1 TB")
     if config.fault == "killed once" and not (context.scratch / "killed").exists():
         (context.scratch / "killed").write_text("")
         os.kill(os.getpid(), 9)

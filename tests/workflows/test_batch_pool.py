@@ -24,7 +24,7 @@ from tests.support.servers import (
 
 TOY = Path(__file__).parents[1] / "support" / "toy_batch.py"
 CAPTURES = {f"{s}/{e}": (s, e) != (2, "1_neutral") for s in (1, 2, 3) for e in ("1_neutral", "2_smile")}
-SLOW = ["--set", "work.steps=8", "--set", "work.pause=0.4"]
+SLOW = ["--set", "work.steps=6", "--set", "work.pause=0.4"]
 
 
 def counts(tally: Path) -> Counter[str]:
@@ -94,7 +94,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
     assert max(c["attempts"] for c in summary["captures"]) >= 2, "the killed worker's capture was tried again"
     assert "CRASHED" in {r["state_type"] for r in runs}
     alone = tmp_path / "tally alone"
-    undisturbed = [sys.executable, TOY, "batch", tree, "--out", tmp_path / "alone", "--workers", "2", *SLOW]
+    undisturbed = [sys.executable, TOY, "batch", tree, "--out", tmp_path / "alone", "--workers", "2"]
     subprocess.run([str(c) for c in undisturbed], env={**environment, "NEUFACE_TALLY": str(alone)}, timeout=120)
     assert counts(tally) == counts(alone)
     assert set(counts(tally).values()) == {1} and len(counts(tally)) == 15
