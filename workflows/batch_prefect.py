@@ -7,6 +7,7 @@ an idempotency key, so that a batch that is started again joins the runs that it
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -41,13 +42,14 @@ AT_A_TIME = 200  # runs that the server tells of in one answer
 
 @dataclass(slots=True)
 class _Run:
-    """A run under way. quiet_since: monotonic time since which no process worked on it."""
+    """A run under way. quiet_since: monotonic time since which no process worked on it; running_since: of its begin."""
 
     id: UUID
     name: str
     request: RunRequest
     state: StateType | None = None
     quiet_since: float = field(default_factory=time.monotonic)
+    running_since: float | None = None
 
 
 class Pool:
@@ -112,11 +114,13 @@ class Pool:
             fault = fault_in(message)
             return Ended(run.name, fault, _rays(run.request) if fault.kind == "memory" else None)
         if state == StateType.CRASHED:
-            return Ended(run.name, Fault(kind="lost", message=message or "the run crashed"))
+            return Ended(run.name, _crash(run, message, now))
         if state in (StateType.CANCELLED, StateType.CANCELLING):
             return Ended(run.name, Fault(kind="bug", message="the run was cancelled on the server"))
         if state != run.state or state == StateType.SCHEDULED or self._works(run):
             run.state, run.quiet_since = state, now
+            if state == StateType.RUNNING and run.running_since is None:
+                run.running_since = now
         patience = self.request.lost_after * (1.0 if state == StateType.RUNNING else SLOW_START)
         return self._lost(run, now - run.quiet_since) if now - run.quiet_since > patience else None
 
@@ -178,6 +182,15 @@ class Pool:
 
 def _runs_among(some: FlowRunFilter, client: SyncPrefectClient) -> list[FlowRun]:
     return client.read_flow_runs(flow_run_filter=some, limit=AT_A_TIME)
+
+
+def _crash(run: _Run, message: str, now: float) -> Fault:
+    """A process that ended itself with code 1 after the time that a stage may take hung: it would hang again."""
+    limit = run.request.stage_limit
+    long_enough = limit is not None and run.running_since is not None and now - run.running_since >= limit
+    if long_enough and re.search(r"status code:? 1\b", message):
+        return Fault(kind="limit", message=f"a stage did not stop within its {limit:g} s: {message}")
+    return Fault(kind="lost", message=message or "the run crashed")
 
 
 def _away(e: Exception) -> StageError:
