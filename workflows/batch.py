@@ -22,7 +22,7 @@ from workflows.batch_faults import Fault, back_off, smaller
 from workflows.batch_ledger import Entry, Ledger, fingerprint
 from workflows.batch_request import BatchRequest
 from workflows.folders import writable
-from workflows.plan import RunRequest
+from workflows.plan import RunRequest, check_settings
 
 PAGE_EVERY = 20.0  # seconds between two updates of the page while the batch runs
 
@@ -102,6 +102,8 @@ def run_batch(
     items = batch_captures.find(Path(request.root), request.subjects, request.expressions)
     out, store, ledger = Path(request.out).absolute(), request.store_path, Ledger(request.folder)
     _not_inside(out, Path(request.root))
+    for item in {str(i.own): i for i in items}.values():  # a wrong word is told at once, not by every capture in turn
+        check_settings(request.run_request(item.capture, item.name, (), item.own))
     with writable(out, store), alone(store, request.folder, stopped, said):
         works = [_prepared(i, ledger, request) for i in items]
         summary = Summary([w.entry for w in works])

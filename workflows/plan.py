@@ -26,14 +26,14 @@ class RunRequest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    capture: str = Field(min_length=1, description="folder with the photos; absolute, as the worker sees it")
-    out: str = Field(min_length=1, description="folder for the results; made if it is not there")
+    capture: str = Field(description="folder with the photos; absolute, as the worker sees it")
+    out: str = Field(description="folder for the results; made if it is not there")
     preset: str = Field(default=DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
     holdout: str | None = Field(
         default=None, description='views kept from the fit and used for the metrics: "every:5:2" or "names:a.jpg,b.jpg"'
     )
     name: str | None = Field(default=None, description="name of the asset")
-    seed: int = Field(default=0, ge=0, description="of every random draw")
+    seed: int = Field(default=0, description="of every random draw")
     device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(default=None, description="last stage to run")
     from_stage: str | None = Field(
@@ -79,16 +79,7 @@ def make_plan(request: RunRequest) -> Plan:
     from stages.capture.scan import scan_capture
 
     chosen, anew = _choose(request.until, request.from_stage)
-    configs = configs_for(
-        request.preset,
-        parse_sets(request.sets),
-        request.config,
-        holdout=request.holdout,
-        name=request.name,
-        seed=request.seed,
-        registry=registry.REGISTRY,
-    )
-    known(request.device, DEVICES, what="unknown device", where="--device")
+    configs = check_settings(request)
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
@@ -110,6 +101,25 @@ def make_plan(request: RunRequest) -> Plan:
         configs,
         device_for(request.device) if needs_torch else "cpu",
         anew,
+    )
+
+
+def check_settings(request: RunRequest) -> dict[str, StageConfig]:
+    """The settings of every stage that a request makes, whatever its capture holds.
+
+    Raises:
+        UsageError: unknown names, or settings outside their limits.
+    """
+    _choose(request.until, request.from_stage)
+    known(request.device, DEVICES, what="unknown device", where="--device")
+    return configs_for(
+        request.preset,
+        parse_sets(request.sets),
+        request.config,
+        holdout=request.holdout,
+        name=request.name,
+        seed=request.seed,
+        registry=registry.REGISTRY,
     )
 
 

@@ -313,6 +313,21 @@ def test_results_never_land_among_the_captures(tree: Path) -> None:
     assert not (tree / "out").exists()
 
 
+@pytest.mark.parametrize("change", [{"preset": "besst"}, {"sets": ("bake.size=x",)}, {"until": "baek"}, {"seed": 2.5}])
+def test_wrong_words_are_told_before_anything_is_written(tree: Path, change: dict[str, Any]) -> None:
+    with pytest.raises((UsageError, ValueError)):
+        run_batch(request(tree, **change), Scripted(tree, {}))
+    assert not (tree.parent / "out").exists()
+
+
+@pytest.mark.parametrize("option", [["--attempts", "0"], ["--seed", "-1"], ["--preset", "besst"], ["--chunk", "9999"]])
+def test_wrong_options_are_exit_code_2(tree: Path, option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    from workflows.cli import main
+
+    assert main(["batch", str(tree), "--out", str(tree.parent / "out"), *option]) == 2
+    assert "what to do:" in capsys.readouterr().err
+
+
 # ------------------------------------------------------------------ table and page
 def rows(figures: list[float]) -> list[Row]:
     return [Row(f"c{i}", "done", 1, figures={"psnr": v}) for i, v in enumerate(figures)]
