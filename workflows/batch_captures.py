@@ -55,6 +55,7 @@ def find(root: Path, subjects: str | None = None, expressions: str | None = None
     Raises:
         StageError: nothing there, or nothing left by the filters. UsageError: a filter or a list can't be read.
     """
+    root = root.absolute()  # workers and later commands have other working folders
     if root.is_dir():
         found = list(_tree(root))
     elif root.suffix.lower() in (".csv", ".json") and root.is_file():

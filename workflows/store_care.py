@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.store import LINEAGE, Store, lineage
+from stages.registry import SOURCE
 from workflows.alone import lock_is_free
 from workflows.batch_captures import RECORDS
 from workflows.batch_ledger import Entry
@@ -102,7 +103,7 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     out = out.absolute()
     runs = [r for r in _roots_of(out, store) if _is_of(subject, r, out)]
     entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
-    photos = {Path(r.capture).absolute() for r in runs} | {Path(e.capture).absolute() for _, e in entries}
+    photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
     paths: set[Path] = set(_made_from(photos, store)) | {o for o in outs if o.is_dir() and o != out}
     if out in outs:  # the run's own folder: the store inside it may serve others
@@ -141,6 +142,12 @@ def _is_of(subject: str, root: Root, out: Path) -> bool:
     """The run's folder is OUT/SUBJECT or lies in it; or OUT is a single run of a capture of that name."""
     inside = root.out.resolve().relative_to(out.resolve()).parts
     return inside[:1] == (subject,) if inside else Path(root.capture).name == subject
+
+
+def _photos_of(root: Root, store: Store) -> Iterator[Path]:
+    """The folders that a run's first stage read; run.json may name them relative to a folder that nobody knows now."""
+    for stage, key in root.keys.items():
+        yield from (Path(p) for p in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(SOURCE, ()))
 
 
 def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:

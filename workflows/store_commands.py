@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.errors import StageError
 from pipeline.store import Store
+from workflows.alone import is_held
 from workflows.console import Console
 
 
@@ -59,6 +60,15 @@ def purge_command(options: argparse.Namespace, console: Console) -> int:
             value=options.subject,
             limit="the name of a subject's folder in this batch, or of this run's capture",
             remedy="look at DIR/batch/index.html or DIR/run.json for its name; name the store with --store",
+        )
+    busy = [o for o in found.outs if is_held(store.root, o)]
+    if busy and not options.dry_run:
+        raise StageError(
+            "a run of this subject is under way",
+            where=busy[0],
+            value=f"{len(busy)} of its folders are written to",
+            limit="none: what is removed would be made again",
+            remedy="stop the run, or wait for its end, and repeat the command",
         )
     size = found.size
     for path in found.paths:

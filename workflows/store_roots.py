@@ -17,7 +17,7 @@ ROOTS = ".roots"
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """A published run: its folder, its capture's folder and the keys of its stages."""
+    """A published run: its folder, its capture's folder as it was asked for, and the keys of its stages."""
 
     out: Path
     capture: str

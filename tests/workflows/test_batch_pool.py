@@ -66,7 +66,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
         workers = [Process(environment, tmp_path / f"worker{i}.log", tmp_path, PREFECT, "worker", "start", "--pool",
                            "heads", "--name", f"w{i}", "--limit", 1) for i in (1, 2)]  # fmt: skip
         batch = Process(environment, tmp_path / "batch.log", tmp_path, sys.executable, TOY, "batch", tree, "--out",
-                        tmp_path / "out", "--server", "--lost-after", "6s", *SLOW)  # fmt: skip
+                        tmp_path / "out", "--server", "--lost-after", "6s", "--priority", "high", "--gpus", "2", *SLOW)  # fmt: skip
         with server:
             wait_healthy(url)
             call(environment, PREFECT, "work-pool", "create", "heads", "--type", "process", cwd=tmp_path)
@@ -84,6 +84,8 @@ def test_a_night_with_a_killed_worker_server_and_database(
                 assert batch.child is not None
                 code = batch.child.wait(240)
             runs = ask(url, "/flow_runs/filter", {"limit": 50})
+            limits = ask(url, "/v2/concurrency_limits/filter", {})
+            queues = ask(url, "/work_pools/heads/queues/filter", {})
     said = (tmp_path / "batch.log").read_text()
     assert code == 1, said
     summary = json.loads((tmp_path / "out/batch/summary.json").read_text())
@@ -93,6 +95,9 @@ def test_a_night_with_a_killed_worker_server_and_database(
     assert len(list((tmp_path / "out").glob("*/*/asset/*.usd"))) == 5
     assert max(c["attempts"] for c in summary["captures"]) >= 2, "the killed worker's capture was tried again"
     assert "CRASHED" in {r["state_type"] for r in runs}
+    assert {r["work_queue_name"] for r in runs} == {"high"}
+    assert [(q["name"], q["priority"]) for q in queues if q["name"] == "high"] == [("high", 1)]
+    assert [(x["name"], x["limit"]) for x in limits] == [("neuface-fits", 2)]
     alone = tmp_path / "tally alone"
     undisturbed = [sys.executable, TOY, "batch", tree, "--out", tmp_path / "alone", "--workers", "2"]
     subprocess.run([str(c) for c in undisturbed], env={**environment, "NEUFACE_TALLY": str(alone)}, timeout=120)

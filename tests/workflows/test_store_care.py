@@ -177,6 +177,18 @@ def test_the_same_photos_from_two_folders_are_found_from_both(photos: Path, tmp_
     assert finished(tmp_path / "store") == []
 
 
+def test_a_run_that_was_started_with_relative_paths(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run(Path("photos"), Path("out"), Path("out/.store"))
+    monkeypatch.chdir("/")
+    found = belongings("photos", tmp_path / "out", Store(tmp_path / "out/.store"))
+    assert found.photos == (photos,)
+    assert purge(found, Store(tmp_path / "out/.store")) == []
+    assert finished(tmp_path / "out/.store") == []
+
+
 def test_purge_command_of_a_single_run(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     run(photos, out, out / ".store")
@@ -185,6 +197,9 @@ def test_purge_command_of_a_single_run(photos: Path, tmp_path: Path, capsys: pyt
     assert "nothing is known of this subject" in capsys.readouterr().err
     assert main(["store", "purge", "photos", "--out", str(out), "--dry-run"]) == 0
     assert "would be removed" in capsys.readouterr().out and (out / "run.json").is_file()
+    with alone(out / ".store", out, lambda: False, print):
+        assert main(["store", "purge", "photos", "--out", str(out)]) == 1
+    assert "under way" in capsys.readouterr().err and (out / "run.json").is_file()
     assert main(["store", "purge", "photos", "--out", str(out)]) == 0
     assert str(photos) in capsys.readouterr().out
     assert finished(out / ".store") == [] and not (out / "run.json").exists()
