@@ -66,7 +66,8 @@ def test_a_night_with_a_killed_worker_server_and_database(
         workers = [Process(environment, tmp_path / f"worker{i}.log", tmp_path, PREFECT, "worker", "start", "--pool",
                            "heads", "--name", f"w{i}", "--limit", 1) for i in (1, 2)]  # fmt: skip
         batch = Process(environment, tmp_path / "batch.log", tmp_path, sys.executable, TOY, "batch", tree, "--out",
-                        tmp_path / "out", "--server", "--lost-after", "6s", "--priority", "high", "--gpus", "2", *SLOW)  # fmt: skip
+                        tmp_path / "out", "--server", "--lost-after", "6s", "--priority", "high", "--gpus", "2",
+                        *SLOW)  # fmt: skip
         with server:
             wait_healthy(url)
             call(environment, PREFECT, "work-pool", "create", "heads", "--type", "process", cwd=tmp_path)
