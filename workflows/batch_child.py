@@ -86,7 +86,9 @@ def rays_a_step(plan: Plan) -> int | None:
 
 
 def _stop_at_the_end_of_stdin(watch: Session) -> None:
-    sys.stdin.buffer.read()
+    descriptor = sys.stdin.fileno()  # not through sys.stdin: its lock would be held when the interpreter ends
+    while os.read(descriptor, 1024):
+        continue
     watch.stop.set()
 
 

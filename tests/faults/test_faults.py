@@ -21,10 +21,11 @@ import pytest
 
 from tests.support.facescape_tree import write_tree
 from tests.support.servers import wait_for
+from workflows.plan import RunRequest
 
 pytestmark = pytest.mark.slow
 SUPPORT = Path(__file__).parents[1] / "support"
-TOY_BATCH, TOY_RUN = SUPPORT / "toy_batch.py", SUPPORT / "toy_neuface.py"
+TOY_BATCH = SUPPORT / "toy_batch.py"
 
 
 @pytest.fixture
@@ -195,21 +196,24 @@ def test_a_read_only_store_is_told_before_any_work(tree: Path, environment: dict
 
 
 # ------------------------------------------------------------------ two at once
-def test_two_runs_of_one_capture_into_one_folder_at_once(tmp_path: Path, environment: dict[str, str]) -> None:
-    """Through Prefect, as users have it: one waits for the other and then finds everything done."""
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    for name in "ab":
-        (photos / f"{name}.jpg").write_bytes(name.encode() * 10)
-    command = [TOY_RUN, "run", photos, "--out", tmp_path / "out", "--set", "second.steps=5", "--set", "second.pause=.2"]
-    children = [start(environment, *command) for _ in range(2)]
-    ends = [finish(c) for c in children]
-    assert [code for code, _ in ends] == [0, 0], ends
-    both = "".join(said for _, said in ends)
-    assert "another run writes to" in both
-    assert both.count("[2/3] second: reused") == 1
-    assert json.loads((tmp_path / "out/run.json").read_text())["stages"]["second"]["reused"]
-    assert not [p for p in (tmp_path / "out").iterdir() if ".partial" in p.name or ".old" in p.name]
+def test_two_runs_of_one_capture_into_one_folder_at_once(tree: Path, environment: dict[str, str]) -> None:
+    """One waits for the other and then finds everything done."""
+    out = tree.parent / "one"
+    asked = RunRequest(capture=str(tree / "1/1_neutral"), out=str(out), sets=("work.steps=8", "work.pause=0.2"))
+    children = []
+    for _ in range(2):
+        child = subprocess.Popen([sys.executable, TOY_BATCH, "--child", "1"], env=environment, text=True,
+                                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+        assert child.stdin is not None
+        child.stdin.write(asked.model_dump_json() + "\n")
+        child.stdin.flush()  # and not closed: its end would mean stop
+        children.append(child)
+    assert [c.wait(60) for c in children] == [0, 0]
+    said = [c.communicate() for c in children]
+    assert sum("another run writes to" in err for _, err in said) == 1
+    assert set(tally(tree).values()) == {1}
+    assert json.loads((out / "run.json").read_text())["stages"]["work"]["reused"]
+    assert not [p for p in out.iterdir() if ".partial" in p.name or ".old" in p.name]
 
 
 def test_two_batches_into_one_folder_at_once(tree: Path, environment: dict[str, str]) -> None:
