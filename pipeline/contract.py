@@ -133,6 +133,10 @@ def execute(
     """
     k = key(stage, inputs, config)
     with store.lock(stage.name, k):
+        try:
+            store.trace(stage.name, k, {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)})  # type: ignore[arg-type]
+        except OSError as e:
+            raise stage_error_from_os_error(e, store.root) or e from e
         found = store.load(stage.name, k, stage.output)
         if found is not None:
             log.info("%s: reused %s", stage.name, k[:12])

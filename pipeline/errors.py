@@ -42,6 +42,14 @@ class UsageError(StageError):
     exit_code = 2
 
 
+class DiskError(StageError):
+    """A disk that is full, read-only, forbidden or failing: somebody has to mend it. Exit code 1."""
+
+
+class TimeLimitError(StageError):
+    """A stage took longer than it may. Exit code 1."""
+
+
 class Cancelled(NeufaceError):
     """The user stopped the run; finished stages and checkpoints are kept. Exit code 130."""
 
@@ -55,6 +63,8 @@ def _rebuild(kind: type[StageError], what: str, fields: dict[str, str]) -> Stage
 _DISK_REMEDIES = {
     errno.ENOSPC: ("no space is left on the disk", "free space on this disk, or choose another with --out or --store"),
     errno.EDQUOT: ("the disk quota is used up", "free space, or choose another disk with --out or --store"),
+    errno.EFBIG: ("a file is larger than may be written here", "raise the limit (ulimit -f), or choose another disk"),
+    errno.EIO: ("the disk fails to read or write", "look at the disk, or choose another with --out or --store"),
     errno.EROFS: ("the disk is read-only", "choose a writable folder with --out or --store"),
     errno.EACCES: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
     errno.EPERM: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
@@ -62,13 +72,13 @@ _DISK_REMEDIES = {
 }
 
 
-def stage_error_from_os_error(error: OSError, where: Path | str) -> StageError | None:
+def stage_error_from_os_error(error: OSError, where: Path | str) -> DiskError | None:
     """The user's message for a disk fault, or None when it is not one that a user can mend."""
     found = _DISK_REMEDIES.get(error.errno or 0)
     if found is None:
         return None
     what, remedy = found
-    return StageError(
+    return DiskError(
         what,
         where=error.filename or where,
         value=error.strerror or error,

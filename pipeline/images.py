@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,18 @@ import numpy.typing as npt
 
 from pipeline.colour import REC709, Chromaticities, linear_from_srgb, srgb_from_linear
 from pipeline.errors import StageError
+from pipeline.picture_size import declared_size
 
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
+MAX_BYTES = 4_000_000_000  # 250 megapixels of RGBA in 32-bit floats, uncompressed
 MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
 
 
 def read_encoded(path: Path) -> npt.NDArray[Any]:
     """(H, W, C) as stored, RGB order. Raises StageError if the file is empty, corrupt or absurdly large."""
     size = path.stat().st_size if path.is_file() else 0
+    _refuse_bombs(path, size)
     image = _decoded(path) if size else None
     if image is None:
         raise StageError(
@@ -30,17 +34,32 @@ def read_encoded(path: Path) -> npt.NDArray[Any]:
             remedy="copy the file again from the camera, or take it out of the folder",
         )
     if image.shape[0] * image.shape[1] > MAX_PIXELS:
-        raise StageError(
-            "the image is too large",
-            where=path.name,
-            value=f"{image.shape[1]} x {image.shape[0]}",
-            limit=f"{MAX_PIXELS / 1e6:.0f} megapixels",
-            remedy="scale it down",
-        )
+        raise _too_large(path, f"{image.shape[1]} x {image.shape[0]}")
     if image.ndim == 2:
         image = image[..., None]
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
     return np.ascontiguousarray(image[..., order])
+
+
+def _refuse_bombs(path: Path, size: int) -> None:
+    """A header that declares more than any camera has, or a file larger than any photo: nothing is decoded."""
+    if size > MAX_BYTES:
+        raise _too_large(path, f"{size / 1e9:.1f} GB")
+    if size:
+        with path.open("rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            declared = declared_size(data)
+        if declared is not None and abs(declared[0] * declared[1]) > MAX_PIXELS:
+            raise _too_large(path, f"{declared[0]} x {declared[1]}")
+
+
+def _too_large(path: Path, value: str) -> StageError:
+    return StageError(
+        "the image is too large",
+        where=path.name,
+        value=value,
+        limit=f"{MAX_PIXELS / 1e6:.0f} megapixels, {MAX_BYTES / 1e9:.0f} GB",
+        remedy="scale it down",
+    )
 
 
 def _decoded(path: Path) -> npt.NDArray[Any] | None:

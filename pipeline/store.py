@@ -2,19 +2,21 @@
 
 Layout: `<root>/<stage>/<key>/` is finished and holds `manifest.json`, the artifact's files and `run.json`;
 `<key>.partial-*` is being written; `<key>.scratch/` holds checkpoints of work under way; `.locks/<stage>-<key>` is
-held while one process works on the key. Only a rename turns a partial folder into a finished one, so that a process
-killed at any moment leaves nothing that could be taken for finished.
+held while one process works on the key; `.lineage/<stage>-<key>.json` names what it was made from, so that all that
+came from one folder of photos can be found (docs/privacy.md). Only a rename turns a partial folder into a finished
+one, so that a process killed at any moment leaves nothing that could be taken for finished.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import logging
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -26,6 +28,7 @@ from pipeline.errors import stage_error_from_os_error
 
 log = logging.getLogger(__name__)
 A = TypeVar("A", bound=Artifact)
+LINEAGE = ".lineage"
 MANIFEST, RUN = "manifest.json", "run.json"
 
 
@@ -60,6 +63,8 @@ class Store:
             if fault:
                 self._discard(folder, fault)
                 return None
+        with contextlib.suppress(OSError):  # when it was last used, for those who clear up
+            os.utime(folder)
         return Located(artifact, folder)
 
     def load_run(self, stage: str, key: str) -> dict[str, object]:
@@ -73,6 +78,24 @@ class Store:
         shutil.rmtree(folder)
 
     # ---------------------------------------------------------------- writing
+    def trace(self, stage: str, key: str, folders: Mapping[str, Path]) -> None:
+        """Note what a key is made from: `stage/key` of other artifacts, absolute folders for the user's own files.
+
+        The same photos may lie in several folders: each is kept. Call with the lock held.
+        """
+        path = self.root / LINEAGE / f"{stage}-{key}.json"
+        known = lineage(path)
+        merged = {n: sorted({*known.get(n, ()), self._name_of(f)}) for n, f in folders.items()}
+        if merged != known:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = path.with_suffix(".partial")
+            partial.write_text(json.dumps(merged))
+            partial.replace(path)
+
+    def _name_of(self, folder: Path) -> str:
+        inside = folder.is_relative_to(self.root)
+        return folder.relative_to(self.root).as_posix() if inside else str(folder.absolute())
+
     @contextmanager
     def lock(self, stage: str, key: str) -> Iterator[None]:
         """Exclusive work on one key. The kernel lets go of it when the process dies, however it dies."""
@@ -118,6 +141,15 @@ class Store:
         sync(final.parent)
         shutil.rmtree(self.scratch(stage, key), ignore_errors=True)
         return Located(artifact, final)
+
+
+def lineage(path: Path) -> dict[str, list[str]]:
+    """What a key was made from; empty where it is not known."""
+    try:
+        found: dict[str, list[str]] = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found
 
 
 def file_refs(model: BaseModel) -> Iterator[FileRef]:

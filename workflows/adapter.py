@@ -6,8 +6,10 @@ and folders are all that is passed, and a stage that failed on bad input would o
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
@@ -23,11 +25,15 @@ from prefect.cache_policies import NO_CACHE
 from prefect.logging import get_run_logger
 from prefect.settings import get_current_settings
 
-from pipeline.contract import Done, Stage, StageConfig, execute
+from pipeline.contract import Done, Stage, StageConfig, execute, key
+from pipeline.store import MANIFEST
 from workflows.plan import Plan
 from workflows.runner import RunStage
 from workflows.session import current
 
+log = logging.getLogger(__name__)
+FIT = "inverse_rendering"  # the stage that a GPU is for
+LEASE = 600.0  # seconds until the slot of a dead process is free again; a server may restart within it
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
 
 
@@ -66,7 +72,7 @@ class _Sealed:
 
 
 def _execute(work: _Sealed) -> Done[Any]:
-    watch, log = current(), get_run_logger()
+    watch, run_log = current(), get_run_logger()
     shown = _Published(work.stage.name) if on_a_server() else None
 
     def progress(done: int, total: int, message: str = "", **figures: float) -> None:
@@ -75,21 +81,42 @@ def _execute(work: _Sealed) -> Done[Any]:
             shown(done, total, message, figures)
 
     plan = work.plan
-    done = execute(
-        work.stage,
-        work.inputs,
-        work.config,
-        plan.store,
-        device=plan.device,
-        progress=progress,
-        cancelled=watch.stop.is_set,
-    )
-    log.info("%s: %s, %s", done.stage, "reused" if done.reused else f"{done.run['seconds']} s", done.key[:12])
+    with _slot(work):
+        done = execute(
+            work.stage,
+            work.inputs,
+            work.config,
+            plan.store,
+            device=plan.device,
+            progress=progress,
+            cancelled=watch.stopped,
+        )
+    run_log.info("%s: %s, %s", done.stage, "reused" if done.reused else f"{done.run['seconds']} s", done.key[:12])
     for warning in getattr(done.located.artifact, "warnings", ()):
-        log.warning("%s: %s", done.stage, warning)
+        run_log.warning("%s: %s", done.stage, warning)
     if shown is not None:
         shown.close("reused from the store" if done.reused else f"done in {done.run['seconds']} s")
     return done
+
+
+@contextmanager
+def _slot(work: _Sealed) -> Iterator[None]:
+    """Hold a slot of the limit that the request names while the fit runs; a fit that the store has needs none.
+
+    Strict: a limit that does not exist would otherwise mean no limit. A lease that can't be renewed because the server
+    is away does not end the fit: hours of work weigh more than two fits on one GPU for a while.
+    """
+    limit, stage, plan = work.plan.request.fit_slots, work.stage, work.plan
+    if limit is None or stage.name != FIT:
+        yield
+        return
+    if (plan.store.folder(stage.name, key(stage, work.inputs, work.config)) / MANIFEST).is_file():
+        yield
+        return
+    from prefect.concurrency.sync import concurrency
+
+    with concurrency(limit, strict=True, lease_duration=LEASE, raise_on_lease_renewal_failure=False):
+        yield
 
 
 class _Published:
@@ -111,10 +138,13 @@ class _Published:
 
     def _put(self, percent: float, text: str) -> None:
         self.last = time.monotonic()
-        if self.artifact is None:
-            self.artifact = cast(UUID, create_progress_artifact(percent, key=self.key, description=text))
-        else:
-            update_progress_artifact(self.artifact, percent, description=text)
+        try:
+            if self.artifact is None:
+                self.artifact = cast(UUID, create_progress_artifact(percent, key=self.key, description=text))
+            else:
+                update_progress_artifact(self.artifact, percent, description=text)
+        except Exception as e:  # decoration: a server that is away, however it says so, must not cost the stage
+            log.debug("progress not shown: %s", e)
 
 
 def publish_result(out: Path, record: dict[str, Any]) -> None:
@@ -126,7 +156,16 @@ def publish_result(out: Path, record: dict[str, Any]) -> None:
         lines.append(f"| {name} | {'reused' if s['reused'] else s['seconds']} | `{s['key'][:12]}` |")
     warnings = [f"- {name}: {w}" for name, s in record["stages"].items() for w in s["warnings"]]
     text = "\n".join([f"# {out.name}", f"`{out.resolve()}`", "", *lines, "", *warnings])
-    create_markdown_artifact(text, key="run", description="stages of this run")
     page = out.resolve() / "report" / "index.html"
-    if page.is_file():
-        create_link_artifact(page.as_uri(), link_text="report", key="report", description="figures and pictures")
+    try:
+        create_markdown_artifact(text, key="run", description="stages of this run")
+        if page.is_file():
+            create_link_artifact(page.as_uri(), link_text="report", key="report", description="figures and pictures")
+    except Exception as e:  # the run is done and published, whatever the server does
+        log.warning("the run's table is not shown on the server: %s", e)
+
+
+def report_batch(out: Path, counts: dict[str, int]) -> None:
+    """Show a batch's end in Prefect: how many captures came to which end, and where its page is."""
+    rows = "\n".join(f"| {state} | {count} |" for state, count in counts.items())
+    create_markdown_artifact(f"| state | captures |\n|---|---|\n{rows}\n\n`{out}/batch/index.html`", key="batch")

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
-from workflows import bench, commands
+from workflows import batch_commands, bench, commands, schedule, store_commands
 from workflows.console import Console
 
 EXAMPLES = """examples:
@@ -55,6 +55,9 @@ def parser() -> argparse.ArgumentParser:
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
         sub.set_defaults(run=run)
     bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations"))
+    batch_commands.add_commands(commands_of)
+    store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
+    schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)
@@ -80,6 +83,9 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--seed", type=int, default=0, help="of every random draw (%(default)s)")
     run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
     run.add_argument("--until", metavar="S", help="stop after this stage")
+    run.add_argument(
+        "--stage-limit", type=batch_commands.a_time, metavar="TIME", help="time that one stage may take: 90s, 30m, 2h"
+    )
     run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")
     run.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
     run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")

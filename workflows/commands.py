@@ -14,6 +14,7 @@ from typing import Any
 
 from pipeline.errors import Cancelled, StageError
 from workflows import environment, folders
+from workflows.alone import alone
 from workflows.console import Console
 from workflows.interrupt import deaf_children, interruptible
 from workflows.plan import RunRequest, make_plan, preview
@@ -40,7 +41,11 @@ def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, A
         atexit.register(folders.sweep, made, plan.store.root)
         environment.settle(plan.store.root, plan.out)
         watch = Session(console, plan=plan)
-        with session(watch), interruptible(watch.stop, _end_server, console.note):
+        with (
+            session(watch),
+            interruptible(watch.stop, _end_server, console.note),
+            alone(plan.store.root, plan.out, watch.stop.is_set, console.note),
+        ):
             return _through_prefect(request)
 
 
@@ -249,6 +254,7 @@ def request_from(options: argparse.Namespace) -> RunRequest:
         sets=tuple(options.set),
         config=config,
         store=options.store,
+        stage_limit=options.stage_limit,
     )
 
 

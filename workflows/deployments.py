@@ -1,17 +1,89 @@
-"""Offer the flow to a Prefect server from this process: `python -m workflows.deployments`.
+"""Offer the flows to a Prefect server from this process: `neuface serve`, for one workstation without a pool.
 
 For a work pool and workers on several machines use `prefect deploy` with workflows/prefect.yaml instead.
 """
 
-from workflows.flows import capture_to_asset
+from __future__ import annotations
 
-NAME = "local"
+import os
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import StageError
+from workflows import environment
+from workflows.interrupt import deaf_children
+
+NAME, BATCH = "local", "batch-local"  # as in prefect.yaml
+START = 180.0  # seconds that a server may take to start
 
 
-def main() -> None:
-    """Serve the deployment capture-to-asset/local, one run at a time, until stopped."""
-    capture_to_asset.serve(name=NAME, limit=1, description="Photos of a head in, a relightable USD asset out.")
+def serve(host: str, port: int, limit: int, home: Path, said: Callable[[str], None]) -> int:
+    """Serve both deployments until stopped; with a server of its own unless PREFECT_API_URL names one."""
+    environment.defaults()
+    own = "PREFECT_API_URL" not in os.environ
+    with _server(host, port, home) if own else nullcontext():
+        if own:
+            os.environ["PREFECT_API_URL"] = f"http://{_reachable(host)}:{port}/api"
+        from prefect import serve as serve_all
+        from prefect.types.entrypoint import EntrypointType
+
+        from workflows.flows import capture_to_asset, facescape_batch
+
+        said(f"serving capture-to-asset/{NAME} and facescape-batch/{BATCH} from {os.environ['PREFECT_API_URL']}")
+        shared: Any = {"tags": ["neuface"], "entrypoint_type": EntrypointType.MODULE_PATH}  # from any working folder
+        served: Any = (
+            capture_to_asset.to_deployment(NAME, concurrency_limit=limit, **shared),
+            facescape_batch.to_deployment(BATCH, concurrency_limit=1, **shared),
+        )
+        serve_all(*served, limit=limit + 1)  # a batch waits for its captures: it must not hold the slot they need
+    return 0
 
 
-if __name__ == "__main__":
-    main()
+@contextmanager
+def _server(host: str, port: int, home: Path) -> Iterator[None]:
+    """A Prefect server as a child. It listens on this machine alone unless another address is asked for."""
+    home.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("PREFECT_HOME", str(home))
+    command = [sys.executable, "-m", "prefect", "server", "start", "--host", host, "--port", str(port)]
+    log = home / "server.log"
+    with log.open("ab") as stream, deaf_children():
+        child = subprocess.Popen(command, stdout=stream, stderr=stream)
+    try:
+        _wait_for(child, f"http://{_reachable(host)}:{port}/api/health", log)
+        yield
+    finally:
+        child.terminate()
+        try:
+            child.wait(20)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
+def _reachable(host: str) -> str:
+    """An address to call a server by that listens on `host`."""
+    return {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+
+
+def _wait_for(child: subprocess.Popen[bytes], url: str, log: Path) -> None:
+    end = time.monotonic() + START
+    while child.poll() is None and time.monotonic() < end:
+        try:
+            with urllib.request.urlopen(url, timeout=5):
+                return
+        except (urllib.error.URLError, OSError):
+            time.sleep(0.3)
+    raise StageError(
+        "the Prefect server did not start",
+        where=log,
+        value="it ended" if child.poll() is not None else f"no answer in {START:.0f} s",
+        limit="an answer from its health page",
+        remedy="read its log; another program may use the port: choose one with --port",
+    )

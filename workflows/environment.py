@@ -18,13 +18,18 @@ OFFLINE = {
 }
 
 
+def defaults() -> None:
+    """Quiet and offline, unless the user says otherwise."""
+    for name, value in OFFLINE.items():
+        os.environ.setdefault(name, value)
+
+
 def settle(store: Path, out: Path) -> None:
     """Prepare the environment for `neuface run`: a throw-away server unless PREFECT_API_URL names one.
 
     The server's home lies in the store, one for each `out`: two runs on one SQLite file lock each other out.
     """
-    for name, value in OFFLINE.items():
-        os.environ.setdefault(name, value)
+    defaults()
     if "PREFECT_API_URL" not in os.environ:
         own = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
         home = Path(os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve())))

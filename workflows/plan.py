@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
@@ -19,22 +19,35 @@ DEVICES = ("auto", "cpu", "cuda")
 
 
 class RunRequest(BaseModel):
-    """A run as the user asks for it: plain data, the same from the command line and from a deployment."""
+    """A run as the user asks for it: plain data, the same from the command line and from a deployment.
+
+    The deployment's form is made of these fields (workflows/forms.py).
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    capture: str
-    out: str
-    preset: str = DEFAULT_PRESET
-    holdout: str | None = None
-    name: str | None = None
-    seed: int = 0
-    device: str = "auto"
-    until: str | None = None
-    from_stage: str | None = None
-    sets: tuple[str, ...] = ()
-    config: dict[str, dict[str, Any]] = {}
-    store: str | None = None
+    capture: str = Field(description="folder with the photos; absolute, as the worker sees it")
+    out: str = Field(description="folder for the results; made if it is not there")
+    preset: str = Field(default=DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
+    holdout: str | None = Field(
+        default=None, description='views kept from the fit and used for the metrics: "every:5:2" or "names:a.jpg,b.jpg"'
+    )
+    name: str | None = Field(default=None, description="name of the asset")
+    seed: int = Field(default=0, description="of every random draw")
+    device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
+    until: str | None = Field(default=None, description="last stage to run")
+    from_stage: str | None = Field(
+        default=None, description="this stage and those after it run even if the store has them"
+    )
+    sets: tuple[str, ...] = Field(default=(), description='single settings, "stage.key=value"')
+    config: dict[str, dict[str, Any]] = Field(default={}, description="settings by stage, then by key")
+    store: str | None = Field(default=None, description="folder of finished stages; OUT/.store by default")
+    stage_limit: float | None = Field(
+        default=None, gt=0, description="seconds that one stage may take; none by default"
+    )
+    fit_slots: str | None = Field(
+        default=None, description="name of a global concurrency limit; the fit holds one of its slots (a GPU, say)"
+    )
 
     @property
     def store_path(self) -> Path:
@@ -66,16 +79,7 @@ def make_plan(request: RunRequest) -> Plan:
     from stages.capture.scan import scan_capture
 
     chosen, anew = _choose(request.until, request.from_stage)
-    configs = configs_for(
-        request.preset,
-        parse_sets(request.sets),
-        request.config,
-        holdout=request.holdout,
-        name=request.name,
-        seed=request.seed,
-        registry=registry.REGISTRY,
-    )
-    known(request.device, DEVICES, what="unknown device", where="--device")
+    configs = check_settings(request)
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
@@ -97,6 +101,25 @@ def make_plan(request: RunRequest) -> Plan:
         configs,
         device_for(request.device) if needs_torch else "cpu",
         anew,
+    )
+
+
+def check_settings(request: RunRequest) -> dict[str, StageConfig]:
+    """The settings of every stage that a request makes, whatever its capture holds.
+
+    Raises:
+        UsageError: unknown names, or settings outside their limits.
+    """
+    _choose(request.until, request.from_stage)
+    known(request.device, DEVICES, what="unknown device", where="--device")
+    return configs_for(
+        request.preset,
+        parse_sets(request.sets),
+        request.config,
+        holdout=request.holdout,
+        name=request.name,
+        seed=request.seed,
+        registry=registry.REGISTRY,
     )
 
 

@@ -15,6 +15,7 @@ from pipeline.contract import Done, versions
 from pipeline.errors import stage_error_from_os_error
 from pipeline.store import sync, write_synced
 from workflows.plan import Plan
+from workflows.store_roots import note_root
 
 Copies = dict[str, Path]  # path below the published folder -> file in the store
 
@@ -34,6 +35,7 @@ def publish(plan: Plan, done: Iterable[Done[Any]]) -> dict[str, Any]:
         partial = plan.out / f".run.json.partial-{uuid.uuid4().hex[:8]}"
         write_synced(partial, json.dumps(record, indent=1))
         partial.replace(plan.out / "run.json")
+        note_root(plan.store, plan.out, {n: d.key for n, d in stages.items()})
     except OSError as e:
         raise stage_error_from_os_error(e, plan.out) or e from e
     return record

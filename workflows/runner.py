@@ -11,6 +11,7 @@ from pipeline.errors import Cancelled
 from stages import registry
 from workflows.plan import Plan
 from workflows.session import current
+from workflows.watchdog import time_limit
 
 RunStage = Callable[[Stage[Any, Any, Any], Any, StageConfig], Done[Any]]
 
@@ -19,7 +20,8 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
     """Run the plan's stages in order and hand back what was done, first to last.
 
     Raises:
-        StageError: from the first stage that can't go on; those before it stay in the store.
+        StageError: from the first stage that can't go on, or takes longer than it may; those before it stay in the
+            store.
         Cancelled: the user stopped the run.
     """
     watch = current()
@@ -32,7 +34,8 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
-        result = run_stage(stage, inputs, config)
+        with time_limit(stage.name, plan.request.stage_limit, watch.late):
+            result = run_stage(stage, inputs, config)
         watch.observer.finished(result)
         finished[stage.name] = result.located
         done.append(result)
@@ -51,7 +54,7 @@ def run_here(plan: Plan) -> RunStage:
             plan.store,
             device=plan.device,
             progress=watch.observer.progress,
-            cancelled=watch.stop.is_set,
+            cancelled=watch.stopped,
         )
 
     return run_stage

@@ -43,11 +43,19 @@ class Silent:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One run's watcher and its stop flag. `plan`: the one that was already made for these parameters, if any."""
+    """One run's watcher and its stop flags. `plan`: the one that was already made for these parameters, if any.
+
+    stop: the user's. late: the time limit's, of the stage at work.
+    """
 
     observer: Observer = field(default_factory=Silent)
     stop: threading.Event = field(default_factory=threading.Event)
     plan: Any = None
+    late: threading.Event = field(default_factory=threading.Event)
+
+    def stopped(self) -> bool:
+        """Whether the stage at work has to end: the user said so, or its time is over."""
+        return self.stop.is_set() or self.late.is_set()
 
 
 _SESSION: ContextVar[Session | None] = ContextVar("neuface_session", default=None)

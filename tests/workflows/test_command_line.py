@@ -51,7 +51,7 @@ def test_wrong_usage_is_exit_code_2(arguments: list[str], capsys: pytest.Capture
 @pytest.mark.parametrize(
     "options",
     [["--preset", "besst"], ["--until", "frist"], ["--set", "first.puls=1"], ["--config", "gone.toml"],
-     ["--device", "tpu"], ["--set", "first.plus=-1"]],
+     ["--device", "tpu"], ["--set", "first.plus=-1"], ["--out", ""]],
 )  # fmt: skip
 def test_unknown_words_are_exit_code_2_and_leave_nothing(
     photos: Path, options: list[str], capsys: pytest.CaptureFixture[str]
@@ -65,7 +65,7 @@ def test_unknown_words_are_exit_code_2_and_leave_nothing(
 
 
 def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("run", "demo", "validate", "render", "report", "view", "doctor"):
+    for command in ("run", "demo", "validate", "render", "report", "view", "doctor", "batch", "serve", "schedule"):
         with pytest.raises(SystemExit) as e:
             parser().parse_args([command, "--help"])
         assert e.value.code == 0

@@ -5,20 +5,19 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
-import time
-import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.images import write_png
+from tests.support.servers import ask, free_port, wait_for, wait_healthy
+from workflows.batch_request import BatchRequest
+from workflows.plan import RunRequest
 
 PREFECT = Path(sys.executable).parent / "prefect"
 
@@ -46,24 +45,6 @@ def running(environment: dict[str, str], log: Path, *arguments: object, cwd: Pat
             child.wait()
 
 
-def ask(url: str, path: str, body: dict[str, Any] | None = None) -> Any:
-    request = urllib.request.Request(f"{url}{path}", None if body is None else json.dumps(body).encode(),
-                                     {"Content-Type": "application/json"})  # fmt: skip
-    with urllib.request.urlopen(request, timeout=30) as answer:
-        return json.loads(answer.read())
-
-
-def wait_healthy(url: str, seconds: float = 240) -> None:
-    end = time.monotonic() + seconds
-    while True:
-        try:
-            ask(url, "/health")
-            return
-        except OSError:
-            assert time.monotonic() < end, "the server did not start"
-            time.sleep(0.3)
-
-
 @pytest.mark.slow
 def test_deployment_run_on_a_server_with_a_worker(
     tmp_path: Path, repo: Path, child_environment: dict[str, str]
@@ -72,17 +53,18 @@ def test_deployment_run_on_a_server_with_a_worker(
     photos.mkdir()
     for i in range(4):
         write_png(photos / f"{i}.png", np.random.default_rng(i).uniform(0, 1, (96, 128, 3)))
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
+    port = free_port()
     url = f"http://127.0.0.1:{port}/api"
     environment = {**child_environment, "PREFECT_API_URL": url, "PREFECT_HOME": str(tmp_path / "home")}
     with running(
         environment, tmp_path / "server.log", "server", "start", "--host", "127.0.0.1", "--port", port, cwd=repo
     ):
         wait_healthy(url)
-        call(environment, "work-pool", "create", "heads", "--type", "process", cwd=repo)
+        for kind, end in (("process", ""), ("docker", "-docker"), ("kubernetes", "-kubernetes")):
+            for pool in ("heads", "batches"):
+                call(environment, "work-pool", "create", f"{pool}{end}", "--type", kind, cwd=repo)
         call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        deployed = {d["name"]: d for d in ask(url, "/deployments/filter", {})}
         with running(
             environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
         ):
@@ -102,6 +84,43 @@ def test_deployment_run_on_a_server_with_a_worker(
     assert bad.returncode != 0
     assert not (tmp_path / "bad").exists()
     assert [(t["name"], t["state_type"]) for t in tasks] == [("capture", "COMPLETED")]
+    ends = ("local", "docker", "kubernetes")
+    assert set(deployed) == {*ends, *(f"batch-{e}" for e in ends)}
+    for name, deployment in deployed.items():
+        fields = deployment["parameter_openapi_schema"]["properties"]
+        model = BatchRequest if name.startswith("batch-") else RunRequest
+        assert list(fields) == list(model.model_fields)
+        assert all(fields[n]["description"] == f.description for n, f in model.model_fields.items())
+        assert fields["preset"]["default"] == "draft" and deployment["enforce_parameter_schema"]
+    assert deployed["docker"]["job_variables"]["volumes"] == ["/photos:/photos:ro", "/runs:/runs"]
+    assert deployed["kubernetes"]["work_pool_name"] == "heads-kubernetes"
     assert artifacts["progress-capture"]["data"] == 100
     assert "| capture |" in artifacts["run"]["data"]
     assert str(out) in artifacts["run"]["data"]
+
+
+@pytest.mark.slow
+def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
+    tmp_path: Path, child_environment: dict[str, str]
+) -> None:
+    port = free_port()
+    url = f"http://127.0.0.1:{port}/api"
+    command = [sys.executable, "-m", "workflows.cli", "serve", "--port", str(port), "--home", str(tmp_path / "home")]
+    with (tmp_path / "log").open("wb") as log:
+        child = subprocess.Popen(command, env=child_environment, cwd=tmp_path, stdout=log, stderr=log,
+                                 start_new_session=True)  # fmt: skip
+    try:
+        wait_healthy(url)
+        wait_for(lambda: len(ask(url, "/deployments/filter", {})) == 2)
+        sockets = [line.split() for f in ("tcp", "tcp6") for line in Path(f"/proc/net/{f}").read_text().splitlines()]
+        listening = [s[1] for s in sockets if s[1].endswith(f":{port:04X}") and s[3] == "0A"]
+        assert listening == [f"0100007F:{port:04X}"]
+        entrypoints = {d["entrypoint"] for d in ask(url, "/deployments/filter", {})}
+        assert entrypoints == {"workflows.flows.capture_to_asset", "workflows.flows.facescape_batch"}
+        os.kill(child.pid, signal.SIGINT)
+        assert child.wait(60) == 0, (tmp_path / "log").read_text()
+        with pytest.raises(OSError):
+            ask(url, "/health")
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)

@@ -1,0 +1,76 @@
+"""How large a picture says it is, from its header alone: a bomb is refused before anything is decoded.
+
+A file of a few kilobytes can declare a picture that fills the memory. Only headers are read here, and no length in
+them is trusted beyond the bytes that are there. Sources: PNG (ISO 15948), JPEG (T.81), TIFF 6.0, OpenEXR file layout.
+"""
+
+from __future__ import annotations
+
+import struct
+from mmap import mmap
+
+Data = bytes | mmap
+_SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others in that range are tables
+_ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+
+
+def declared_size(data: Data) -> tuple[int, int] | None:
+    """(width, height) as the header of a PNG, JPEG, TIFF or EXR file has it; None if there is none to be found."""
+    try:
+        if data[:8] == b"\x89PNG\r\n\x1a\n":
+            return struct.unpack_from(">II", data, 16)
+        if data[:2] == b"\xff\xd8":
+            return _jpeg(data)
+        if data[:4] in (b"II*\0", b"MM\0*"):
+            return _tiff(data, "<" if data[:1] == b"I" else ">")
+        if data[:4] == b"\x76\x2f\x31\x01":
+            return _exr(data)
+    except (struct.error, ValueError, IndexError):  # the header ends before it should: the decoder will say so
+        return None
+    return None
+
+
+def _jpeg(data: Data) -> tuple[int, int] | None:
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return None
+        marker = data[at + 1]
+        if marker == 0xFF or marker in _ALONE:
+            at += 1 if marker == 0xFF else 2
+            continue
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if marker in _SOF:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 2 + length
+    return None
+
+
+def _tiff(data: Data, order: str) -> tuple[int, int] | None:
+    (first,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, first)
+    found = {}
+    for entry in range(count):
+        tag, kind = struct.unpack_from(f"{order}HH", data, first + 2 + 12 * entry)
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+            form = {3: "H", 4: "I"}[kind] if kind in (3, 4) else "I"
+            (found[tag],) = struct.unpack_from(f"{order}{form}", data, first + 10 + 12 * entry)
+    return (found[_TIFF_WIDTH], found[_TIFF_HEIGHT]) if len(found) == 2 else None
+
+
+def _exr(data: Data) -> tuple[int, int] | None:
+    """The dataWindow attribute: name, type, size in bytes, value; an empty name ends the header."""
+    at = 8
+    while data[at]:
+        name_end = data.find(b"\0", at)
+        type_end = data.find(b"\0", name_end + 1)
+        (size,) = struct.unpack_from("<i", data, type_end + 1)
+        if size < 0 or name_end < at or type_end < name_end:
+            return None
+        if data[at:name_end] == b"dataWindow":
+            left, top, right, bottom = struct.unpack_from("<4i", data, type_end + 5)
+            return right - left + 1, bottom - top + 1
+        at = type_end + 5 + size
+    return None

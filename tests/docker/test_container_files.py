@@ -1,0 +1,112 @@
+"""The container files, as far as they can be checked without an engine: what they promise, and that they add up."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+INSTRUCTIONS = {"ARG", "FROM", "ENV", "RUN", "WORKDIR", "COPY", "USER", "VOLUME", "ENTRYPOINT", "CMD"}
+
+
+@pytest.fixture(scope="module")
+def compose(repo: Path) -> dict[str, Any]:
+    read: dict[str, Any] = yaml.safe_load((repo / "docker/compose.yaml").read_text())
+    return read
+
+
+@pytest.fixture(scope="module")
+def steps(repo: Path) -> list[tuple[str, str]]:
+    """(instruction, its text), lines joined, comments gone."""
+    text = re.sub(r"(?m)^\s*#.*\n", "", (repo / "docker/Dockerfile").read_text()).replace("\\\n", " ")
+    return [(line.split(maxsplit=1)[0], line.split(maxsplit=1)[1]) for line in text.splitlines() if line.strip()]
+
+
+def stages(steps: list[tuple[str, str]]) -> dict[str, list[tuple[str, str]]]:
+    found: dict[str, list[tuple[str, str]]] = {}
+    for word, text in steps:
+        if word == "FROM":
+            found[text.split(" AS ")[1]] = []
+        if found:
+            found[list(found)[-1]].append((word, text))
+    return found
+
+
+def test_only_known_instructions_and_shells_that_parse(steps: list[tuple[str, str]]) -> None:
+    assert {word for word, _ in steps} <= INSTRUCTIONS
+    for word, text in steps:
+        if word == "RUN":
+            assert shlex.split(text), text
+
+
+def test_stages_build_on_what_is_there_and_on_a_pinned_base(steps: list[tuple[str, str]]) -> None:
+    known = {"${BASE}"}
+    for word, text in steps:
+        if word == "FROM":
+            assert text.split(" AS ")[0] in known
+            known.add(text.split(" AS ")[1])
+        if word == "COPY" and "--from=" in text:
+            assert text.split()[0].removeprefix("--from=") in known
+    assert {"build", "cpu", "gpu", "tests"} <= known
+    base = next(text for word, text in steps if word == "ARG" and text.startswith("BASE="))
+    assert re.fullmatch(r"BASE=python:3\.11\.\d+-slim-bookworm", base)
+
+
+def test_what_is_copied_is_there(steps: list[tuple[str, str]], repo: Path) -> None:
+    for word, text in steps:
+        if word == "COPY" and "--from=" not in text:
+            assert [p for p in text.split()[:-1] if not (repo / p).exists()] == []
+
+
+def test_what_runs_has_no_root_no_compiler_and_no_package_manager_leftovers(steps: list[tuple[str, str]]) -> None:
+    cpu = stages(steps)["cpu"]
+    assert ("USER", "10001:10001") in cpu
+    assert cpu.index(("USER", "10001:10001")) > max(i for i, (word, _) in enumerate(cpu) if word in ("RUN", "COPY"))
+    installs = " ".join(text for word, text in cpu if word == "RUN")
+    assert "gcc" not in installs and "pip" not in installs and "rm -rf /var/lib/apt/lists" in installs
+
+
+def test_every_service_is_pinned_hardened_and_watched(compose: dict[str, Any]) -> None:
+    for name, service in compose["services"].items():
+        tag = service["image"].partition(":")[2]
+        assert tag and tag != "latest", name
+        assert service["read_only"] is True and service["cap_drop"] == ["ALL"], name
+        assert "no-new-privileges:true" in service["security_opt"], name
+        assert service["user"].split(":")[0] not in ("0", "root"), name
+        assert "healthcheck" in service or service.get("restart") == "no", name
+
+
+def test_services_wait_for_what_they_need(compose: dict[str, Any]) -> None:
+    services = compose["services"]
+    for name, service in services.items():
+        for other, how in service.get("depends_on", {}).items():
+            assert how["condition"] != "service_healthy" or "healthcheck" in services[other], (name, other)
+            assert how["condition"] != "service_completed_successfully" or services[other]["restart"] == "no"
+    for name, service in services.items():
+        for volume in service.get("volumes", []):
+            source = volume.split(":")[0]
+            assert source.startswith("..") or source in compose["volumes"], (name, volume)
+
+
+def test_no_secret_is_written_down(repo: Path) -> None:
+    for name in ("compose.yaml", "Dockerfile"):
+        text = (repo / "docker" / name).read_text()
+        for line in text.splitlines():
+            value = re.search(r"(?i)(password|secret|token)\w*[:=]\s*(\S+)", line)
+            allowed = value is None or line.lstrip().startswith("#") or value[2].startswith(("${", "?"))
+            assert allowed, line
+
+
+def test_compose_deploys_what_prefect_yaml_has(compose: dict[str, Any], repo: Path) -> None:
+    deployed = yaml.safe_load((repo / "workflows/prefect.yaml").read_text())["deployments"]
+    names = {(d["entrypoint"], d["name"]): d["work_pool"]["name"] for d in deployed}
+    assert len(names) == 6
+    command = compose["services"]["deploy"]["command"][0]
+    for (_, name), pool in names.items():
+        if name.endswith("local"):
+            assert f"work-pool create {pool} " in command
+    assert compose["services"]["worker"]["entrypoint"][4] == names["workflows.flows.capture_to_asset", "local"]

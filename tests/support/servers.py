@@ -1,0 +1,162 @@
+"""Postgres, a Prefect server and workers as processes of a test, to be killed and started again."""
+
+from __future__ import annotations
+
+import json
+import os
+import pwd
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+PREFECT = str(Path(sys.executable).parent / "prefect")
+
+
+def free_port() -> int:
+    """A port of the loopback that nobody listens on now."""
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return int(s.getsockname()[1])
+
+
+def postgres_programs() -> Path | None:
+    """Where initdb and pg_ctl are: in PATH, or where Debian puts them."""
+    found = shutil.which("initdb")
+    places = [Path(found).parent] if found else sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    usable = [p for p in places if (p / "initdb").is_file() and (p / "pg_ctl").is_file()]
+    if not usable or (os.getuid() == 0 and (not shutil.which("runuser") or not _owner())):
+        return None
+    return usable[0]
+
+
+def _owner() -> str | None:
+    """Postgres refuses to run as root: another user that this machine has."""
+    names = {p.pw_name for p in pwd.getpwall()}
+    return next((n for n in ("postgres", "nobody") if n in names), None)
+
+
+class Postgres:
+    """A cluster of its own in a temporary folder."""
+
+    def __init__(self, programs: Path, folder: Path) -> None:
+        self.programs, self.folder, self.port = programs, folder, free_port()
+        self.url = f"postgresql+asyncpg://tests@127.0.0.1:{self.port}/postgres"
+
+    def call(self, program: str, *arguments: object) -> None:
+        """Run one of Postgres's programs as a user that is not root."""
+        command = [str(self.programs / program), *map(str, arguments)]
+        if os.getuid() == 0:
+            command = ["runuser", "-u", str(_owner()), "--", *command]
+        subprocess.run(command, check=True, cwd=self.folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def restart(self) -> None:
+        """As after a power cut."""
+        self.call("pg_ctl", "-D", self.folder / "data", "-m", "immediate", "-w", "restart")
+
+
+@contextmanager
+def postgres() -> Iterator[Postgres]:
+    """A running cluster."""
+    programs = postgres_programs()
+    assert programs is not None
+    folder = Path(tempfile.mkdtemp(prefix="pg"))
+    folder.chmod(0o755)
+    if os.getuid() == 0:
+        shutil.chown(folder, str(_owner()))
+    cluster = Postgres(programs, folder)
+    data = folder / "data"
+    try:
+        cluster.call("initdb", "-D", data, "-U", "tests", "-A", "trust", "--no-sync", "-E", "UTF8")
+        options = f"-p {cluster.port} -c listen_addresses=127.0.0.1 -c unix_socket_directories={folder} -c fsync=off"
+        cluster.call("pg_ctl", "-D", data, "-o", options, "-l", folder / "log", "-w", "start")
+        yield cluster
+    finally:
+        with suppress(subprocess.CalledProcessError):
+            cluster.call("pg_ctl", "-D", data, "-m", "immediate", "-w", "stop")
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+class Process:
+    """A program with its children, which go when it goes."""
+
+    def __init__(self, environment: dict[str, str], log: Path, cwd: Path, *command: object) -> None:
+        self.environment, self.log, self.cwd, self.command = environment, log, cwd, [str(c) for c in command]
+        self.child: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> Process:
+        """Start it (again)."""
+        with self.log.open("ab") as stream:
+            self.child = subprocess.Popen(
+                self.command,
+                env=self.environment,
+                cwd=self.cwd,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        return self
+
+    def kill(self) -> None:
+        """SIGKILL for it and all that it started."""
+        if self.child is not None:
+            for pid in [self.child.pid, *descendants(self.child.pid)]:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            self.child.wait()
+
+    def __enter__(self) -> Process:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+
+def descendants(pid: int) -> list[int]:
+    """Every process below `pid`."""
+    parents: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError, ValueError, IndexError):
+            parents.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+    found, wanted = [], [pid]
+    while wanted:
+        below = parents.get(wanted.pop(), [])
+        found += below
+        wanted += below
+    return found
+
+
+def ask(url: str, path: str, body: dict[str, Any] | None = None) -> Any:
+    """One call of a Prefect server's API."""
+    data = None if body is None else json.dumps(body).encode()
+    request = urllib.request.Request(f"{url}{path}", data, {"Content-Type": "application/json"})
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return json.loads(answer.read())
+
+
+def wait_healthy(url: str, seconds: float = 240) -> None:
+    """Until the server answers."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            ask(url, "/health")
+            return
+        except OSError:
+            assert time.monotonic() < end, "the server did not start"
+            time.sleep(0.3)
+
+
+def wait_for(condition: Any, seconds: float = 60.0) -> None:
+    """Until something is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not happen in time"
+        time.sleep(0.05)

@@ -1,0 +1,119 @@
+"""A batch whose stages are the real capture, a toy that works in steps with checkpoints, and a toy asset.
+
+As a module it offers the flow to a Prefect worker; as a program it is `neuface` (or, with --child, one capture's
+process) with these stages. Every stage that comes to its end adds a line to the file $NEUFACE_TALLY.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pipeline.threads  # noqa: F401
+from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
+from pipeline.contract import Context, Stage, StageConfig
+from stages import registry
+from stages.capture.stage import STAGE as CAPTURE
+from workflows import batch_local
+
+
+class Worked(Artifact):
+    """What the toy made."""
+
+    file: FileRef
+
+
+@dataclass(frozen=True, slots=True)
+class WorkInputs:
+    capture: Located[Capture]
+
+
+@dataclass(frozen=True, slots=True)
+class UsdInputs:
+    work: Located[Worked]
+
+
+class WorkConfig(StageConfig):
+    steps: int = 4
+    pause: float = 0.05
+    fault: str = ""
+
+
+class UsdConfig(StageConfig):
+    name: str = "head"
+
+
+def tally(stage: str, inputs: str) -> None:
+    path = os.environ.get("NEUFACE_TALLY")
+    if path:
+        with Path(path).open("a") as f:
+            f.write(f"{stage} {inputs}\n")
+
+
+def run_capture(inputs: Any, config: Any, context: Context) -> Capture:
+    made = CAPTURE.run(inputs, config, context)
+    tally("capture", inputs.source.artifact.digest()[:16])
+    return made
+
+
+def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked:
+    """As many steps as asked, a checkpoint after each; ends as its setting says."""
+    checkpoint = context.scratch / "step.txt"
+    begin = int(checkpoint.read_text()) if checkpoint.is_file() else 0
+    for step in range(begin, config.steps):
+        context.check()
+        context.progress(step, config.steps, "working")
+        time.sleep(config.pause)
+        checkpoint.write_text(str(step + 1))
+    if config.fault == "hangs":
+        while True:
+            time.sleep(0.05)
+    if config.fault == "hangs in C":  # with Python's lock held: no thread of Python runs any more
+        ctypes.PyDLL(None).sleep(600)
+    if config.fault == "hangs politely":
+        while True:
+            context.check()
+            time.sleep(0.05)
+    if config.fault == "killed once" and not (context.scratch / "killed").exists():
+        (context.scratch / "killed").write_text("")
+        os.kill(os.getpid(), 9)
+    (context.workdir / "w.bin").write_bytes(inputs.capture.artifact.digest().encode() * 1000)
+    tally("work", inputs.capture.artifact.digest()[:16])
+    return Worked(file=context.file("w.bin"))
+
+
+def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
+    """A folder that looks like an asset."""
+    root = context.workdir / "asset" / f"{config.name}.usd"
+    root.parent.mkdir()
+    root.write_text(f'#usda 1.0\ndef "x" {{}} # {inputs.work.artifact.file.sha256}\n')
+    tally("usd", inputs.work.artifact.digest()[:16])
+    return UsdAsset(name=config.name, root=f"asset/{config.name}.usd", files=(context.file(root),), checks=0)
+
+
+TOYS: tuple[Stage[Any, Any, Any], ...] = (
+    Stage("capture", CAPTURE.version, CAPTURE.inputs, CAPTURE.config, Capture, run_capture),
+    Stage("work", 1, WorkInputs, WorkConfig, Worked, run_work),
+    Stage("usd", 1, UsdInputs, UsdConfig, UsdAsset, run_usd),
+)
+registry.REGISTRY = TOYS
+batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        from workflows.batch_child import main as child
+
+        sys.exit(child(sys.argv[2:]))
+    from workflows.cli import main
+
+    sys.exit(main())
+else:  # what a worker's entrypoint names
+    from workflows.flows import capture_to_asset, facescape_batch
+
+    __all__ = ["capture_to_asset", "facescape_batch"]

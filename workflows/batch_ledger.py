@@ -1,0 +1,95 @@
+"""What is known of each capture of a batch, on disk after every change: a batch that was killed goes on from here."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from pipeline.artifacts import RelativePath
+from stages import registry
+from workflows.batch_captures import Item
+from workflows.batch_faults import Fault
+from workflows.plan import RunRequest
+
+State = Literal["waiting", "submitted", "done", "failed"]
+
+
+class Entry(BaseModel):
+    """One capture's state.
+
+    attempt: counts every try, over all commands; it is in the key that keeps a server from running one try twice.
+    sets: settings that earlier attempts taught (a smaller batch). fingerprint: of what was asked and what it was of.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: str
+    capture: str
+    state: State = "waiting"
+    attempt: int = 0
+    fingerprint: str = ""
+    sets: tuple[str, ...] = ()
+    fault: Fault | None = None
+    earlier: tuple[Fault, ...] = ()
+    asset: RelativePath | None = None
+
+
+class Ledger:
+    """The entries of a batch, a file each, below `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "captures"
+
+    def read(self, item: Item) -> Entry:
+        """The entry of a capture; a new one where there is none that can be read."""
+        path = self._path(item.name)
+        try:
+            entry = Entry.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError):
+            return Entry(name=item.name, capture=str(item.capture))
+        return entry if entry.name == item.name else Entry(name=item.name, capture=str(item.capture))
+
+    def write(self, entry: Entry) -> None:
+        """Replace the entry's file as a whole."""
+        path = self._path(entry.name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(f".{path.name}.partial-{uuid.uuid4().hex[:8]}")
+        partial.write_text(entry.model_dump_json(indent=1))
+        partial.replace(path)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name.replace('/', '__')}.json"
+
+
+def fingerprint(request: RunRequest) -> str:
+    """Of a request, the stages' versions, and names, sizes and times of the capture's files.
+
+    It only decides whether a finished capture is looked at again; what is reused then, the store decides by content.
+    """
+    asked = request.model_dump(mode="json", exclude={"stage_limit", "fit_slots", "store", "device"})
+    parts = [asked, [(s.name, s.version) for s in registry.REGISTRY], _files(Path(request.capture))]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _files(folder: Path) -> list[tuple[str, int, int]]:
+    found = []
+    for place in (folder, folder / "mask", folder / "masks"):
+        if place.is_dir():
+            with os.scandir(place) as entries:
+                for e in entries:
+                    if e.is_file():
+                        stat = e.stat()
+                        found.append((f"{place.name}/{e.name}", stat.st_size, stat.st_mtime_ns))
+    return sorted(found)
+
+
+def idempotency_key(entry: Entry, out: str) -> str:
+    """The same for the same try of the same capture, from whichever command and machine it is submitted."""
+    parts = [out, entry.name, entry.fingerprint, entry.attempt]
+    return "neuface-" + hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:40]

@@ -1,0 +1,183 @@
+"""Clearing up a store: what nobody needs (gc), and all that came from one person's photos (purge)."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.store import LINEAGE, Store, lineage
+from stages.registry import SOURCE
+from workflows.alone import lock_is_free
+from workflows.batch_captures import RECORDS
+from workflows.batch_ledger import Entry
+from workflows.store_roots import Root, forget_root, roots
+
+DAY = 86400.0
+_KEY = re.compile(r"([0-9a-f]{64})(\.scratch|\.partial-[0-9a-f]+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Something in a store that may go. why: for the user. size: bytes."""
+
+    path: Path
+    why: str
+    size: int
+
+
+# ------------------------------------------------------------------ gc
+def garbage(store: Store, older_than: float, now: float | None = None) -> list[Piece]:
+    """What no published folder names and nobody used for `older_than` seconds.
+
+    While a run is under way only what was not used for a day counts: the run has not named its artifacts yet.
+    """
+    now = time.time() if now is None else now
+    needed = {(stage, key) for root in roots(store) for stage, key in root.keys.items()}
+    limit = max(older_than, DAY) if _busy(store) else older_than
+    found = []
+    for stage, key, kind, path in _pieces(store):
+        if not lock_is_free(store.root / ".locks" / f"{stage}-{key}"):
+            continue
+        if kind.startswith(".partial"):
+            found.append(Piece(path, "left by a process that died", _size(path)))
+        elif now - path.stat().st_mtime < limit:
+            continue
+        elif kind == ".scratch":
+            found.append(Piece(path, "checkpoints of a fit that nobody goes on with", _size(path)))
+        elif (stage, key) not in needed:
+            found.append(Piece(path, "no published folder was made from it", _size(path)))
+    return found
+
+
+def remove(store: Store, pieces: Iterable[Piece]) -> None:
+    """Take pieces out of the store; one that a process took up meanwhile stays."""
+    for piece in pieces:
+        match = _KEY.fullmatch(piece.path.name)
+        if match is None or not lock_is_free(store.root / ".locks" / f"{piece.path.parent.name}-{match[1]}"):
+            continue
+        shutil.rmtree(piece.path, ignore_errors=True)
+        if match[2] is None:
+            (store.root / LINEAGE / f"{piece.path.parent.name}-{match[1]}.json").unlink(missing_ok=True)
+
+
+def _busy(store: Store) -> bool:
+    return any(not lock_is_free(p) for p in (store.root / ".locks").glob("run-*"))
+
+
+def _pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
+    """(stage, key, "" | ".scratch" | ".partial-...", folder)"""
+    for stage in sorted(p for p in store.root.iterdir() if p.is_dir() and not p.name.startswith(".")):
+        for path in sorted(stage.iterdir()):
+            match = _KEY.fullmatch(path.name)
+            if match is not None and path.is_dir() and not path.is_symlink():
+                yield stage.name, match[1], match[2] or "", path
+
+
+def _size(path: Path) -> int:
+    return sum(p.lstat().st_size for p in path.rglob("*") if p.is_file() and not p.is_symlink())
+
+
+# ------------------------------------------------------------------ purge
+@dataclass(frozen=True, slots=True)
+class Purge:
+    """All that a subject left: folders and files to remove, the runs among them, and the photos, which stay."""
+
+    paths: tuple[Path, ...]
+    outs: tuple[Path, ...]
+    photos: tuple[Path, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return sum(_size(p) if p.is_dir() else p.lstat().st_size for p in self.paths)
+
+
+def belongings(subject: str, out: Path, store: Store) -> Purge:
+    """Everything below `out` and in the store that was made from the subject's photos, finished or not."""
+    out = out.absolute()
+    runs = [r for r in _roots_of(out, store) if _is_of(subject, r, out)]
+    entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
+    photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
+    outs = {r.out for r in runs} | {out / e.name for _, e in entries}
+    paths: set[Path] = set(_made_from(photos, store)) | {o for o in outs if o.is_dir() and o != out}
+    if out in outs:  # the run's own folder: the store inside it may serve others
+        paths |= {out / n for n in ("asset", "report", "run.json", "truth", "truth.json") if (out / n).exists()}
+    for path, entry in entries:
+        log = out / RECORDS / "logs" / f"{entry.name.replace('/', '__')}.log"
+        paths |= {p for p in (path, log) if p.exists()}
+    if entries and (out / RECORDS).is_dir():  # the table names the subject; the next batch writes it anew
+        tables = ("summary.json", "summary.csv", "index.html")
+        paths |= {out / RECORDS / n for n in tables if (out / RECORDS / n).exists()}
+    for o in outs:  # the throw-away server of a run keeps its parameters
+        home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
+        paths |= {home} if home.is_dir() else set()
+    return Purge(tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)))
+
+
+def purge(found: Purge, store: Store) -> list[Path]:
+    """Remove it. Hands back what is still there: a process works on it, or it can't be removed."""
+    for path in found.paths:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    for out in found.outs:
+        forget_root(store, out)
+        if out.parent.is_dir() and not any(out.parent.iterdir()):
+            out.parent.rmdir()
+    return [p for p in found.paths if p.exists()]
+
+
+def _roots_of(out: Path, store: Store) -> list[Root]:
+    return [r for r in roots(store) if r.out == out.resolve() or out.resolve() in r.out.resolve().parents]
+
+
+def _is_of(subject: str, root: Root, out: Path) -> bool:
+    """The run's folder is OUT/SUBJECT or lies in it; or OUT is a single run of a capture of that name."""
+    inside = root.out.resolve().relative_to(out.resolve()).parts
+    return inside[:1] == (subject,) if inside else Path(root.capture).name == subject
+
+
+def _photos_of(root: Root, store: Store) -> Iterator[Path]:
+    """The folders that a run's first stage read; run.json may name them relative to a folder that nobody knows now."""
+    for stage, key in root.keys.items():
+        yield from (Path(p) for p in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(SOURCE, ()))
+
+
+def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:
+    for path in sorted((out / RECORDS / "captures").glob("*.json")):
+        try:
+            yield path, Entry.model_validate_json(path.read_bytes())
+        except ValueError:
+            continue
+
+
+def _made_from(photos: set[Path], store: Store) -> Iterator[Path]:
+    """Every folder of the store that comes, over any number of stages, from one of these folders; and its lineage."""
+    folder = store.root / LINEAGE
+    known = {p: {x for names in lineage(p).values() for x in names} for p in sorted(folder.glob("*.json"))}
+    reached, grown = {str(p) for p in photos}, True
+    taken: set[Path] = set()
+    while grown:
+        grown = False
+        for path, origins in known.items():
+            if path not in taken and origins & reached:
+                stage, _, key = path.stem.rpartition("-")
+                taken.add(path)
+                reached.add(f"{stage}/{key}")
+                grown = True
+    for path in taken:
+        stage, _, key = path.stem.rpartition("-")
+        yield path
+        yield from (store.root / stage).glob(f"{key}*")
+
+
+def as_json(found: Iterable[Piece]) -> str:
+    """For a script."""
+    return json.dumps([{"path": str(p.path), "why": p.why, "bytes": p.size} for p in found], indent=1)
