@@ -80,12 +80,20 @@ class Located(Generic[A]):
 
 
 # ------------------------------------------------------------------ capture
-class CaptureSource(Artifact):
-    """What was found in the user's folder, by content; the folder itself is not part of it."""
+CaptureKind = Literal[
+    "facescape", "transforms", "idr", "metashape", "realityscan", "colmap", "photos", "video"
+]  # fmt: skip
 
-    kind: Literal["facescape", "photos"]
+
+class CaptureSource(Artifact):
+    """What was found in the user's folder, by content; the folder itself is not part of it.
+
+    photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
+    """
+
+    kind: CaptureKind
     photos: tuple[FileRef, ...]
-    params: FileRef | None = None
+    cameras: tuple[FileRef, ...] = ()
     masks: tuple[FileRef, ...] = ()
 
 
@@ -118,7 +126,7 @@ class CaptureView(Artifact):
 class Capture(Artifact):
     """The photos that take part, checked and in one place."""
 
-    kind: Literal["facescape", "photos"]
+    kind: CaptureKind
     views: tuple[CaptureView, ...]
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
