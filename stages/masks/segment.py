@@ -20,6 +20,7 @@ from stages.masks.agree import Opinion, contradiction, opinions, outliers, trima
 from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
+from stages.masks.solid import Solid, Support, distinct, find_solid
 from stages.masks.sources import Method, Plan, View, mask, plan, to_full_size
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
@@ -61,16 +62,21 @@ class Masked:
         return not LIMITS[0] <= self.coverage <= LIMITS[1]
 
 
-def segment(capture: Located[Capture], poses: CameraSet, settings: Settings, context: Context) -> MaskSet:
+def segment(
+    capture: Located[Capture], located: Located[CameraSet], settings: Settings, context: Context
+) -> MaskSet:  # fmt: skip
     """Masks of all registered views; see stages.masks.stage.run."""
+    poses = located.artifact
     pairs = _views(capture, poses)
-    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed)
+    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed,
+               lambda: _solid(located, settings.seed))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
     warnings: list[str] = []
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
-    found = _opinions(masked, voting, poses, settings)
+    support = how.solid.support if how.solid is not None else None
+    found = _opinions(masked, voting, poses, settings, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     if settings.mend:
         bad = _outliers(masked, settings)
@@ -78,7 +84,7 @@ def segment(capture: Located[Capture], poses: CameraSet, settings: Settings, con
                        list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
         if any(a is not b for a, b in zip(mended, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in mended]
-            found = _opinions(mended, voting, poses, settings)
+            found = _opinions(mended, voting, poses, settings, support)
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
     dropped = _dropped(masked, settings, warnings)
@@ -91,7 +97,9 @@ def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Came
     for camera in poses.cameras:
         v = by_index[camera.index]
         disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
-        out.append((View(v.index, v.name, disc, v.holdout, _reader(capture, v), _mask_reader(capture, v)), camera))
+        out.append(
+            (View(v.index, v.name, camera, disc, v.holdout, _reader(capture, v), _mask_reader(capture, v)), camera)
+        )
     return out
 
 
@@ -151,9 +159,21 @@ def _path(index: int, context: Context) -> Path:
     return context.workdir / "masks" / f"{index}.png"
 
 
-def _opinions(masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings) -> list[Opinion]:
+def _solid(poses: Located[CameraSet], seed: int) -> Solid | None:
+    """The object among the sparse points, if the cameras came with any."""
+    ref = poses.artifact.points
+    if ref is None:
+        return None
+    with np.load(poses.path(ref)) as data:
+        points = np.asarray(data["points"], np.float64)
+    return find_solid(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
+
+
+def _opinions(
+    masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings, support: Support | None
+) -> list[Opinion]:
     return opinions([m.camera for m in masked], [m.small for m in masked], voting, poses.roi_radius,
-                    settings.hull_cells)  # fmt: skip
+                    settings.hull_cells, support)  # fmt: skip
 
 
 def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
@@ -168,14 +188,15 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source == "given" or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = made.source in ("person", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
+    doubtful = made.source in ("person", "object", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
     if not (bad or doubtful):
         return made
     image = made.view.read()
     w, h = working_size(image.shape[1], image.shape[0], settings.working_size)
     opinion_here = _at_size(opinion, w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
-    new = cut(np.asarray(resized(image, w, h), np.uint8), trimap(prior, opinion_here), settings.seed)
+    small = np.asarray(resized(image, w, h), np.uint8)
+    new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), settings.seed)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:

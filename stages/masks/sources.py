@@ -8,14 +8,16 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
 from stages.masks.cut_out import cut_by_region
 from stages.masks.key_out import Background, border_colours, find_background, key_out
 from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
 from stages.masks.soften import soft_edge
+from stages.masks.solid import Solid, cut_by_points
 
-Method = Literal["auto", "given", "key", "person", "grabcut"]
+Method = Literal["auto", "given", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
 SOFT = 2  # pixels of the working size to which a cut-out contour is right
@@ -27,6 +29,7 @@ class View:
 
     index: int
     name: str
+    camera: Camera
     disc: Disc
     holdout: bool
     read: Callable[[], U8]
@@ -37,15 +40,19 @@ class View:
 class Plan:
     """How views without a mask of their own are masked."""
 
-    method: Literal["given", "key", "person", "grabcut"]
+    method: Literal["given", "key", "person", "object", "grabcut"]
     background: Background | None = None
+    solid: Solid | None = None
 
 
-def plan(views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int) -> Plan:
-    """Choose the way from a few of the views that are fitted.
+def plan(
+    views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
+    solid: Callable[[], Solid | None] = lambda: None,
+) -> Plan:  # fmt: skip
+    """Choose the way from a few of the views that are fitted. solid: looks for the object among the sparse points.
 
     Raises:
-        StageError: masks or a uniform background were asked for and are not there.
+        StageError: masks, a uniform background or an object were asked for and are not there.
     """
     bare = [v for v in views if v.given is None] if method in ("auto", "given") else list(views)
     if method == "given" and bare:
@@ -66,9 +73,23 @@ def plan(views: Sequence[View], method: Method, threshold: float, working_size: 
                              "same in all photos", remedy="use masks.method=auto, or give masks")  # fmt: skip
     if method in ("person", "grabcut"):
         return Plan(method)
+    if method == "object":
+        return _by_points(solid())
     shares = [_person_share(i, v.disc, threshold, min(working_size, 320), seed)
               for i, v in zip(images[::2], some[::2], strict=True)]  # fmt: skip
-    return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
+    if np.median(shares) >= PERSON_SHARE:
+        return Plan("person")
+    found = solid()
+    return Plan("grabcut") if found is None else _by_points(found)
+
+
+def _by_points(solid: Solid | None) -> Plan:
+    if solid is None:
+        raise StageError("no object is found among the sparse points", where="masks.method=object",
+                         value="no points, or too few that hang together", limit="cameras solved from the photos "
+                         "(poses.method=colmap) of an object with texture",
+                         remedy="use masks.method=auto, or give masks")  # fmt: skip
+    return Plan("object", solid=solid)
 
 
 def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> float:
@@ -88,6 +109,8 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
     image = view.read()
     if how.method == "key" and how.background is not None:
         return key_out(image, how.background), "key"
+    if how.method == "object" and how.solid is not None:
+        return to_full_size(image, cut_by_points(image, view.camera, how.solid, working_size, seed)), "object"
     if how.method == "person":
         return to_full_size(image, person_mask(image, view.disc, threshold, working_size, seed)), "person"
     return to_full_size(image, cut_by_region(image, view.disc, working_size, seed)), "grabcut"

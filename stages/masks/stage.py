@@ -22,10 +22,11 @@ class Inputs:
 class Config(StageConfig):
     """Settings of the masks stage."""
 
-    method: Literal["auto", "given", "key", "person", "grabcut"] = Field(
+    method: Literal["auto", "given", "key", "person", "object", "grabcut"] = Field(
         "auto",
         description="given: the capture's masks; key: uniform background; person: learned segmentation of people; "
-        "grabcut: colour statistics around the region of interest; auto: the first of these that works",
+        "object: what the sparse points show to stand on a support; grabcut: colour statistics around the region of "
+        "interest; auto: the first of these that works",
     )
     threshold: float = Field(0.5, gt=0, lt=1, description="probability from which a pixel counts as a person")
     working_size: int = Field(640, ge=128, le=2048, description="longest edge at which people and objects are cut out")
@@ -59,7 +60,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
         mend=config.mend,
         seed=config.seed,
     )
-    return segment(inputs.capture, inputs.poses.artifact, settings, context)
+    return segment(inputs.capture, inputs.poses, settings, context)
 
 
-STAGE = Stage(name="masks", version=1, inputs=Inputs, config=Config, output=MaskSet, run=run)
+STAGE = Stage(name="masks", version=2, inputs=Inputs, config=Config, output=MaskSet, run=run)

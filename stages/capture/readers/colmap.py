@@ -93,7 +93,6 @@ def _lens(camera: Any, where: str) -> tuple[F64, F64, float]:
     K = np.array([[focal, 0, camera.principal_point_x], [0, focal, camera.principal_point_y], [0, 0, 1.0]])
 
     def image_from_plane(xy: F64) -> F64:
-        found = [camera.img_from_cam(np.array([x, y, 1.0])) for x, y in xy]
-        return np.array([(np.nan, np.nan) if f is None else f for f in found], np.float64)
+        return np.asarray(camera.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], 1)), np.float64)
 
     return five_terms(image_from_plane, K, camera.width, camera.height, where)
