@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, Capture, CaptureView, Located
+from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError, UsageError
 
@@ -43,6 +43,11 @@ class Config(StageConfig):
     refine_distortion: bool = Field(True, description="let the solver move the lens distortion")
     refine_principal_point: bool = Field(False, description="let the solver move the principal point")
     use_masks: bool = Field(True, description="look for features on the subject only, where the capture has masks")
+    check: bool = Field(True, description="hold given cameras against the photos; leave out views that contradict")
+    unit: Literal["auto", "metres", "centimetres", "millimetres", "unknown"] = Field(
+        "auto",
+        description="unit of the given cameras; auto: FaceScape's from the subject's size, other formats' unknown",
+    )
     min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
 
 
@@ -54,7 +59,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
 
     Raises:
         UsageError: given cameras are asked for and there are none.
-        StageError: the given cameras share no view, or the photos can't be placed.
+        StageError: the given cameras share no view or contradict the photos, or the photos can't be placed.
     """
     views = inputs.capture.artifact.views
     all_given = all(v.camera is not None for v in views)
@@ -67,30 +72,73 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
             remedy="use poses.method=auto or poses.method=colmap",
         )
     if all_given and config.method != "colmap":
-        return _given(views)
+        return _given(inputs.capture, config, context)
     return _solved(inputs.capture, config, context)
 
 
-def _given(views: tuple[CaptureView, ...]) -> CameraSet:
-    """The capture's own cameras, moved to asset coordinates."""
+def _given(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
+    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict."""
     from pipeline.transforms import inverse_rigid, matrix
-    from stages.poses.normalise import normalise
+    from stages.poses.normalise import Unit, normalise
     from stages.poses.place import camera_of, in_asset
 
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
-        for v, c in ((v, v.camera) for v in views)
+        for v, c in ((v, v.camera) for v in capture.artifact.views)
         if c is not None
     ]
-    found = normalise(cameras, given=True)
+    # only FaceScape says what its numbers are: metres or millimetres; the others' worlds have any size
+    auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
+    unit: Unit = auto if config.unit == "auto" else config.unit
+    wrong = _contradicted(capture, cameras, config, context) if config.check else []
+    names = tuple(cameras[i].name for i in wrong)
+    cameras = [c for i, c in enumerate(cameras) if i not in wrong]
+    found = normalise(cameras, given=True, unit=unit)
+    told = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
+            for n in names]  # fmt: skip
     return CameraSet(
         source="given",
         metric=found.metric,
         capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
-        warnings=found.warnings,
+        unregistered=names,
+        warnings=(*told, *found.warnings),
     )
+
+
+def _contradicted(
+    capture: Located[Capture], cameras: list[Camera], config: Config, context: Context
+) -> list[int]:  # fmt: skip
+    """Places of the views whose photos contradict their cameras.
+
+    Raises:
+        StageError: most of them do.
+    """
+    from stages.poses.check import EDGE, FEATURES, check_cameras
+    from stages.poses.features import PLAIN
+    from stages.poses.photogrammetry import Settings, detect_all
+    from stages.poses.photos import photos_of
+    from stages.poses.solve import Refine
+
+    def progress(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, message)
+
+    settings = Settings(config.seed, EDGE, FEATURES, config.neighbours, "no", config.camera_model, Refine())
+    features = detect_all(photos_of(capture, config.use_masks), settings, PLAIN, progress)
+    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"))
+    if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
+        raise StageError(
+            "the cameras do not belong to the photos",
+            where="poses",
+            value=f"{len(verdict.wrong)} of {verdict.known} views contradict their neighbours, such as "
+            + ", ".join(cameras[i].name for i in verdict.wrong[:5]),
+            limit="most views' features on each other's epipolar lines",
+            remedy="check that photos and cameras are in the same order and of the same size, or set "
+            "poses.method=colmap to have the cameras solved; poses.check=false uses them as they are",
+        )
+    return verdict.wrong
 
 
 def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
@@ -159,4 +207,4 @@ def _not_placed(total: int, placed: int, fitted: int, missing: tuple[str, ...], 
     )
 
 
-STAGE = Stage(name="poses", version=1, inputs=Inputs, config=Config, output=CameraSet, run=run)
+STAGE = Stage(name="poses", version=2, inputs=Inputs, config=Config, output=CameraSet, run=run)
