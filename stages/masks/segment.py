@@ -21,12 +21,13 @@ from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, Support, distinct, find_solid
-from stages.masks.sources import Method, Plan, View, mask, plan, to_full_size
+from stages.masks.sources import Method, Plan, View, inverted, mask, plan, to_full_size
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
+INVERTED = "given, inverted"
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -72,7 +73,8 @@ def segment(
                lambda: _solid(located, settings.seed))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
-    warnings: list[str] = []
+    warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the other "
+                "way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
     support = how.solid.support if how.solid is not None else None
@@ -140,8 +142,10 @@ def _each(work: Callable[[T], R], items: list[T], context: Context, message: str
 def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Context) -> Masked:
     use = view if settings.method in ("auto", "given") else replace(view, given=None)
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
+    if source == "given" and inverted(alpha, view.disc):
+        alpha, source = 1 - alpha, INVERTED
     made = _keep(use, camera, alpha, source, context)
-    if made.useless and source == "given":
+    if made.useless and source in ("given", INVERTED):
         raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
                          where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
                          limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
@@ -186,7 +190,7 @@ def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
 def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context: Context) -> Masked:
     """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
     inside = made.small >= 0.5
-    if made.source == "given" or made.view.holdout or (made.source == "key" and made.useless):
+    if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
     doubtful = made.source in ("person", "object", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
     if not (bad or doubtful):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, spatial
 
 from pipeline.artifacts import Camera
 from pipeline.transforms import F64, inverse_rigid, matrix, project
@@ -23,7 +23,7 @@ AROUND, REACH = 2.5, 1.6  # R: where a support is looked for; how far the object
 TRIES = 600
 THICK, CLEAR = 0.015, 0.03  # R: a support's points lie so near it; what is higher is not it
 MIN_ON, MAX_BENEATH, MIN_ABOVE = 0.08, 0.05, 0.95  # shares: of points on it, beneath it, of cameras above it
-LINK = 0.1  # R: points nearer than this hang together
+LINK, COMPANY = 0.1, 4  # R: points nearer than this hang together; of so many others at least
 MIN_POINTS = 200
 SPACING = 0.07  # R: gaps between projected points that are closed
 GREY = 6  # levels: a photo whose channels differ less has no colours
@@ -83,7 +83,11 @@ def find_support(points: F64, centres: F64, roi_radius: float, seed: int) -> Sup
 
 
 def _largest_cluster(points: F64, link: float) -> F64:
-    """The points of the largest group in which each is within about `link` of another."""
+    """The points of the largest group in which each is within about `link` of others; wrong ones stand alone."""
+    if len(points) <= COMPANY:
+        return points
+    farthest = spatial.cKDTree(points).query(points, COMPANY + 1)[0][:, -1]
+    points = points[farthest < link]
     if not len(points):
         return points
     index = ((points - points.min(0)) / link).astype(np.intp) + 1

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
-from stages.masks.cut_out import cut_by_region
+from stages.masks.cut_out import INNER, OUTER, cut_by_region
 from stages.masks.key_out import Background, border_colours, find_background, key_out
 from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
@@ -20,6 +20,7 @@ from stages.masks.solid import Solid, cut_by_points
 Method = Literal["auto", "given", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
+TELLING, WRONG_SIDE = 0.02, 0.3  # share of the photo around the region; mean alpha that is all but empty
 SOFT = 2  # pixels of the working size to which a cut-out contour is right
 
 
@@ -114,6 +115,15 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
     if how.method == "person":
         return to_full_size(image, person_mask(image, view.disc, threshold, working_size, seed)), "person"
     return to_full_size(image, cut_by_region(image, view.disc, working_size, seed)), "grabcut"
+
+
+def inverted(alpha: F32, disc: Disc) -> bool:
+    """Whether a given mask shows the background: all but empty in the middle of the region of interest and all but
+    full around it, where there is enough around it to tell."""
+    core, around = disc.covers(*alpha.shape, INNER), ~disc.covers(*alpha.shape, OUTER)
+    if not core.any() or around.mean() < TELLING:
+        return False
+    return bool(alpha[core].mean() < WRONG_SIDE and alpha[around].mean() > 1 - WRONG_SIDE)
 
 
 def to_full_size(image: U8, inside: Bool) -> F32:

@@ -257,3 +257,13 @@ def test_contradiction_and_trimap() -> None:
     assert found[50, 70] == cv2.GC_FGD and found[5, 5] == cv2.GC_BGD
     elsewhere = replace(opinion, here=x < 0)
     assert (trimap(half, elsewhere)[:, 60:][body[:, 60:]] == cv2.GC_BGD).all()  # outside the region: its own word
+
+
+def test_inverted_masks_are_turned_and_named(scene: Scene, tmp_path: Path) -> None:
+    for c in scene.cameras:
+        alpha = ball_alpha(c)
+        scene.give(c.index, 1 - alpha if c.index in (4, 7) else alpha)
+    found, alphas = run(scene, tmp_path / "s")
+    assert [m.index for m in found.masks if m.source == "given, inverted"] == [4, 7] and found.dropped == ()
+    assert all(iou(a, ball_alpha(c)) > 0.99 for a, c in zip(alphas, scene.cameras, strict=True))
+    assert "(4.png)" in found.warnings[0] and "white on the subject" in found.warnings[0]
