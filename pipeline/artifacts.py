@@ -152,7 +152,8 @@ class Camera(Artifact):
 class CameraSet(Artifact):
     """Cameras around the subject.
 
-    capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin.
+    capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
+    reprojection error of each solved view, by its photo's name.
     """
 
     source: Literal["given", "colmap"]
@@ -162,6 +163,7 @@ class CameraSet(Artifact):
     cameras: tuple[Camera, ...]
     unregistered: tuple[str, ...] = ()
     reprojection_error_px: float | None = None
+    view_errors_px: dict[str, float] = {}
     points: FileRef | None = None
     warnings: tuple[str, ...] = ()
 

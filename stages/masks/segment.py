@@ -73,8 +73,8 @@ def segment(
                lambda: _solid(located, settings.seed))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
-    warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the other "
-                "way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
+    warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the "
+                "other way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
     support = how.solid.support if how.solid is not None else None

@@ -120,7 +120,8 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
 def inverted(alpha: F32, disc: Disc) -> bool:
     """Whether a given mask shows the background: all but empty in the middle of the region of interest and all but
     full around it, where there is enough around it to tell."""
-    core, around = disc.covers(*alpha.shape, INNER), ~disc.covers(*alpha.shape, OUTER)
+    h, w = alpha.shape
+    core, around = disc.covers(h, w, INNER), ~disc.covers(h, w, OUTER)
     if not core.any() or around.mean() < TELLING:
         return False
     return bool(alpha[core].mean() < WRONG_SIDE and alpha[around].mean() > 1 - WRONG_SIDE)

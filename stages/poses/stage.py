@@ -41,7 +41,9 @@ class Config(StageConfig):
     )
     refine_focal: bool = Field(True, description="let the solver move focal lengths")
     refine_distortion: bool = Field(True, description="let the solver move the lens distortion")
-    refine_principal_point: bool = Field(False, description="let the solver move the principal point")
+    refine_principal_point: Literal["auto", "yes", "no"] = Field(
+        "auto", description="let the solver move the principal point; auto: at the end, if the photos tell where it is"
+    )
     use_masks: bool = Field(True, description="look for features on the subject only, where the capture has masks")
     check: bool = Field(True, description="hold given cameras against the photos; leave out views that contradict")
     unit: Literal["auto", "metres", "centimetres", "millimetres", "unknown"] = Field(
@@ -162,15 +164,21 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     model = solve(photos_of(capture, config.use_masks), settings, context.scratch, progress)
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
+    strangers = {i for group in (model.others if model is not None else ()) for i in group} - set(placed)
     fitted = sum(not views[i].holdout for i in placed)
-    if model is None or len(placed) < config.min_registered * len(views) or fitted < MIN_FITTED:
+    if model is None or len(placed) < config.min_registered * (len(views) - len(strangers)) or fitted < MIN_FITTED:
         raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     found = normalise(cameras, model.points, given=False)
     save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     warnings = [*found.warnings]
     if missing:
-        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: " + ", ".join(missing))
+        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {', '.join(missing)}; "
+                        "they show something else, are mirrored or blurred, or stand too far from the others: "
+                        "photograph the way between")  # fmt: skip
+    for group in model.others if strangers else ():
+        warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
+                        + "; if they show another subject, make a capture of their own")  # fmt: skip
     return CameraSet(
         source="colmap",
         metric=found.metric,
@@ -179,6 +187,7 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
         cameras=in_asset(cameras, found.capture_from_asset),
         unregistered=missing,
         reprojection_error_px=model.reprojection_error_px,
+        view_errors_px={views[i].name: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e},
         points=context.file("points.npz"),
         warnings=tuple(warnings),
     )
