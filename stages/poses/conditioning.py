@@ -19,7 +19,7 @@ from scipy import sparse
 from pipeline.transforms import F64
 
 STEP = 1e-6
-PRIOR = 1e-9  # of the mean diagonal
+PRIOR = 1e-10  # of each unknown's own information
 LENS, POSE = 4, 6
 
 
@@ -74,8 +74,8 @@ def principal_point_deviation(
     S = _schur(by_camera, by_point, len(points))
     freedom = max(2 * len(i) - by_camera.shape[1] - by_point.shape[1] + 7, 1)
     variance = float((residual**2).sum()) / freedom
-    S[np.diag_indices_from(S)] += PRIOR * np.trace(S) / len(S)
-    covariance = np.linalg.inv(S) * variance
+    size = np.sqrt(np.maximum(np.diag(S), 1e-300))  # turns and pixels have sizes of their own
+    covariance = np.linalg.inv(S / np.outer(size, size) + PRIOR * np.eye(len(S))) * variance / np.outer(size, size)
     first = photos * POSE + np.arange(lenses) * LENS
     diagonal = np.diag(covariance)
     return np.asarray(np.sqrt(np.maximum(np.stack([diagonal[first + 1], diagonal[first + 2]], 1), 0)), np.float64)
