@@ -111,3 +111,11 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
     if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None
     return Verified(np.asarray(F, np.float64), matches[inliers.ravel() > 0])
+
+
+def homography_share(a: Features, b: Features, pair: Verified, edge: int, seed: int) -> float:
+    """Share of a pair's matches that one homography explains: all, if the camera only turned or the scene is flat."""
+    cv2.setRNGSeed(seed)
+    uv_a, uv_b = a.uv[pair.matches[:, 0]], b.uv[pair.matches[:, 1]]
+    _, inliers = cv2.findHomography(uv_a, uv_b, cv2.RANSAC, 1.5 * EPIPOLAR_LIMIT * edge, None, RANSAC_TRIALS)
+    return 0.0 if inliers is None else float(inliers.mean())

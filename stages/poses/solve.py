@@ -23,6 +23,7 @@ DEFAULT_FOCAL = 1.2  # of the longest edge: COLMAP's own guess, a 43 mm lens on 
 MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
+MIN_POINTS = 100
 PRINCIPAL_POINT_LIMIT = (
     1.5e-3  # of the longest edge, standard deviation: it turns a view by less than a tenth of a degree
 )
@@ -127,6 +128,8 @@ def _tells_principal_points(reconstruction: Any, numbers: Mapping[str, int], len
     """Whether the photos of every lens tell its principal point well enough to move it from the frame's centre."""
     from stages.poses.conditioning import Observations, principal_point_deviation
 
+    if reconstruction.num_points3D() < MIN_POINTS:
+        return False
     images = [i for i in reconstruction.images.values() if i.has_pose]
     place = {k: n for n, k in enumerate(sorted(reconstruction.points3D))}
     seen = [_sightings(image) for image in images]

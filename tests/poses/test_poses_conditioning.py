@@ -1,4 +1,4 @@
-"""Standard deviations of principal points: against repeated noisy adjustments by scipy, and where nothing tells them."""
+"""Standard deviations of principal points: against the whole normal matrix, and where nothing tells them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def all_around() -> list[F64]:
 
 def test_projection_is_that_of_the_cameras() -> None:
     cams, x, seen = scene(all_around(), 7)
-    for i, cam in enumerate(cams):
+    for cam in cams:
         uv, _ = project(K, rigid(cam[:, :3], cam[:, 3]), np.array([0.1, 0, 0, 0, 0]), x)
         lens = np.tile([700.0, 320, 240, 0.1], (7, 1))
         np.testing.assert_allclose(project_all(lens, np.ones(7), np.tile(cam, (7, 1, 1)), x), uv, atol=1e-9)
