@@ -14,8 +14,8 @@ import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.hull import BAND_CELLS, Hull, render_silhouette, visual_hull
+from pipeline.support import Support
 from stages.masks.region import F32, Bool, dilated, eroded, region
-from stages.masks.solid import Support
 
 CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
 POSSIBLE = 1.4  # radii within which 'no part of the subject can be there' is believed

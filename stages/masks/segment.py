@@ -16,11 +16,12 @@ from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Located,
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_encoded, write_png
+from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
-from stages.masks.solid import Solid, Support, distinct, find_solid
+from stages.masks.solid import Solid, distinct, find_solid
 from stages.masks.sources import Method, Plan, View, inverted, mask, plan, to_full_size
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything

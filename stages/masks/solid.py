@@ -1,8 +1,8 @@
 """An object that no network knows, from the sparse points of structure from motion: what stands on the support.
 
 Symbols: points (N, 3) asset coordinates; R radius of the region of interest; plane n . x = o, n towards the cameras.
-A table or a floor is a plane that many points lie on, none beneath, and all cameras above. What rises from it within
-reach of the region of interest and hangs together is the object; its points, seen from anywhere, fill its silhouette.
+What rises from the support (pipeline.support) within reach of the region of interest and hangs together is the object;
+its points, seen from anywhere, fill its silhouette.
 """
 
 from __future__ import annotations
@@ -15,27 +15,17 @@ import numpy as np
 from scipy import ndimage, spatial
 
 from pipeline.artifacts import Camera
+from pipeline.support import CLEAR, Support, find_support
 from pipeline.transforms import F64, inverse_rigid, matrix, project
 from stages.masks.cut_out import cut
 from stages.masks.region import U8, Bool, dilated, eroded, resized, working_size
 
 AROUND, REACH = 2.5, 1.6  # R: where a support is looked for; how far the object may reach
-TRIES = 600
-THICK, CLEAR = 0.015, 0.03  # R: a support's points lie so near it; what is higher is not it
-MIN_ON, MAX_BENEATH, MIN_ABOVE = 0.08, 0.05, 0.95  # shares: of points on it, beneath it, of cameras above it
 LINK, COMPANY = 0.1, 4  # R: points nearer than this hang together; of so many others at least
 MIN_POINTS = 200
 SPACING = 0.07  # R: gaps between projected points that are closed
 GREY = 6  # levels: a photo whose channels differ less has no colours
 TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
-
-
-@dataclass(frozen=True, slots=True)
-class Support:
-    """The plane normal . x = offset that an object stands on; the normal points up from it."""
-
-    normal: F64
-    offset: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,29 +47,6 @@ def find_solid(points: F64, cameras: Sequence[Camera], roi_radius: float, seed: 
         own &= points @ support.normal - support.offset > CLEAR * roi_radius
     found = _largest_cluster(points[own], LINK * roi_radius)
     return Solid(found, support, roi_radius) if len(found) >= MIN_POINTS else None
-
-
-def find_support(points: F64, centres: F64, roi_radius: float, seed: int) -> Support | None:
-    """The plane that most points lie on among those with nothing beneath and the cameras above, or None."""
-    if len(points) < MIN_POINTS:
-        return None
-    random = np.random.default_rng(seed)
-    best, most = None, MIN_ON
-    for _ in range(TRIES):
-        a, b, c = points[random.choice(len(points), 3, replace=False)]
-        n = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(n))
-        if length < 1e-6 * roi_radius**2:
-            continue
-        n = n / length * (1 if np.median((centres - a) @ n) > 0 else -1)
-        height = (points - a) @ n
-        on = float((np.abs(height) < THICK * roi_radius).mean())
-        beneath = float((height < -3 * THICK * roi_radius).mean())
-        if on > most and beneath <= MAX_BENEATH and float(((centres - a) @ n > 0).mean()) >= MIN_ABOVE:
-            best, most = Support(n, float(a @ n)), on
-    # an object that is all there is has no support: its own flat side would pass for one
-    above = 0 if best is None else int((points @ best.normal - best.offset > CLEAR * roi_radius).sum())
-    return best if above >= MIN_POINTS else None
 
 
 def _largest_cluster(points: F64, link: float) -> F64:

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
 
 NOMINAL_ROI = 0.18  # metres: a head with some air around it
@@ -28,6 +29,7 @@ POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head
 POINTS_TAIL, SHIFT_LIMIT = 0.02, 0.12  # share of weight beyond the range; of the radius
 MIN_POINTS = 50
 ROBUST_STEPS = 30
+AROUND = 2.5  # radii within which the support is looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,9 @@ def normalise(
         reach = POINTS_MARGIN * float(np.quantile(distances[distances < radius], POINTS_WITHIN))
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
-    rotation = given_axes(poses, warnings) if given else solved_axes(poses, centre)
+    rotation = (
+        given_axes(poses, warnings) if given else solved_axes(poses, centre, _floor(points, centres, centre, radius))
+    )
     scale, metric = given_scale(radius, warnings, unit) if given else (NOMINAL_ROI / radius, False)
     inverse = similarity(1.0 / scale, rotation.T, centre)
     return Normalisation(inverse, radius * scale, metric, tuple(warnings))
@@ -157,7 +161,17 @@ def given_axes(poses: F64, warnings: list[str]) -> F64:
     return least_turn(up, np.array([0.0, 1.0, 0.0]))
 
 
-def solved_axes(poses: F64, centre: F64) -> F64:
+def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 | None:
+    """The upward normal (3,) of what the subject stands on, or None. Photos held upright and sideways by turns say
+    nothing of up; a table does."""
+    if points is None:
+        return None
+    near = points[np.linalg.norm(points - centre, axis=1) < AROUND * radius] - centre
+    support = find_support(near, centres - centre, radius, 0)
+    return support.normal if support is not None and is_level(support, centres - centre) else None
+
+
+def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
     """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z towards the side with the cameras.
 
     Up is the direction that the cameras' x axes are square to (a photographer tilts a camera more than he rolls it,
@@ -173,6 +187,7 @@ def solved_axes(poses: F64, centre: F64) -> F64:
         y = np.linalg.eigh(A)[1][:, 0]
         up = y if y @ start > 0 else -y
         weights = 1.0 / np.maximum(np.abs(x @ up), 0.02)
+    up = up if floor is None else floor
     side = np.mean(poses[:, :3, 3] - centre, axis=0)
     side = side - (side @ up) * up
     if np.linalg.norm(side) < 1e-6 * np.linalg.norm(poses[:, :3, 3] - centre, axis=1).mean():

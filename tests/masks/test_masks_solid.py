@@ -12,8 +12,9 @@ from pipeline.contract import execute
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, write_png
 from pipeline.store import Store
+from pipeline.support import Support, find_support, is_level
 from pipeline.transforms import F64, matrix, pixel_centres, rays, rows
-from stages.masks.solid import distinct, find_solid, find_support, silhouette_of_points
+from stages.masks.solid import distinct, find_solid, silhouette_of_points
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.support.textured_ball import camera_on_orbit
 
@@ -78,6 +79,13 @@ def test_a_ceiling_is_no_support() -> None:
     upside_down = points() * (1, -1, 1)
     centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras()])
     assert find_support(upside_down, centres, ROI, 0) is None
+
+
+def test_a_wall_is_not_level() -> None:
+    around = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras()])
+    before_a_wall = np.array([camera_on_orbit(a, 5, 0.45, np.zeros(3))[:3, 3] for a in range(-70, 71, 20)])
+    assert is_level(Support(np.array([0.0, 1, 0]), TABLE), around)
+    assert not is_level(Support(np.array([0.0, 0, 1]), -0.2), before_a_wall)
 
 
 def test_projected_points_fill_the_silhouette() -> None:
