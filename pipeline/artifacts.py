@@ -89,12 +89,14 @@ class CaptureSource(Artifact):
     """What was found in the user's folder, by content; the folder itself is not part of it.
 
     photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
+    plates: photos of the same views without the subject.
     """
 
     kind: CaptureKind
     photos: tuple[FileRef, ...]
     cameras: tuple[FileRef, ...] = ()
     masks: tuple[FileRef, ...] = ()
+    plates: tuple[FileRef, ...] = ()
 
 
 class GivenCamera(Artifact):
@@ -109,7 +111,8 @@ class GivenCamera(Artifact):
 
 
 class CaptureView(Artifact):
-    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit."""
+    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
+    same view without the subject."""
 
     index: int
     name: str
@@ -118,6 +121,7 @@ class CaptureView(Artifact):
     height: int
     camera: GivenCamera | None = None
     mask: FileRef | None = None
+    plate: FileRef | None = None
     focal_px: float | None = None
     camera_group: str = ""
     holdout: bool = False

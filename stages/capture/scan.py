@@ -1,8 +1,8 @@
 """Recognises what lies in the user's folder and hashes it; no picture is decoded here.
 
 Understood: a folder with a description of cameras (`stages.capture.readers`), a plain folder of photos, a folder with
-one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem. Hidden files and other
-sub-folders are ignored.
+one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem, and `clean_plate/` the same views
+without the subject. Hidden files and other sub-folders are ignored.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp")
-MASK_FOLDERS = ("mask", "masks")
+MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
 MIN_PHOTOS = 3  # two views leave depth along their common line open, and nothing to check it against
 
 
@@ -49,7 +49,8 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
     if not photos:
         raise _no_photos(folder, films)
     _enough(folder, [p.name for p in photos])
-    return Located(_source("photos", folder, photos, [], _masks_of(folder, photos)), folder)
+    masks, plates = _beside(folder, photos, MASK_FOLDERS, "mask"), _beside(folder, photos, PLATE_FOLDERS, "plate")
+    return Located(_source("photos", folder, photos, [], masks, plates), folder)
 
 
 def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Located[CaptureSource]:
@@ -59,15 +60,23 @@ def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Locate
         raise _none_named(folder, files[0], said)
     _once(said.views)
     masks = {v.photo: v.mask for v in said.views if v.photo is not None and v.mask is not None}
-    by_stem = _masks_of(folder, [p for p in photos if p not in masks]) if len(masks) < len(photos) else []
-    return Located(_source(kind, folder, photos, files, [*masks.values(), *by_stem]), folder)
+    by_stem = (
+        _beside(folder, [p for p in photos if p not in masks], MASK_FOLDERS, "mask") if len(masks) < len(photos) else []
+    )
+    plates = _beside(folder, photos, PLATE_FOLDERS, "plate")
+    return Located(_source(kind, folder, photos, files, [*masks.values(), *by_stem], plates), folder)
 
 
 def _source(
-    kind: CaptureKind, folder: Path, photos: Sequence[Path], cameras: Sequence[Path], masks: Sequence[Path]
+    kind: CaptureKind,
+    folder: Path,
+    photos: Sequence[Path],
+    cameras: Sequence[Path],
+    masks: Sequence[Path],
+    plates: Sequence[Path],
 ) -> CaptureSource:
-    refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks)]
-    return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2])
+    refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
+    return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3])
 
 
 def _film(path: Path) -> Located[CaptureSource]:
@@ -108,9 +117,9 @@ def _pictures(folder: Path) -> list[Path]:
     return sorted((p for p in found if not p.name.startswith(".") and p.is_file()), key=lambda p: natural_key(p.name))
 
 
-def _masks_of(folder: Path, photos: Sequence[Path]) -> list[Path]:
-    """Mask files that belong to a photo: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
-    present = [folder / m for m in MASK_FOLDERS if (folder / m).is_dir()]
+def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: str) -> list[Path]:
+    """Files that belong to a photo each: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
+    present = [folder / m for m in folders if (folder / m).is_dir()]
     if len(present) > 1:
         raise StageError(
             "two folders of masks",
@@ -125,10 +134,10 @@ def _masks_of(folder: Path, photos: Sequence[Path]) -> list[Path]:
         owner = owners.get(mask.stem)
         if owner is not None and owner in found:
             raise StageError(
-                "two masks for one photo",
+                f"two {what}s for one photo",
                 where=owner.name,
                 value=f"{found[owner].name} and {mask.name}",
-                limit="one mask per photo",
+                limit=f"one {what} per photo",
                 remedy="take one of them out of the folder",
             )
         if owner is not None:

@@ -51,6 +51,7 @@ class _Candidate:
     size: tuple[int, int] | None = None
     serial: str = ""
     mask: FileRef | None = None
+    plate: FileRef | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +113,11 @@ def _photos_of_film(source: Located[CaptureSource], config: Config, context: Con
 
 def _candidates(source: Located[CaptureSource]) -> _Found:
     photos = source.artifact.photos
-    by_stem = {PurePath(m.path).stem: m for m in source.artifact.masks}
+    by_stem, plates = ({PurePath(f.path).stem: f for f in files}
+                       for files in (source.artifact.masks, source.artifact.plates))  # fmt: skip
     if not source.artifact.cameras:
         names = [PurePath(p.path).name for p in photos]
-        found = [_Candidate(i, n, p, mask=by_stem.get(PurePath(n).stem) or by_stem.get(n))
+        found = [_Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
                  for i, n, p in zip(indices_of(names), names, photos, strict=True)]  # fmt: skip
         return _Found(sorted(found, key=lambda c: c.index), [], [], [])
     said = describe(source.artifact.kind, source.folder, [source.path(c) for c in source.artifact.cameras])
@@ -126,9 +128,14 @@ def _candidates(source: Located[CaptureSource]) -> _Found:
             continue
         ref = refs[v.photo.relative_to(source.folder).as_posix()]
         own = masks.get(v.mask.relative_to(source.folder).as_posix()) if v.mask is not None else None
-        mask = own or by_stem.get(PurePath(v.name).stem) or by_stem.get(v.name)
-        out.append(_Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, mask))
+        out.append(_Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, own or _of(by_stem, v.name),
+                              _of(plates, v.name)))  # fmt: skip
     return _Found(sorted(out, key=lambda c: c.index), list(said.left_out), list(said.absent), list(said.warnings))
+
+
+def _of(by_stem: dict[str, FileRef], name: str) -> FileRef | None:
+    """The file beside a photo: `a.png` or `a.jpg.png` for a.jpg."""
+    return by_stem.get(PurePath(name).stem) or by_stem.get(name)
 
 
 def _without_doubles(found: _Found, given: bool) -> list[_Candidate]:
@@ -197,15 +204,35 @@ def _view(
         if fault is not None:
             warnings.append(f"{fault}; until then it is made from the photo")
             mask_path = None
+    plate = _plate(source, candidate, photo, warnings, context)
     focal = photo.exif.focal_px(photo.width, photo.height)
     return CaptureView(
         index=candidate.index, name=candidate.name, image=context.file(photo.image), width=photo.width,
-        height=photo.height, camera=candidate.camera, mask=context.file(mask_path) if mask_path else None,
+        height=photo.height, camera=candidate.camera, mask=context.file(mask_path) if mask_path else None, plate=plate,
         focal_px=round(focal, 6) if focal else None,
         camera_group=_group(photo.width, photo.height, candidate.serial, photo.exif.body,
                             photo.exif.focal_mm or photo.exif.focal_35mm),
         holdout=held,
     )  # fmt: skip
+
+
+def _plate(
+    source: Located[CaptureSource], candidate: _Candidate, photo: Gathered, warnings: list[str], context: Context
+) -> FileRef | None:
+    """The view without its subject, checked and turned as its photo is; None if there is none or it does not fit."""
+    from stages.capture.gather import gather_photo
+
+    if candidate.plate is None:
+        return None
+    path = source.path(candidate.plate)
+    target = context.workdir / "plates" / f"{candidate.index}_{path.name}"
+    plate = gather_photo(path, candidate.plate, target, candidate.size)
+    if (plate.width, plate.height) == (photo.width, photo.height):
+        return context.file(plate.image)
+    plate.image.unlink()
+    sizes = f"{plate.width} x {plate.height} and its photo {photo.width} x {photo.height}"
+    warnings.append(f"the clean plate of {candidate.name} is {sizes}; take it with the same camera at the same size")
+    return None
 
 
 def _group(width: int, height: int, serial: str, body: str, focal: float | None) -> str:

@@ -12,7 +12,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Located, MaskSet, ViewMask
+from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located, MaskSet, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_encoded, write_png
@@ -101,13 +101,25 @@ def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Came
         v = by_index[camera.index]
         disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
         out.append(
-            (View(v.index, v.name, camera, disc, v.holdout, _reader(capture, v), _mask_reader(capture, v)), camera)
+            (
+                View(
+                    v.index,
+                    v.name,
+                    camera,
+                    disc,
+                    v.holdout,
+                    _reader(capture, v.image),
+                    _mask_reader(capture, v),
+                    None if v.plate is None else _reader(capture, v.plate),
+                ),
+                camera,
+            )
         )
     return out
 
 
-def _reader(capture: Located[Capture], view: CaptureView) -> Callable[[], U8]:
-    return lambda: eight_bit(read_encoded(capture.path(view.image)))
+def _reader(capture: Located[Capture], picture: FileRef) -> Callable[[], U8]:
+    return lambda: eight_bit(read_encoded(capture.path(picture)))
 
 
 def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F32] | None:
@@ -141,7 +153,8 @@ def _each(work: Callable[[T], R], items: list[T], context: Context, message: str
 
 
 def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Context) -> Masked:
-    use = view if settings.method in ("auto", "given") else replace(view, given=None)
+    use = replace(view, given=view.given if settings.method in ("auto", "given") else None,
+                  plate=view.plate if settings.method in ("auto", "plate") else None)  # fmt: skip
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
     if source == "given" and inverted(alpha, view.disc):
         alpha, source = 1 - alpha, INVERTED
@@ -193,7 +206,7 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = made.source in ("person", "object", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
+    doubtful = made.source in ("plate", "person", "object", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
     if not (bad or doubtful):
         return made
     image = made.view.read()

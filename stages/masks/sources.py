@@ -11,13 +11,13 @@ import numpy as np
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
 from stages.masks.cut_out import INNER, OUTER, cut_by_region
-from stages.masks.key_out import Background, border_colours, find_background, key_out
+from stages.masks.key_out import Background, border_colours, find_background, key_out, key_out_plate
 from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
 from stages.masks.soften import soft_edge
 from stages.masks.solid import Solid, cut_by_points
 
-Method = Literal["auto", "given", "key", "person", "object", "grabcut"]
+Method = Literal["auto", "given", "plate", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
 TELLING, WRONG_SIDE = 0.02, 0.3  # share of the photo around the region; mean alpha that is all but empty
@@ -26,7 +26,8 @@ SOFT = 2  # pixels of the working size to which a cut-out contour is right
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W)."""
+    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W). plate: reads the
+    same view without the subject."""
 
     index: int
     name: str
@@ -35,13 +36,20 @@ class View:
     holdout: bool
     read: Callable[[], U8]
     given: Callable[[], F32] | None
+    plate: Callable[[], U8] | None = None
+
+    def known(self, method: Method) -> bool:
+        """Whether the user's own mask or clean plate says what is subject."""
+        return (self.given is not None and method in ("auto", "given")) or (
+            self.plate is not None and method in ("auto", "plate")
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
     """How views without a mask of their own are masked."""
 
-    method: Literal["given", "key", "person", "object", "grabcut"]
+    method: Literal["given", "plate", "key", "person", "object", "grabcut"]
     background: Background | None = None
     solid: Solid | None = None
 
@@ -55,12 +63,14 @@ def plan(
     Raises:
         StageError: masks, a uniform background or an object were asked for and are not there.
     """
-    bare = [v for v in views if v.given is None] if method in ("auto", "given") else list(views)
-    if method == "given" and bare:
-        raise UsageError("views without a mask", where="masks.method=given", value=", ".join(v.name for v in bare[:5]),
-                         limit="a mask for every view", remedy="add the masks, or use masks.method=auto")  # fmt: skip
+    bare = [v for v in views if not v.known(method)]
+    if method in ("given", "plate") and bare:
+        what = "mask" if method == "given" else "clean plate"
+        raise UsageError(f"views without a {what}", where=f"masks.method={method}",
+                         value=", ".join(v.name for v in bare[:5]), limit=f"a {what} for every view",
+                         remedy="add them, or use masks.method=auto")  # fmt: skip
     if not bare:
-        return Plan("given")
+        return Plan("plate" if method == "plate" else "given")
     fitted = [v for v in bare if not v.holdout] or bare
     some = fitted[:: -(-len(fitted) // LOOKED_AT)]
     images = [v.read() for v in some]
@@ -108,6 +118,8 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
     if view.given is not None:
         return view.given(), "given"
     image = view.read()
+    if view.plate is not None:
+        return key_out_plate(image, view.plate()), "plate"
     if how.method == "key" and how.background is not None:
         return key_out(image, how.background), "key"
     if how.method == "object" and how.solid is not None:

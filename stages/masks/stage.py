@@ -22,11 +22,11 @@ class Inputs:
 class Config(StageConfig):
     """Settings of the masks stage."""
 
-    method: Literal["auto", "given", "key", "person", "object", "grabcut"] = Field(
+    method: Literal["auto", "given", "plate", "key", "person", "object", "grabcut"] = Field(
         "auto",
-        description="given: the capture's masks; key: uniform background; person: learned segmentation of people; "
-        "object: what the sparse points show to stand on a support; grabcut: colour statistics around the region of "
-        "interest; auto: the first of these that works",
+        description="given: the capture's masks; plate: its clean plates; key: uniform background; person: learned "
+        "segmentation of people; object: what the sparse points show to stand on a support; grabcut: colour statistics "
+        "around the region of interest; auto: the first of these that works",
     )
     threshold: float = Field(0.5, gt=0, lt=1, description="probability from which a pixel counts as a person")
     working_size: int = Field(640, ge=128, le=2048, description="longest edge at which people and objects are cut out")

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -18,13 +18,24 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import StageError
-from stages.poses.features import PATIENT, PLAIN, Effort, Features, detect, grey8
-from stages.poses.matching import Pair, Verified, homography_share, match, promising_pairs, verify
+from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.matching import (
+    MIN_INLIERS,
+    Pair,
+    Verified,
+    homography_share,
+    joined,
+    match,
+    promising_pairs,
+    verify,
+    without_repeats,
+)
 from stages.poses.solve import MIN_POINTS, Lens, Model, Refine, reconstruct
 
 WORKERS = 2  # the result does not depend on it: each photo is a task of its own
 GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth a second, slower look at the photos
 POOR_SHARE = 0.75  # and with fewer than this it is worth doubting that they share a lens
+REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends are one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
 BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
 
@@ -86,6 +97,9 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
         if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
             break
+    if best is None or len(best.poses) < GOOD_SHARE * len(photos):
+        features, verified = _askew(photos, features, verified, settings, progress)
+        best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
     if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):
         separate = _place(photos, features, verified, settings, False, scratch, progress)
         if best is None or (separate is not None and len(separate.poses) >= BETTER_BY * len(best.poses)):
@@ -93,6 +107,25 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
         _not_from_one_spot(photos, features, verified, settings.seed)
     return best
+
+
+def _askew(
+    photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], settings: Settings,
+    progress: Progress,
+) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
+    """The features and matches so far, and those of photos seen as if from farther round."""
+    more = replace(settings, max_features=MORE_ASKEW * settings.max_features)
+    askew = detect_all(photos, more, ASKEW, progress)
+    found = match_all(photos, askew, more, ASKEW, progress)
+    single = {}
+    for (i, j), pair in found.items():
+        cell = REPEAT * max(photos[i].width, photos[i].height)
+        kept = without_repeats(pair, askew[i], askew[j], cell)
+        if len(kept.matches) >= MIN_INLIERS:
+            single[i, j] = kept
+    both = [Features(np.concatenate([f.uv, g.uv]), np.concatenate([f.descriptors, g.descriptors]))
+            for f, g in zip(features, askew, strict=True)]  # fmt: skip
+    return both, joined(verified, single, [len(f.uv) for f in features])
 
 
 def _hardly_moved(model: Model) -> bool:

@@ -243,6 +243,16 @@ def test_a_mask_of_another_size_is_named_and_done_without(tmp_path: Path, gather
     assert "b.png is 50 x 50 and its photo 96 x 80; export it at the photo's size" in capture.warnings[0]
 
 
+def test_clean_plates_belong_to_their_photos(tmp_path: Path, gather) -> None:
+    folder = plain(tmp_path / "c")
+    (folder / "clean_plate").mkdir()
+    cv2.imwrite(str(folder / "clean_plate" / "a.png"), flat(SIZE, 30))
+    cv2.imwrite(str(folder / "clean_plate" / "b.jpg"), flat((90, 90), 30))
+    capture = gather(folder).artifact
+    assert capture.views[0].plate is not None and capture.views[0].plate.path == "plates/0_a.png"
+    assert capture.views[1].plate is None and "clean plate of b.jpg is 90 x 90" in capture.warnings[0]
+
+
 # ------------------------------------------------------------------ bad cameras
 def broken(params: dict, key: str, row: int, column: int, value: float) -> dict:
     m = np.array(params[key], float)
