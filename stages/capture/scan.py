@@ -1,8 +1,8 @@
 """Recognises what lies in the user's folder and hashes it; no picture is decoded here.
 
 Understood: a folder with a description of cameras (`stages.capture.readers`), a plain folder of photos, a folder with
-one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem, and `clean_plate/` the same views
-without the subject. Hidden files and other sub-folders are ignored.
+one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem, and `clean_plate/` the same
+views without the subject. Hidden files and other sub-folders are ignored.
 """
 
 from __future__ import annotations

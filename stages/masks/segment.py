@@ -23,12 +23,14 @@ from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, worki
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, distinct, find_solid
 from stages.masks.sources import Method, Plan, View, inverted, mask, plan, to_full_size
+from stages.masks.user_model import UserModel
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
+COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull may find wrong
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -45,6 +47,7 @@ class Settings:
     max_deviation: float
     mend: bool
     seed: int
+    model: UserModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ def segment(
     poses = located.artifact
     pairs = _views(capture, poses)
     how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed,
-               lambda: _solid(located, settings.seed))  # fmt: skip
+               lambda: _solid(located, settings.seed), settings.model)  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
     warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the "
@@ -206,7 +209,10 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = made.source in ("plate", "person", "object", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
+    doubtful = (
+        made.source in ("plate", "model", "person", "object", "grabcut")
+        and contradiction(inside, opinion) > CONTRADICTED
+    )
     if not (bad or doubtful):
         return made
     image = made.view.read()

@@ -16,6 +16,7 @@ from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
 from stages.masks.soften import soft_edge
 from stages.masks.solid import Solid, cut_by_points
+from stages.masks.user_model import UserModel, mask_by_model
 
 Method = Literal["auto", "given", "plate", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
@@ -49,16 +50,18 @@ class View:
 class Plan:
     """How views without a mask of their own are masked."""
 
-    method: Literal["given", "plate", "key", "person", "object", "grabcut"]
+    method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
     solid: Solid | None = None
+    model: UserModel | None = None
 
 
 def plan(
     views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
-    solid: Callable[[], Solid | None] = lambda: None,
+    solid: Callable[[], Solid | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
     """Choose the way from a few of the views that are fitted. solid: looks for the object among the sparse points.
+    model: the user's network, which goes before all guesses.
 
     Raises:
         StageError: masks, a uniform background or an object were asked for and are not there.
@@ -71,6 +74,8 @@ def plan(
                          remedy="add them, or use masks.method=auto")  # fmt: skip
     if not bare:
         return Plan("plate" if method == "plate" else "given")
+    if model is not None and method == "auto":
+        return Plan("model", model=model)
     fitted = [v for v in bare if not v.holdout] or bare
     some = fitted[:: -(-len(fitted) // LOOKED_AT)]
     images = [v.read() for v in some]
@@ -122,6 +127,9 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
         return key_out_plate(image, view.plate()), "plate"
     if how.method == "key" and how.background is not None:
         return key_out(image, how.background), "key"
+    if how.method == "model" and how.model is not None:
+        inside = mask_by_model(image, view.disc, how.model, threshold, working_size, seed)
+        return to_full_size(image, inside), "model"
     if how.method == "object" and how.solid is not None:
         return to_full_size(image, cut_by_points(image, view.camera, how.solid, working_size, seed)), "object"
     if how.method == "person":

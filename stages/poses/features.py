@@ -7,6 +7,7 @@ Image positions are in pixels of the full photo, first pixel's centre at (0.5, 0
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -86,7 +87,7 @@ def detect(
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]
         max_features * OVERSAMPLING, LAYERS, effort.contrast, effort.edge_ratio, SIGMA, cv2.CV_32F, True
     )
-    finder = cv2.AffineFeature.create(sift, effort.tilts, 0) if effort.tilts else sift  # type: ignore[attr-defined]
+    finder = cv2.AffineFeature.create(sift, effort.tilts, 0) if effort.tilts else sift
     keypoints, raw = finder.detectAndCompute(grey, inside)
     kept = _spread(keypoints, grey.shape, max_features)
     if not len(kept):
@@ -99,7 +100,7 @@ def detect(
     return Features(uv.astype(np.float32), root.astype(np.float32))
 
 
-def _spread(keypoints: tuple[cv2.KeyPoint, ...], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
+def _spread(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
     """Indices of at most `count` keypoints: rank by rank over the cells of a grid, in each the strongest first."""
     if not keypoints:
         return np.zeros(0, np.int64)

@@ -79,6 +79,7 @@ class Settings:
     shared: Literal["auto", "yes", "no"]
     camera_model: str
     refine: Refine
+    patience: int = 3
 
 
 Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
@@ -91,13 +92,13 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
         StageError: the photos were taken from one spot.
     """
     best: Model | None = None
-    for effort in (PLAIN, PATIENT):
+    for effort in (PLAIN, PATIENT)[: settings.patience]:
         features = detect_all(photos, settings, effort, progress)
         verified = match_all(photos, features, settings, effort, progress)
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
         if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
             break
-    if best is None or len(best.poses) < GOOD_SHARE * len(photos):
+    if settings.patience >= 3 and (best is None or len(best.poses) < GOOD_SHARE * len(photos)):
         features, verified = _askew(photos, features, verified, settings, progress)
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
     if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):

@@ -33,6 +33,9 @@ class Config(StageConfig):
     max_image_size: int = Field(1000, ge=200, description="longest edge, in pixels, at which features are looked for")
     max_features: int = Field(1500, ge=200, le=20000, description="most features per photo")
     neighbours: int = Field(14, ge=2, description="partners that a photo is matched with; up to 20 photos, all")
+    patience: int = Field(
+        3, ge=1, le=3, description="tries while photos lack a place: 1 plain, 2 without noise, 3 also as if seen askew"
+    )
     shared_intrinsics: Literal["auto", "yes", "no"] = Field(
         "auto", description="one lens for all photos of equal size and EXIF; auto: unless far more photos fit without"
     )
@@ -159,7 +162,7 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
     settings = Settings(
         config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
-        config.camera_model, refine,
+        config.camera_model, refine, config.patience,
     )  # fmt: skip
     model = solve(photos_of(capture, config.use_masks), settings, context.scratch, progress)
     placed = sorted(model.poses) if model is not None else []

@@ -94,7 +94,7 @@ def test_photos_from_one_spot(tmp_path: Path, capture_of, place) -> None:
         pose = rigid(ORBIT[3][:3, :3] @ turn, ORBIT[3][:3, 3])
         cv2.imwrite(str(folder / f"{i}.png"), photograph(pose, K, SIZE)[..., ::-1])
     with pytest.raises(StageError, match="one spot") as caught:
-        place(capture_of(folder))
+        place(capture_of(folder), patience=1)
     assert "walk around" in caught.value.remedy
 
 
@@ -107,7 +107,7 @@ def test_two_scenes_a_mirrored_and_a_rotated_photo(ball: Path, tmp_path: Path, c
         cv2.imwrite(str(folder / f"{i + 20}.png"), mirrored)
     pose = camera_on_orbit(3.0, 6.0, 0.6, np.zeros(3))
     cv2.imwrite(str(folder / "40.png"), np.rot90(photograph(pose, K, SIZE)[..., ::-1]))
-    found = place(capture_of(folder), max_features=700).artifact
+    found = place(capture_of(folder), max_features=700, patience=1).artifact
     assert found.unregistered == ("20.png", "21.png", "22.png")
     assert {c.name for c in found.cameras} >= {"40.png", "0.jpg"} and len(found.cameras) == 8
     assert set(found.view_errors_px) == {c.name for c in found.cameras}
