@@ -16,11 +16,11 @@ from pipeline.transforms import F64, inverse_rigid, matrix, undistort
 from stages.poses.features import PLAIN, Features
 from stages.poses.matching import match, verify
 
-EDGE, FEATURES = 640, 700  # pixels, number: enough to tell, quick
-PARTNERS = 3  # photos that each is held against
+EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
+PARTNERS = 4  # photos that each is held against
 FAR = 0.01  # of the longest edge: farther from its epipolar line a match speaks against the cameras
 AGREE = 0.3  # share of a view's matches that must agree with its camera
-MIN_MATCHES = 30  # of a view over all its pairs, to judge it
+MIN_MATCHES = 20  # of a view over all its pairs, to judge it
 
 
 @dataclass(frozen=True, slots=True)
