@@ -18,6 +18,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
+from stages.capture.profile import profile_name
 from stages.capture.suspects import detail, is_blank, small_grey
 
 Image = npt.NDArray[np.generic]
@@ -28,7 +29,7 @@ _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True
 @dataclass(frozen=True, slots=True)
 class Gathered:
     """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
-    stages.capture.suspects, None if the photo is blank."""
+    stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one."""
 
     image: Path
     width: int
@@ -36,6 +37,7 @@ class Gathered:
     exif: Exif
     turned: bool
     detail: float | None = None
+    profile: str | None = None
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
@@ -82,7 +84,8 @@ def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, in
     else:
         target.write_bytes(data)
     grey = small_grey(image)
-    return Gathered(target, size[0], size[1], exif, turn, None if is_blank(grey) else detail(grey))
+    sharpness = None if is_blank(grey) else detail(grey)
+    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data))
 
 
 def gather_mask(path: Path, ref: FileRef, target: Path, photo: Gathered) -> str | None:

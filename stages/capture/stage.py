@@ -91,7 +91,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     _enough(len(candidates) - len(held), len(held), found.left_out, config.min_views)
     views = [_view(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
-    warnings = found.warnings + _partly_masked(views)
+    warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), left_out=tuple(found.left_out),
                    warnings=tuple(warnings))  # fmt: skip
 
@@ -246,6 +246,18 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
         raise StageError("too few views remain for the fit", where="capture",
                          value=f"{fitted} to fit, {held} held out, {len(left_out)} left out",
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
+
+
+def _foreign_colours(candidates: list[_Candidate], photos: list[Gathered]) -> list[str]:
+    """A note for each colour profile that is not sRGB."""
+    from stages.capture.profile import is_srgb
+
+    named: dict[str, list[str]] = {}
+    for candidate, photo in zip(candidates, photos, strict=True):
+        if photo.profile is not None and not is_srgb(photo.profile):
+            named.setdefault(photo.profile, []).append(candidate.name)
+    return [f"{len(names)} photos have the colour profile {profile!r}, such as {names[0]}; their colours are taken as "
+            "sRGB: export them as sRGB for true ones" for profile, names in sorted(named.items())]  # fmt: skip
 
 
 def _partly_masked(views: list[CaptureView]) -> list[str]:

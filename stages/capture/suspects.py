@@ -12,7 +12,7 @@ from pipeline.colour import srgb_from_linear
 
 WORKING = 1000  # pixels, longest edge
 BLANK = 2.0  # levels of 255: spread below which nothing is to be seen (an 8-bit camera's noise in the dark is 1)
-BLURRED = 0.25  # of the median detail
+BLURRED = 0.2  # of the median detail
 MOST_BLURRED = 0.5  # of the photos: if more look blurred, 'blurred' is how this capture is
 
 
