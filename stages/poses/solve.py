@@ -163,7 +163,12 @@ def _adjust(reconstruction: Any, refine: Refine) -> None:
     options.refine_focal_length, options.refine_extra_params = refine.focal, refine.distortion
     options.refine_principal_point, options.print_summary = True, False
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(reconstruction, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for number, image in reconstruction.images.items():
+        if image.has_pose:
+            config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
     reconstruction.update_point_3d_errors()
 
 
