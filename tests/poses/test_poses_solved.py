@@ -76,7 +76,7 @@ def test_photos_of_something_else_are_named(ball: Path, tmp_path: Path, capture_
     for i in (20, 21):
         noise = cv2.GaussianBlur(rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8), (0, 0), 2)
         cv2.imwrite(str(folder / f"{i}.jpg"), cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX))
-    capture = capture_of(folder)
+    capture = capture_of(folder, drop_blurred=False)
     found = place(capture, patience=2).artifact
     assert found.unregistered == ("20.jpg", "21.jpg") and "20.jpg, 21.jpg" in found.warnings[-1]
 
