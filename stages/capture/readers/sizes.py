@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.images import read_encoded
 from stages.capture.exif import jpeg_segments
 
 START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -26,5 +25,7 @@ def picture_size(path: Path) -> tuple[int, int]:
                 return int.from_bytes(head[start + 3 : start + 5], "big"), int.from_bytes(
                     head[start + 1 : start + 3], "big"
                 )
+    from pipeline.images import read_encoded
+
     image = read_encoded(path)
     return image.shape[1], image.shape[0]
