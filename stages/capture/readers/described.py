@@ -18,7 +18,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
 ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
 LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
-GRID = 33  # positions across the frame at which a lens is compared
+GRID = 17  # half the positions along each edge of the frame at which a lens is compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Declared:
 @dataclass(frozen=True, slots=True)
 class Described:
     """All views that take part. left_out: notes on views that the description itself rules out, with their photos'
-    names in `absent`. missing: what a view without its photo is called in a warning."""
+    names in `absent`."""
 
     views: tuple[Declared, ...]
     left_out: tuple[str, ...] = ()
