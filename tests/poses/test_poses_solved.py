@@ -13,7 +13,9 @@ from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
 from stages.poses.features import ASKEW, PATIENT, PLAIN, detect, grey8
 from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
-from stages.poses.solve import opencv_distortion
+from stages.poses.photogrammetry import Settings, _askew, detect_all, match_all
+from stages.poses.photos import photos_of
+from stages.poses.solve import Refine, opencv_distortion
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -205,6 +207,23 @@ def test_photos_far_apart_match_when_looked_at_askew() -> None:
         right = np.abs(uv_b - uv_a * (turned.shape[1] / 300, 1)).max(1) < 2
         counts.append(int(right.sum()))
     assert counts[1] > 3 * max(counts[0], 10)
+
+
+def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -> None:
+    photos = photos_of(capture_of(ball), False)[:2]
+    settings = Settings(0, 200, 150, 4, "yes", "SIMPLE_RADIAL", Refine())
+    plain = detect_all(photos, settings, PLAIN, lambda *_: None)
+    verified = match_all(photos, plain, settings, PLAIN, lambda *_: None)
+    both, joint = _askew(photos, plain, verified, settings, lambda *_: None)
+    first, second = joint[0, 1].matches.T
+    assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
+    new = joint[0, 1].matches[first >= len(plain[0].uv)]
+    assert len(new) >= 15 and (new[:, 1] >= len(plain[1].uv)).all()
+    relative = np.linalg.inv(ORBIT[1]) @ ORBIT[0]
+    x, y = ((np.c_[f.uv[k] - K[:2, 2], np.full(len(k), K[0, 0])]) for f, k in zip(both, new.T, strict=True))
+    line = x @ np.cross(relative[:3, 3], relative[:3, :3].T)  # x (t x R)^T
+    off = np.abs((y * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
+    assert np.median(off) < 2
 
 
 def test_matches_of_two_kinds_are_joined_behind_each_other() -> None:
