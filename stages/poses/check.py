@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.transforms import F64, inverse_rigid, matrix, undistort
-from stages.poses.features import PLAIN, Features
+from stages.poses.features import PLAIN, Features, detect, grey8
 from stages.poses.matching import match, verify
+from stages.poses.photos import StoredPhoto
 
 EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
 PARTNERS = 4  # photos that each is held against
@@ -59,6 +61,20 @@ def check_cameras(
         good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < FAR * edge
         counts[i, j] = (int(good.sum()), len(good))
     return Verdict(_shares(counts, len(cameras)))
+
+
+def features_of(photos: Sequence[StoredPhoto], tick: Callable[[int, int], None]) -> list[Features]:
+    """Features of every photo, on the subject only where it has a mask. tick: done, total."""
+    found = []
+    for n, photo in enumerate(photos):
+        tick(n, len(photos))
+        grey, alpha = grey8(photo.pixels(), EDGE), photo.inside()
+        inside = None
+        if alpha is not None:
+            small = np.asarray(cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA))
+            inside = (small > 0.5).astype(np.uint8)
+        found.append(detect(grey, (photo.width, photo.height), FEATURES, PLAIN, inside))
+    return found
 
 
 def near_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:

@@ -120,18 +120,15 @@ def _contradicted(
     Raises:
         StageError: most of them do.
     """
-    from stages.poses.check import EDGE, FEATURES, check_cameras
-    from stages.poses.features import PLAIN
-    from stages.poses.photogrammetry import Settings, detect_all
+    from stages.poses.check import check_cameras, features_of
     from stages.poses.photos import photos_of
-    from stages.poses.solve import Refine
 
     def progress(done: int, total: int, message: str) -> None:
         context.check()
         context.progress(done, total, message)
 
-    settings = Settings(config.seed, EDGE, FEATURES, config.neighbours, "no", config.camera_model, Refine())
-    features = detect_all(photos_of(capture, config.use_masks), settings, PLAIN, progress)
+    photos = photos_of(capture, config.use_masks)
+    features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
     verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"))
     if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
         raise StageError(
