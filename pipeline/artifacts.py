@@ -80,13 +80,23 @@ class Located(Generic[A]):
 
 
 # ------------------------------------------------------------------ capture
-class CaptureSource(Artifact):
-    """What was found in the user's folder, by content; the folder itself is not part of it."""
+CaptureKind = Literal[
+    "facescape", "transforms", "idr", "metashape", "realityscan", "colmap", "photos", "video"
+]  # fmt: skip
 
-    kind: Literal["facescape", "photos"]
+
+class CaptureSource(Artifact):
+    """What was found in the user's folder, by content; the folder itself is not part of it.
+
+    photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
+    plates: photos of the same views without the subject.
+    """
+
+    kind: CaptureKind
     photos: tuple[FileRef, ...]
-    params: FileRef | None = None
+    cameras: tuple[FileRef, ...] = ()
     masks: tuple[FileRef, ...] = ()
+    plates: tuple[FileRef, ...] = ()
 
 
 class GivenCamera(Artifact):
@@ -101,7 +111,8 @@ class GivenCamera(Artifact):
 
 
 class CaptureView(Artifact):
-    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit."""
+    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
+    same view without the subject."""
 
     index: int
     name: str
@@ -110,6 +121,7 @@ class CaptureView(Artifact):
     height: int
     camera: GivenCamera | None = None
     mask: FileRef | None = None
+    plate: FileRef | None = None
     focal_px: float | None = None
     camera_group: str = ""
     holdout: bool = False
@@ -118,7 +130,7 @@ class CaptureView(Artifact):
 class Capture(Artifact):
     """The photos that take part, checked and in one place."""
 
-    kind: Literal["facescape", "photos"]
+    kind: CaptureKind
     views: tuple[CaptureView, ...]
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -144,7 +156,8 @@ class Camera(Artifact):
 class CameraSet(Artifact):
     """Cameras around the subject.
 
-    capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin.
+    capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
+    reprojection error of each solved view, by its photo's name.
     """
 
     source: Literal["given", "colmap"]
@@ -154,6 +167,7 @@ class CameraSet(Artifact):
     cameras: tuple[Camera, ...]
     unregistered: tuple[str, ...] = ()
     reprojection_error_px: float | None = None
+    view_errors_px: dict[str, float] = {}
     points: FileRef | None = None
     warnings: tuple[str, ...] = ()
 

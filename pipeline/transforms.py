@@ -14,6 +14,7 @@ F64 = npt.NDArray[np.float64]
 UNDISTORT_STEPS, UNDISTORT_TOLERANCE = 50, 1e-12
 
 USD_CAM_FROM_OPENCV_CAM: F64 = np.diag([1.0, -1.0, -1.0, 1.0])  # USD cameras look along -z with +y up
+OPENCV_CAM_FROM_OPENGL_CAM: F64 = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's (NeRF's) look along -z with +y up too
 
 
 def matrix(rows: object) -> F64:

@@ -140,7 +140,7 @@ def _indices(text: str) -> list[int]:
 def _given(params: Path, folder: Path) -> dict[int, View]:
     """Cameras of a params.json, moved from the capture's world into the asset's by the run's own matrix."""
     from pipeline.transforms import inverse_rigid, matrix, rescale_camera
-    from stages.capture.facescape import declared_view, is_valid, read_params, view_indices
+    from stages.capture.readers.facescape import given_view, is_valid, read_params, view_indices
     from stages.usd.view import View
 
     record = folder / "run.json"
@@ -158,10 +158,8 @@ def _given(params: Path, folder: Path) -> dict[int, View]:
     out = {}
     for index in view_indices(found):
         if is_valid(found, index):
-            said = declared_view(found, index)
-            capture_from_cam = inverse_rigid(matrix(said.camera.cam_from_world))
+            camera, (width, height) = given_view(found, index)
+            capture_from_cam = inverse_rigid(matrix(camera.cam_from_world))
             pose = rescale_camera(matrix(np.linalg.inv(capture_from_asset)), capture_from_cam)
-            out[index] = View(
-                matrix(said.camera.K), pose, said.width, said.height, np.array(said.camera.distortion, np.float64)
-            )
+            out[index] = View(matrix(camera.K), pose, width, height, np.array(camera.distortion, np.float64))
     return out

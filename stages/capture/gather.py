@@ -18,6 +18,8 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
+from stages.capture.profile import profile_name
+from stages.capture.suspects import detail, is_blank, small_grey
 
 Image = npt.NDArray[np.generic]
 MIN_EDGE = 64  # pixels: below it neither features nor a fit have anything to hold on to
@@ -26,13 +28,16 @@ _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew."""
+    """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
+    stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one."""
 
     image: Path
     width: int
     height: int
     exif: Exif
     turned: bool
+    detail: float | None = None
+    profile: str | None = None
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
@@ -45,8 +50,8 @@ def turn_upright(image: Image, orientation: int) -> Image:
 def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None) -> Gathered:
     """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be turned).
 
-    declared: (width, height) from params.json, or None. A given camera belongs to the stored pixels if their size is
-    the declared one; then nothing is turned, whatever EXIF says.
+    declared: (width, height) that the camera's description gives, or None. A given camera belongs to the
+    stored pixels if their size is the declared one; then nothing is turned, whatever EXIF says.
     Raises StageError if the file is not whole, too small or large, not finite, or not of the declared size.
     """
     data = _read(path, ref)
@@ -58,7 +63,7 @@ def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, in
     size = upright if turn else (w, h)
     if declared is not None and size != declared:
         raise StageError(
-            "the photo is not of the size that params.json declares",
+            "the photo is not of the size that its camera declares",
             where=path.name,
             value=f"{size[0]} x {size[1]}",
             limit=f"{declared[0]} x {declared[1]}",
@@ -78,44 +83,36 @@ def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, in
         _write_png(target, turn_upright(image, exif.orientation))
     else:
         target.write_bytes(data)
-    return Gathered(target, size[0], size[1], exif, turn)
+    grey = small_grey(image)
+    sharpness = None if is_blank(grey) else detail(grey)
+    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data))
 
 
-def gather_mask(path: Path, ref: FileRef, target: Path, photo: Gathered) -> None:
-    """Check one mask against its photo and copy it to `target`.
+def gather_mask(path: Path, ref: FileRef, target: Path, photo: Gathered) -> str | None:
+    """Check one mask against its photo and copy it to `target`; or say why it is of no use, and copy nothing.
 
     A mask of the upright size is taken as upright; one that only fits the stored pixels is turned with its photo.
-    Raises StageError if it is not whole, of another size, empty or full.
+    Raises StageError if the file is not whole.
     """
     data = _read(path, ref)
     image = _decode(path, data)
     size = (image.shape[1], image.shape[0])
     turn = photo.turned and size != (photo.width, photo.height) and size == (photo.height, photo.width)
     if size != (photo.width, photo.height) and not turn:
-        raise StageError(
-            "the mask is not of its photo's size",
-            where=path.name,
-            value=f"{size[0]} x {size[1]}",
-            limit=f"{photo.width} x {photo.height}",
-            remedy="export the mask at the photo's size",
-        )
+        sizes = f"{size[0]} x {size[1]} and its photo {photo.width} x {photo.height}"
+        return f"the mask {path.name} is {sizes}; export it at the photo's size"
     plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
     peak = float(np.iinfo(plane.dtype.name).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
     inside = float((plane.astype(np.float64) > peak / 2).mean())
     if inside in (0.0, 1.0):
-        what = "empty" if inside == 0 else "full"
-        raise StageError(
-            f"the mask is {what}",
-            where=path.name,
-            value=f"{inside:.0%} of the pixels show the subject",
-            limit="0 on the background and 255 on the subject, both present",
-            remedy="draw this mask again, or remove it to have it made from the photo",
-        )
+        return (f"the mask {path.name} is {'empty' if inside == 0 else 'full'}; draw it again, 0 on the background and "
+                "255 on the subject")  # fmt: skip
     target.parent.mkdir(parents=True, exist_ok=True)
     if turn:
         _write_png(target.with_suffix(".png"), turn_upright(image, photo.exif.orientation))
     else:
         target.write_bytes(data)
+    return None
 
 
 def _read(path: Path, ref: FileRef) -> bytes:

@@ -1,32 +1,35 @@
-"""Recognises what lies in the user's folder and hashes it; nothing is decoded here.
+"""Recognises what lies in the user's folder and hashes it; no picture is decoded here.
 
-Understood: a FaceScape folder (`params.json` beside `{index}.jpg|jpeg|png|tif|tiff|exr`) or a plain folder of photos;
-in both, `mask/` or `masks/` with one file per photo, matched by stem. Hidden files and other sub-folders are ignored.
+Understood: a folder with a description of cameras (`stages.capture.readers`), a plain folder of photos, a folder with
+one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem, and `clean_plate/` the same
+views without the subject. Hidden files and other sub-folders are ignored.
 """
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import CaptureSource, FileRef, Located
+from pipeline.artifacts import CaptureKind, CaptureSource, FileRef, Located
 from pipeline.errors import StageError
-from stages.capture.facescape import read_params, view_indices
+from stages.capture.readers import describe, find_reader
+from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key
 
-PARAMS = "params.json"
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp")
-MASK_FOLDERS = ("mask", "masks")
+MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
 MIN_PHOTOS = 3  # two views leave depth along their common line open, and nothing to check it against
 
 
 def scan_capture(folder: Path) -> Located[CaptureSource]:
-    """What `folder` holds, by content.
+    """What `folder` holds, by content. A film may be named itself.
 
     Raises:
-        StageError: no such folder, no photos or too few of them, `params.json` is not readable, two files for one view.
+        StageError: no such folder, no photos or too few of them, cameras that can't be read, two files for one view.
     """
     folder = Path(folder).absolute()
+    if folder.is_file() and folder.suffix.lower() in FILM_SUFFIXES:
+        return _film(folder)
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise StageError(
@@ -36,34 +39,76 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
             limit="a folder with photos",
             remedy="check the path; name the folder that holds the photos, not a photo",
         )
-    params = folder / PARAMS
+    found = find_reader(folder)
+    if found is not None:
+        return _described(folder, *found)
     photos = _pictures(folder)
-    if params.is_file():
-        photos = _named_by(params, photos)
+    films = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
+    if not photos and len(films) == 1:
+        return _film(films[0])
     if not photos:
-        raise _no_photos(folder, params.is_file())
-    if len(photos) < MIN_PHOTOS:
-        found = ", ".join(p.name for p in photos)
+        raise _no_photos(folder, films)
+    _enough(folder, [p.name for p in photos])
+    masks, plates = _beside(folder, photos, MASK_FOLDERS, "mask"), _beside(folder, photos, PLATE_FOLDERS, "plate")
+    return Located(_source("photos", folder, photos, [], masks, plates), folder)
+
+
+def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Located[CaptureSource]:
+    said = describe(kind, folder, files)
+    photos = [v.photo for v in said.views if v.photo is not None]
+    if not photos:
+        raise _none_named(folder, files[0], said)
+    _once(said.views)
+    masks = {v.photo: v.mask for v in said.views if v.photo is not None and v.mask is not None}
+    by_stem = (
+        _beside(folder, [p for p in photos if p not in masks], MASK_FOLDERS, "mask") if len(masks) < len(photos) else []
+    )
+    plates = _beside(folder, photos, PLATE_FOLDERS, "plate")
+    return Located(_source(kind, folder, photos, files, [*masks.values(), *by_stem], plates), folder)
+
+
+def _source(
+    kind: CaptureKind,
+    folder: Path,
+    photos: Sequence[Path],
+    cameras: Sequence[Path],
+    masks: Sequence[Path],
+    plates: Sequence[Path],
+) -> CaptureSource:
+    refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
+    return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3])
+
+
+def _film(path: Path) -> Located[CaptureSource]:
+    return Located(CaptureSource(kind="video", photos=(FileRef.of(path.parent, path),)), path.parent)
+
+
+def _enough(folder: Path, names: Sequence[str]) -> None:
+    if len(names) < MIN_PHOTOS:
         raise StageError(
             "too few photos",
             where=folder,
-            value=f"{len(photos)} ({found})",
+            value=f"{len(names)} ({', '.join(names)})",
             limit=f"at least {MIN_PHOTOS} views",
             remedy="photograph the subject from more sides; 30 to 60 views all around serve best",
         )
-    source = CaptureSource(
-        kind="facescape" if params.is_file() else "photos",
-        photos=tuple(FileRef.of(folder, p) for p in photos),
-        params=FileRef.of(folder, params) if params.is_file() else None,
-        masks=tuple(FileRef.of(folder, p) for p in _masks_of(folder, photos)),
-    )
-    return Located(source, folder)
 
 
-def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Sort key that puts 2.jpg before 10.jpg."""
-    parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p.lower()) for p in parts)
+def _once(views: Sequence[Declared]) -> None:
+    """Each view has a photo and a number of its own."""
+    for what in ("photo", "number"):
+        of: dict[object, str] = {}
+        for view in views:
+            mark = view.photo if what == "photo" else view.index
+            if mark in of:
+                raise StageError(
+                    f"two views with one {what}",
+                    where=view.name,
+                    value=f"{of[mark]} and {view.name}",
+                    limit=f"a {what} of its own for each view",
+                    remedy="take one of them out of the description",
+                )
+            of[mark] = view.name
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -72,29 +117,9 @@ def _pictures(folder: Path) -> list[Path]:
     return sorted((p for p in found if not p.name.startswith(".") and p.is_file()), key=lambda p: natural_key(p.name))
 
 
-def _named_by(params: Path, photos: list[Path]) -> list[Path]:
-    """The photos that params.json names, by index. One file per view."""
-    indices = set(view_indices(read_params(params)))
-    named: dict[int, Path] = {}
-    for photo in photos:
-        if not photo.stem.isdecimal() or int(photo.stem) not in indices:
-            continue
-        index = int(photo.stem)
-        if index in named:
-            raise StageError(
-                "two photos for one view",
-                where=f"view {index}",
-                value=f"{named[index].name} and {photo.name}",
-                limit="one file per view",
-                remedy="take one of them out of the folder",
-            )
-        named[index] = photo
-    return [named[i] for i in sorted(named)]
-
-
-def _masks_of(folder: Path, photos: list[Path]) -> list[Path]:
-    """Mask files that belong to a photo: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
-    present = [folder / m for m in MASK_FOLDERS if (folder / m).is_dir()]
+def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: str) -> list[Path]:
+    """Files that belong to a photo each: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
+    present = [folder / m for m in folders if (folder / m).is_dir()]
     if len(present) > 1:
         raise StageError(
             "two folders of masks",
@@ -109,10 +134,10 @@ def _masks_of(folder: Path, photos: list[Path]) -> list[Path]:
         owner = owners.get(mask.stem)
         if owner is not None and owner in found:
             raise StageError(
-                "two masks for one photo",
+                f"two {what}s for one photo",
                 where=owner.name,
                 value=f"{found[owner].name} and {mask.name}",
-                limit="one mask per photo",
+                limit=f"one {what} per photo",
                 remedy="take one of them out of the folder",
             )
         if owner is not None:
@@ -120,20 +145,37 @@ def _masks_of(folder: Path, photos: list[Path]) -> list[Path]:
     return [found[p] for p in photos if p in found]
 
 
-def _no_photos(folder: Path, has_params: bool) -> StageError:
+def _none_named(folder: Path, description: Path, said: Described) -> StageError:
+    foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
+    value = said.warnings[0] if said.warnings else "; ".join(said.left_out[:3]) or "none"
+    remedy = "put the photos where the file says, or into images/; or remove the file to have the cameras solved"
+    if description.name == "params.json":
+        remedy = "put 0.jpg, 1.jpg, ... beside params.json"
+    if foreign:
+        remedy = f"convert {foreign[0]} and its like to JPEG, PNG, TIFF or EXR"
+    return StageError(
+        "no photos in the capture folder",
+        where=folder,
+        value=f"none that {description.name} names: {value}",
+        limit=f"at least {MIN_PHOTOS} of " + " ".join(s[1:] for s in PHOTO_SUFFIXES),
+        remedy=remedy,
+    )
+
+
+def _no_photos(folder: Path, films: Sequence[Path]) -> StageError:
     foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
     deeper = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _pictures(p))
     value, remedy = "none", "put the photos directly into this folder"
-    if has_params:
-        value, remedy = "none that params.json names", "put 0.jpg, 1.jpg, ... beside params.json"
-    elif foreign:
+    if foreign:
         value, remedy = f"{len(foreign)} files such as {foreign[0]}", "convert them to JPEG, PNG, TIFF or EXR"
+    elif films:
+        value, remedy = f"{len(films)} films", f"name one of them as the capture, such as {films[0].name}"
     elif deeper:
         value, remedy = f"none here, some in {deeper[0]}/", f"name {deeper[0]}/ as the capture, or move the photos up"
     return StageError(
         "no photos in the capture folder",
         where=folder,
         value=value,
-        limit="at least 3 of " + " ".join(s[1:] for s in PHOTO_SUFFIXES),
+        limit=f"at least {MIN_PHOTOS} of " + " ".join(s[1:] for s in PHOTO_SUFFIXES),
         remedy=remedy,
     )

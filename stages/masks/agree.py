@@ -7,13 +7,14 @@ more than the hull's own coarseness, the mask is wrong (or the camera is).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera
-from pipeline.hull import render_silhouette, visual_hull
+from pipeline.hull import BAND_CELLS, Hull, render_silhouette, visual_hull
+from pipeline.support import Support
 from stages.masks.region import F32, Bool, dilated, eroded, region
 
 CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
@@ -44,17 +45,19 @@ def tolerated(votes: int) -> int:
 
 
 def opinions(
-    cameras: Sequence[Camera], alphas: Sequence[F32], votes: Sequence[bool], roi_radius: float, cells: int
-) -> list[Opinion]:
-    """One opinion per view. alphas: (h, w) each, small. votes: which views carve (held-out and dropped ones don't)."""
+    cameras: Sequence[Camera], alphas: Sequence[F32], votes: Sequence[bool], roi_radius: float, cells: int,
+    support: Support | None = None,
+) -> list[Opinion]:  # fmt: skip
+    """One opinion per view. alphas: (h, w) each, small. votes: which views carve (held-out and dropped ones don't).
+    support: nothing of the subject is beneath it."""
     voters = [(c, a) for c, a, v in zip(cameras, alphas, votes, strict=True) if v]
     lenient, edge = tolerated(len(voters)), CUBE * roi_radius
     cell = 2 * edge / cells
-    sure, possible = (
+    sure, possible = (_above(support, h) for h in (
         visual_hull([c for c, _ in voters], [a for _, a in voters], [-edge] * 3, [edge] * 3, cell,
                     min_views=least, max_outside=lenient, outside_share=WRONG_SHARE)
         for least in (min(3, len(voters)), 0)
-    )  # fmt: skip
+    ))  # fmt: skip
     out = []
     for camera, alpha in zip(cameras, alphas, strict=True):
         h, w = alpha.shape
@@ -70,6 +73,16 @@ def opinions(
         margin = max(1, round(MARGIN * disc.radius * cell / roi_radius))
         out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here)))
     return out
+
+
+def _above(support: Support | None, hull: Hull) -> Hull:
+    """The part of a hull that is above the support."""
+    if support is None:
+        return hull
+    centres = hull.centres(np.ones(hull.level.shape, bool)).reshape(*hull.level.shape, 3)
+    beneath = np.asarray(support.offset - centres @ support.normal, np.float32)
+    level = np.maximum(hull.level, beneath.clip(-BAND_CELLS * hull.cell, BAND_CELLS * hull.cell))
+    return replace(hull, level=level, occupied=hull.occupied & (beneath <= 0.5 * hull.cell))
 
 
 def _iou(a: Bool, b: Bool, where: Bool) -> float | None:

@@ -1,4 +1,4 @@
-"""Subject against a uniform background (black, grey, green ...): whatever hangs together with the frame is background.
+"""Subject against a known background (black, green ..., or a clean plate): what hangs together with the frame is it.
 
 Colour alone can't do it: brows, nostrils and beards are as black as a black background. They don't reach the frame,
 the background does.
@@ -21,6 +21,8 @@ SAMPLES = 4000  # border pixels per view
 MAX_SPREAD = 6.0  # levels, robust standard deviation: above it a background is not uniform
 MIN_SHARE, MIN_SHARE_ANY = 0.5, 0.25  # of all border pixels, and of one view's, that must be background
 HOLE = 0.005  # of the photo: an enclosed patch of background colour this large may be a hole
+UNCHANGED = 0.3  # share of a photo that its clean plate surely shows too
+PLATE_NOISE, PLATE_LEVELS = 6.0, (8.0, 32.0)  # tolerance against the plate: times the noise, within these levels
 EDGE = 3  # pixels: the threshold's contour is right to this
 
 
@@ -64,13 +66,29 @@ def find_background(borders: Sequence[U8]) -> Background | None:
 
 def key_out(image: U8, background: Background) -> F32:
     """Alpha (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
-    return soft_edge(image, _inside(image, background), EDGE)
-
-
-def _inside(image: U8, background: Background) -> Bool:
     apart = [np.abs(image[..., k].astype(np.float32) - np.float32(background.colour[k])) for k in range(3)]
     away = np.maximum(np.maximum(apart[0], apart[1]), apart[2])
-    like = away <= background.tolerance
+    return soft_edge(image, _inside(away, background.tolerance), EDGE)
+
+
+def key_out_plate(image: U8, plate: U8) -> F32:
+    """Alpha (H, W) of what a photo has and its clean plate, taken with the same camera, has not; (H, W, 3) 8-bit sRGB.
+
+    Exposure may have drifted: the plate is brought to the photo by one gain, over pixels that differ least.
+    """
+    photo, empty = image.astype(np.float32), plate.astype(np.float32)
+    like = np.abs(photo - empty).max(2)
+    same = like <= np.quantile(like, UNCHANGED)
+    gain = float(np.median((photo[same] + 1) / (empty[same] + 1)))
+    away = np.abs(photo - empty * np.float32(gain)).max(2)
+    away = np.asarray(cv2.GaussianBlur(away, (0, 0), 1.0), np.float32)  # noise goes, a subject is larger
+    tolerance = float(np.clip(PLATE_NOISE * np.median(away[same]), *PLATE_LEVELS))
+    return soft_edge(image, _inside(away, tolerance), EDGE)
+
+
+def _inside(away: F32, tolerance: float) -> Bool:
+    """(H, W) of the subject, from the distance of each pixel from the background in levels."""
+    like = away <= tolerance
     count, label, stats, _ = cv2.connectedComponentsWithStats(like.astype(np.uint8), connectivity=4)
     frame = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
     outer = np.zeros(count, bool)
@@ -78,7 +96,7 @@ def _inside(image: U8, background: Background) -> Bool:
     outer[[i for i in np.unique(frame) if i and stats[i, cv2.CC_STAT_AREA] >= 1e-3 * like.size]] = True
     for i in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= HOLE * like.size):
         if i and not outer[i]:  # a hole is as flat as the background around; dark skin or cloth is not
-            outer[i] = bool(away[label == i].std() <= 0.25 * background.tolerance)
+            outer[i] = bool(away[label == i].std() <= 0.25 * tolerance)
     inside = largest_parts(~outer[label], 0.02)
     opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return np.asarray(opened) > 0

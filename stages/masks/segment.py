@@ -12,20 +12,25 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Located, MaskSet, ViewMask
+from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located, MaskSet, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_encoded, write_png
+from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
-from stages.masks.sources import Method, Plan, View, mask, plan, to_full_size
+from stages.masks.solid import Solid, distinct, find_solid
+from stages.masks.sources import Method, Plan, View, inverted, mask, plan, to_full_size
+from stages.masks.user_model import UserModel
 
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
+INVERTED = "given, inverted"
+COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull may find wrong
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -42,6 +47,7 @@ class Settings:
     max_deviation: float
     mend: bool
     seed: int
+    model: UserModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,16 +67,22 @@ class Masked:
         return not LIMITS[0] <= self.coverage <= LIMITS[1]
 
 
-def segment(capture: Located[Capture], poses: CameraSet, settings: Settings, context: Context) -> MaskSet:
+def segment(
+    capture: Located[Capture], located: Located[CameraSet], settings: Settings, context: Context
+) -> MaskSet:  # fmt: skip
     """Masks of all registered views; see stages.masks.stage.run."""
+    poses = located.artifact
     pairs = _views(capture, poses)
-    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed)
+    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed,
+               lambda: _solid(located, settings.seed), settings.model)  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
-    warnings: list[str] = []
+    warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the "
+                "other way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
-    found = _opinions(masked, voting, poses, settings)
+    support = how.solid.support if how.solid is not None else None
+    found = _opinions(masked, voting, poses, settings, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     if settings.mend:
         bad = _outliers(masked, settings)
@@ -78,7 +90,7 @@ def segment(capture: Located[Capture], poses: CameraSet, settings: Settings, con
                        list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
         if any(a is not b for a, b in zip(mended, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in mended]
-            found = _opinions(mended, voting, poses, settings)
+            found = _opinions(mended, voting, poses, settings, support)
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
     dropped = _dropped(masked, settings, warnings)
@@ -91,12 +103,26 @@ def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Came
     for camera in poses.cameras:
         v = by_index[camera.index]
         disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
-        out.append((View(v.index, v.name, disc, v.holdout, _reader(capture, v), _mask_reader(capture, v)), camera))
+        out.append(
+            (
+                View(
+                    v.index,
+                    v.name,
+                    camera,
+                    disc,
+                    v.holdout,
+                    _reader(capture, v.image),
+                    _mask_reader(capture, v),
+                    None if v.plate is None else _reader(capture, v.plate),
+                ),
+                camera,
+            )
+        )
     return out
 
 
-def _reader(capture: Located[Capture], view: CaptureView) -> Callable[[], U8]:
-    return lambda: eight_bit(read_encoded(capture.path(view.image)))
+def _reader(capture: Located[Capture], picture: FileRef) -> Callable[[], U8]:
+    return lambda: eight_bit(read_encoded(capture.path(picture)))
 
 
 def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F32] | None:
@@ -130,10 +156,13 @@ def _each(work: Callable[[T], R], items: list[T], context: Context, message: str
 
 
 def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Context) -> Masked:
-    use = view if settings.method in ("auto", "given") else replace(view, given=None)
+    use = replace(view, given=view.given if settings.method in ("auto", "given") else None,
+                  plate=view.plate if settings.method in ("auto", "plate") else None)  # fmt: skip
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
+    if source == "given" and inverted(alpha, view.disc):
+        alpha, source = 1 - alpha, INVERTED
     made = _keep(use, camera, alpha, source, context)
-    if made.useless and source == "given":
+    if made.useless and source in ("given", INVERTED):
         raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
                          where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
                          limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
@@ -151,9 +180,21 @@ def _path(index: int, context: Context) -> Path:
     return context.workdir / "masks" / f"{index}.png"
 
 
-def _opinions(masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings) -> list[Opinion]:
+def _solid(poses: Located[CameraSet], seed: int) -> Solid | None:
+    """The object among the sparse points, if the cameras came with any."""
+    ref = poses.artifact.points
+    if ref is None:
+        return None
+    with np.load(poses.path(ref)) as data:
+        points = np.asarray(data["points"], np.float64)
+    return find_solid(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
+
+
+def _opinions(
+    masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings, support: Support | None
+) -> list[Opinion]:
     return opinions([m.camera for m in masked], [m.small for m in masked], voting, poses.roi_radius,
-                    settings.hull_cells)  # fmt: skip
+                    settings.hull_cells, support)  # fmt: skip
 
 
 def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
@@ -166,16 +207,20 @@ def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
 def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context: Context) -> Masked:
     """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
     inside = made.small >= 0.5
-    if made.source == "given" or made.view.holdout or (made.source == "key" and made.useless):
+    if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = made.source in ("person", "grabcut") and contradiction(inside, opinion) > CONTRADICTED
+    doubtful = (
+        made.source in ("plate", "model", "person", "object", "grabcut")
+        and contradiction(inside, opinion) > CONTRADICTED
+    )
     if not (bad or doubtful):
         return made
     image = made.view.read()
     w, h = working_size(image.shape[1], image.shape[0], settings.working_size)
     opinion_here = _at_size(opinion, w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
-    new = cut(np.asarray(resized(image, w, h), np.uint8), trimap(prior, opinion_here), settings.seed)
+    small = np.asarray(resized(image, w, h), np.uint8)
+    new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), settings.seed)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:

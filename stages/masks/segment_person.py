@@ -81,6 +81,14 @@ def person_mask(image: U8, disc: Disc, threshold: float, longest: int, seed: int
     small = np.asarray(resized(image, w, h), np.uint8)
     disc = disc.scaled(w / image.shape[1])
     found, scale = person_probability(small, disc)
+    return refined(small, found, scale, disc, threshold, seed)
+
+
+def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, seed: int) -> Bool:
+    """Hard mask (h, w) from a network's probability: the photo's colours and contrast decide near its contour.
+
+    scale: size in pixels of what the network took for one pixel.
+    """
     inside = of_subject(found >= threshold, disc)
     if not inside.any():
         return inside

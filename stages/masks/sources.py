@@ -8,51 +8,74 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
-from stages.masks.cut_out import cut_by_region
-from stages.masks.key_out import Background, border_colours, find_background, key_out
+from stages.masks.cut_out import INNER, OUTER, cut_by_region
+from stages.masks.key_out import Background, border_colours, find_background, key_out, key_out_plate
 from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
 from stages.masks.soften import soft_edge
+from stages.masks.solid import Solid, cut_by_points
+from stages.masks.user_model import UserModel, mask_by_model
 
-Method = Literal["auto", "given", "key", "person", "grabcut"]
+Method = Literal["auto", "given", "plate", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
+TELLING, WRONG_SIDE = 0.02, 0.3  # share of the photo around the region; mean alpha that is all but empty
 SOFT = 2  # pixels of the working size to which a cut-out contour is right
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W)."""
+    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W). plate: reads the
+    same view without the subject."""
 
     index: int
     name: str
+    camera: Camera
     disc: Disc
     holdout: bool
     read: Callable[[], U8]
     given: Callable[[], F32] | None
+    plate: Callable[[], U8] | None = None
+
+    def known(self, method: Method) -> bool:
+        """Whether the user's own mask or clean plate says what is subject."""
+        return (self.given is not None and method in ("auto", "given")) or (
+            self.plate is not None and method in ("auto", "plate")
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
     """How views without a mask of their own are masked."""
 
-    method: Literal["given", "key", "person", "grabcut"]
+    method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
+    solid: Solid | None = None
+    model: UserModel | None = None
 
 
-def plan(views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int) -> Plan:
-    """Choose the way from a few of the views that are fitted.
+def plan(
+    views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
+    solid: Callable[[], Solid | None] = lambda: None, model: UserModel | None = None,
+) -> Plan:  # fmt: skip
+    """Choose the way from a few of the views that are fitted. solid: looks for the object among the sparse points.
+    model: the user's network, which goes before all guesses.
 
     Raises:
-        StageError: masks or a uniform background were asked for and are not there.
+        StageError: masks, a uniform background or an object were asked for and are not there.
     """
-    bare = [v for v in views if v.given is None] if method in ("auto", "given") else list(views)
-    if method == "given" and bare:
-        raise UsageError("views without a mask", where="masks.method=given", value=", ".join(v.name for v in bare[:5]),
-                         limit="a mask for every view", remedy="add the masks, or use masks.method=auto")  # fmt: skip
+    bare = [v for v in views if not v.known(method)]
+    if method in ("given", "plate") and bare:
+        what = "mask" if method == "given" else "clean plate"
+        raise UsageError(f"views without a {what}", where=f"masks.method={method}",
+                         value=", ".join(v.name for v in bare[:5]), limit=f"a {what} for every view",
+                         remedy="add them, or use masks.method=auto")  # fmt: skip
     if not bare:
-        return Plan("given")
+        return Plan("plate" if method == "plate" else "given")
+    if model is not None and method == "auto":
+        return Plan("model", model=model)
     fitted = [v for v in bare if not v.holdout] or bare
     some = fitted[:: -(-len(fitted) // LOOKED_AT)]
     images = [v.read() for v in some]
@@ -66,9 +89,23 @@ def plan(views: Sequence[View], method: Method, threshold: float, working_size: 
                              "same in all photos", remedy="use masks.method=auto, or give masks")  # fmt: skip
     if method in ("person", "grabcut"):
         return Plan(method)
+    if method == "object":
+        return _by_points(solid())
     shares = [_person_share(i, v.disc, threshold, min(working_size, 320), seed)
               for i, v in zip(images[::2], some[::2], strict=True)]  # fmt: skip
-    return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
+    if np.median(shares) >= PERSON_SHARE:
+        return Plan("person")
+    found = solid()
+    return Plan("grabcut") if found is None else _by_points(found)
+
+
+def _by_points(solid: Solid | None) -> Plan:
+    if solid is None:
+        raise StageError("no object is found among the sparse points", where="masks.method=object",
+                         value="no points, or too few that hang together", limit="cameras solved from the photos "
+                         "(poses.method=colmap) of an object with texture",
+                         remedy="use masks.method=auto, or give masks")  # fmt: skip
+    return Plan("object", solid=solid)
 
 
 def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> float:
@@ -86,11 +123,28 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
     if view.given is not None:
         return view.given(), "given"
     image = view.read()
+    if view.plate is not None:
+        return key_out_plate(image, view.plate()), "plate"
     if how.method == "key" and how.background is not None:
         return key_out(image, how.background), "key"
+    if how.method == "model" and how.model is not None:
+        inside = mask_by_model(image, view.disc, how.model, threshold, working_size, seed)
+        return to_full_size(image, inside), "model"
+    if how.method == "object" and how.solid is not None:
+        return to_full_size(image, cut_by_points(image, view.camera, how.solid, working_size, seed)), "object"
     if how.method == "person":
         return to_full_size(image, person_mask(image, view.disc, threshold, working_size, seed)), "person"
     return to_full_size(image, cut_by_region(image, view.disc, working_size, seed)), "grabcut"
+
+
+def inverted(alpha: F32, disc: Disc) -> bool:
+    """Whether a given mask shows the background: all but empty in the middle of the region of interest and all but
+    full around it, where there is enough around it to tell."""
+    h, w = alpha.shape
+    core, around = disc.covers(h, w, INNER), ~disc.covers(h, w, OUTER)
+    if not core.any() or around.mean() < TELLING:
+        return False
+    return bool(alpha[core].mean() < WRONG_SIDE and alpha[around].mean() > 1 - WRONG_SIDE)
 
 
 def to_full_size(image: U8, inside: Bool) -> F32:

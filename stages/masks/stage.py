@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import CameraSet, Capture, Located, MaskSet, sha256_of
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +24,16 @@ class Inputs:
 class Config(StageConfig):
     """Settings of the masks stage."""
 
-    method: Literal["auto", "given", "key", "person", "grabcut"] = Field(
+    method: Literal["auto", "given", "plate", "key", "person", "object", "grabcut"] = Field(
         "auto",
-        description="given: the capture's masks; key: uniform background; person: learned segmentation of people; "
-        "grabcut: colour statistics around the region of interest; auto: the first of these that works",
+        description="given: the capture's masks; plate: its clean plates; key: uniform background; person: learned "
+        "segmentation of people; object: what the sparse points show to stand on a support; grabcut: colour statistics "
+        "around the region of interest; auto: the first of these that works",
     )
+    model: str = Field("", description="a segmentation network of your own, an ONNX file: used where auto would guess")
+    model_sha256: str = Field("", description="of that file; filled in, so that another content is another result")
+    model_side: int = Field(320, ge=32, le=2048, description="edge of the network's square input")
+    model_imagenet: bool = Field(False, description="normalise its input as ImageNet's networks expect")
     threshold: float = Field(0.5, gt=0, lt=1, description="probability from which a pixel counts as a person")
     working_size: int = Field(640, ge=128, le=2048, description="longest edge at which people and objects are cut out")
     hull_cells: int = Field(64, ge=16, le=256, description="voxels along each edge of the consistency check")
@@ -39,6 +46,22 @@ class Config(StageConfig):
     mend: bool = Field(True, description="cut a computed mask out anew where the other views contradict it")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
 
+    @model_validator(mode="before")
+    @classmethod
+    def _content(cls, given: Any) -> Any:
+        if not isinstance(given, dict) or not given.get("model"):
+            return given
+        path = Path(str(given["model"])).expanduser()
+        if not path.is_file():
+            raise UsageError(
+                "the network's file is not there",
+                where="masks.model",
+                value=given["model"],
+                limit="an ONNX file",
+                remedy="check the path",
+            )
+        return given | {"model": str(path.absolute()), "model_sha256": sha256_of(path)}
+
 
 def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
     """Masks of all registered views.
@@ -48,6 +71,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
             asked for; too few views left that agree.
     """
     from stages.masks.segment import Settings, segment
+    from stages.masks.user_model import UserModel
 
     settings = Settings(
         method=config.method,
@@ -58,8 +82,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
         max_deviation=config.max_deviation,
         mend=config.mend,
         seed=config.seed,
+        model=UserModel(Path(config.model), config.model_side, config.model_imagenet) if config.model else None,
     )
-    return segment(inputs.capture, inputs.poses.artifact, settings, context)
+    return segment(inputs.capture, inputs.poses, settings, context)
 
 
-STAGE = Stage(name="masks", version=1, inputs=Inputs, config=Config, output=MaskSet, run=run)
+STAGE = Stage(name="masks", version=2, inputs=Inputs, config=Config, output=MaskSet, run=run)

@@ -7,6 +7,7 @@ Image positions are in pixels of the full photo, first pixel's centre at (0.5, 0
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -28,17 +29,22 @@ NLM_STRENGTH, NLM_PATCH, NLM_WINDOW = 8.0, 5, 15  # levels of 255, pixels, pixel
 class Effort:
     """How hard to look. contrast: cv2's threshold (its default 0.04 finds next to nothing on skin). edge_ratio: how
     elongated a spot may be. ratio: Lowe's test on distances, when matching. denoise: non-local means beforehand.
+    tilts: look at the photo as if seen askew too, so many steps of the square root of 2 (Morel, Yu, ASIFT, 2009).
     """
 
     contrast: float
     edge_ratio: float
     ratio: float
     denoise: bool
+    tilts: int = 0
 
 
 PLAIN = Effort(contrast=0.004, edge_ratio=10.0, ratio=0.85, denoise=False)
 # a second chance for noisy or small photos: wrinkles and hair count too, geometry weeds out what slides along them
 PATIENT = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True)
+# the last chance, ten times slower: photos too far apart for SIFT, such as the next ring of cameras seen from above
+ASKEW = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True, tilts=2)
+MORE_ASKEW = 3  # times the features: the same spot is found under several tilts
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +87,8 @@ def detect(
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]
         max_features * OVERSAMPLING, LAYERS, effort.contrast, effort.edge_ratio, SIGMA, cv2.CV_32F, True
     )
-    keypoints, raw = sift.detectAndCompute(grey, inside)
+    finder = cv2.AffineFeature.create(sift, effort.tilts, 0) if effort.tilts else sift
+    keypoints, raw = finder.detectAndCompute(grey, inside)
     kept = _spread(keypoints, grey.shape, max_features)
     if not len(kept):
         return Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
@@ -93,7 +100,7 @@ def detect(
     return Features(uv.astype(np.float32), root.astype(np.float32))
 
 
-def _spread(keypoints: tuple[cv2.KeyPoint, ...], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
+def _spread(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
     """Indices of at most `count` keypoints: rank by rank over the cells of a grid, in each the strongest first."""
     if not keypoints:
         return np.zeros(0, np.int64)

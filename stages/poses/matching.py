@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -111,3 +111,29 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
     if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None
     return Verified(np.asarray(F, np.float64), matches[inliers.ravel() > 0])
+
+
+def without_repeats(pair: Verified, a: Features, b: Features, cell: float) -> Verified:
+    """One match for each pair of places: the same spot is found under several tilts. cell: pixels."""
+    at = np.concatenate([a.uv[pair.matches[:, 0]], b.uv[pair.matches[:, 1]]], 1)
+    _, first = np.unique(np.floor(at / cell), axis=0, return_index=True)
+    return Verified(pair.F, pair.matches[np.sort(first)])
+
+
+def joined(one: Mapping[Pair, Verified], other: Mapping[Pair, Verified], counts: Sequence[int]) -> dict[Pair, Verified]:
+    """Matches of two kinds of features; those of `other` come behind the counts[i] features of each photo."""
+    out = dict(one)
+    for (i, j), pair in other.items():
+        moved = pair.matches + np.array([counts[i], counts[j]], np.uint32)
+        known = one.get((i, j))
+        F = pair.F if known is None or len(pair.matches) > len(known.matches) else known.F
+        out[i, j] = Verified(F, moved if known is None else np.concatenate([known.matches, moved]))
+    return out
+
+
+def homography_share(a: Features, b: Features, pair: Verified, edge: int, seed: int) -> float:
+    """Share of a pair's matches that one homography explains: all, if the camera only turned or the scene is flat."""
+    cv2.setRNGSeed(seed)
+    uv_a, uv_b = a.uv[pair.matches[:, 0]], b.uv[pair.matches[:, 1]]
+    _, inliers = cv2.findHomography(uv_a, uv_b, cv2.RANSAC, 1.5 * EPIPOLAR_LIMIT * edge, None, RANSAC_TRIALS)
+    return 0.0 if inliers is None else float(inliers.mean())

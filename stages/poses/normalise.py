@@ -9,22 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
 
 NOMINAL_ROI = 0.18  # metres: a head with some air around it
 PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
 UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
+Unit = Literal["guess", "unknown", "metres", "centimetres", "millimetres"]
+ONE_SPOT = 0.02  # of the cameras' distance: nearer together than this they turn on the spot, and see no depth
 UP_LIMIT = np.cos(np.radians(45.0))
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points, air around them
 POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head have few points, and must stay inside
 POINTS_TAIL, SHIFT_LIMIT = 0.02, 0.12  # share of weight beyond the range; of the radius
 MIN_POINTS = 50
 ROBUST_STEPS = 30
+AROUND = 2.5  # radii within which the support is looked for
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +42,18 @@ class Normalisation:
     warnings: tuple[str, ...]
 
 
-def normalise(cameras: Sequence[Camera], points: F64 | None = None, *, given: bool) -> Normalisation:
+def normalise(
+    cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess"
+) -> Normalisation:
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
-    Raises StageError if the cameras do not look at a common place.
+    unit: of a given world; guess: the one under which the subject has a head's size.
+    Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
     centres, axes = viewing_rays(cameras)
     warnings: list[str] = []
+    _not_in_one_spot(cameras, centres)
     centre = nearest_point(centres, axes)
     _in_front(cameras, centres, axes, centre, warnings)
     radius = frame_radius(cameras, centres, centre)
@@ -55,8 +64,10 @@ def normalise(cameras: Sequence[Camera], points: F64 | None = None, *, given: bo
         reach = POINTS_MARGIN * float(np.quantile(distances[distances < radius], POINTS_WITHIN))
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
-    rotation = given_axes(poses, warnings) if given else solved_axes(poses, centre)
-    scale, metric = given_scale(radius, warnings) if given else (NOMINAL_ROI / radius, False)
+    rotation = (
+        given_axes(poses, warnings) if given else solved_axes(poses, centre, _floor(points, centres, centre, radius))
+    )
+    scale, metric = given_scale(radius, warnings, unit) if given else (NOMINAL_ROI / radius, False)
     inverse = similarity(1.0 / scale, rotation.T, centre)
     return Normalisation(inverse, radius * scale, metric, tuple(warnings))
 
@@ -92,6 +103,21 @@ def nearest_point(centres: F64, axes: F64) -> F64:
         distance = np.linalg.norm(np.einsum("nij,nj->ni", across, x - centres), axis=1)
         weights = 1.0 / np.maximum(distance, 1e-2 * max(float(np.median(distance)), 1e-12))
     return x
+
+
+def _not_in_one_spot(cameras: Sequence[Camera], centres: F64) -> None:
+    """Cameras that only turn see no depth: their centres must differ by a share of the distance to where they look."""
+    middle = np.median(centres, axis=0)
+    spread = float(np.linalg.norm(centres - middle, axis=1).max())
+    size = max(float(np.abs(centres).max()), 1e-12)
+    if spread > 1e-9 * size:
+        x = nearest_point(*viewing_rays(cameras))
+        if spread > ONE_SPOT * float(np.median(np.linalg.norm(centres - x, axis=1))):
+            return
+    raise StageError("the cameras are all in one spot", where="poses", value=f"{len(cameras)} views within "
+                     f"{spread:.3g} units of each other", limit=f"at least {ONE_SPOT:.0%} of the distance to the "
+                     "subject apart", remedy="walk around the subject instead of turning the camera; each photo from "
+                     "another place")  # fmt: skip
 
 
 def frame_radius(cameras: Sequence[Camera], centres: F64, centre: F64) -> float:
@@ -135,7 +161,17 @@ def given_axes(poses: F64, warnings: list[str]) -> F64:
     return least_turn(up, np.array([0.0, 1.0, 0.0]))
 
 
-def solved_axes(poses: F64, centre: F64) -> F64:
+def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 | None:
+    """The upward normal (3,) of what the subject stands on, or None. Photos held upright and sideways by turns say
+    nothing of up; a table does."""
+    if points is None:
+        return None
+    near = points[np.linalg.norm(points - centre, axis=1) < AROUND * radius] - centre
+    support = find_support(near, centres - centre, radius, 0)
+    return support.normal if support is not None and is_level(support, centres - centre) else None
+
+
+def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
     """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z towards the side with the cameras.
 
     Up is the direction that the cameras' x axes are square to (a photographer tilts a camera more than he rolls it,
@@ -151,6 +187,7 @@ def solved_axes(poses: F64, centre: F64) -> F64:
         y = np.linalg.eigh(A)[1][:, 0]
         up = y if y @ start > 0 else -y
         weights = 1.0 / np.maximum(np.abs(x @ up), 0.02)
+    up = up if floor is None else floor
     side = np.mean(poses[:, :3, 3] - centre, axis=0)
     side = side - (side @ up) * up
     if np.linalg.norm(side) < 1e-6 * np.linalg.norm(poses[:, :3, 3] - centre, axis=1).mean():
@@ -183,18 +220,24 @@ def least_turn(a: F64, b: F64) -> F64:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + c), np.float64)
 
 
-def given_scale(radius: float, warnings: list[str]) -> tuple[float, bool]:
-    """(asset units per capture unit, metric). The unit under which the region of interest has a head's size."""
+def given_scale(radius: float, warnings: list[str], unit: Unit = "guess") -> tuple[float, bool]:
+    """(asset units per capture unit, metric). Guessed: the one under which the region of interest has a head's size."""
+    if unit == "unknown":
+        warnings.append(f"the cameras' unit is not known; the asset is scaled to a nominal {NOMINAL_ROI} m around the "
+                        "subject; say poses.unit=metres (centimetres, millimetres) if you know it")  # fmt: skip
+        return NOMINAL_ROI / radius, False
+    if unit != "guess":
+        return UNITS[unit], True
     low, high = PLAUSIBLE_ROI
     fitting = [u for u, factor in UNITS.items() if low <= radius * factor <= high]
     if not fitting:
         warnings.append(f"the cameras' unit is not known (the views see {radius:.4g} units around the subject); the "
                         f"asset is scaled to a nominal {NOMINAL_ROI} m")  # fmt: skip
         return NOMINAL_ROI / radius, False
-    unit = min(fitting, key=lambda u: abs(np.log(radius * UNITS[u] / NOMINAL_ROI)))
-    if unit != "metres":
-        warnings.append(f"the cameras' unit is taken as {unit} (the views see {radius:.4g} units around the subject)")
-    return UNITS[unit], True
+    likely = min(fitting, key=lambda u: abs(np.log(radius * UNITS[u] / NOMINAL_ROI)))
+    if likely != "metres":
+        warnings.append(f"the cameras' unit is taken as {likely} (the views see {radius:.4g} units around the subject)")
+    return UNITS[likely], True
 
 
 def _in_front(cameras: Sequence[Camera], centres: F64, axes: F64, centre: F64, warnings: list[str]) -> None:

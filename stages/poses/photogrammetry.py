@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -17,13 +17,26 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stages.poses.features import PATIENT, PLAIN, Effort, Features, detect, grey8
-from stages.poses.matching import Pair, Verified, match, promising_pairs, verify
-from stages.poses.solve import Lens, Model, Refine, reconstruct
+from pipeline.errors import StageError
+from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.matching import (
+    MIN_INLIERS,
+    Pair,
+    Verified,
+    homography_share,
+    joined,
+    match,
+    promising_pairs,
+    verify,
+    without_repeats,
+)
+from stages.poses.solve import MIN_POINTS, Lens, Model, Refine, reconstruct
 
 WORKERS = 2  # the result does not depend on it: each photo is a task of its own
 GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth a second, slower look at the photos
 POOR_SHARE = 0.75  # and with fewer than this it is worth doubting that they share a lens
+REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends are one
+ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
 BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
 
 
@@ -66,25 +79,82 @@ class Settings:
     shared: Literal["auto", "yes", "no"]
     camera_model: str
     refine: Refine
+    patience: int = 3
 
 
 Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
 
 
 def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: Progress) -> Model | None:
-    """The model with the most photos of all tries, or None if no two photos fit together."""
+    """The model with the most photos of all tries, or None if no two photos fit together.
+
+    Raises:
+        StageError: the photos were taken from one spot.
+    """
     best: Model | None = None
-    for effort in (PLAIN, PATIENT):
+    for effort in (PLAIN, PATIENT)[: settings.patience]:
         features = detect_all(photos, settings, effort, progress)
         verified = match_all(photos, features, settings, effort, progress)
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
         if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
-            return best
+            break
+    if settings.patience >= 3 and (best is None or len(best.poses) < GOOD_SHARE * len(photos)):
+        features, verified = _askew(photos, features, verified, settings, progress)
+        best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
     if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):
         separate = _place(photos, features, verified, settings, False, scratch, progress)
         if best is None or (separate is not None and len(separate.poses) >= BETTER_BY * len(best.poses)):
             best = separate
+    if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
+        _not_from_one_spot(photos, features, verified, settings.seed)
     return best
+
+
+def _askew(
+    photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], settings: Settings,
+    progress: Progress,
+) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
+    """The features and matches so far, and those of photos seen as if from farther round."""
+    more = replace(settings, max_features=MORE_ASKEW * settings.max_features)
+    askew = detect_all(photos, more, ASKEW, progress)
+    found = match_all(photos, askew, more, ASKEW, progress)
+    single = {}
+    for (i, j), pair in found.items():
+        cell = REPEAT * max(photos[i].width, photos[i].height)
+        kept = without_repeats(pair, askew[i], askew[j], cell)
+        if len(kept.matches) >= MIN_INLIERS:
+            single[i, j] = kept
+    both = [Features(np.concatenate([f.uv, g.uv]), np.concatenate([f.descriptors, g.descriptors]))
+            for f, g in zip(features, askew, strict=True)]  # fmt: skip
+    return both, joined(verified, single, [len(f.uv) for f in features])
+
+
+def _hardly_moved(model: Model) -> bool:
+    """Whether the cameras' centres lie close together against their distance from the points."""
+    if len(model.points) < MIN_POINTS:
+        return True
+    centres = np.stack([p.world_from_cam[:3, 3] for p in model.poses.values()])
+    spread = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))
+    away = float(np.linalg.norm(np.median(model.points, axis=0) - np.median(centres, axis=0)))
+    return spread < HARDLY * away
+
+
+def _not_from_one_spot(
+    photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], seed: int
+) -> None:  # fmt: skip
+    """Photos from one spot differ by a homography each, whatever they show."""
+    shares = []
+    for (i, j), pair in verified.items():
+        edge = max(photos[i].width, photos[i].height)
+        shares.append(homography_share(features[i], features[j], pair, edge, seed))
+    if len(shares) >= len(photos) / 2 and float(np.median(shares)) > ONE_SPOT_SHARE:
+        raise StageError(
+            "the photos look as if taken from one spot",
+            where="poses",
+            value=f"{np.median(shares):.0%} of the matches of two photos fit a camera that only turns",
+            limit=f"at most {ONE_SPOT_SHARE:.0%}",
+            remedy="walk around the subject instead of turning the camera or zooming; each photo from another place",
+        )
 
 
 def detect_all(photos: Sequence[Photo], settings: Settings, effort: Effort, progress: Progress) -> list[Features]:

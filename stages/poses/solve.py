@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import pycolmap
 
-from pipeline.transforms import F64, inverse_rigid, rigid
+from pipeline.transforms import F64, inverse_rigid, project, rigid
 from stages.poses.features import Features
 from stages.poses.matching import Pair, Verified
 
@@ -22,6 +23,10 @@ DEFAULT_FOCAL = 1.2  # of the longest edge: COLMAP's own guess, a 43 mm lens on 
 MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
+MIN_POINTS = 100
+PRINCIPAL_POINT_LIMIT = (
+    1.5e-3  # of the longest edge, standard deviation: it turns a view by less than a tenth of a degree
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +40,11 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Refine:
-    """What bundle adjustment may move, besides poses and points."""
+    """What bundle adjustment may move, besides poses and points. principal_point: auto: where the photos tell it."""
 
     focal: bool = True
     distortion: bool = True
-    principal_point: bool = False
+    principal_point: Literal["auto", "yes", "no"] = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +58,17 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """The largest reconstruction. poses: by photo number. points (M, 3); error_px (M,); track (M,) photos per point."""
+    """The largest reconstruction. poses, view_error_px: by photo number. points (M, 3); error_px (M,); track (M,)
+    photos per point. others: photos of each other reconstruction, of another subject or not linked to this one.
+    """
 
     poses: dict[int, Pose]
     points: F64
     error_px: F64
     track: F64
     reprojection_error_px: float
+    view_error_px: dict[int, float]
+    others: tuple[tuple[int, ...], ...] = ()
 
 
 def reconstruct(
@@ -97,8 +106,12 @@ def reconstruct(
     if not found:
         return None
     # the most photos; of equally large ones the one with more points
-    largest = max(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()))
-    return _model(largest, numbers)
+    ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
+    largest = ranked[0]
+    of_lens = np.array(lens_of, np.int64)
+    if refine.principal_point == "auto" and _tells_principal_points(largest, numbers, of_lens):
+        _adjust(largest, refine)
+    return _model(largest, numbers, ranked[1:])
 
 
 def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float, float, float, float]:
@@ -111,6 +124,54 @@ def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float
     raise ValueError(f"camera model {model} has no exact k1 k2 p1 p2 k3")
 
 
+def _tells_principal_points(reconstruction: Any, numbers: Mapping[str, int], lens_of: npt.NDArray[np.int64]) -> bool:
+    """Whether the photos of every lens tell its principal point well enough to move it from the frame's centre."""
+    from stages.poses.conditioning import Observations, principal_point_deviation
+
+    if reconstruction.num_points3D() < MIN_POINTS:
+        return False
+    images = [i for i in reconstruction.images.values() if i.has_pose]
+    place = {k: n for n, k in enumerate(sorted(reconstruction.points3D))}
+    seen = [_sightings(image) for image in images]
+    lenses, of_lens = np.unique(lens_of[[numbers[i.name] for i in images]], return_inverse=True)
+    cameras = [reconstruction.cameras[i.camera_id] for i in images]
+    deviation = principal_point_deviation(
+        np.array([c.calibration_matrix() for c in cameras]),
+        np.array([opencv_distortion(c.model_name, list(c.params))[0] for c in cameras]),
+        np.array([i.cam_from_world().matrix() for i in images]),
+        np.array([reconstruction.points3D[k].xyz for k in place]),
+        Observations(
+            np.repeat(np.arange(len(images)), [len(ids) for ids, _ in seen]),
+            np.array([place[k] for ids, _ in seen for k in ids]),
+            np.concatenate([uv for _, uv in seen]),
+            of_lens.astype(np.int64),
+        ),
+    )
+    edge = max(max(c.width, c.height) for c in cameras)
+    return bool(deviation.max() <= PRINCIPAL_POINT_LIMIT * edge)
+
+
+def _sightings(image: Any) -> tuple[list[int], F64]:
+    """Points (ids) that an image sees, and where (L, 2)."""
+    found = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
+    return [k for k, _ in found], np.array([uv for _, uv in found], np.float64).reshape(-1, 2)
+
+
+def _adjust(reconstruction: Any, refine: Refine) -> None:
+    """Bundle adjustment of everything, principal points included."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length, options.refine_extra_params = refine.focal, refine.distortion
+    options.refine_principal_point, options.print_summary = True, False
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for number, image in reconstruction.images.items():
+        if image.has_pose:
+            config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
+    reconstruction.update_point_3d_errors()
+
+
 def _options(refine: Refine, seed: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -120,7 +181,7 @@ def _options(refine: Refine, seed: int) -> Any:
     options.extract_colors = False
     options.ba_refine_focal_length = refine.focal
     options.ba_refine_extra_params = refine.distortion
-    options.ba_refine_principal_point = refine.principal_point
+    options.ba_refine_principal_point = refine.principal_point == "yes"
     return options
 
 
@@ -154,8 +215,8 @@ def _write_database(
     return {f"{i:05d}": i for i in range(len(features))}
 
 
-def _model(reconstruction: Any, numbers: Mapping[str, int]) -> Model:
-    poses = {}
+def _model(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[Any]) -> Model:
+    poses, errors = {}, {}
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
@@ -166,6 +227,11 @@ def _model(reconstruction: Any, numbers: Mapping[str, int]) -> Model:
             world_from_cam=inverse_rigid(rigid(m[:, :3], m[:, 3])),
             distortion=opencv_distortion(camera.model_name, list(camera.params)),
         )
+        ids, uv = _sightings(image)
+        xyz = np.array([reconstruction.points3D[k].xyz for k in ids]).reshape(-1, 3)
+        pose = poses[numbers[image.name]]
+        seen, _ = project(pose.K, inverse_rigid(pose.world_from_cam), np.array(pose.distortion), xyz)
+        errors[numbers[image.name]] = float(np.linalg.norm(seen - uv, axis=1).mean()) if len(ids) else float("nan")
     points = [reconstruction.points3D[k] for k in sorted(reconstruction.points3D)]
     return Model(
         poses=dict(sorted(poses.items())),
@@ -173,4 +239,6 @@ def _model(reconstruction: Any, numbers: Mapping[str, int]) -> Model:
         error_px=np.array([p.error for p in points], np.float64),
         track=np.array([p.track.length() for p in points], np.float64),
         reprojection_error_px=float(reconstruction.compute_mean_reprojection_error()),
+        view_error_px=errors,
+        others=tuple(tuple(sorted(numbers[i.name] for i in o.images.values() if i.has_pose)) for o in others),
     )

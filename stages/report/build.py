@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.images import read_encoded, read_exr
+from stages.report.captured import captured
 from stages.report.compare import JudgedView
 from stages.report.gather import Results
 from stages.report.metrics import Scores, encoded, mean_scores
@@ -77,7 +78,7 @@ def _both(row: JudgedRow) -> dict[str, float | None]:
     return model | ({f"asset_{k}": v for k, v in row.asset.json().items()} if row.asset else {})
 
 
-def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, side: int) -> str:
+def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, side: int, outlines: int) -> str:
     """The page with its pictures."""
     return render_page(
         metrics,
@@ -88,6 +89,7 @@ def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, si
             light=_light(r, side),
             scale=data_uri(scale_bar(), 256, lossless=True),
             scale_top=ERROR_RANGE,
+            captured=captured(r, side // 2, outlines),
         ),
     )
 

@@ -44,6 +44,7 @@ class Pictures:
     light: Picture | None = None
     scale: str = ""
     scale_top: float = 0.0
+    captured: object | None = None  # stages.report.captured.Captured
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:

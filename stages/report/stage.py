@@ -40,6 +40,7 @@ class Config(StageConfig):
 
     picture_side: int = Field(360, ge=64, le=2048, description="largest side of a picture on the page, pixels")
     views_shown: int = Field(8, ge=0, le=200, description="views shown as pictures; the table lists all")
+    masks_shown: int = Field(24, ge=0, le=1000, description="photos shown with their mask's outline, the worst first")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Report:
@@ -58,10 +59,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     metrics = {"holdout": summary(rows), "timing": {}, **figures(inputs)}
     metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
     (context.workdir / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-    page = build_page(metrics, rows[: config.views_shown], inputs, config.picture_side)
+    page = build_page(metrics, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
     return Report(files=(context.file("index.html"), context.file("metrics.json")), warnings=tuple(unjudged(inputs)))
 
 
-STAGE = Stage(name="report", version=2, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=3, inputs=Inputs, config=Config, output=Report, run=run)

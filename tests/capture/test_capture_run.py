@@ -141,16 +141,48 @@ def test_a_given_camera_belongs_to_the_stored_pixels(facescape, gather) -> None:
 def test_exr_and_sixteen_bit_photos(tmp_path: Path, gather) -> None:
     folder = plain(tmp_path / "c")
     cv2.imwrite(str(folder / "d.png"), flat(SIZE, 3).astype(np.uint16) * 257)
-    write_exr(folder / "e.exr", np.full((80, 96, 3), 0.25, np.float32))
+    write_exr(folder / "e.exr", np.linspace(0, 1, 80 * 96 * 3, dtype=np.float32).reshape(80, 96, 3))
     assert len(gather(folder).artifact.views) == 5
     write_exr(folder / "e.exr", np.full((80, 96, 3), np.nan, np.float32))
     assert "not finite" in refused(gather, folder).what
 
 
-def test_the_same_photo_twice_is_told(tmp_path: Path, gather) -> None:
+def test_the_same_photo_twice_is_told_and_used_once(tmp_path: Path, gather) -> None:
     folder = plain(tmp_path / "c")
     (folder / "z.jpg").write_bytes((folder / "a.jpg").read_bytes())
-    assert gather(folder).artifact.warnings == ("z.jpg is the same file as a.jpg",)
+    capture = gather(folder).artifact
+    assert len(capture.views) == 3 and capture.left_out == ("z.jpg: it is the same file as a.jpg",)
+    assert "z.jpg" in capture.warnings[0]
+
+
+def test_the_same_photo_under_two_cameras_is_told(facescape, gather) -> None:
+    folder, _ = facescape
+    (folder / "4.jpg").write_bytes((folder / "1.jpg").read_bytes())
+    capture = gather(folder).artifact
+    assert len(capture.views) == 6 and "4.jpg is the same file as 1.jpg" in capture.warnings[0]
+
+
+def test_a_black_frame_is_left_out_and_named(facescape, gather) -> None:
+    folder, _ = facescape
+    cv2.imwrite(str(folder / "3.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
+    found = gather(folder)
+    assert [v.index for v in found.artifact.views] == [0, 1, 2, 4, 5]
+    assert "3.jpg is left out: it is blank" in found.artifact.warnings[0]
+    assert not (found.folder / "photos" / "3_3.jpg").exists()
+
+
+def test_a_blurred_third_is_left_out_and_named(tmp_path: Path, gather) -> None:
+    folder, noise = tmp_path / "c", np.random.default_rng(1)
+    folder.mkdir()
+    for i in range(9):
+        picture = cv2.GaussianBlur(noise.random((160, 200, 3)).astype(np.float32), (0, 0), 0.8)
+        if i % 3 == 1:
+            picture = cv2.GaussianBlur(picture, (0, 0), 4)
+        cv2.imwrite(str(folder / f"{i}.png"), np.round(picture * 255).astype(np.uint8))
+    capture = gather(folder).artifact
+    assert [v.index for v in capture.views] == [0, 2, 3, 5, 6, 8]
+    assert [w.split(" ")[0] for w in capture.warnings] == ["1.png", "4.png", "7.png"]
+    assert len(gather(folder, drop_blurred=False).artifact.views) == 9
 
 
 # ------------------------------------------------------------------ bad files
@@ -193,20 +225,32 @@ def test_a_file_that_changes_under_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("value", "what"), [(0, "empty"), (255, "full"), (100, "empty")])
-def test_useless_masks(tmp_path: Path, gather, value: int, what: str) -> None:
+def test_useless_masks_are_named_and_done_without(tmp_path: Path, gather, value: int, what: str) -> None:
     folder = plain(tmp_path / "c")
     (folder / "masks").mkdir()
     cv2.imwrite(str(folder / "masks" / "b.png"), np.full((80, 96), value, np.uint8))
-    error = refused(gather, folder)
-    assert what in error.what and error.where == "b.png"
+    capture = gather(folder).artifact
+    assert [v.mask for v in capture.views] == [None] * 3
+    assert f"b.png is {what}" in capture.warnings[0] and "draw it again" in capture.warnings[0]
 
 
-def test_a_mask_of_another_size(tmp_path: Path, gather) -> None:
+def test_a_mask_of_another_size_is_named_and_done_without(tmp_path: Path, gather) -> None:
     folder = plain(tmp_path / "c")
     (folder / "mask").mkdir()
     cv2.imwrite(str(folder / "mask" / "b.png"), np.eye(50, dtype=np.uint8) * 255)
-    error = refused(gather, folder)
-    assert error.value == "50 x 50" and error.limit == "96 x 80"
+    capture = gather(folder).artifact
+    assert capture.views[1].mask is None
+    assert "b.png is 50 x 50 and its photo 96 x 80; export it at the photo's size" in capture.warnings[0]
+
+
+def test_clean_plates_belong_to_their_photos(tmp_path: Path, gather) -> None:
+    folder = plain(tmp_path / "c")
+    (folder / "clean_plate").mkdir()
+    cv2.imwrite(str(folder / "clean_plate" / "a.png"), flat(SIZE, 30))
+    cv2.imwrite(str(folder / "clean_plate" / "b.jpg"), flat((90, 90), 30))
+    capture = gather(folder).artifact
+    assert capture.views[0].plate is not None and capture.views[0].plate.path == "plates/0_a.png"
+    assert capture.views[1].plate is None and "clean plate of b.jpg is 90 x 90" in capture.warnings[0]
 
 
 # ------------------------------------------------------------------ bad cameras

@@ -32,7 +32,7 @@ def test_plain_photos_in_natural_order_of_any_suffix_case(tmp_path: Path) -> Non
     photos(folder / "previews", "img99.jpg")
     (folder / "notes.txt").write_text("not a photo")
     found = scan_capture(folder).artifact
-    assert found.kind == "photos" and found.params is None and found.masks == ()
+    assert found.kind == "photos" and found.cameras == () and found.masks == ()
     assert names(found.photos) == ["img1.Png", "img2.jpg", "img10.JPG", "x.tiff"]
     assert all(r.size == (folder / r.path).stat().st_size and len(r.sha256) == 64 for r in found.photos)
 
@@ -45,7 +45,7 @@ def test_facescape_takes_only_the_photos_that_params_names(facescape) -> None:
     folder, _ = facescape
     photos(folder, "contact_sheet.jpg", "99.jpg")
     found = scan_capture(folder).artifact
-    assert found.kind == "facescape" and found.params is not None
+    assert found.kind == "facescape" and names(found.cameras) == ["params.json"]
     assert names(found.photos) == [f"{i}.jpg" for i in range(6)]
 
 

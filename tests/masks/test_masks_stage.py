@@ -257,3 +257,32 @@ def test_contradiction_and_trimap() -> None:
     assert found[50, 70] == cv2.GC_FGD and found[5, 5] == cv2.GC_BGD
     elsewhere = replace(opinion, here=x < 0)
     assert (trimap(half, elsewhere)[:, 60:][body[:, 60:]] == cv2.GC_BGD).all()  # outside the region: its own word
+
+
+def test_inverted_masks_are_turned_and_named(scene: Scene, tmp_path: Path) -> None:
+    for c in scene.cameras:
+        alpha = ball_alpha(c)
+        scene.give(c.index, 1 - alpha if c.index in (4, 7) else alpha)
+    found, alphas = run(scene, tmp_path / "s")
+    assert [m.index for m in found.masks if m.source == "given, inverted"] == [4, 7] and found.dropped == ()
+    assert all(iou(a, ball_alpha(c)) > 0.99 for a, c in zip(alphas, scene.cameras, strict=True))
+    assert "(4.png)" in found.warnings[0] and "white on the subject" in found.warnings[0]
+
+
+def test_clean_plates(tmp_path: Path) -> None:
+    """A busy background that the subject's colours occur in, exposed a little differently, with noise."""
+    random = np.random.default_rng(6)
+    busy = np.kron(random.uniform(0.1, 0.95, (8, 8, 3)), np.ones((16, 16, 1))).astype(np.float32)
+    scene = build(tmp_path / "capture", 12, busy)
+    for c in scene.cameras:
+        noise = random.normal(scale=0.012, size=(2, SIZE, SIZE, 3))
+        scene.repaint(c.index, (paint(ball_alpha(c), busy) + noise[0]).clip(0, 1))
+        write_png(scene.folder / f"p{c.index}.png", (1.06 * busy + noise[1]).clip(0, 1))
+        plate = FileRef.of(scene.folder, f"p{c.index}.png")
+        scene.views[c.index] = scene.views[c.index].model_copy(update={"plate": plate})
+    found, alphas = run(scene, tmp_path / "s")
+    assert {m.source.split("+")[0] for m in found.masks} == {"plate"} and found.dropped == ()
+    assert min(iou(a, ball_alpha(c)) for a, c in zip(alphas, scene.cameras, strict=True)) > 0.93
+    scene.views[4] = scene.views[4].model_copy(update={"plate": None})
+    with pytest.raises(UsageError, match="without a clean plate"):
+        run(scene, tmp_path / "s", method="plate")

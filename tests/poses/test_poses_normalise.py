@@ -115,6 +115,23 @@ def test_up_does_not_lean_back_with_cameras_that_all_look_down() -> None:
         np.linalg.det(found.capture_from_asset[:3, :3])))) < 2  # fmt: skip
 
 
+def test_a_table_tells_up_where_photos_were_held_sideways() -> None:
+    """Two thirds of the photos are held sideways, so that the cameras' own up is wrong by a quarter turn."""
+    quarter = similarity(1.0, Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.zeros(3))
+    poses = [camera_on_orbit(a, e, 1.0, TARGET) for e in (20, 45) for a in range(0, 360, 30)]
+    held = [p @ quarter if i % 3 else p for i, p in enumerate(poses)]
+    random = np.random.default_rng(4)
+    table = random.uniform(-0.4, 0.4, (900, 3)) * (1, 0, 1) + TARGET + (0, -0.1, 0)
+    points = np.concatenate([head_points(1500), table[np.linalg.norm(table - TARGET, axis=1) > 0.12]])
+    turned = similarity(2.0, Rotation.from_euler("xyz", [40, 160, 70], degrees=True).as_matrix(), np.ones(3))
+    found = normalise(cameras(held, turned), apply(turned, points), given=False)
+    up = np.linalg.inv(found.capture_from_asset)[:3, :3] @ turned[:3, :3] @ [0.0, 1, 0]
+    assert up[1] / np.linalg.norm(up) > 0.999
+    bare = normalise(cameras(held, turned), apply(turned, head_points(1500)), given=False)
+    up = np.linalg.inv(bare.capture_from_asset)[:3, :3] @ turned[:3, :3] @ [0.0, 1, 0]
+    assert up[1] / np.linalg.norm(up) < 0.5
+
+
 def test_cameras_all_around_have_a_front_too() -> None:
     poses = [camera_on_orbit(a, 5, 1.0, TARGET) for a in np.arange(0, 360, 15)]
     check_rigid(normalise(cameras(poses), given=False))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,9 +11,11 @@ import pytest
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
-from stages.poses.features import PATIENT, PLAIN, detect, grey8
-from stages.poses.matching import match, promising_pairs, verify
-from stages.poses.solve import opencv_distortion
+from stages.poses.features import ASKEW, PATIENT, PLAIN, detect, grey8
+from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
+from stages.poses.photogrammetry import Settings, _askew, detect_all, match_all
+from stages.poses.photos import photos_of
+from stages.poses.solve import Refine, opencv_distortion
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -75,8 +78,8 @@ def test_photos_of_something_else_are_named(ball: Path, tmp_path: Path, capture_
     for i in (20, 21):
         noise = cv2.GaussianBlur(rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8), (0, 0), 2)
         cv2.imwrite(str(folder / f"{i}.jpg"), cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX))
-    capture = capture_of(folder)
-    found = place(capture).artifact
+    capture = capture_of(folder, drop_blurred=False)
+    found = place(capture, patience=2).artifact
     assert found.unregistered == ("20.jpg", "21.jpg") and "20.jpg, 21.jpg" in found.warnings[-1]
 
 
@@ -88,7 +91,7 @@ def test_too_few_placed_photos_are_an_error_that_names_the_others(
     for i in range(4):
         (folder / f"{i + 10}.jpg").write_bytes((ball / f"{i}.jpg").read_bytes())
     with pytest.raises(StageError) as caught:
-        place(capture_of(folder))
+        place(capture_of(folder), patience=2)
     assert caught.value.value == "4 of 9 placed; without a place: 0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg"
     assert caught.value.limit == "at least 60%"
 
@@ -122,7 +125,7 @@ def no_overlap(folder: Path) -> Path:
 
 def test_photos_without_overlap_fail_clearly(tmp_path: Path, capture_of, place) -> None:
     with pytest.raises(StageError) as caught:
-        place(capture_of(no_overlap(tmp_path / "c")))
+        place(capture_of(no_overlap(tmp_path / "c")), patience=1)
     error = caught.value
     assert error.where == "poses" and "of 5 placed" in error.value and "0.jpg" in error.value
     assert "overlapping" in error.remedy and "60%" in error.limit
@@ -131,9 +134,9 @@ def test_photos_without_overlap_fail_clearly(tmp_path: Path, capture_of, place) 
 def test_photos_without_any_feature_fail_clearly(tmp_path: Path, capture_of, place) -> None:
     (tmp_path / "c").mkdir()
     for i in range(3):
-        cv2.imwrite(str(tmp_path / "c" / f"{i}.jpg"), np.full((200, 200, 3), 90 + i, np.uint8))
+        cv2.imwrite(str(tmp_path / "c" / f"{i}.jpg"), np.tile(np.linspace(60, 90 + i, 200), (200, 1)))
     with pytest.raises(StageError, match="nothing in common"):
-        place(capture_of(tmp_path / "c"))
+        place(capture_of(tmp_path / "c"), patience=1)
 
 
 def test_the_user_can_stop_it(ball: Path, capture_of, place) -> None:
@@ -187,6 +190,50 @@ def test_features_are_spread_masked_and_repeatable() -> None:
     inside[200:] = 1
     assert detect(picture, (400, 400), 200, PLAIN, inside).uv[:, 1].min() > 199
     assert len(detect(np.full((100, 100), 7, np.uint8), (100, 100), 50, PATIENT).uv) == 0
+
+
+def test_photos_far_apart_match_when_looked_at_askew() -> None:
+    """A flat pattern straight on and turned by 65 degrees: its image is squeezed by cos 65."""
+    rng = np.random.default_rng(2)
+    flat = cv2.normalize(cv2.GaussianBlur(rng.random((240, 300)), (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
+    turned = cv2.resize(flat, (round(300 * np.cos(np.radians(65))), 240), interpolation=cv2.INTER_AREA)
+    counts = []
+    for effort in (PLAIN, replace(ASKEW, denoise=False)):
+        a, b = (detect(p.astype(np.uint8), p.shape[::-1], 800, effort) for p in (flat, turned))
+        pair = Verified(np.eye(3), match(a.descriptors, b.descriptors, effort.ratio))
+        kept = without_repeats(pair, a, b, 2.0)
+        assert len(kept.matches) <= len(pair.matches)
+        uv_a, uv_b = a.uv[kept.matches[:, 0]], b.uv[kept.matches[:, 1]]
+        right = np.abs(uv_b - uv_a * (turned.shape[1] / 300, 1)).max(1) < 2
+        counts.append(int(right.sum()))
+    assert counts[1] > 3 * max(counts[0], 10)
+
+
+def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -> None:
+    photos = photos_of(capture_of(ball), False)[:2]
+    settings = Settings(0, 200, 150, 4, "yes", "SIMPLE_RADIAL", Refine())
+    plain = detect_all(photos, settings, PLAIN, lambda *_: None)
+    verified = match_all(photos, plain, settings, PLAIN, lambda *_: None)
+    both, joint = _askew(photos, plain, verified, settings, lambda *_: None)
+    first, second = joint[0, 1].matches.T
+    assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
+    new = joint[0, 1].matches[first >= len(plain[0].uv)]
+    assert len(new) >= 15 and (new[:, 1] >= len(plain[1].uv)).all()
+    relative = np.linalg.inv(ORBIT[1]) @ ORBIT[0]
+    x, y = ((np.c_[f.uv[k] - K[:2, 2], np.full(len(k), K[0, 0])]) for f, k in zip(both, new.T, strict=True))
+    line = x @ np.cross(relative[:3, 3], relative[:3, :3].T)  # x (t x R)^T
+    off = np.abs((y * line).sum(1)) / np.linalg.norm(line[:, :2], axis=1)
+    assert np.median(off) < 2
+
+
+def test_matches_of_two_kinds_are_joined_behind_each_other() -> None:
+    F = np.eye(3)
+    one = {(0, 1): Verified(F, np.array([[1, 2], [3, 4], [5, 6]], np.uint32))}
+    other = {(0, 1): Verified(2 * F, np.array([[0, 0]], np.uint32)), (1, 2): Verified(F, np.array([[7, 8]], np.uint32))}
+    both = joined(one, other, [10, 20, 30])
+    np.testing.assert_array_equal(both[0, 1].matches, [[1, 2], [3, 4], [5, 6], [10, 20]])
+    np.testing.assert_array_equal(both[1, 2].matches, [[27, 38]])
+    assert both[0, 1].F is F  # of the kind that agreed on more
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,67 @@ import numpy as np
 
 from pipeline.artifacts import GivenCamera
 from pipeline.errors import StageError
-from pipeline.transforms import F64, corner_K_from_centre_K, rigid, rows
+from pipeline.transforms import F64, corner_K_from_centre_K
+from stages.capture.readers.described import (
+    PHOTO_SUFFIXES,
+    Declared,
+    Described,
+    checked_K,
+    fault,
+    given_camera,
+    natural_key,
+)
 
-ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
+PARAMS = "params.json"
 _KEY = re.compile(r"(\d+)_(K|Rt|distortion|width|height|valid|ori|sn|matches)")
 
 
-@dataclass(frozen=True, slots=True)
-class DeclaredView:
-    """What params.json says of one valid view. width, height: pixels. serial: the camera body, "" if not named."""
+def find(folder: Path) -> list[Path]:
+    """params.json."""
+    params = folder / PARAMS
+    return [params] if params.is_file() else []
 
-    index: int
-    camera: GivenCamera
-    width: int
-    height: int
-    serial: str
+
+def read(folder: Path, files: Sequence[Path]) -> Described:
+    """Valid views with their photos; invalid ones and those whose photo is missing are left out."""
+    params = read_params(files[0])
+    indices = view_indices(params)
+    photos = _by_index(folder, set(indices))
+    views, left_out, absent, warnings = [], [], [], []
+    for index in indices:
+        photo = photos.get(index)
+        name = photo.name if photo else f"{index}"
+        if not is_valid(params, index):
+            left_out.append(f"{name}: params.json marks it invalid")
+            absent.append(name)
+        elif photo is None:
+            left_out.append(f"{name}: its photo is missing")
+            absent.append(name)
+            warnings.append(f"params.json names view {index}, but its photo is missing")
+        else:
+            camera, size = given_view(params, index)
+            views.append(Declared(index, photo.name, photo, camera, size, str(params.get(f"{index}_sn", ""))))
+    return Described(tuple(views), tuple(left_out), tuple(absent), tuple(warnings))
+
+
+def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
+    """The photos that params.json names. One file per view."""
+    named: dict[int, Path] = {}
+    for photo in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
+        usable = photo.suffix.lower() in PHOTO_SUFFIXES and not photo.name.startswith(".") and photo.is_file()
+        if not usable or not photo.stem.isdecimal() or int(photo.stem) not in indices:
+            continue
+        index = int(photo.stem)
+        if index in named:
+            raise StageError(
+                "two photos for one view",
+                where=f"view {index}",
+                value=f"{named[index].name} and {photo.name}",
+                limit="one file per view",
+                remedy="take one of them out of the folder",
+            )
+        named[index] = photo
+    return named
 
 
 def read_params(path: Path) -> dict[str, Any]:
@@ -69,93 +114,39 @@ def is_valid(params: Mapping[str, Any], index: int) -> bool:
     return bool(params.get(f"{index}_valid", True))
 
 
-def declared_view(params: Mapping[str, Any], index: int) -> DeclaredView:
-    """One view's camera, checked.
+def given_view(params: Mapping[str, Any], index: int) -> tuple[GivenCamera, tuple[int, int]]:
+    """One view's camera, checked, and its photo's width and height in pixels.
 
     Raises:
         StageError: naming the key: missing, wrong shape, not finite, K singular, R not a rotation or left-handed.
     """
-    K = _intrinsics(params, f"{index}_K")
-    pose = _pose(params, f"{index}_Rt")
+    K = checked_K(_numbers(params, f"{index}_K"), _where(f"{index}_K"))
+    pose = _numbers(params, f"{index}_Rt")
     key = f"{index}_distortion"
     d = _numbers(params, key)
     if d.ndim != 1 or d.size not in (4, 5):
-        raise _fault(
+        raise fault(
             "lens distortion has the wrong number of coefficients",
-            key,
+            _where(key),
             f"shape {d.shape}",
             "k1 k2 p1 p2 k3",
             "list five numbers; zeros for a lens without distortion",
         )
     d = np.concatenate([d, np.zeros(5 - d.size)])
-    camera = GivenCamera(K=rows(corner_K_from_centre_K(K)), cam_from_world=rows(pose), distortion=tuple(map(float, d)))
-    serial = str(params.get(f"{index}_sn", ""))
-    return DeclaredView(index, camera, _pixels(params, f"{index}_width"), _pixels(params, f"{index}_height"), serial)
+    camera = given_camera(corner_K_from_centre_K(K), pose, d, _where(f"{index}_Rt"))
+    return camera, (_pixels(params, f"{index}_width"), _pixels(params, f"{index}_height"))
 
 
-def _intrinsics(params: Mapping[str, Any], key: str) -> F64:
-    K = _numbers(params, key)
-    if K.shape != (3, 3):
-        raise _fault("camera matrix has the wrong shape", key, f"shape {K.shape}", "3 x 3", "write K as three rows")
-    scale = max(float(np.abs(K).max()), 1e-300)
-    if abs(float(np.linalg.det(K / scale))) * scale**2 < 1e-9 or min(K[0, 0], K[1, 1]) <= 0:
-        raise _fault(
-            "camera matrix K is singular",
-            key,
-            f"fx = {K[0, 0]:g}, fy = {K[1, 1]:g}, determinant {float(np.linalg.det(K)):.3g}",
-            "fx and fy above 0",
-            "write the focal lengths in pixels",
-        )
-    if np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6 * K[0, 0]:
-        raise _fault(
-            "camera matrix K is not upper triangular",
-            key,
-            K.tolist(),
-            "rows (fx, s, cx), (0, fy, cy), (0, 0, 1)",
-            "check that the matrix is not transposed",
-        )
-    return K
-
-
-def _pose(params: Mapping[str, Any], key: str) -> F64:
-    """4x4 cam_from_world, its rotation made exact."""
-    m = _numbers(params, key)
-    if m.shape not in ((3, 4), (4, 4)) or (m.shape == (4, 4) and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-6):
-        raise _fault(
-            "camera pose has the wrong shape",
-            key,
-            f"shape {m.shape}",
-            "3 x 4: rotation, then translation",
-            "write Rt as three rows of four",
-        )
-    R = m[:3, :3]
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
-    if error > ORTHONORMAL_LIMIT:
-        raise _fault(
-            "camera pose has no rotation matrix",
-            key,
-            f"|R R^T - 1| = {error:.3g}",
-            f"at most {ORTHONORMAL_LIMIT:g}",
-            "write a pure rotation, without scale or shear",
-        )
-    if np.linalg.det(R) < 0:
-        raise _fault(
-            "camera pose is left-handed",
-            key,
-            "det R = -1 (mirrored)",
-            "det R = +1",
-            "use OpenCV's axes: x right, y down, z forward; flip one axis where the pose is written",
-        )
-    u, _, vt = np.linalg.svd(R)
-    return rigid(u @ vt, m[:3, 3])
+def _where(key: str) -> str:
+    return f"params.json, key {key}"
 
 
 def _pixels(params: Mapping[str, Any], key: str) -> int:
     value = _numbers(params, key)
     if value.ndim != 0 or value != np.round(value) or value < 1:
-        raise _fault(
+        raise fault(
             "image size is not a whole number of pixels",
-            key,
+            _where(key),
             params[key],
             "a whole number above 0",
             "write the photo's size in pixels",
@@ -165,9 +156,9 @@ def _pixels(params: Mapping[str, Any], key: str) -> int:
 
 def _numbers(params: Mapping[str, Any], key: str) -> F64:
     if key not in params:
-        raise _fault(
+        raise fault(
             "a camera parameter is missing",
-            key,
+            _where(key),
             "no such key",
             "every valid view has K, Rt, distortion, width and height",
             f"add {key}, or set {key.split('_')[0]}_valid to false",
@@ -175,23 +166,19 @@ def _numbers(params: Mapping[str, Any], key: str) -> F64:
     try:
         found = np.array(params[key], np.float64)
     except (TypeError, ValueError) as e:
-        raise _fault(
+        raise fault(
             "a camera parameter is not a table of numbers",
-            key,
+            _where(key),
             str(params[key])[:80],
             "numbers only",
             "write it as plain JSON numbers in rows of equal length",
         ) from e
     if not np.isfinite(found).all():
-        raise _fault(
+        raise fault(
             "a camera parameter is not finite",
-            key,
+            _where(key),
             params[key],
             "finite numbers only (no NaN, no Infinity)",
             f"write it again from the calibration, or set {key.split('_')[0]}_valid to false",
         )
     return found
-
-
-def _fault(what: str, key: str, value: object, limit: object, remedy: str) -> StageError:
-    return StageError(what, where=f"params.json, key {key}", value=value, limit=limit, remedy=remedy)

@@ -1,0 +1,62 @@
+"""The colour profile that a photo carries: its name, to tell when a photo's colours are not sRGB's.
+
+Source: ICC.1:2022, sections 7.2 (header), 7.3 (tag table), 10.15 (multiLocalizedUnicodeType); ICC.1:2001-04 for the
+older textDescriptionType. In JPEG the profile is in APP2 segments, in PNG in an iCCP chunk, compressed.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+from stages.capture.exif import jpeg_segments, png_chunks
+
+HEADER, MAX_BYTES = 128, 8_000_000
+_MARK = b"ICC_PROFILE\0"
+
+
+def profile_name(data: bytes) -> str | None:
+    """The profile's description, None if the JPEG or PNG file carries none or it is damaged."""
+    block = _profile(data)
+    if block is None or len(block) < HEADER + 4:
+        return None
+    count = struct.unpack_from(">I", block, HEADER)[0]
+    for i in range(min(count, 100)):
+        entry = HEADER + 4 + 12 * i
+        if entry + 12 > len(block):
+            return None
+        name, offset, size = struct.unpack_from(">4sII", block, entry)
+        if name == b"desc" and offset + size <= len(block) and size >= 12:
+            return _text(block[offset : offset + size])
+    return None
+
+
+def is_srgb(name: str | None) -> bool:
+    """Whether a photo with this profile has sRGB's colours; one without a profile is taken to."""
+    return name is None or "srgb" in name.lower().replace(" ", "")
+
+
+def _profile(data: bytes) -> bytes | None:
+    if data[:2] == b"\xff\xd8":
+        parts = [data[a:b] for marker, a, b in jpeg_segments(data) if marker == 0xE2]
+        mine = sorted((p[12], p[14:]) for p in parts if p[:12] == _MARK and len(p) > 14)
+        return b"".join(p for _, p in mine) or None
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        for kind, a, b in png_chunks(data):
+            if kind == b"iCCP":
+                packed = data[a:b].partition(b"\0")[2][1:]
+                try:
+                    return zlib.decompressobj().decompress(packed, MAX_BYTES)
+                except zlib.error:
+                    return None
+    return None
+
+
+def _text(tag: bytes) -> str | None:
+    if tag[:4] == b"desc":
+        length = struct.unpack_from(">I", tag, 8)[0]
+        return tag[12 : 12 + length].split(b"\0")[0].decode("latin-1").strip() or None
+    if tag[:4] == b"mluc" and len(tag) >= 28:
+        length, offset = struct.unpack_from(">II", tag, 20)
+        return tag[offset : offset + length].decode("utf-16-be", "replace").strip("\0 ") or None
+    return None

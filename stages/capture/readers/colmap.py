@@ -1,0 +1,98 @@
+"""Reads a COLMAP model, binary or text: `cameras`, `images`, `points3D` in `sparse/0/`, `sparse/` or the folder itself.
+
+Every camera model that pycolmap knows is taken: those that k1 k2 p1 p2 k3 can say exactly as they are, the others by
+the nearest lens of that kind over the frame, if it is near enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from pipeline.transforms import F64
+from stages.capture.readers.described import (
+    Declared,
+    Described,
+    fault,
+    find_photo,
+    five_terms,
+    given_camera,
+    indices_of,
+    natural_key,
+)
+
+FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", "")
+NAMES = ("cameras", "images", "points3D")
+MORE = ("rigs", "frames")  # newer versions write these too
+NOTED = 0.02  # pixels: a lens replaced with less error than this needs no note
+
+
+def find(folder: Path) -> list[Path]:
+    """The model's files, binary ones first."""
+    for root in FOLDERS:
+        for suffix in (".bin", ".txt"):
+            files = [folder / root / (n + suffix) for n in NAMES]
+            if all(f.is_file() for f in files):
+                return files + [f for n in MORE if (f := folder / root / (n + suffix)).is_file()]
+    return []
+
+
+def read(folder: Path, files: Sequence[Path]) -> Described:
+    """Registered images with their photos; those whose photo is missing are left out and named."""
+    model = _model(files[0].parent, files[0].suffix)
+    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: natural_key(i.name))
+    if not images:
+        raise fault("the COLMAP model has no registered images", files[1].name, 0, "at least 3",
+                    "run the mapper again, or remove the model to have the cameras solved")  # fmt: skip
+    lenses = {k: _lens(c, f"{files[0].name}, camera {k}") for k, c in model.cameras.items()}
+    views, left_out, warnings = [], [], []
+    for index, image in zip(indices_of([i.name for i in images]), images, strict=True):
+        photo = find_photo(folder, image.name)
+        if photo is None:
+            left_out.append(f"{PurePosixPath(image.name).name}: its photo is missing")
+            warnings.append(f"the COLMAP model has {image.name}, which is not in the capture; put the photo into "
+                            "images/ or into the folder itself")  # fmt: skip
+            continue
+        (K, d, _), camera = lenses[image.camera_id], model.cameras[image.camera_id]
+        pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+        given = given_camera(K, pose, d, f"{files[1].name}, {image.name}")
+        views.append(Declared(index, photo.name, photo, given, (camera.width, camera.height), f"{image.camera_id}"))
+    warnings += [f"COLMAP camera {k} ({model.cameras[k].model_name}) is replaced by the nearest k1 k2 p1 p2 k3, "
+                 f"{error:.2f} pixels off at most" for k, (_, _, error) in lenses.items() if error > NOTED]  # fmt: skip
+    return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
+
+
+def _model(folder: Path, suffix: str) -> Any:
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    try:
+        (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
+    except (RuntimeError, ValueError, IndexError) as e:
+        raise fault("the COLMAP model can't be read", folder.name, str(e).strip().splitlines()[-1][:200],
+                    "a complete model as COLMAP writes it",
+                    "export the model again, or remove it to have the cameras solved") from e  # fmt: skip
+    return model
+
+
+def _lens(camera: Any, where: str) -> tuple[F64, F64, float]:
+    """K (3, 3), k1 k2 p1 p2 k3, greatest error in pixels. COLMAP has the first pixel's centre at (0.5, 0.5)."""
+    p, model = [float(x) for x in camera.params], camera.model_name
+    exact = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
+    if model in exact and not (model == "FULL_OPENCV" and any(p[9:])):
+        terms = p[exact[model] :]
+        d = {0: [0.0] * 5, 1: [*terms, 0, 0, 0, 0], 2: [*terms, 0, 0, 0], 4: [*terms, 0.0], 8: terms[:5]}[len(terms)]
+        return np.asarray(camera.calibration_matrix(), np.float64), np.array(d, np.float64), 0.0
+    if camera.is_spherical():
+        raise fault("a panorama has no pinhole camera", where, model, "a perspective or fisheye lens",
+                    "cut perspective photos out of the panoramas")  # fmt: skip
+    focal = camera.mean_focal_length()
+    K = np.array([[focal, 0, camera.principal_point_x], [0, focal, camera.principal_point_y], [0, 0, 1.0]])
+
+    def image_from_plane(xy: F64) -> F64:
+        return np.asarray(camera.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], 1)), np.float64)
+
+    return five_terms(image_from_plane, K, camera.width, camera.height, where)

@@ -1,0 +1,218 @@
+"""What a description of cameras says, whatever its format; and the checks that all formats share."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Protocol
+
+import numpy as np
+
+from pipeline.artifacts import GivenCamera
+from pipeline.errors import StageError
+from pipeline.transforms import F64, distort, rigid, rows
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
+ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
+LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
+GRID = 17  # half the positions along each edge of the frame at which a lens is compared
+
+
+@dataclass(frozen=True, slots=True)
+class Declared:
+    """One view. name: the photo as the description writes it. photo, mask: files in the capture, None if not there.
+
+    camera: None if the description has none. size: (width, height) in pixels, None if it does not say. serial: the
+    camera body, "" if not named.
+    """
+
+    index: int
+    name: str
+    photo: Path | None
+    camera: GivenCamera | None
+    size: tuple[int, int] | None
+    serial: str = ""
+    mask: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """All views that take part. left_out: notes on views that the description itself rules out, with their photos'
+    names in `absent`."""
+
+    views: tuple[Declared, ...]
+    left_out: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+class Reader(Protocol):
+    """A format. Modules of this package are readers."""
+
+    def find(self, folder: Path) -> list[Path]:
+        """The files in `folder` that describe cameras in this format; none if it is not this format."""
+        ...
+
+    def read(self, folder: Path, files: Sequence[Path]) -> Described:
+        """The views. Raises StageError where a file or a camera is wrong, naming it."""
+        ...
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key that puts 2.jpg before 10.jpg."""
+    parts = re.findall(r"\d+|\D+", name)
+    return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p.lower()) for p in parts)
+
+
+def indices_of(names: Sequence[str]) -> list[int]:
+    """View numbers: the files' stems if all are different numbers, else the order."""
+    stems = [PurePosixPath(n).stem for n in names]
+    if all(s.isdecimal() and len(s) < 10 for s in stems) and len({int(s) for s in stems}) == len(stems):
+        return [int(s) for s in stems]
+    return list(range(len(stems)))
+
+
+def find_photo(folder: Path, written: str) -> Path | None:
+    """The file that a description means: as written, without its suffix, or by its name in one of the usual folders.
+
+    Paths that lead out of the capture are not followed.
+    """
+    plain = written.replace("\\", "/").removeprefix("./")
+    inside = not PurePosixPath(plain).is_absolute() and ".." not in PurePosixPath(plain).parts
+    candidates = [folder / root / plain for root in PHOTO_FOLDERS] if inside else []
+    candidates += [folder / root / PurePosixPath(plain).name for root in PHOTO_FOLDERS]
+    for candidate in candidates:
+        if candidate.suffix.lower() in PHOTO_SUFFIXES and candidate.is_file():
+            return candidate
+        for suffix in PHOTO_SUFFIXES:
+            with_suffix = candidate.with_name(candidate.name + suffix)
+            if with_suffix.is_file():
+                return with_suffix
+    return None
+
+
+def given_camera(K: F64, cam_from_world: F64, distortion: F64, where: str) -> GivenCamera:
+    """A camera, checked. K (3, 3): the first pixel's centre at (0.5, 0.5). Pose (3, 4) or (4, 4). k1 k2 p1 p2 k3."""
+    K, pose = checked_K(K, where), checked_pose(cam_from_world, where)
+    return GivenCamera(K=rows(K), cam_from_world=rows(pose), distortion=tuple(float(x) for x in distortion))
+
+
+def checked_K(K: F64, where: str) -> F64:
+    """K itself. Raises StageError if it is not finite, not 3 x 3, singular or not upper triangular."""
+    if K.shape != (3, 3):
+        raise fault("camera matrix has the wrong shape", where, f"shape {K.shape}", "3 x 3", "write K as three rows")
+    finite(K, where)
+    scale = max(float(np.abs(K).max()), 1e-300)
+    if abs(float(np.linalg.det(K / scale))) * scale**2 < 1e-9 or min(K[0, 0], K[1, 1]) <= 0:
+        raise fault(
+            "camera matrix K is singular",
+            where,
+            f"fx = {K[0, 0]:g}, fy = {K[1, 1]:g}, determinant {float(np.linalg.det(K)):.3g}",
+            "fx and fy above 0",
+            "write the focal lengths in pixels",
+        )
+    if np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6 * K[0, 0]:
+        raise fault(
+            "camera matrix K is not upper triangular",
+            where,
+            K.tolist(),
+            "rows (fx, s, cx), (0, fy, cy), (0, 0, 1)",
+            "check that the matrix is not transposed",
+        )
+    return K
+
+
+def checked_pose(m: F64, where: str) -> F64:
+    """4x4 cam_from_world, its rotation made exact. Raises StageError if it is none, or left-handed."""
+    if m.shape not in ((3, 4), (4, 4)) or (m.shape == (4, 4) and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-6):
+        raise fault(
+            "camera pose has the wrong shape",
+            where,
+            f"shape {m.shape}",
+            "3 x 4: rotation, then translation",
+            "write the pose as three rows of four",
+        )
+    finite(m, where)
+    R = m[:3, :3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ORTHONORMAL_LIMIT:
+        raise fault(
+            "camera pose has no rotation matrix",
+            where,
+            f"|R R^T - 1| = {error:.3g}",
+            f"at most {ORTHONORMAL_LIMIT:g}",
+            "write a pure rotation, without scale or shear",
+        )
+    if np.linalg.det(R) < 0:
+        raise fault(
+            "camera pose is left-handed",
+            where,
+            "det R = -1 (mirrored)",
+            "det R = +1",
+            "use right-handed axes; flip one axis where the pose is written",
+        )
+    u, _, vt = np.linalg.svd(R)
+    return rigid(u @ vt, m[:3, 3])
+
+
+def finite(values: F64, where: str) -> F64:
+    """The values themselves. Raises StageError if any is NaN or infinite."""
+    if not np.isfinite(values).all():
+        raise fault(
+            "a camera parameter is not finite",
+            where,
+            values.tolist(),
+            "finite numbers only (no NaN, no Infinity)",
+            "write it again from the calibration, or take the view out",
+        )
+    return values
+
+
+def fault(what: str, where: str, value: object, limit: object, remedy: str) -> StageError:
+    """The user's message."""
+    return StageError(what, where=where, value=value, limit=limit, remedy=remedy)
+
+
+def five_terms(
+    image_from_plane: Callable[[F64], F64], K: F64, width: int, height: int, where: str
+) -> tuple[F64, F64, float]:
+    """K (3, 3), k1 k2 p1 p2 k3 and the greatest error in pixels of the lens that comes nearest to another model.
+
+    image_from_plane: pixels (N, 2) of positions (N, 2) on the plane z = 1, NaN where the model has none. Least squares
+    over the frame, so that a fisheye or a rational lens needs no resampled photos.
+    Raises StageError if the nearest one is off by more than LENS_LIMIT.
+    """
+    from scipy.optimize import least_squares
+
+    xy, uv = _over_the_frame(image_from_plane, K, width, height)
+    start = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0, 0, 0, 0, 0])
+
+    def error(p: F64) -> F64:
+        return np.asarray((distort(xy, p[4:]) * p[:2] + p[2:4] - uv).ravel(), np.float64)
+
+    p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1)).x if len(xy) >= 9 else start
+    worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max()) if len(xy) >= 9 else np.inf
+    if worst > LENS_LIMIT:
+        raise fault(
+            "the lens can't be described by k1 k2 p1 p2 k3",
+            where,
+            f"{worst:.2f} pixels off somewhere in the frame",
+            f"at most {LENS_LIMIT} pixels",
+            "undistort the photos first and give the undistorted cameras, or remove the description to have the "
+            "cameras solved",
+        )
+    found = np.array([[p[0], K[0, 1], p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
+    return found, np.asarray(p[4:], np.float64), worst
+
+
+def _over_the_frame(image_from_plane: Callable[[F64], F64], K: F64, width: int, height: int) -> tuple[F64, F64]:
+    """Positions on the plane z = 1 whose images lie in the frame (a pixel around it included), and those images."""
+    reach = np.array([max(K[0, 2], width - K[0, 2]) / K[0, 0], max(K[1, 2], height - K[1, 2]) / K[1, 1]])
+    side = np.linspace(-1, 1, 2 * GRID)
+    xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2) * reach * 1.5
+    uv = image_from_plane(xy)
+    inside = np.isfinite(uv).all(1) & (uv > -1).all(1) & (uv < np.array([width, height]) + 1).all(1)
+    return xy[inside], uv[inside]

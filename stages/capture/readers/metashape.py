@@ -1,0 +1,147 @@
+"""Reads the cameras that Agisoft Metashape exports as XML (`<document>` with `<sensors>` and `<cameras>`).
+
+Metashape's frame camera: x = X / Z, y = Y / Z with OpenCV's axes, the first pixel's centre at (0.5, 0.5);
+    x' = x (1 + K1 r^2 + K2 r^4 + K3 r^6 + K4 r^8) + P1 (r^2 + 2 x^2) + 2 P2 x y
+    y' = y (1 + K1 r^2 + ...)                      + P2 (r^2 + 2 y^2) + 2 P1 x y
+    u = w / 2 + cx + x' f + x' B1 + y' B2,   v = h / 2 + cy + y' f
+so that its P1 and P2 are OpenCV's p2 and p1. A camera's `transform` is chunk from camera; the chunk's own similarity
+takes it to the world. Source: Metashape user manual, appendix 'Camera models'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from pipeline.transforms import F64, apply, inverse_rigid, rigid, similarity
+from stages.capture.readers.described import (
+    Declared,
+    Described,
+    checked_pose,
+    fault,
+    find_photo,
+    five_terms,
+    given_camera,
+    indices_of,
+)
+
+HEAD = 4096  # bytes in which the format shows
+REMEDY = "export the cameras again (File > Export > Export Cameras, Agisoft XML), or remove the file"
+Lens = tuple[F64, F64, tuple[int, int]]
+
+
+def find(folder: Path) -> list[Path]:
+    """The first XML file (by name) that Metashape wrote."""
+    for path in sorted(folder.glob("*.xml")):
+        with path.open("rb") as f:
+            head = f.read(HEAD)
+        if b"<document" in head and b"<chunk" in head:
+            return [path]
+    return []
+
+
+def read(folder: Path, files: Sequence[Path]) -> Described:
+    """Aligned and enabled cameras with their photos; others are left out and named."""
+    chunk = _chunk(files[0])
+    lenses = {s.get("id", ""): s for s in chunk.iter("sensor")}
+    world_from_chunk = _world_from_chunk(chunk, files[0].name)
+    cameras = [c for c in chunk.iter("camera") if c.get("label")]
+    labels = [c.get("label", "") for c in cameras]
+    views, left_out, warnings = [], [], []
+    for index, label, camera in zip(indices_of(labels), labels, cameras, strict=True):
+        photo, where = find_photo(folder, label), f"{files[0].name}, camera {label}"
+        pose = camera.find("transform")
+        if camera.get("enabled", "true") in ("false", "0") or pose is None:
+            left_out.append(f"{label}: {'not aligned' if pose is None else 'disabled'} in {files[0].name}")
+        elif photo is None:
+            left_out.append(f"{label}: its photo is missing")
+            warnings.append(f"{files[0].name} names {label}, which is not in the capture; put the photo beside it")
+        else:
+            K, d, size = _lens(lenses.get(camera.get("sensor_id", "")), where)
+            chunk_from_cam = checked_pose(_numbers(pose.text, 16, where).reshape(4, 4), where)
+            moved = _rigid_part(world_from_chunk, chunk_from_cam)
+            given = given_camera(K, inverse_rigid(moved), d, where)
+            views.append(Declared(index, photo.name, photo, given, size, f"sensor {camera.get('sensor_id')}"))
+    return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
+
+
+def _chunk(path: Path) -> ElementTree.Element:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as e:
+        raise fault("the cameras' file can't be read", path.name, str(e), "Agisoft XML", REMEDY) from e
+    chunk = root.find("chunk")
+    if chunk is None or next(chunk.iter("camera"), None) is None:
+        raise fault("the cameras' file names no cameras", path.name, "no <camera>", "at least 3 cameras", REMEDY)
+    return chunk
+
+
+def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
+    """The chunk's similarity (4, 4); without one the chunk's own axes are the world."""
+    found = chunk.find("transform")
+    if found is None:
+        return np.eye(4)
+    where = f"{name}, the chunk's transform"
+    rotation, translation, scale = (found.findtext(k) for k in ("rotation", "translation", "scale"))
+    R = _numbers(rotation, 9, where).reshape(3, 3) if rotation else np.eye(3)
+    t = _numbers(translation, 3, where) if translation else np.zeros(3)
+    s = float(_numbers(scale, 1, where)[0]) if scale else 1.0
+    if s <= 0:
+        raise fault("the chunk has no scale", where, s, "above 0", REMEDY)
+    return similarity(s, R, t)
+
+
+def _rigid_part(world_from_chunk: F64, chunk_from_cam: F64) -> F64:
+    """world_from_cam: the rotation of the product, and the centre where the similarity takes it."""
+    scale = float(np.cbrt(np.linalg.det(world_from_chunk[:3, :3])))
+    centre = apply(world_from_chunk, chunk_from_cam[None, :3, 3])[0]
+    return rigid(world_from_chunk[:3, :3] / scale @ chunk_from_cam[:3, :3], centre)
+
+
+def _lens(sensor: ElementTree.Element | None, where: str) -> Lens:
+    found = [] if sensor is None else sensor.findall("calibration")
+    adjusted = [c for c in found if c.get("class") == "adjusted"] or found
+    if not adjusted:
+        raise fault("a camera has no calibration", where, "no <calibration> of its sensor", "an adjusted one", REMEDY)
+    c = adjusted[0]
+    if c.get("type", "frame") != "frame":
+        raise fault("the lens is of a kind that is not understood", where, c.get("type"), "frame",
+                    "undistort the photos in Metashape and export those")  # fmt: skip
+    resolution = c.find("resolution")
+    if resolution is None:
+        raise fault("a calibration has no size", where, "no <resolution>", "width and height", REMEDY)
+    width, height = int(resolution.get("width", 0)), int(resolution.get("height", 0))
+
+    def value(name: str) -> float:
+        text = c.findtext(name)
+        return float(_numbers(text, 1, f"{where}, {name}")[0]) if text else 0.0
+
+    f, skew = value("f"), value("b2")
+    K = np.array([[f + value("b1"), skew, width / 2 + value("cx")], [0, f, height / 2 + value("cy")], [0, 0, 1.0]])
+    radial, p = np.array([value(f"k{i}") for i in (1, 2, 3, 4)]), (value("p1"), value("p2"))
+    d = np.array([radial[0], radial[1], p[1], p[0], radial[2]])
+    if radial[3] == 0:
+        return K, d, (width, height)
+
+    def image_from_plane(xy: F64) -> F64:
+        x, y, r2 = xy[:, 0], xy[:, 1], (xy * xy).sum(1)
+        bent = 1 + r2 * (radial[0] + r2 * (radial[1] + r2 * (radial[2] + r2 * radial[3])))
+        across = x * bent + p[0] * (r2 + 2 * x * x) + 2 * p[1] * x * y
+        down = y * bent + p[1] * (r2 + 2 * y * y) + 2 * p[0] * x * y
+        return np.stack([K[0, 0] * across + skew * down + K[0, 2], f * down + K[1, 2]], -1)
+
+    K5, d5, _ = five_terms(image_from_plane, K, width, height, where)
+    return K5, d5, (width, height)
+
+
+def _numbers(text: str | None, count: int, where: str) -> F64:
+    try:
+        found = np.array((text or "").split(), np.float64)
+    except ValueError as e:
+        raise fault("a camera parameter is not a table of numbers", where, (text or "")[:80], "numbers", REMEDY) from e
+    if found.size != count:
+        raise fault("a camera parameter has the wrong length", where, found.size, f"{count} numbers", REMEDY)
+    return found

@@ -1,0 +1,143 @@
+"""Reads `transforms.json` of instant-ngp and nerfstudio.
+
+For all frames or for each: `fl_x`, `fl_y`, `cx`, `cy` (pixels; the first pixel's centre at (0.5, 0.5)), `w`, `h`, or
+`camera_angle_x` (radians, over the width); `k1`..`k6`, `p1`, `p2` of OpenCV's models, or `is_fisheye` /
+`camera_model: OPENCV_FISHEYE`. `frames[i]`: `file_path`, `transform_matrix` (world from camera, OpenGL axes: y up,
+z backwards), `mask_path`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from pipeline.artifacts import GivenCamera
+from pipeline.transforms import F64, OPENCV_CAM_FROM_OPENGL_CAM, inverse_rigid
+from stages.capture.readers.described import (
+    Declared,
+    Described,
+    checked_pose,
+    fault,
+    find_photo,
+    five_terms,
+    given_camera,
+    indices_of,
+)
+from stages.capture.readers.sizes import picture_size
+
+NAMES = ("transforms.json", "transforms_train.json")
+REMEDY = "copy the file again, or remove it to have the cameras solved from the photos"
+
+
+def find(folder: Path) -> list[Path]:
+    """transforms.json, or the training part of a split one."""
+    return [folder / n for n in NAMES if (folder / n).is_file()][:1]
+
+
+def read(folder: Path, files: Sequence[Path]) -> Described:
+    """Frames with their photos; those whose photo is missing are left out and named."""
+    data = _object(files[0])
+    frames = data["frames"]
+    names = [str(f.get("file_path", "")) for f in frames]
+    views, left_out, warnings = [], [], []
+    for index, name, frame in zip(indices_of(names), names, frames, strict=True):
+        photo = find_photo(folder, name) if name else None
+        if photo is None:
+            left_out.append(f"{PurePosixPath(name).name or f'frame {index}'}: its photo is missing")
+            warnings.append(f"{files[0].name} lists {name or '(no file_path)'}, which is not there; put the photo back "
+                            "or take the frame out of the file")  # fmt: skip
+            continue
+        size = _size(data | frame, photo)
+        mask = find_photo(folder, str(frame["mask_path"])) if frame.get("mask_path") else None
+        camera = _camera(data | frame, size, f"{files[0].name}, {name}")
+        views.append(Declared(index, photo.name, photo, camera, size, mask=mask))
+    absent = tuple(note.split(":")[0] for note in left_out)
+    return Described(tuple(views), tuple(left_out), absent, tuple(warnings))
+
+
+def _object(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as e:
+        raise fault("the cameras' file can't be read", path.name, str(e)[:200], "a JSON object", REMEDY) from e
+    frames = found.get("frames") if isinstance(found, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise fault("the cameras' file names no frames", path.name, "no list 'frames'",
+                    "frames with file_path and transform_matrix", REMEDY)  # fmt: skip
+    return dict(found)
+
+
+def _size(values: Mapping[str, Any], photo: Path) -> tuple[int, int]:
+    w, h = values.get("w"), values.get("h")
+    return (int(w), int(h)) if w and h else picture_size(photo)
+
+
+def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str) -> GivenCamera:
+    width, height = size
+    if "transform_matrix" not in values:
+        raise fault("a frame has no pose", where, "no transform_matrix", "a 4 x 4 matrix", "write the pose, or take "
+                    "the frame out of the file")  # fmt: skip
+    world_from_cam = checked_pose(_numbers(values, "transform_matrix", where), where) @ OPENCV_CAM_FROM_OPENGL_CAM
+    K = np.array([[_focal(values, size, "x", where), 0, _number(values, "cx", width / 2, where)],
+                  [0, _focal(values, size, "y", where), _number(values, "cy", height / 2, where)],
+                  [0, 0, 1.0]])  # fmt: skip
+    d = np.array([_number(values, k, 0.0, where) for k in ("k1", "k2", "p1", "p2", "k3")])
+    higher = np.array([_number(values, k, 0.0, where) for k in ("k4", "k5", "k6")])
+    model = str(values.get("camera_model", ""))
+    if values.get("is_fisheye") or model == "OPENCV_FISHEYE":
+        radial = np.array([d[0], d[1], d[4], higher[0]])
+        K, d, _ = five_terms(lambda xy: _fisheye(xy, radial) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
+    elif np.any(higher) and model != "OPENCV":  # k4 is 0 in OPENCV, and some writers leave a stray value there
+        K, d, _ = five_terms(lambda xy: _rational(xy, d, higher) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
+    return given_camera(K, inverse_rigid(world_from_cam), d, where)
+
+
+def _fisheye(xy: F64, k: F64) -> F64:
+    """OpenCV's fisheye model. r = |xy|, theta = atan r; theta_d = theta (1 + k1 theta^2 + ... + k4 theta^8)."""
+    r = np.maximum(np.linalg.norm(xy, axis=1), 1e-12)
+    t = np.arctan(r)
+    bent = t * (1 + t**2 * (k[0] + t**2 * (k[1] + t**2 * (k[2] + t**2 * k[3]))))
+    return np.asarray(xy * (bent / r)[:, None], np.float64)
+
+
+def _rational(xy: F64, d: F64, higher: F64) -> F64:
+    """OpenCV's rational model: (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)."""
+    x, y, r2 = xy[:, 0], xy[:, 1], (xy * xy).sum(1)
+    above = 1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))
+    radial = above / (1 + r2 * (higher[0] + r2 * (higher[1] + r2 * higher[2])))
+    p1, p2 = d[2], d[3]
+    return np.stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                     y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1)  # fmt: skip
+
+
+def _focal(values: Mapping[str, Any], size: tuple[int, int], axis: str, where: str) -> float:
+    """Pixels, from fl_x / fl_y or the angle of view; one for both axes where only one is given."""
+    for a in (axis, "x", "y"):
+        if values.get(f"fl_{a}"):
+            return _number(values, f"fl_{a}", 0.0, where)
+    for a, edge in ((axis, size["xy".index(axis)]), ("x", size[0]), ("y", size[1])):
+        if values.get(f"camera_angle_{a}"):
+            return edge / 2 / float(np.tan(_number(values, f"camera_angle_{a}", 0.0, where) / 2))
+    raise fault("a camera has no focal length", where, "neither fl_x nor camera_angle_x", "fl_x in pixels",
+                "write fl_x and fl_y, or remove the file to have the cameras solved")  # fmt: skip
+
+
+def _number(values: Mapping[str, Any], key: str, default: float, where: str) -> float:
+    try:
+        found = float(values.get(key, default))
+    except (TypeError, ValueError) as e:
+        raise fault("a camera parameter is not a number", f"{where}, {key}", str(values[key])[:80], "a number",
+                    "write it as a plain JSON number") from e  # fmt: skip
+    return found
+
+
+def _numbers(values: Mapping[str, Any], key: str, where: str) -> F64:
+    try:
+        return np.array(values[key], np.float64)
+    except (TypeError, ValueError) as e:
+        raise fault("a camera parameter is not a table of numbers", f"{where}, {key}", str(values[key])[:80],
+                    "numbers only", "write it as plain JSON numbers in rows of equal length") from e  # fmt: skip

@@ -1,0 +1,124 @@
+"""Do the given cameras belong to the photos? Features of neighbouring photos must lie on each other's epipolar lines.
+
+Symbols: x_i (N, 2) undistorted positions on camera i's plane z = 1; E the essential matrix of two cameras,
+(x_j, 1)^T E (x_i, 1) = 0 for the same point. A pair counts where the photos themselves agree on some geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.artifacts import Camera
+from pipeline.transforms import F64, inverse_rigid, matrix, undistort
+from stages.poses.features import PLAIN, Features, detect, grey8
+from stages.poses.matching import match, verify
+from stages.poses.photos import StoredPhoto
+
+EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
+PARTNERS = 4  # photos that each is held against
+FAR = 0.01  # of the longest edge: farther from its epipolar line a match speaks against the cameras
+AGREE = 0.3  # share of a view's matches that must agree with its camera
+MIN_MATCHES = 20  # of a view over all its pairs, to judge it
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """share: of each view's matches that agree with the cameras, NaN where there are too few to tell."""
+
+    share: F64
+
+    @property
+    def wrong(self) -> list[int]:
+        """Views whose photos and cameras don't belong together."""
+        return [int(i) for i in np.flatnonzero(self.share < AGREE)]
+
+    @property
+    def known(self) -> int:
+        """Number of views that can be judged."""
+        return int(np.isfinite(self.share).sum())
+
+
+def check_cameras(
+    cameras: Sequence[Camera], features: Sequence[Features], seed: int, tick: Callable[[int, int], None]
+) -> Verdict:
+    """Hold each view against its nearest ones. A wrong view spoils its pairs: it is found first, and its pairs no
+    longer count against its neighbours. tick: done, total."""
+    pairs = near_pairs(cameras)
+    counts: dict[tuple[int, int], tuple[int, int]] = {}
+    for n, (i, j) in enumerate(pairs):
+        tick(n, len(pairs))
+        found = match(features[i].descriptors, features[j].descriptors, PLAIN.ratio)
+        edge = max(cameras[i].width, cameras[i].height)
+        pair = verify(features[i], features[j], found, edge, seed)
+        if pair is None:
+            continue
+        uv_i = np.asarray(features[i].uv[pair.matches[:, 0]], np.float64)
+        uv_j = np.asarray(features[j].uv[pair.matches[:, 1]], np.float64)
+        good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < FAR * edge
+        counts[i, j] = (int(good.sum()), len(good))
+    return Verdict(_shares(counts, len(cameras)))
+
+
+def features_of(photos: Sequence[StoredPhoto], tick: Callable[[int, int], None]) -> list[Features]:
+    """Features of every photo, on the subject only where it has a mask. tick: done, total."""
+    found = []
+    for n, photo in enumerate(photos):
+        tick(n, len(photos))
+        grey, alpha = grey8(photo.pixels(), EDGE), photo.inside()
+        inside = None
+        if alpha is not None:
+            small = np.asarray(cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA))
+            inside = (small > 0.5).astype(np.uint8)
+        found.append(detect(grey, (photo.width, photo.height), FEATURES, PLAIN, inside))
+    return found
+
+
+def near_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Each view with the PARTNERS that look from the most similar direction, first < second."""
+    axes = np.stack([matrix(c.world_from_cam)[:3, 2] for c in cameras])
+    likeness = axes @ axes.T
+    np.fill_diagonal(likeness, -np.inf)
+    order = np.argsort(-likeness, axis=1, kind="stable")[:, :PARTNERS]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if i != j})
+
+
+def epipolar_pixels(a: Camera, b: Camera, uv_a: F64, uv_b: F64) -> F64:
+    """(N,) Sampson distances in pixels of matches uv_a, uv_b (N, 2) under the two cameras."""
+    b_from_a = inverse_rigid(matrix(b.world_from_cam)) @ matrix(a.world_from_cam)
+    R, t = b_from_a[:3, :3], b_from_a[:3, 3]
+    E = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]]) @ R
+    x_a, x_b = _on_plane(a, uv_a), _on_plane(b, uv_b)
+    line_b, line_a = x_a @ E.T, x_b @ E
+    value = np.abs((x_b * line_b).sum(1))
+    norm = np.sqrt((line_b[:, :2] ** 2).sum(1) + (line_a[:, :2] ** 2).sum(1))
+    return np.asarray(value / np.maximum(norm, 1e-15) * np.sqrt(a.K[0][0] * b.K[0][0]), np.float64)
+
+
+def _on_plane(camera: Camera, uv: F64) -> F64:
+    """(N, 3) positions on the plane z = 1, the lens undone."""
+    K = matrix(camera.K)
+    flat = np.asarray(np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T, np.float64)
+    xy = undistort(flat, np.array(camera.distortion, np.float64))
+    return np.concatenate([xy, np.ones((len(xy), 1))], 1)
+
+
+def _shares(counts: dict[tuple[int, int], tuple[int, int]], views: int) -> F64:
+    """Share of agreeing matches of each view; the worst view is taken out before its neighbours are judged again."""
+    out, left = np.full(views, np.nan), dict(counts)
+    while True:
+        good, every = np.zeros(views), np.zeros(views)
+        for (i, j), (g, n) in left.items():
+            for k in (i, j):
+                good[k] += g
+                every[k] += n
+        share = np.where(every >= MIN_MATCHES, good / np.maximum(every, 1), np.nan)
+        fresh = np.isnan(out) | (out >= AGREE)
+        out = np.where(fresh & np.isfinite(share), share, out)
+        if not np.isfinite(share).any() or np.nanmin(share) >= AGREE:
+            return out
+        worst = int(np.nanargmin(share))
+        left = {pair: c for pair, c in left.items() if worst not in pair}
