@@ -20,7 +20,8 @@ def standardised(patches: Tensor, floor: float = FLOOR) -> Tensor:
     """
     centred = patches - patches.mean(-1, keepdim=True)
     length = centred.square().sum(-1, keepdim=True).sqrt()
-    return centred / (length + floor * patches.shape[-1] ** 0.5)
+    unit: Tensor = centred / (length + floor * patches.shape[-1] ** 0.5)
+    return unit
 
 
 def agreement(patches: Tensor, seen: Tensor, floor: float = FLOOR) -> Tensor:

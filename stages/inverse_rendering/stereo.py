@@ -110,7 +110,7 @@ def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
     if not np.any(distortion):
         return image
     h, w = image.shape
-    xy = np.linalg.solve(K[:2, :2], (transforms.pixel_centres(w, h) - K[:2, 2]).T).T
+    xy: F64 = np.asarray(np.linalg.solve(K[:2, :2], (transforms.pixel_centres(w, h) - K[:2, 2]).T).T, np.float64)
     uv = transforms.distort(xy, distortion) @ K[:2, :2].T + K[:2, 2] - 0.5
     x, y = (uv[:, i].reshape(h, w).astype(np.float32) for i in (0, 1))
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
@@ -259,4 +259,4 @@ def distances(values: F64, cell: float) -> F32:
     inside, outside = ndimage.distance_transform_edt(solid), ndimage.distance_transform_edt(~solid)
     far = np.where(solid, 0.5 - inside, outside - 0.5) * cell
     keep = (np.abs(far) < 2 * cell) & (solid == (values < 0))
-    return np.where(keep, near, far).astype(np.float32)
+    return np.asarray(np.where(keep, near, far), np.float32)

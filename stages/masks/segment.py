@@ -185,7 +185,7 @@ def _solid(poses: Located[CameraSet], seed: int) -> Solid | None:
     ref = poses.artifact.points
     if ref is None:
         return None
-    with np.load(poses.path(ref)) as data:
+    with np.load(poses.path(ref), allow_pickle=False) as data:
         points = np.asarray(data["points"], np.float64)
     return find_solid(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
 

@@ -156,7 +156,7 @@ def _points(poses: Located[CameraSet]) -> F64:
     """(M, 3) at most SHOWN_POINTS sparse points near the subject; none for given cameras."""
     if poses.artifact.points is None:
         return np.zeros((0, 3))
-    with np.load(poses.path(poses.artifact.points)) as data:
+    with np.load(poses.path(poses.artifact.points), allow_pickle=False) as data:
         points = np.asarray(data["points"], np.float64)
     near = points[np.linalg.norm(points, axis=1) < 4 * poses.artifact.roi_radius]
     return np.asarray(near[:: max(1, -(-len(near) // SHOWN_POINTS))], np.float64)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pipeline.maths
-from pipeline.maths import brdf, cubemap, density, losses, relight, sdf, sh, split_sum, vmf
+from pipeline.maths import brdf, correlation, cubemap, density, losses, relight, sdf, sh, split_sum, vmf
 
 
 def draw(*shape: int, seed: int = 0, low: float = 0.1, high: float = 0.9) -> torch.Tensor:
@@ -40,6 +40,11 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "brdf.lambertian": (brdf.lambertian, (draw(4, 3), draw(4, 3, seed=1))),
     "brdf.light_integral": (lambda d, s, c: brdf.light_integral(d, s, c, "exact"), (unit(4), draw(4), lit())),
     "brdf.specular": (brdf.specular, (draw(4), draw(4, seed=1), draw(4, 3, seed=2))),
+    "correlation.standardised": (correlation.standardised, (draw(3, 9),)),
+    "correlation.agreement": (
+        lambda p: correlation.agreement(p, torch.ones(2, 4, dtype=torch.bool)),
+        (draw(2, 4, 9),),
+    ),
     "cubemap.project": (lambda d: cubemap.project(d)[1:], (unit(6),)),
     "cubemap.corners": (lambda d: cubemap.corners(d, 3)[1], (unit(6),)),
     "cubemap.lookup": (cubemap.lookup, (draw(3, 54, 3), unit(6), draw(6, low=0.1, high=1.9))),
