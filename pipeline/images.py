@@ -23,7 +23,7 @@ MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is 
 def read_encoded(path: Path) -> npt.NDArray[Any]:
     """(H, W, C) as stored, RGB order. Raises StageError if the file is empty, corrupt or absurdly large."""
     size = path.stat().st_size if path.is_file() else 0
-    _refuse_bombs(path, size)
+    refuse_bombs(path, size)
     image = _decoded(path) if size else None
     if image is None:
         raise StageError(
@@ -41,7 +41,7 @@ def read_encoded(path: Path) -> npt.NDArray[Any]:
     return np.ascontiguousarray(image[..., order])
 
 
-def _refuse_bombs(path: Path, size: int) -> None:
+def refuse_bombs(path: Path, size: int) -> None:
     """A header that declares more than any camera has, or a file larger than any photo: nothing is decoded."""
     if size > MAX_BYTES:
         raise _too_large(path, f"{size / 1e9:.1f} GB")

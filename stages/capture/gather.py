@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import FileRef, sha256_of
 from pipeline.errors import StageError
-from pipeline.images import read_encoded
+from pipeline.images import read_encoded, refuse_bombs
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
 from stages.capture.profile import profile_name
@@ -137,6 +137,7 @@ def _decode(path: Path, data: bytes) -> Image:
             limit="a complete image file",
             remedy="copy the file again from the camera, or take it out of the folder",
         )
+    refuse_bombs(path, len(data))  # before `fault_of`, which decodes what says it is a JPEG
     fault = fault_of(data)
     if fault is not None:
         raise StageError(

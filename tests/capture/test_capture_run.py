@@ -206,6 +206,20 @@ def test_truncated_photos(tmp_path: Path, gather) -> None:
         (folder / name).write_bytes(data)
 
 
+def test_a_bomb_is_refused_before_anything_is_decoded(tmp_path: Path, gather, monkeypatch) -> None:
+    """A JPEG whose frame header claims 65,535 x 65,535 pixels."""
+    folder = plain(tmp_path / "c")
+    data = bytearray((folder / "b.jpg").read_bytes())
+    at = next(data.index(bytes([0xFF, m])) for m in (0xC0, 0xC2) if bytes([0xFF, m]) in data)
+    data[at + 5 : at + 9] = b"\xff" * 4
+    (folder / "b.jpg").write_bytes(data)
+    decode, bomb = cv2.imdecode, bytes(data[at : at + 9])
+    watch = lambda x, *a: pytest.fail("decoded") if bomb in x.tobytes() else decode(x, *a)  # noqa: E731
+    monkeypatch.setattr(cv2, "imdecode", watch)
+    error = refused(gather, folder)
+    assert error.where == "b.jpg" and error.value == "65535 x 65535"
+
+
 def test_tiny_photos(tmp_path: Path, gather) -> None:
     folder = plain(tmp_path / "c")
     cv2.imwrite(str(folder / "b.jpg"), flat((200, 32), 0))
