@@ -35,7 +35,7 @@ class Config(StageConfig):
     samples: int = Field(description="samples a ray in the shell around the surface", ge=4, le=128)
     grid_cells: int = Field(description="cells of the final SDF grid along the subject's longest side", ge=16, le=2048)
     levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
-    stereo: bool = Field(description="move the hull to where the photos agree before the fit begins")
+    stereo: bool = Field(description="move the hull to where the photos agree before the fit begins (prior hull)")
     rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
     light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
     attenuation: Literal["exponential", "exact", "phong"] = Field(
@@ -144,7 +144,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         start = sphere_start(radius, settings.grid_cells, settings.levels)
     else:
         start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
-        if settings.stereo:
+        if settings.stereo and settings.prior == "hull":
             context.progress(0, settings.steps, "stereo")
             start = start_from_photos(start, views, context.device)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
