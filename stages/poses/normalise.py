@@ -61,6 +61,7 @@ def normalise(
         centre = points_centre(points, centre, radius)
         radius = frame_radius(cameras, centres, centre)
         distances = np.linalg.norm(points - centre, axis=1)
+        _not_elsewhere(distances, radius)
         reach = POINTS_MARGIN * float(np.quantile(distances[distances < radius], POINTS_WITHIN))
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
@@ -118,6 +119,18 @@ def _not_in_one_spot(cameras: Sequence[Camera], centres: F64) -> None:
                      f"{spread:.3g} units of each other", limit=f"at least {ONE_SPOT:.0%} of the distance to the "
                      "subject apart", remedy="walk around the subject instead of turning the camera; each photo from "
                      "another place")  # fmt: skip
+
+
+def _not_elsewhere(distances: F64, radius: float) -> None:
+    """Cameras solved from one spot may be spread by their errors; their points then lie anywhere but in view."""
+    if not (distances < radius).any():
+        raise StageError(
+            "the photos look as if taken from one spot",
+            where="poses",
+            value=f"none of the {len(distances)} points that were found lies where the cameras look",
+            limit="points on the subject",
+            remedy="walk around the subject instead of turning the camera or zooming; each photo from another place",
+        )
 
 
 def frame_radius(cameras: Sequence[Camera], centres: F64, centre: F64) -> float:

@@ -218,3 +218,11 @@ def test_robust_direction_has_none_where_all_cancels() -> None:
     assert robust_direction(np.array([[0.0, 1, 0], [0, -1, 0]])) is None
     mixed = np.array([[0.0, 1, 0]] * 5 + [[1.0, 0, 0]] * 2)
     np.testing.assert_allclose(robust_direction(mixed), [0, 1, 0], atol=0.05)
+
+
+def test_points_out_of_view() -> None:
+    """What a solver makes of photos from one spot: points anywhere but where the cameras look."""
+    points = np.random.default_rng(0).normal(size=(500, 3)) + [0, 1e3, 0]
+    with pytest.raises(StageError, match="one spot") as caught:
+        normalise(cameras(orbit()), points, given=False)
+    assert "walk around" in caught.value.remedy
