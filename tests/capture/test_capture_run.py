@@ -220,6 +220,16 @@ def test_a_bomb_is_refused_before_anything_is_decoded(tmp_path: Path, gather, mo
     assert error.where == "b.jpg" and error.value == "65535 x 65535"
 
 
+@pytest.mark.parametrize("name", ["params.json", "transforms.json"])
+def test_a_description_of_absurd_size_is_not_read(tmp_path: Path, gather, name: str) -> None:
+    folder = plain(tmp_path / "c")
+    with (folder / name).open("wb") as f:
+        f.write(b'{"frames": [{}], "0_K": ')
+        f.truncate(3_000_000_000)  # sparse: takes no room on the disk
+    error = refused(gather, folder)
+    assert error.where == name and error.value == "3000 MB" and "64 MB" in error.limit
+
+
 def test_tiny_photos(tmp_path: Path, gather) -> None:
     folder = plain(tmp_path / "c")
     cv2.imwrite(str(folder / "b.jpg"), flat((200, 32), 0))

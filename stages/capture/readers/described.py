@@ -18,7 +18,22 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
 ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
 LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
+MOST_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
 GRID = 17  # half the positions along each edge of the frame at which a lens is compared
+
+
+def description(path: Path) -> bytes:
+    """A description's bytes. Raises StageError if it is larger than any is, before anything is read."""
+    size = path.stat().st_size
+    if size > MOST_BYTES:
+        raise StageError(
+            "the cameras' file is too large",
+            where=path.name,
+            value=f"{size / 1e6:.0f} MB",
+            limit=f"{MOST_BYTES / 1e6:.0f} MB",
+            remedy="export the cameras alone, without points and pictures",
+        )
+    return path.read_bytes()
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from stages.capture.readers.described import (
     Declared,
     Described,
     checked_K,
+    description,
     fault,
     given_camera,
     natural_key,
@@ -83,7 +84,7 @@ def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
 def read_params(path: Path) -> dict[str, Any]:
     """The file as a dictionary. Raises StageError if it is not a JSON object that names views."""
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(description(path))
     except (ValueError, RecursionError) as e:
         raise StageError(
             "params.json can't be read",

@@ -21,6 +21,7 @@ from stages.capture.readers.described import (
     Declared,
     Described,
     checked_pose,
+    description,
     fault,
     find_photo,
     five_terms,
@@ -70,7 +71,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 def _chunk(path: Path) -> ElementTree.Element:
     try:
-        root = ElementTree.parse(path).getroot()
+        root = ElementTree.fromstring(description(path))
     except ElementTree.ParseError as e:
         raise fault("the cameras' file can't be read", path.name, str(e), "Agisoft XML", REMEDY) from e
     chunk = root.find("chunk")

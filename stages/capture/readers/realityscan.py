@@ -19,6 +19,7 @@ from stages.capture.readers.described import (
     PHOTO_SUFFIXES,
     Declared,
     Described,
+    description,
     fault,
     finite,
     five_terms,
@@ -37,7 +38,7 @@ REMEDY = "export the registration again (Export > Metadata (XMP)), or remove the
 def find(folder: Path) -> list[Path]:
     """Sidecars with a pose, in natural order. Other tools write .xmp files too; those don't speak of cameras."""
     found = sorted(folder.glob("*.xmp"), key=lambda p: natural_key(p.name))
-    return [p for p in found if MARK in (text := p.read_bytes()) and b"Position" in text]
+    return [p for p in found if MARK in (text := description(p)) and b"Position" in text]
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
@@ -60,7 +61,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 def _fields(path: Path) -> dict[str, str]:
     try:
-        root = ElementTree.parse(path).getroot()
+        root = ElementTree.fromstring(description(path))
     except ElementTree.ParseError as e:
         raise fault("a camera's file can't be read", path.name, str(e), "XMP of RealityScan", REMEDY) from e
     found: dict[str, str] = {}

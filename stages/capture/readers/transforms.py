@@ -21,6 +21,7 @@ from stages.capture.readers.described import (
     Declared,
     Described,
     checked_pose,
+    description,
     fault,
     find_photo,
     five_terms,
@@ -61,7 +62,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 def _object(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(description(path))
     except (ValueError, RecursionError) as e:
         raise fault("the cameras' file can't be read", path.name, str(e)[:200], "a JSON object", REMEDY) from e
     frames = found.get("frames") if isinstance(found, dict) else None
