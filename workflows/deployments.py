@@ -6,6 +6,7 @@ For a work pool and workers on several machines use `prefect deploy` with workfl
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -27,6 +28,7 @@ START = 180.0  # seconds that a server may take to start
 def serve(host: str, port: int, limit: int, home: Path, said: Callable[[str], None]) -> int:
     """Serve both deployments until stopped; with a server of its own unless PREFECT_API_URL names one."""
     environment.defaults()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job inherits it ignored
     own = "PREFECT_API_URL" not in os.environ
     with _server(host, port, home) if own else nullcontext():
         if own:
