@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         sub = commands_of.add_parser(name, help=text)
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
         sub.set_defaults(run=run)
-    bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations"))
+    bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations, tradeoff, speed"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)

@@ -123,6 +123,12 @@ class Config(StageConfig):
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)
 
+    @model_validator(mode="after")
+    def _possible(self) -> Config:
+        if self.relief == "off" and self.method != "fast":
+            raise ValueError("relief = off is for method fast; the paper's displacement is what its method fits")
+        return self
+
     def settings(self) -> FitSettings:
         """What the fit reads."""
         return FitSettings(**{f.name: getattr(self, f.name) for f in fields(FitSettings)})
@@ -194,4 +200,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     return len({v.camera_group for v in inputs.capture.artifact.views if v.index in set(usable)}) > 1
 
 
-STAGE = Stage(name="inverse_rendering", version=1, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=2, inputs=Inputs, config=Config, output=FittedFace, run=run)

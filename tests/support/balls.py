@@ -42,7 +42,7 @@ class Ball:
         return [self.photo(i) for i in range(self.views)]
 
     def photo(self, index: int) -> PhotoView:
-        """A view, 3 x 3 samples a pixel."""
+        """A view, 2 x 2 samples a pixel."""
         angle = 2 * math.pi * index / self.views
         o = DISTANCE * np.array([math.sin(angle), 0.5 * math.sin(5 * angle), math.cos(angle)])
         z = -o / np.linalg.norm(o)
@@ -50,15 +50,15 @@ class Ball:
         x /= np.linalg.norm(x)
         world_from_cam = transforms.rigid(np.stack([x, np.cross(z, x), z], 1), o)
         K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
-        _, d = transforms.rays(K, world_from_cam, np.zeros(5), transforms.pixel_centres(3 * SIDE, 3 * SIDE) / 3)
+        _, d = transforms.rays(K, world_from_cam, np.zeros(5), transforms.pixel_centres(2 * SIDE, 2 * SIDE) / 2)
         b = d @ o
         under = b * b - (o @ o - RADIUS**2)
         hit = under > 0
         n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d)[hit] / RADIUS
         rgb = np.zeros((len(d), 3))
         rgb[hit] = (texture(n) * (0.7 + 0.3 * n[:, 1:2]) + self.lobe(n, -d[hit])[:, None]) * self.gain(index)
-        image = rgb.reshape(SIDE, 3, SIDE, 3, 3).mean((1, 3))
-        alpha = hit.reshape(SIDE, 3, SIDE, 3).mean((1, 3))
+        image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3))
+        alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3))
         return PhotoView(index, image.astype(np.float32), alpha.astype(np.float32), K, world_from_cam, np.zeros(5))
 
 
