@@ -29,6 +29,16 @@ PICTURE = 1024
 SH_DIRECTIONS = 100_000
 AXES: dict[str, tuple[int, ...]] = {"views": (12, 24, 48), "side": (128, 256, 512), "cells": (72, 144, 288)}
 MIDDLE = {"views": 24, "side": 256, "cells": 144}
+WHOLE: dict[str, Any] = {"rank": 3, "light_order": 10, "specular": "on", "relief": "on", "calibration": "on"}
+PARTS: dict[str, dict[str, Any]] = {
+    "the whole model": {},
+    "k = 1": {"rank": 1},
+    "SH order 3": {"light_order": 3},
+    "no lobe": {"specular": "off"},
+    "no calibration": {"calibration": "off"},
+    "the surface at rest": {"relief": "off"},
+    "nothing but albedo and light": {"specular": "off", "light_order": 3, "calibration": "off", "relief": "off"},
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +77,8 @@ def run(given: argparse.Namespace, console: Console) -> int:
         points.append(measure(**setup, batch=given.batch, least=given.least, device=device))
     found["training"] = [asdict(p) for p in points]
     found["growth"] = laws(points)
-    console.note("spherical harmonics, pictures")
+    console.note("parts of the model, spherical harmonics, pictures")
+    found["parts_ms"] = parts(given, device)
     found["sh"] = harmonics(given.least, device)
     found["picture_ms"] = pictures(given, device)
     (out / "speed.json").write_text(json.dumps(found, indent=1) + "\n")
@@ -121,17 +132,15 @@ def ball_start(cells: int) -> Start:
     return Start(np.asarray(values, np.float32), np.full(3, -HALF, np.float32), 2 * HALF / cells)
 
 
-def trainer(views: int, side: int, cells: int, batch: int, device: str) -> Trainer:
-    """A fit of the ball with the draft's model, whole and on one grid, about to begin."""
+def trainer(views: int, side: int, cells: int, batch: int, device: str, part: dict[str, Any] | None = None) -> Trainer:
+    """A fit of the ball with the draft's model on one grid, about to begin: whole, or without a part."""
     from stages.inverse_rendering.fit import new_trainer
     from stages.inverse_rendering.settings import FitSettings
 
-    settings = FitSettings(
-        steps=1_000_000, batch=batch, levels=1, image_side=side, rank=3, light_order=10, specular="on",
-        relief="on", calibration="off", shadows=False,
-    )  # fmt: skip
+    model = {**WHOLE, **(part or {})}
+    settings = FitSettings(steps=1_000_000, batch=batch, levels=1, image_side=side, shadows=False, **model)
     photos = [ball_view(i, views, side) for i in range(views)]
-    t = new_trainer(photos, ball_start(cells), settings, False, device)
+    t = new_trainer(photos, ball_start(cells), settings, settings.calibration == "on", device)
     t.enter_level()
     return t
 
@@ -150,6 +159,15 @@ def measure(views: int, side: int, cells: int, batch: int, least: float, device:
 
 
 STEPS = 3
+
+
+def parts(given: argparse.Namespace, device: str) -> dict[str, float]:
+    """Milliseconds of a step at the middle point without parts of the model: what their absence saves."""
+    out = {}
+    for name, part in PARTS.items():
+        t = trainer(**MIDDLE, batch=given.batch, device=device, part=part)
+        out[name] = round(1e3 * machine.seconds_each(lambda t=t: _steps(t, device), given.least, 5) / STEPS, 2)  # type: ignore[misc]
+    return out
 
 
 def _steps(t: Trainer, device: str) -> None:
@@ -242,6 +260,9 @@ def report(found: dict[str, Any]) -> list[str]:
     lines += ["", "Growth, exponent b of x^b:", "", "| with | a step | the start | memory |", "|---|---|---|---|"]
     for axis, b in found["growth"].items():
         lines.append(f"| {axis} | {b['step_ms']} | {b['start_s']} | {b['memory_mb']} |")
+    whole = next(iter(found["parts_ms"].values()))
+    lines += ["", "| model, at the middle point | ms a step | saved |", "|---|---|---|"]
+    lines += [f"| {k} | {v} | {1 - v / whole:.0%} |" for k, v in found["parts_ms"].items()]
     s = found["sh"]
     lines += [
         "",
