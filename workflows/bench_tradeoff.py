@@ -10,9 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,7 +106,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
         if knob.name in found or late:
             continue
         console.note(f"point {number} of {len(chosen)}: {knob.name}")
-        found[knob.name] = apart(knob, given)
+        found[knob.name] = machine.apart(measure, knob, given)
         found = {k.name: found[k.name] for k in KNOBS if k.name in found}
         points = {k: asdict(v) for k, v in found.items()}
         path.write_text(json.dumps({"machine": about, "budget": budget, "points": points}, indent=1) + "\n")
@@ -147,12 +145,6 @@ def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
     for k, v in knob.settings.items():
         values[k] = round(v * values[k]) if k in SCALED else v
     return (*(f"inverse_rendering.{k}={v}" for k, v in values.items()), "surface.resolution=160")
-
-
-def apart(knob: Knob, given: argparse.Namespace) -> Measured:
-    """Measure a point in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, knob, given).result()
 
 
 def measure(knob: Knob, given: argparse.Namespace) -> Measured:

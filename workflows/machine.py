@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import datetime
+import multiprocessing
 import os
 import platform
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 
 def machine() -> dict[str, Any]:
@@ -36,10 +40,10 @@ def told(m: dict[str, Any]) -> str:
     return f"{m['cores']} cores of {m['processor']}, {m['memory_gb']} GB{gpu}, torch {m['torch']}, {m['date']}{busy}"
 
 
-def resident_mb() -> float:
-    """Memory that this process holds now; NaN where the system does not say."""
-    kb = _kilobytes(Path("/proc/self/status"), "VmRSS")
-    return kb / 1024 if kb else float("nan")
+def apart(work: Callable[..., T], *arguments: Any) -> T:
+    """What a function of a module returns, called in a process of its own: its peak memory is then its own."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(work, *arguments).result()
 
 
 def _line(path: Path, name: str) -> str:
@@ -56,14 +60,15 @@ def _kilobytes(path: Path, name: str) -> float:
 
 
 def seconds_each(work: Callable[[], object], least: float = 1.0, rounds: int = 3) -> float:
-    """Median seconds of a call over at least `rounds` calls and `least` seconds, after one call that warms up."""
+    """Least seconds of a call over at least `rounds` calls and `least` seconds, after one call that warms up: whatever
+    else the machine does can only add to it."""
     work()
     taken: list[float] = []
     while len(taken) < rounds or sum(taken) < least:
         start = time.perf_counter()
         work()
         taken.append(time.perf_counter() - start)
-    return float(np.median(taken))
+    return min(taken)
 
 
 def growth(x: list[float], y: list[float]) -> tuple[float, float]:

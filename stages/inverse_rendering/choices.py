@@ -112,8 +112,8 @@ def _table(trainer: Trainer) -> PixelTable:
 
 def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -> Choices:
     """Lobe, calibration, order and rank, each given what the others need."""
-    full, facts = model.spec.light_order, _facts(given, s, "setting")
-    most = full if given.specular else None
+    full, facts = model.spec.light_order, _facts(given, s, "not judged")
+    most = _best_order(t, full) if given.specular else None
     one, gains = evidence.alike(t), evidence.solve_response(t, most, gain=True)
     offsets = evidence.solve_response(t, most, gain=False)
     without, with_gains, control = (evidence.held_out(t, most, r) for r in (one, gains, offsets))
@@ -134,6 +134,8 @@ def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -
         order = max(order, DIFFUSE_ORDER)
         facts["light"] = {"order": order, "why": "evidence", "error_of_order": _listed(orders)}
     columns = given.columns
+    if s.rank == AUTO and not specular:
+        facts["rank"]["why"] = "no lobe, so that its bases are not used"
     if s.rank == AUTO and specular:
         ranks = evidence.by_rank(t, order, used, given.rank)
         k = evidence.least_rank(ranks)
@@ -142,16 +144,29 @@ def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -
     return Choices(specular, order, columns, calibrated, given.relief, facts)
 
 
+def _best_order(t: Trial, full: int) -> int:
+    """The order with the least held-out error while cameras count as alike: a higher one would fit noise."""
+    errors = [evidence.held_out(t, order, evidence.alike(t)) for order in range(full + 1)]
+    return int(np.argmin(errors))
+
+
 def _judge_relief(out: Choices, trainer: Trainer, t: Trial, shots: list[Any]) -> Choices:
     """Whether the fitted surface explains the waiting views better than the prior that it began as."""
     prior = prior_surface(trainer)
     seen = sight(prior, shots, *surface_points(prior, _table(trainer).draw(RAYS, 0.0, SEED + 1).rays))
     before = evidence.trial(seen, trainer.waiting, trainer.model)
     own, theirs = (silhouette_error(trainer, g) for g in (trainer.model.geometry, prior))
-    now = _consistency(t, out.calibrated)
-    was = _consistency(before, out.calibrated) if before is not None else float("inf")
-    relief = more(was, now) > NEGLIGIBLE or theirs > own + SILHOUETTE
-    fact = _fact(relief, AUTO, was, now) | {"silhouette_error_of_prior": theirs, "silhouette_error": own}
+    relief = theirs > own + SILHOUETTE
+    fact: dict[str, str | float | bool] = {
+        "modelled": relief,
+        "why": "evidence",
+        "silhouette_error_of_prior": round(theirs, 5),
+        "silhouette_error": round(own, 5),
+    }
+    if before is not None:  # else the prior is so far off that hardly a point of it is seen as the subject
+        was, now = (_consistency(x, out.calibrated) for x in (before, t))
+        relief = relief or more(was, now) > NEGLIGIBLE
+        fact |= _fact(relief, AUTO, was, now)
     return replace(out, relief=relief, facts=out.facts | {"relief": fact})
 
 
@@ -180,7 +195,7 @@ def prior_surface(trainer: Trainer) -> GridSdf:
     """The surface that the fit began with, on the present grid."""
     assert trainer.start is not None
     start = trainer.start
-    prior = GridSdf(torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    prior = GridSdf(torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     for _ in range(trainer.level):
         prior.refine()
     prior.to(trainer.device)

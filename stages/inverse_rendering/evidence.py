@@ -35,7 +35,7 @@ BOOL = npt.NDArray[np.bool_]
 
 NEGLIGIBLE = 0.005  # of the mean radiance: at middle grey an error of 52 dB, far below what any fit leaves
 LEAST_TRAIN = 3  # training views that must see a point
-LEAST_TEST = 200  # observations without which nothing can be said
+LEAST_TEST = 100  # observations without which nothing can be said
 RIDGE = 1e-9  # of the mean eigenvalue
 ROUNDS = 4
 COSINE_POWERS = 4  # functions of n . wo from which bases are made up

@@ -309,7 +309,8 @@ def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, cal
     """A fit that has not begun: geometry from the hull, an even white light, grey skin."""
     torch.manual_seed(settings.seed)
     spec = spec_for(views, start, settings, calibrated, device)
-    model = FaceModel(spec, torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    values = torch.from_numpy(start.values.copy())  # the start itself stays what it was: the evidence asks for it
+    model = FaceModel(spec, values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     model.to(device)
     model.geometry.to_device(device)
     return Trainer(views, settings, device, model, start)

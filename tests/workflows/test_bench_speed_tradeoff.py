@@ -39,10 +39,9 @@ def test_the_machine_is_told() -> None:
     m = machine.machine()
     text = machine.told(m)
     assert str(m["date"]) in text and str(m["torch"]) in text and f"{m['cores']} cores" in text
-    assert machine.resident_mb() > 10
 
 
-def test_seconds_each_is_a_median_after_a_warm_up() -> None:
+def test_seconds_each_is_the_least_after_a_warm_up() -> None:
     calls: list[int] = []
     assert machine.seconds_each(lambda: calls.append(1), 0.0, 3) < 0.1 and len(calls) == 4
 
@@ -122,11 +121,11 @@ def test_the_front_holds_what_nothing_beats() -> None:
 def test_a_bench_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[str] = []
 
-    def apart(knob: Any, given: Any) -> Measured:
+    def apart(work: Any, knob: Any, given: Any) -> Measured:
         seen.append(knob.name)
         return measured(10 + len(seen), 30 + 0.1 * len(knob.name))
 
-    monkeypatch.setattr(bench_tradeoff, "apart", apart)
+    monkeypatch.setattr(machine, "apart", apart)
     assert bench_tradeoff.run(trade(tmp_path, "--points", "SH order"), Console()) == 0
     assert bench_tradeoff.run(trade(tmp_path, "--stop-after", "0"), Console()) == 0
     assert seen == ["SH order 2", "SH order 4", "SH order 6"]
