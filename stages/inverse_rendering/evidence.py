@@ -41,7 +41,7 @@ ROUNDS = 4
 COSINE_POWERS = 4  # functions of n . wo from which bases are made up
 RANK_ROUNDS = 12
 RANK_RIDGE = 1e-4  # of the mean region's trace
-WORTH = 0.05  # of the error: what a further basis has to take off
+WORTH = 0.002  # of the error: what a further basis has to take off; little, because it costs hardly any time
 REGIONS = 5  # an axis: where coefficients may differ
 
 

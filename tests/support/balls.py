@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -29,17 +30,22 @@ def nothing(n: F64, wo: F64) -> F64:
     return np.zeros(len(n))
 
 
+def alike(view: int) -> F64:
+    """Every camera's gain."""
+    return np.ones(3)
+
+
 @dataclass(frozen=True)
 class Ball:
     """diffuse(n) (N, 3) and lobe(n, wo) (N,) radiance; gain(view) (3,) of its camera; views around the ball."""
 
     lobe: Callable[[F64, F64], F64] = nothing
-    gain: Callable[[int], F64] = lambda view: np.ones(3)
+    gain: Callable[[int], F64] = alike
     views: int = 24
 
     def photos(self) -> list[PhotoView]:
         """All views, evenly around the ball and up and down."""
-        return [self.photo(i) for i in range(self.views)]
+        return list(_photos(self))
 
     def photo(self, index: int) -> PhotoView:
         """A view, 2 x 2 samples a pixel."""
@@ -60,6 +66,11 @@ class Ball:
         image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3))
         alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3))
         return PhotoView(index, image.astype(np.float32), alpha.astype(np.float32), K, world_from_cam, np.zeros(5))
+
+
+@lru_cache(maxsize=8)
+def _photos(ball: Ball) -> tuple[PhotoView, ...]:
+    return tuple(ball.photo(i) for i in range(ball.views))
 
 
 def gloss(band: int, strength: float = 0.1) -> Callable[[F64, F64], F64]:
