@@ -72,12 +72,17 @@ def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | No
 def _surface_of(start: Start) -> tuple[F64, F64, float]:
     """Points on the start's zero set, their normals, and its area (faces of the voxels times 2 / 3, the mean over
     directions of how much a staircase is longer than the slope)."""
-    values = start.values.astype(np.float64)
-    slope = np.stack(list(np.gradient(values, start.cell)), -1)
-    near = np.argwhere(np.abs(values) < 0.75 * start.cell)
+    values = start.values
+    inner = np.abs(values[1:-1, 1:-1, 1:-1]) < 0.75 * start.cell
+    near = np.argwhere(inner) + 1
     near = near[:: max(len(near) // MOST_POINTS, 1)]
     i, j, k = near.T
-    g = slope[i, j, k]
+    sides = [
+        values[i + 1, j, k] - values[i - 1, j, k],
+        values[i, j + 1, k] - values[i, j - 1, k],
+        values[i, j, k + 1] - values[i, j, k - 1],
+    ]
+    g = np.stack(sides, -1).astype(np.float64) / (2 * start.cell)
     length = np.linalg.norm(g, axis=1).clip(min=1e-9)
     normals = g / length[:, None]
     points = start.lo + near * start.cell - (values[i, j, k] / length)[:, None] * normals

@@ -17,11 +17,12 @@ from pipeline.maths import sh
 from pipeline.transforms import F64
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.choices import Choices, decide, restored, waiting_views
-from stages.inverse_rendering.fit import Trainer, new_trainer
+from stages.inverse_rendering.fit import Start, Trainer, new_trainer
+from stages.inverse_rendering.footprint import footprint, supported
 from stages.inverse_rendering.settings import PRESETS, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
 from stages.inverse_rendering.stage import Config
-from tests.support.balls import RADIUS, Ball, gloss, start, texture
+from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
 SMALL = FitSettings(
     image_side=96,
@@ -251,3 +252,29 @@ def test_the_least_rank_is_not_led_by_noise() -> None:
     assert evidence.least_rank([0.13, 0.1001, 0.1]) == 2
     assert evidence.least_rank([0.1001, 0.1, 0.102]) == 1
     assert evidence.least_rank([0.004, 0.001]) == 1  # both are negligible
+
+
+# ------------------------------------------------------------------ resolution
+def test_the_footprint_is_a_pixel_on_the_ball() -> None:
+    """From 0.5 to 0.56 m at 170 pixels of focal length, the nearest point at 0.4: 2.35 to 3.3 mm, a little more at an
+    angle; and the ball's own area."""
+    looked = footprint(start(), Ball().photos(), 96)
+    assert looked is not None
+    assert 0.4 / FOCAL < looked.pixel < 0.5 / FOCAL * 1.3
+    assert looked.area == pytest.approx(4 * np.pi * RADIUS**2, rel=0.06)
+    coarse = footprint(start(), Ball().photos(), 48)
+    assert coarse is not None and coarse.pixel == pytest.approx(2 * looked.pixel)
+    assert looked.texture == 2 * coarse.texture
+
+
+def test_settings_no_finer_than_the_photos() -> None:
+    looked = footprint(start(), Ball().photos(), 96)
+    assert looked is not None
+    wish = replace(SMALL, grid_cells=1000, hash_fine=1e-5)
+    cell = 0.2 / 1000
+    got = supported(wish, looked, Start(start().values, start().lo, cell))
+    assert got.grid_cells * looked.pixel == pytest.approx(1000 * cell, rel=0.02)
+    assert got.hash_fine == pytest.approx(0.5 * looked.pixel)
+    modest = replace(SMALL, grid_cells=20, hash_fine=0.01)
+    assert supported(modest, looked, Start(start().values, start().lo, 0.01)) == modest
+    assert supported(wish, None, start()) == wish
