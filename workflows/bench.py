@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from workflows import bench_ablations
+from workflows import bench_ablations, bench_speed, bench_tradeoff
 from workflows.console import Console
 
 
@@ -24,6 +24,14 @@ BENCHES: dict[str, Bench] = {
         "the paper's other systems at one budget: Tables 2, 3, A2 and Fig. A3",
         bench_ablations.options,
         bench_ablations.run,
+    ),
+    "tradeoff": Bench(
+        "single knobs against time, memory and accuracy, with the Pareto front",
+        bench_tradeoff.options,
+        bench_tradeoff.run,
+    ),
+    "speed": Bench(
+        "rays, pictures and SH evaluations a second; how time and memory grow", bench_speed.options, bench_speed.run
     ),
 }
 

@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         sub = commands_of.add_parser(name, help=text)
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
         sub.set_defaults(run=run)
-    bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations"))
+    bench.add_commands(commands_of.add_parser("bench", help="measurements that repeat: ablations, tradeoff, speed"))
     batch_commands.add_commands(commands_of)
     store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
     schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))

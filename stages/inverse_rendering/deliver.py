@@ -8,6 +8,8 @@ from pipeline.artifacts import CameraSet, Capture, HeldOutView
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel
 from pipeline.images import write_exr, write_png_from_linear
+from stages.inverse_rendering.choices import Choices
+from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.gather import camera_only
 from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.predict import predict_view
@@ -52,31 +54,26 @@ def predict_held_out(
     return tuple(out)
 
 
-def model_facts(settings: FitSettings, model: FaceModel, guard: Guard) -> dict[str, dict[str, str | float | bool]]:
-    """What was modelled and what was left out, for the report."""
+def model_facts(
+    settings: FitSettings, model: FaceModel, guard: Guard, choices: Choices | None, looked: Footprint | None
+) -> dict[str, dict[str, str | float | bool]]:
+    """What was modelled, what was left out, and the evidence for it, for the report."""
+    decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
-        "specular": {"modelled": settings.specular, "attenuation": settings.attenuation, "why": "setting"},
-        "light": {"order": settings.light_order, "why": "setting"},
-        "rank": {"k": settings.rank, "why": "setting"},
-        "calibration": {
-            "modelled": model.spec.calibrated,
-            "why": "more than one kind of camera"
-            if settings.calibration == "auto" and model.spec.calibrated
-            else "one kind of camera"
-            if settings.calibration == "auto"
-            else "setting",
-        },
+        **decided,
         "geometry": {
             "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
             "cell_mm": round(model.geometry.cell * 1e3, 4),
             "why": "no licensed prior" if settings.prior == "hull" else "setting",
         },
+        "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "density": {"kind": settings.density, "why": "setting"},
         "system": {
             "method": settings.method,
             "shading": settings.shading,
             "light": settings.light,
             "integral": settings.integral,
+            "attenuation": settings.attenuation,
             "why": "setting",
         },
         "faults": {"dropped_steps": guard.dropped, "why": guard.causes[-1] if guard.causes else "none"},

@@ -18,6 +18,15 @@ import torch
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel, FaceSpec
+from stages.inverse_rendering.choices import (
+    EVIDENCE_AT,
+    Choices,
+    decide,
+    prior_surface,
+    restored,
+    take_over,
+    waiting_views,
+)
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.settings import FitSettings
@@ -61,17 +70,21 @@ class Trainer:
     settings: FitSettings
     device: str
     model: FaceModel
+    prior: Start | None = None
     step: int = 0
     level: int = 0
     loss: float = float("nan")
     error: float = float("nan")
     table: PixelTable | None = None
+    choices: Choices | None = None
+    waiting: tuple[int, ...] = field(init=False)
     optimiser: torch.optim.Optimizer = field(init=False)
     guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
         self.optimiser = self.make_optimiser()
         self.guard = Guard(self.settings.max_dropped)
+        self.waiting = waiting_views(len(self.views), self.settings)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Of everything that has not its own."""
@@ -99,6 +112,37 @@ class Trainer:
             side = self.settings.image_side
             side = max(side // 2 ** (len(starts) - 1 - self.level), min(side, 256))
             self.table = PixelTable(self.views, side, self.device)
+            self.table.wait(() if self.choices else self.waiting)
+        if self.rests:
+            self.model.geometry.values.requires_grad_(False)
+
+    @property
+    def rests(self) -> bool:
+        """Whether the surface stays the prior that it began as."""
+        return self.settings.relief == "off" or (self.choices is not None and not self.choices.relief)
+
+    def decide(self) -> None:
+        """Find out what the scene requires, and leave out the rest."""
+        assert self.table is not None
+        self.take(decide(self))
+        self.table.wait(())
+
+    def take(self, choices: Choices) -> None:
+        """Go on with the model that was chosen. What stays of a parameter keeps its momentum."""
+        swaps, known = take_over(self.model, choices), self.optimiser.state
+        self.choices = choices
+        if swaps:
+            self.optimiser = self.make_optimiser()
+        for group in self.optimiser.param_groups if swaps else ():
+            for new in group["params"]:
+                old, rows = swaps.get(new, (new, slice(None)))
+                if old in known:
+                    self.optimiser.state[new] = {
+                        k: v[rows].clone() if v.shape == old.shape else v for k, v in known[old].items()
+                    }
+        if self.rests and self.prior is not None:
+            self.model.geometry.restore(prior_surface(self).values.detach())
+            self.model.geometry.values.requires_grad_(False)
 
     def set_rates(self) -> float:
         """Learning rates, beta and open encoding levels of this step; returns the SDF's rate in asset units.
@@ -124,13 +168,15 @@ class Trainer:
         opened = s.open_from + (1 - s.open_from) * min(p / s.open_until, 1.0)
         self.model.spatial.encoding.open_levels(opened)
         still = s.even_from <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
-        return 0.0 if still else s.lr_sdf * self.model.geometry.cell * decay * warm
+        return 0.0 if still or self.rests else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
         """Draw, evaluate, move."""
         self.enter_level()
         assert self.table is not None
+        if self.choices is None and self.step >= round(EVIDENCE_AT * self.settings.steps):
+            self.decide()
         rate = self.set_rates()
         if self.step in {round(s * self.settings.steps) for s in SHADOWS_AT}:
             self.model.solve_shadows()
@@ -139,7 +185,8 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         found = self._terms(batch, seed)
         loss, error = found.total, found.error
-        loss.backward()
+        if loss.requires_grad:  # not so where the surface rests and no ray meets it
+            loss.backward()
         if not self._is_finite(loss):
             self._drop(batch, seed)
             return
@@ -213,6 +260,7 @@ class Trainer:
                 "loss": self.loss,
                 "error": self.error,
                 "dropped": self.guard.causes,
+                "choices": self.choices.plain() if self.choices else None,
                 "cell": g.cell,
                 "model": self.model.state_dict(),
                 "band": g.optimiser_state(),
@@ -233,12 +281,15 @@ class Trainer:
         values = state["model"]["geometry.values"]
         g = self.model.geometry
         g.cell = float(state["cell"])
+        if state["choices"] is not None:
+            self.take(restored(state["choices"]))
         g.restore(values.to(self.device))
         self.model.load_state_dict(state["model"])
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
         self.guard.causes = list(state["dropped"])
+        self.table = None
         return True
 
 
@@ -254,16 +305,23 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def new_trainer(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> Trainer:
-    """A fit that has not begun: geometry from the hull, an even white light, grey skin."""
+def new_trainer(
+    views: list[PhotoView],
+    start: Start,
+    settings: FitSettings,
+    calibrated: bool,
+    device: str,
+    prior: Start | None = None,
+) -> Trainer:
+    """A fit that has not begun: geometry from the start, an even white light, grey skin. prior: the surface that any
+    relief is judged against, where the photos have already moved the start away from it."""
     torch.manual_seed(settings.seed)
     spec = spec_for(views, start, settings, calibrated, device)
-    model = FaceModel(
-        spec, torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo.astype(np.float32)), start.cell
-    )
+    values = torch.from_numpy(start.values.copy())  # a start that is the prior stays what it was
+    model = FaceModel(spec, values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     model.to(device)
     model.geometry.to_device(device)
-    return Trainer(views, settings, device, model)
+    return Trainer(views, settings, device, model, prior or start)
 
 
 def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
@@ -276,14 +334,14 @@ def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibr
         lo=_triple(lo),
         hi=_triple(hi),
         views=len(views),
-        rank=settings.rank,
-        light_order=settings.light_order,
+        rank=settings.first_rank,
+        light_order=settings.first_order,
         light_start=grey / ALBEDO_START,
         albedo_start=_triple((colour / grey * ALBEDO_START).clamp(0.02, 0.95).cpu().numpy()),
         attenuation=settings.attenuation,
         basis_inputs=settings.basis_inputs,
         density=settings.density,
-        specular=settings.specular,
+        specular=settings.specular != "off",
         shadows=settings.shadows,
         calibrated=calibrated,
         levels=settings.hash_levels,

@@ -86,7 +86,8 @@ def terms(
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
-    out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
+    if model.geometry.values.requires_grad:  # a surface that rests is as smooth as it is
+        out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
         out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
     return out

@@ -157,7 +157,12 @@ def paper_optimiser(model: FaceModel, settings: FitSettings) -> torch.optim.Opti
 
 
 def new_paper_trainer(
-    views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str
+    views: list[PhotoView],
+    start: Start,
+    settings: FitSettings,
+    calibrated: bool,
+    device: str,
+    _prior: Start | None = None,
 ) -> PaperTrainer:
     """A fit of the paper's kind that has not begun. Raises StageError if ImFace is asked for and can't be read."""
     torch.manual_seed(settings.seed)

@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+AUTO = "auto"  # decided by evidence in mid-fit (stages.inverse_rendering.evidence)
+MOST_RANK, MOST_ORDER = 3, 10  # what a fit begins with until it knows better: the paper's own
+
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
@@ -23,14 +26,16 @@ class FitSettings:
     levels: int = 2
     stereo: bool = True
     # model
-    rank: int = 3
-    light_order: int = 10
+    rank: int | str = AUTO
+    light_order: int | str = AUTO
     attenuation: str = "exponential"
     basis_inputs: str = "cosine"
     density: str = "crossing"
-    specular: bool = True
+    specular: str = AUTO
+    relief: str = AUTO
+    resolution: str = AUTO
     shadows: bool = True
-    calibration: str = "auto"
+    calibration: str = AUTO
     hash_levels: int = 10
     hash_log2_size: int = 17
     hash_fine: float = 0.0008
@@ -72,6 +77,22 @@ class FitSettings:
     # faults
     max_dropped: int = 20
 
+    @property
+    def first_rank(self) -> int:
+        """k that the fit begins with."""
+        return MOST_RANK if isinstance(self.rank, str) else self.rank
+
+    @property
+    def first_order(self) -> int:
+        """SH order that the fit begins with."""
+        return MOST_ORDER if isinstance(self.light_order, str) else self.light_order
+
+    @property
+    def judges(self) -> bool:
+        """Whether this kind of model can be judged by evidence: the fast one with the paper's terms."""
+        kind = (self.method, self.shading, self.light, self.integral)
+        return kind == ("fast", "neural", "sh", "low_rank")
+
 
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {},
@@ -99,6 +120,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "method": "paper",
         "stereo": False,
+        "rank": 3,
+        "light_order": 10,
+        "specular": "on",
+        "relief": "on",
+        "resolution": "given",
         "shadows": False,
         "white": 5e-3,
         "specular_energy": 8e-3,

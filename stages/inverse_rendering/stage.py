@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError
-from stages.inverse_rendering.settings import PRESETS, FitSettings
+from stages.inverse_rendering.settings import AUTO, PRESETS, FitSettings
 
 MIN_VIEWS = 3
 
@@ -36,18 +36,28 @@ class Config(StageConfig):
     grid_cells: int = Field(description="cells of the final SDF grid along the subject's longest side", ge=16, le=2048)
     levels: int = Field(description="grid resolutions from coarse to fine, each half the cell before", ge=1, le=4)
     stereo: bool = Field(description="move the hull to where the photos agree before the fit begins (prior hull)")
-    rank: int = Field(description="k, number of specular bases [NeuFace eq. 7]", ge=1, le=8)
-    light_order: int = Field(description="SH order of the light [NeuFace eq. 2]", ge=0, le=10)
+    rank: Annotated[int, Field(ge=1, le=8)] | Literal["auto"] = Field(
+        description="k, number of specular bases [NeuFace eq. 7]; auto: by evidence, at most 3"
+    )
+    light_order: Annotated[int, Field(ge=0, le=10)] | Literal["auto"] = Field(
+        description="SH order of the light [NeuFace eq. 2]; auto: by evidence"
+    )
     attenuation: Literal["exponential", "exact", "phong"] = Field(
         description="of the light under the lobe [NeuFace eq. 11]"
     )
     basis_inputs: Literal["cosine", "paper"] = Field(description="what the bases see: wo . n, or (wo, n, wo . n)")
     density: Literal["crossing", "laplace"] = Field(description="crossing: no bias; laplace: the paper's")
-    specular: bool = Field(description="model a specular term at all")
+    specular: Literal["auto", "on", "off"] = Field(description="model a specular term at all; auto: by evidence")
+    relief: Literal["auto", "on", "off"] = Field(
+        description="let the surface leave the prior that it begins as; auto: by evidence"
+    )
+    resolution: Literal["auto", "given"] = Field(
+        description="auto: grid_cells and hash_fine no finer than the photos' pixels on the surface"
+    )
     shadows: bool = Field(description="model what the surface itself hides and reflects of the light")
     calibration: Literal["auto", "on", "off"] = Field(
         description="per-image colour matrices [NeuFace eq. 19]; auto: "
-        "where the capture has more than one kind of camera"
+        "by evidence; until it is in, where the capture has more than one kind of camera"
     )
     hash_levels: int = Field(description="levels of the appearance encoding", ge=1, le=24)
     hash_log2_size: int = Field(description="log2 of the largest table", ge=8, le=24)
@@ -109,6 +119,17 @@ class Config(StageConfig):
             filled["prior_digest"] = digest(str(filled["prior_file"]))
         return filled
 
+    @field_validator("specular", "relief", mode="before")
+    @classmethod
+    def _switch(cls, value: Any) -> Any:
+        return {"true": "on", "false": "off"}.get(str(value).lower(), value)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Config:
+        if self.relief == "off" and self.method != "fast":
+            raise ValueError("relief = off is for method fast; the paper's displacement is what its method fits")
+        return self
+
     def settings(self) -> FitSettings:
         """What the fit reads."""
         return FitSettings(**{f.name: getattr(self, f.name) for f in fields(FitSettings)})
@@ -118,6 +139,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
+    from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.gather import read_views
     from stages.inverse_rendering.paper import new_paper_trainer
     from stages.inverse_rendering.start import hull_start, sphere_start
@@ -144,11 +166,17 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         start = sphere_start(radius, settings.grid_cells, settings.levels)
     else:
         start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
-        if settings.stereo and settings.prior == "hull":
-            context.progress(0, settings.steps, "stereo")
-            start = start_from_photos(start, views, context.device)
+    looked = footprint(start, views, settings.image_side)
+    if settings.resolution == AUTO:
+        settings, cells = supported(settings, looked, start), settings.grid_cells
+        if settings.grid_cells < cells and settings.prior != "sphere":
+            start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+    prior = start
+    if settings.stereo and settings.prior == "hull":
+        context.progress(0, settings.steps, "stereo")
+        start = start_from_photos(start, views, context.device)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
-    trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device)
+    trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device, prior)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
@@ -158,8 +186,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     return FittedFace(
         field=context.file("field.npz"),
         light=context.file("light.json"),
-        rank=settings.rank,
-        light_order=settings.light_order,
+        rank=model.spec.rank,
+        light_order=model.spec.light_order,
         fitted_views=tuple(usable),
         held_out=held_out,
         steps=trainer.step,
@@ -167,7 +195,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(settings, model, trainer.guard),
+        model=model_facts(settings, model, trainer.guard, trainer.choices, looked),
     )
 
 
@@ -178,4 +206,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     return len({v.camera_group for v in inputs.capture.artifact.views if v.index in set(usable)}) > 1
 
 
-STAGE = Stage(name="inverse_rendering", version=1, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=2, inputs=Inputs, config=Config, output=FittedFace, run=run)

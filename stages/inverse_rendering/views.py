@@ -6,6 +6,7 @@ the z = 1 plane. Photos are never resampled to remove distortion; a smaller size
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import cv2
@@ -102,8 +103,21 @@ class PixelTable:
         self.alpha, self.view = torch.from_numpy(alpha).to(device), torch.from_numpy(which).to(device)
         self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
         self.outside = torch.from_numpy(np.flatnonzero(kind == 0)).to(device)
+        self._pools = self.inside, self.outside
         self.R = torch.from_numpy(np.stack([v.world_from_cam[:3, :3] for v in views]).astype(np.float32)).to(device)
         self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
+
+    def wait(self, views: tuple[int, ...]) -> None:
+        """Draw from all views but these (positions in the fit) from now on."""
+        out = torch.tensor(views, dtype=self.view.dtype, device=self.view.device)
+        self.inside, self.outside = (p[~torch.isin(self.view[p], out)] if views else p for p in self._pools)
+
+    def only(self, views: tuple[int, ...]) -> PixelTable:
+        """The same table drawing from these views alone."""
+        out = copy.copy(self)
+        these = torch.tensor(views, dtype=self.view.dtype, device=self.view.device)
+        out.inside, out.outside = (p[torch.isin(self.view[p], these)] for p in self._pools)
+        return out
 
     def mean_colour(self) -> Tensor:
         """(3,) mean linear radiance of the subject over all photos, at least DARKEST: black photos still need a light

@@ -97,6 +97,13 @@ def test_the_ball_is_found(fitted: Trainer) -> None:
     assert np.abs(rgba[..., 3] - view.alpha).mean() < 0.02
 
 
+def test_the_fit_finds_out_what_the_ball_requires(fitted: Trainer) -> None:
+    """It is Lambertian, its photos are of one camera, and it began 8 mm too large (test_evidence.py has more)."""
+    c = fitted.choices
+    assert c is not None and not c.specular and not c.calibrated and c.relief and c.light_order == 3
+    assert len(fitted.model.light()) == 16 and all(f["why"] == "evidence" for k, f in c.facts.items() if k != "rank")
+
+
 def test_shading_goes_to_the_light(fitted: Trainer) -> None:
     """The ball's radiance is a (0.7 + 0.3 n_y), for which E = pi c_0 Y_0 + 2 pi / 3 c_1 Y_1 y: c_1 / c_0 = 0.371. Left
     to itself the fit keeps its even light and paints the shading onto the ball."""

@@ -1,0 +1,275 @@
+"""What the scene requires, decided once in mid-fit from the evidence, and taken over by the model. Settings that are
+not 'auto' are never overruled.
+
+The fit begins with the whole model. When `EVIDENCE_AT` of the steps are done, every part that the evidence does not
+call for is left out for the rest of the fit: a lobe that nothing shows, bases beyond the rank, bands of the light
+beyond the order, colour matrices of cameras that agree, a surface that the prior already is. Until then a few views
+(`waiting`) are kept from the fit; it is their error that decides. They join it afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import GridSdf
+from pipeline.maths import sh
+from stages.inverse_rendering import evidence
+from stages.inverse_rendering.evidence import NEGLIGIBLE, Trial, more
+from stages.inverse_rendering.settings import AUTO, FitSettings
+from stages.inverse_rendering.sightings import pictures, sight, surface_points
+from stages.inverse_rendering.views import PixelTable
+
+if TYPE_CHECKING:
+    from stages.inverse_rendering.fit import Trainer
+
+EVIDENCE_AT = 0.3  # share of the steps: the surface is found to a millimetre, most of the work is still to come
+RAYS = 1500
+SEED = 715_517
+LEAST_VIEWS = 8  # fewer can spare none
+WAITING_SHARE, MOST_WAITING = 0.12, 6
+DIFFUSE_ORDER = 3  # what diffuse skin tells of a light [NeuFace eq. 15]
+DIFFERENT = 0.02  # of the mean radiance: cameras that differ by less are not told from what the lobe leaves
+SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
+
+Facts = dict[str, dict[str, str | float | bool]]
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """What is modelled from now on. columns: the bases that stay. facts: how each was decided, for the report."""
+
+    specular: bool
+    light_order: int
+    columns: tuple[int, ...]
+    calibrated: bool
+    relief: bool
+    facts: Facts
+
+    @property
+    def rank(self) -> int:
+        """k."""
+        return len(self.columns)
+
+    def plain(self) -> dict[str, Any]:
+        """As a checkpoint holds it."""
+        return asdict(self)
+
+
+def restored(plain: dict[str, Any]) -> Choices:
+    """Inverse of `plain`."""
+    return Choices(**{**plain, "columns": tuple(plain["columns"])})
+
+
+def open_questions(s: FitSettings) -> bool:
+    """Whether anything is left to the evidence."""
+    return s.judges and AUTO in (s.specular, s.rank, s.light_order, s.calibration, s.relief)
+
+
+def waiting_views(count: int, settings: FitSettings) -> tuple[int, ...]:
+    """Positions of the views that the fit does not see until the evidence is in: about one in eight, spread evenly."""
+    if count < LEAST_VIEWS or not open_questions(settings):
+        return ()
+    n = min(max(round(WAITING_SHARE * count), 2), MOST_WAITING)
+    return tuple(int((i + 0.5) * count / n) for i in range(n))
+
+
+# ------------------------------------------------------------------ deciding
+def decide(trainer: Trainer) -> Choices:
+    """Judge what is open with the waiting views."""
+    s, model = trainer.settings, trainer.model
+    given = Choices(
+        s.specular != "off",
+        s.first_order,
+        tuple(range(s.first_rank)),
+        model.spec.calibrated,
+        s.relief != "off",
+        {},
+    )
+    if not trainer.waiting:
+        why = "setting" if not open_questions(s) else f"fewer than {LEAST_VIEWS} views: nothing to judge by"
+        return replace(given, facts=_facts(given, s, why))
+    shots = pictures(trainer.views)
+    rays = _table(trainer).draw(RAYS, 0.0, SEED + s.seed).rays
+    found = evidence.trial(sight(model.geometry, shots, *surface_points(model.geometry, rays)), trainer.waiting, model)
+    if found is None:
+        return replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
+    out = _judge_colours(given, s, found, model)
+    if s.relief == AUTO and trainer.prior is not None:
+        out = _judge_relief(out, trainer, found, shots)
+    return out
+
+
+def _table(trainer: Trainer) -> PixelTable:
+    assert trainer.table is not None
+    return trainer.table
+
+
+def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -> Choices:
+    """Lobe, calibration, order and rank, each given what the others need."""
+    full, facts = model.spec.light_order, _facts(given, s, "not judged")
+    most = _best_order(t, full) if given.specular else None
+    one, gains = evidence.alike(t), evidence.solve_response(t, most, gain=True)
+    offsets = evidence.solve_response(t, most, gain=False)
+    without, with_gains, control = (evidence.held_out(t, most, r) for r in (one, gains, offsets))
+    differ = more(without, with_gains) > DIFFERENT and with_gains < control
+    calibrated = differ if s.calibration == AUTO else given.calibrated
+    facts["calibration"] = _fact(calibrated, s.calibration, without, with_gains) | {
+        "error_with_offsets": round(control, 5)
+    }
+    used = gains if calibrated else one
+    orders = [evidence.held_out(t, order, used) for order in range(full + 1)]
+    dull = evidence.held_out(t, None, evidence.solve_response(t, None, gain=True) if calibrated else one)
+    best = min(orders)
+    specular = more(dull, best) > NEGLIGIBLE if s.specular == AUTO else given.specular
+    facts["specular"] = _fact(specular, s.specular, dull, best)
+    order = given.light_order
+    if s.light_order == AUTO:
+        order = next(o for o in range(full + 1) if more(orders[o], best) < NEGLIGIBLE) if specular else 0
+        order = max(order, DIFFUSE_ORDER)
+        facts["light"] = {"order": order, "why": "evidence", "error_of_order": _listed(orders)}
+    columns = given.columns
+    if s.rank == AUTO and not specular:
+        facts["rank"]["why"] = "no lobe, so that its bases are not used"
+    if s.rank == AUTO and specular:
+        ranks = evidence.by_rank(t, order, used, given.rank)
+        k = evidence.least_rank(ranks)
+        columns = strongest(model, t, k)
+        facts["rank"] = {"k": k, "why": "evidence", "error_of_rank": _listed(ranks)}
+    return Choices(specular, order, columns, calibrated, given.relief, facts)
+
+
+def _best_order(t: Trial, full: int) -> int:
+    """The order with the least held-out error while cameras count as alike: a higher one would fit noise."""
+    errors = [evidence.held_out(t, order, evidence.alike(t)) for order in range(full + 1)]
+    return int(np.argmin(errors))
+
+
+def _judge_relief(out: Choices, trainer: Trainer, t: Trial, shots: list[Any]) -> Choices:
+    """Whether the fitted surface explains the waiting views better than the prior."""
+    prior = prior_surface(trainer)
+    seen = sight(prior, shots, *surface_points(prior, _table(trainer).draw(RAYS, 0.0, SEED + 1).rays))
+    before = evidence.trial(seen, trainer.waiting, trainer.model)
+    own, theirs = (silhouette_error(trainer, g) for g in (trainer.model.geometry, prior))
+    relief = theirs > own + SILHOUETTE
+    fact: dict[str, str | float | bool] = {
+        "modelled": relief,
+        "why": "evidence",
+        "silhouette_error_of_prior": round(theirs, 5),
+        "silhouette_error": round(own, 5),
+    }
+    if before is not None:  # else the prior is so far off that hardly a point of it is seen as the subject
+        was, now = (_consistency(x, out.calibrated) for x in (before, t))
+        relief = relief or more(was, now) > NEGLIGIBLE
+        fact |= _fact(relief, AUTO, was, now)
+    return replace(out, relief=relief, facts=out.facts | {"relief": fact})
+
+
+def _consistency(t: Trial, calibrated: bool) -> float:
+    """Held-out error of a surface alone: the waiting views from the mean of what the others show of each point."""
+    response = evidence.solve_response(t, None, gain=True) if calibrated else evidence.alike(t)
+    return evidence.held_out(t, None, response)
+
+
+def silhouette_error(trainer: Trainer, geometry: GridSdf) -> float:
+    """Share of the waiting views' rays that hit where the mask shows nothing, or pass where it shows the subject."""
+    batch = _table(trainer).only(trainer.waiting).draw(RAYS, 0.5, SEED + 2)
+    hit = _hits(geometry, batch.rays.o, batch.rays.d)
+    return float((hit != (batch.alpha > 0.5)).double().mean())
+
+
+def _hits(geometry: GridSdf, o: Tensor, d: Tensor) -> Tensor:
+    from pipeline.maths.tracing import box_interval
+
+    near, far = box_interval(o, d, *geometry.box())
+    _, hit, _ = geometry.trace(o, d, near, far)
+    return hit & (far > near)
+
+
+def prior_surface(trainer: Trainer) -> GridSdf:
+    """The prior's surface, on the present grid."""
+    assert trainer.prior is not None
+    start = trainer.prior
+    prior = GridSdf(torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    for _ in range(trainer.level):
+        prior.refine()
+    prior.to(trainer.device)
+    prior.to_device(trainer.device)
+    return prior
+
+
+def strongest(model: FaceModel, t: Trial, k: int) -> tuple[int, ...]:
+    """The k bases that carry most of c . B on average, in their order."""
+    with torch.no_grad():
+        x = torch.from_numpy(t.x[:: max(len(t.x) // 4096, 1)]).float().to(model.beta.device)
+        c = model.spatial(x)[2]
+        up = torch.tensor([[0.0, 0.0, 1.0]], device=x.device)
+        share = (c.mean(0) * model.basis(up, up)[0]).cpu().numpy()
+    return tuple(sorted(int(j) for j in np.argsort(-share, kind="stable")[:k]))
+
+
+def _facts(c: Choices, s: FitSettings, why: str) -> Facts:
+    """Where nothing was tested."""
+    return {
+        "specular": {"modelled": c.specular, "why": "setting" if s.specular != AUTO else why},
+        "light": {"order": c.light_order, "why": "setting" if s.light_order != AUTO else why},
+        "rank": {"k": c.rank, "why": "setting" if s.rank != AUTO else why},
+        "calibration": {"modelled": c.calibrated, "why": "setting" if s.calibration != AUTO else why},
+        "relief": {"modelled": c.relief, "why": "setting" if s.relief != AUTO else why},
+    }
+
+
+def _fact(modelled: bool, setting: str, without: float, with_it: float) -> dict[str, str | float | bool]:
+    return {
+        "modelled": modelled,
+        "why": "evidence" if setting == AUTO else "setting",
+        "error_without": round(without, 5),
+        "error_with": round(with_it, 5),
+    }
+
+
+def _listed(errors: list[float]) -> str:
+    return ", ".join(f"{e:.5f}" for e in errors)
+
+
+# ------------------------------------------------------------------ taking over
+def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]]:
+    """Leave out of the model what is not wanted. Hands back, for every parameter that became smaller, the one that it
+    was and the rows of it that stay."""
+    swaps: dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]] = {}
+    spec = model.spec
+    if c.rank < spec.rank:
+        heads = [*range(5), *(5 + j for j in c.columns)]
+        for net, rows in ((model.spatial.net, heads), (model.basis.net, list(c.columns))):
+            last = net[-1]
+            assert isinstance(last, nn.Linear)
+            for name in ("weight", "bias"):
+                old = getattr(last, name)
+                new = nn.Parameter(old.detach()[rows].clone())
+                setattr(last, name, new)
+                swaps[new] = (old, rows)
+            last.out_features = len(rows)
+        model.spatial.rank = c.rank
+    if c.light_order < spec.light_order:
+        kept = slice(0, sh.count(c.light_order))
+        old = model.light.coefficients
+        model.light.coefficients = nn.Parameter(old.detach()[kept].clone())
+        swaps[model.light.coefficients] = (old, kept)
+    if not c.calibrated:
+        _still(model)
+    model.spec = replace(spec, rank=c.rank, light_order=c.light_order, specular=c.specular, calibrated=c.calibrated)
+    return swaps
+
+
+def _still(model: FaceModel) -> None:
+    """Every colour matrix becomes the identity."""
+    last = model.calibration.net[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.zero_()

@@ -1,0 +1,104 @@
+"""How large a pixel is on the surface, and how fine a grid, an encoding and a texture the photos can fill.
+
+    footprint(x) = min over the views that face x of  z f_b / (f (n . wo))
+
+Symbols: z depth, f focal length in pixels, f_b the side of the blocks of pixels that the fit takes as one. Visibility
+is not tested: a hidden view can only make the median look finer, which costs time and no detail.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline import transforms
+from pipeline.fields.face import FaceModel
+from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.settings import AUTO, FitSettings
+from stages.inverse_rendering.sightings import LEAST_COSINE
+from stages.inverse_rendering.views import PhotoView, factor_for
+
+F64 = npt.NDArray[np.float64]
+CELL_PIXELS = 1.0  # a cell of the grid holds at least so much of a pixel
+FINE_PIXELS = 0.5  # the encoding's finest cell: views overlap, so that half a pixel still has data
+UTILISATION = 0.65  # of a texture by its charts
+MOST_POINTS = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """pixel: median edge of a pixel on the surface, asset units; area of the surface, asset units squared."""
+
+    pixel: float
+    area: float
+
+    @property
+    def texture(self) -> int:
+        """Side of a square texture with one texel a pixel, rounded up to a power of two."""
+        side = float(np.sqrt(self.area / UTILISATION) / self.pixel)
+        return int(2 ** np.ceil(np.log2(max(side, 16))))
+
+    def facts(self, settings: FitSettings, model: FaceModel) -> dict[str, str | float | bool]:
+        """For the report."""
+        return {
+            "pixel_mm": round(self.pixel * 1e3, 4),
+            "grid_cell_mm": round(model.geometry.cell * 1e3, 4),
+            "encoding_mm": round(model.spec.fine * 1e3, 4),
+            "texture_supported": self.texture,
+            "why": "no finer than the photos' pixels on the surface" if settings.resolution == AUTO else "setting",
+        }
+
+
+def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | None:
+    """Of photos that are fitted at `side` pixels, on the surface that the fit begins with; None if nothing faces it."""
+    points, normals, area = _surface_of(start)
+    best = np.full(len(points), np.inf)
+    for view in views:
+        away = view.world_from_cam[:3, 3] - points
+        cosine = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
+        uv, depth = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, points)
+        inside = (
+            (depth > 0) & (np.nan_to_num(uv, nan=-1) >= 0).all(1) & (np.nan_to_num(uv, nan=np.inf) < view.size).all(1)
+        )
+        pixel = depth * factor_for(view.size, side) / float(np.sqrt(abs(np.linalg.det(view.K[:2, :2]))))
+        seen = inside & (cosine > LEAST_COSINE)
+        best[seen] = np.minimum(best[seen], (pixel / cosine.clip(min=LEAST_COSINE))[seen])
+    known = best[np.isfinite(best)]
+    return Footprint(float(np.median(known)), area) if len(known) else None
+
+
+def _surface_of(start: Start) -> tuple[F64, F64, float]:
+    """Points on the start's zero set, their normals, and its area (faces of the voxels times 2 / 3, the mean over
+    directions of how much a staircase is longer than the slope)."""
+    values = start.values
+    inner = np.abs(values[1:-1, 1:-1, 1:-1]) < 0.75 * start.cell
+    near = np.argwhere(inner) + 1
+    near = near[:: max(len(near) // MOST_POINTS, 1)]
+    i, j, k = near.T
+    sides = [
+        values[i + 1, j, k] - values[i - 1, j, k],
+        values[i, j + 1, k] - values[i, j - 1, k],
+        values[i, j, k + 1] - values[i, j, k - 1],
+    ]
+    g = np.stack(sides, -1).astype(np.float64) / (2 * start.cell)
+    length = np.linalg.norm(g, axis=1).clip(min=1e-9)
+    normals = g / length[:, None]
+    points = start.lo + near * start.cell - (values[i, j, k] / length)[:, None] * normals
+    inside = values < 0
+    faces = sum(int((np.diff(inside, axis=a) != 0).sum()) for a in range(3))
+    return points, normals, faces * start.cell**2 * 2 / 3
+
+
+def supported(settings: FitSettings, looked: Footprint | None, start: Start) -> FitSettings:
+    """The settings with a grid and an encoding that the photos can fill."""
+    if looked is None:
+        return settings
+    finest = start.cell / 2 ** (settings.levels - 1)
+    cells = int(settings.grid_cells * min(finest / (CELL_PIXELS * looked.pixel), 1.0))
+    return replace(
+        settings,
+        grid_cells=max(cells, 16),
+        hash_fine=max(settings.hash_fine, FINE_PIXELS * looked.pixel),
+    )

@@ -1,0 +1,159 @@
+"""`neuface bench speed` and `neuface bench tradeoff`: set-ups, growth laws, the front, the plot; fits are not run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from pipeline.errors import UsageError
+from stages.inverse_rendering.stage import Config
+from workflows import bench_speed, bench_tradeoff, machine
+from workflows.bench_tradeoff import KNOBS, Measured, front
+from workflows.cli import parser
+from workflows.console import Console
+from workflows.tradeoff_plot import plot
+
+
+def trade(tmp_path: Path, *more: str) -> Any:
+    return parser().parse_args(["bench", "tradeoff", "photos", "--out", str(tmp_path / "out"), *more])
+
+
+def measured(seconds: float, psnr: float) -> Measured:
+    return Measured(seconds, 1000.0, psnr, 0.9, 0.1, 0.5, 25.0)
+
+
+# ------------------------------------------------------------------ machine
+def test_growth_finds_a_power_law() -> None:
+    x = [1.0, 2.0, 5.0]
+    a, b = machine.growth(x, [3 * v**1.7 for v in x])
+    assert (a, b) == pytest.approx((3, 1.7))
+    assert np.isnan(machine.growth([1, 1], [2, 3])).all() and np.isnan(machine.growth([1, 2], [0, 3])).all()
+
+
+def test_the_machine_is_told() -> None:
+    m = machine.machine()
+    text = machine.told(m)
+    assert str(m["date"]) in text and str(m["torch"]) in text and f"{m['cores']} cores" in text
+
+
+def test_seconds_each_is_the_least_after_a_warm_up() -> None:
+    calls: list[int] = []
+    assert machine.seconds_each(lambda: calls.append(1), 0.0, 3) < 0.1 and len(calls) == 4
+
+
+# ------------------------------------------------------------------ speed
+def test_every_axis_goes_through_the_middle() -> None:
+    setups = bench_speed.setups()
+    assert setups[0] == bench_speed.MIDDLE and len(setups) == 7
+    for s in setups[1:]:
+        assert sum(s[k] != bench_speed.MIDDLE[k] for k in s) == 1
+
+
+def test_laws_are_exponents_of_single_axes() -> None:
+    points = [
+        bench_speed.Point(
+            **s, step_ms=2.0 * s["cells"], rays_per_s=1, start_s=0.1 * s["side"] ** 2, memory_mb=s["views"]
+        )
+        for s in bench_speed.setups()
+    ]
+    laws = bench_speed.laws(points)
+    assert laws["cells"]["step_ms"] == 1.0 and laws["side"]["start_s"] == 2.0 and laws["views"]["memory_mb"] == 1.0
+    assert laws["views"]["step_ms"] == 0.0
+
+
+def test_parts_are_settings_of_the_fit() -> None:
+    for part in bench_speed.PARTS.values():
+        assert set(part) <= set(bench_speed.WHOLE)
+    t = bench_speed.trainer(8, 32, 24, 64, "cpu", bench_speed.PARTS["nothing but albedo and light"])
+    t.advance()
+    assert not t.model.spec.specular and t.rests and t.waiting == ()
+
+
+@pytest.mark.slow
+def test_training_of_the_ball_is_timed() -> None:
+    p = bench_speed.measure(8, 32, 24, 64, 0.0, "cpu")
+    assert p.step_ms > 0 and p.rays_per_s == pytest.approx(64 / (p.step_ms / 1e3), rel=0.02)
+    s = bench_speed.harmonics(0.0, "cpu")
+    assert s["forward_per_s"] > s["with_gradients_per_s"] > 0
+    found = {
+        "machine": machine.machine(),
+        "device": "cpu",
+        "batch": 64,
+        "training": [bench_speed.asdict(p)],
+        "growth": bench_speed.laws([p]),
+        "parts_ms": {"the whole model": 10.0, "no lobe": 7.5},
+        "sh": s,
+        "picture_ms": {"field": 1234.5},
+    }
+    text = "\n".join(bench_speed.report(found))
+    assert f"| 8 | 32 | 24 | {p.step_ms} |" in text and "field 1,2" in text
+    assert "| no lobe | 7.5 | 25% |" in text
+
+
+# ------------------------------------------------------------------ tradeoff
+def test_every_point_is_a_setting_of_the_stage(tmp_path: Path) -> None:
+    given = trade(tmp_path)
+    for knob in KNOBS:
+        sets = dict(s.split("=", 1) for s in bench_tradeoff.settings_of(knob, given))
+        own = {k.split(".", 1)[1]: v for k, v in sets.items() if k.startswith("inverse_rendering.")}
+        config = Config(**own)
+        for key, value in knob.settings.items():
+            assert getattr(config, key) == (round(value * getattr(given, key)) if key in ("steps", "batch") else value)
+    assert len({k.name for k in KNOBS}) == len(KNOBS)
+
+
+def test_the_front_holds_what_nothing_beats() -> None:
+    found = {
+        "a": measured(10, 30),
+        "b": measured(20, 29),
+        "c": measured(20, 33),
+        "d": measured(40, 33),
+        "e": measured(5, 20),
+    }
+    assert front(found) == ["e", "a", "c"]
+
+
+def test_a_bench_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+
+    def apart(work: Any, knob: Any, given: Any) -> Measured:
+        seen.append(knob.name)
+        return measured(10 + len(seen), 30 + 0.1 * len(knob.name))
+
+    monkeypatch.setattr(machine, "apart", apart)
+    assert bench_tradeoff.run(trade(tmp_path, "--points", "SH order"), Console()) == 0
+    assert bench_tradeoff.run(trade(tmp_path, "--stop-after", "0"), Console()) == 0
+    assert seen == ["SH order 2", "SH order 4", "SH order 6"]
+    bench_tradeoff.run(trade(tmp_path), Console())
+    assert len(seen) == len(KNOBS) == len(set(seen))
+    out = tmp_path / "out"
+    kept = json.loads((out / "tradeoff.json").read_text())
+    assert list(kept["points"]) == [k.name for k in KNOBS] and kept["budget"]["capture"] == "photos"
+    text = (out / "tradeoff.md").read_text()
+    assert "Two seeds differ by" in text and "**" in text
+    bench_tradeoff.run(trade(tmp_path, "--points", "k = 5", "--steps", "7"), Console())
+    assert list(json.loads((out / "tradeoff.json").read_text())["points"]) == ["k = 5"]
+
+
+def test_an_unknown_point_is_told(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no point"):
+        bench_tradeoff.run(trade(tmp_path, "--points", "warp drive"), Console())
+
+
+def test_the_plot_shows_every_point_inside_its_frame() -> None:
+    points = {"one & only": (3.0, 28.0), "two": (30.0, 31.5), "three": (31.0, 31.4)}
+    root = ElementTree.fromstring(plot(points, ["one & only", "two"]))
+    space = "{http://www.w3.org/2000/svg}"
+    circles = root.findall(f"{space}circle")
+    assert len(circles) == 3 and sum(c.get("class") == "ahead" for c in circles) == 2
+    assert all(64 <= float(c.get("cx", 0)) <= 840 and 24 <= float(c.get("cy", 0)) <= 468 for c in circles)
+    texts = [t.text for t in root.findall(f"{space}text")]
+    assert {"one & only", "two", "three"} <= set(texts)
+    by_name = {t.text: float(t.get("y", 0)) for t in root.findall(f"{space}text")}
+    assert abs(by_name["two"] - by_name["three"]) >= 12  # labels do not cover each other
+    assert "circle" not in plot({"bad": (1.0, float("nan"))}, [])
