@@ -135,7 +135,7 @@ def ball_start(cells: int) -> Start:
 
 def trainer(views: int, side: int, cells: int, batch: int, device: str, part: dict[str, Any] | None = None) -> Trainer:
     """A fit of the ball with the draft's model on one grid, about to begin: whole, or without a part."""
-    from stages.inverse_rendering.fit import new_trainer
+    from stages.inverse_rendering.begin import new_trainer
     from stages.inverse_rendering.settings import FitSettings
 
     model = {**WHOLE, **(part or {})}

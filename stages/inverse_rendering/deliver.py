@@ -8,12 +8,10 @@ from pipeline.artifacts import CameraSet, Capture, HeldOutView
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel
 from pipeline.images import write_exr, write_png_from_linear
-from stages.inverse_rendering.choices import Choices
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.gather import camera_only
-from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.predict import predict_view
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import factor_for
 
 
@@ -54,10 +52,9 @@ def predict_held_out(
     return tuple(out)
 
 
-def model_facts(
-    settings: FitSettings, model: FaceModel, guard: Guard, choices: Choices | None, looked: Footprint | None
-) -> dict[str, dict[str, str | float | bool]]:
+def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[str, str | float | bool]]:
     """What was modelled, what was left out, and the evidence for it, for the report."""
+    settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
         **decided,
@@ -67,6 +64,7 @@ def model_facts(
             "why": "no licensed prior" if settings.prior == "hull" else "setting",
         },
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
+        "schedule": _schedule(trainer),
         "density": {"kind": settings.density, "why": "setting"},
         "system": {
             "method": settings.method,
@@ -78,3 +76,10 @@ def model_facts(
         },
         "faults": {"dropped_steps": guard.dropped, "why": guard.causes[-1] if guard.causes else "none"},
     }
+
+
+def _schedule(trainer: Trainer) -> dict[str, str | float | bool]:
+    """How long the fit was, and what set its length. Seconds are left out where they do not repeat."""
+    if not trainer.settings.by_clock:
+        return {"steps": trainer.step, "why": "setting"}
+    return {"steps": trainer.step, "seconds_of_the_stage": trainer.settings.seconds, "why": "ended by the clock"}

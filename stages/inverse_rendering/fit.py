@@ -1,7 +1,8 @@
 """The fit itself: start, coarse to fine, checkpoints. Arrays in, a FaceModel out; needs torch, numpy, scipy and OpenCV.
 
 A fit repeats bit by bit for one seed on one machine: every random draw comes from a generator seeded by (seed, step),
-and a checkpoint holds everything else, so that an interrupted fit goes on as if nothing had happened.
+and a checkpoint holds everything else, so that an interrupted fit goes on as if nothing had happened. A fit by the
+clock (settings.seconds) goes on as well, but takes as many steps as its time allows.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from pipeline.errors import Cancelled, StageError
-from pipeline.fields.face import FaceModel, FaceSpec
+from pipeline.fields.face import FaceModel
 from stages.inverse_rendering.choices import (
     EVIDENCE_AT,
     Choices,
@@ -35,12 +37,12 @@ from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
-ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'
 EVEN_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
 EVEN_LIGHT_RATE = 10.0  # times the light's rate
 SETTLING = 0.03  # share of the fit after it in which the surface rests
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
+COUNTED = ("step", "loss", "error", "shadows_solved", "allowance", "spent")  # plain numbers of a checkpoint
 SMOOTHING = 0.98  # of the running loss and error that are shown
 
 
@@ -75,6 +77,9 @@ class Trainer:
     level: int = 0
     loss: float = float("nan")
     error: float = float("nan")
+    shadows_solved: int = 0
+    allowance: float = 0.0  # seconds to train, by the clock; 0: settings.steps decide
+    spent: float = 0.0
     table: PixelTable | None = None
     choices: Choices | None = None
     waiting: tuple[int, ...] = field(init=False)
@@ -97,8 +102,15 @@ class Trainer:
 
     # ---------------------------------------------------------------- schedule
     def share(self) -> float:
-        """How far the fit is, in [0, 1)."""
-        return self.step / self.settings.steps
+        """How far the fit is, in [0, 1]: by the clock, or in steps."""
+        done = self.spent / self.allowance if self.allowance else self.step / self.settings.steps
+        return min(done, 1.0)
+
+    def total(self) -> int:
+        """Steps of the whole fit; by the clock, as many as its pace so far promises."""
+        if not self.allowance:
+            return self.settings.steps
+        return max(round(self.step / max(self.share(), 1e-6)), self.step + (self.share() < 1))
 
     def enter_level(self) -> None:
         """Refine the grid and take larger photos when their time has come."""
@@ -172,14 +184,22 @@ class Trainer:
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
+        """One step, and the time that it took."""
+        begun = time.monotonic()
+        self._advance()
+        self.spent += time.monotonic() - begun
+
+    def _advance(self) -> None:
         """Draw, evaluate, move."""
         self.enter_level()
         assert self.table is not None
-        if self.choices is None and self.step >= round(EVIDENCE_AT * self.settings.steps):
+        if self.choices is None and self.share() >= EVIDENCE_AT:
             self.decide()
         rate = self.set_rates()
-        if self.step in {round(s * self.settings.steps) for s in SHADOWS_AT}:
+        due = sum(self.share() >= s for s in SHADOWS_AT)
+        if self.shadows_solved < due:
             self.model.solve_shadows()
+            self.shadows_solved = due
         seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
         batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
         self.optimiser.zero_grad(set_to_none=True)
@@ -251,23 +271,13 @@ class Trainer:
     # ---------------------------------------------------------------- checkpoints
     def save(self, path: Path) -> None:
         """Write everything that the rest of the fit depends on; the old file stays until the new one is whole."""
-        g = self.model.geometry
-        torch.save(
-            {
-                "settings": repr(self.settings),
-                "step": self.step,
-                "level": self.level,
-                "loss": self.loss,
-                "error": self.error,
-                "dropped": self.guard.causes,
-                "choices": self.choices.plain() if self.choices else None,
-                "cell": g.cell,
-                "model": self.model.state_dict(),
-                "band": g.optimiser_state(),
-                "optimiser": self.optimiser.state_dict(),
-            },
-            path.with_suffix(".new"),
-        )
+        state = {
+            "settings": repr(self.settings),
+            "dropped": self.guard.causes,
+            **{name: getattr(self, name) for name in COUNTED},
+            **self.parts(),
+        }
+        torch.save(state, path.with_suffix(".new"))
         path.with_suffix(".new").rename(path)
 
     def load(self, path: Path) -> bool:
@@ -278,19 +288,36 @@ class Trainer:
             return False
         if state["settings"] != repr(self.settings):
             return False
-        values = state["model"]["geometry.values"]
+        self.restore(state)
+        for name in COUNTED:
+            setattr(self, name, state[name])
+        self.guard.causes = list(state["dropped"])
+        return True
+
+    def parts(self) -> dict[str, Any]:
+        """Model, choices and optimisers, as a checkpoint holds them."""
+        g = self.model.geometry
+        return {
+            "level": self.level,
+            "choices": self.choices.plain() if self.choices else None,
+            "cell": g.cell,
+            "model": self.model.state_dict(),
+            "band": g.optimiser_state(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of `parts`."""
         g = self.model.geometry
         g.cell = float(state["cell"])
+        self.level = state["level"]
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
-        g.restore(values.to(self.device))
+        g.restore(state["model"]["geometry.values"].to(self.device))
         self.model.load_state_dict(state["model"])
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.level, self.loss, self.error = (state[k] for k in ("step", "level", "loss", "error"))
-        self.guard.causes = list(state["dropped"])
         self.table = None
-        return True
 
 
 def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torch.optim.Optimizer:
@@ -305,74 +332,13 @@ def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torc
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
-def new_trainer(
-    views: list[PhotoView],
-    start: Start,
-    settings: FitSettings,
-    calibrated: bool,
-    device: str,
-    prior: Start | None = None,
-) -> Trainer:
-    """A fit that has not begun: geometry from the start, an even white light, grey skin. prior: the surface that any
-    relief is judged against, where the photos have already moved the start away from it."""
-    torch.manual_seed(settings.seed)
-    spec = spec_for(views, start, settings, calibrated, device)
-    values = torch.from_numpy(start.values.copy())  # a start that is the prior stays what it was
-    model = FaceModel(spec, values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
-    model.to(device)
-    model.geometry.to_device(device)
-    return Trainer(views, settings, device, model, prior or start)
-
-
-def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
-    """What the settings make of these photos and this start."""
-    colour = PixelTable(views, 256, device).mean_colour()
-    grey = float(colour.mean().clamp(min=1e-4))
-    lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
-    coarse = float((hi - lo).max()) / 16
-    return FaceSpec(
-        lo=_triple(lo),
-        hi=_triple(hi),
-        views=len(views),
-        rank=settings.first_rank,
-        light_order=settings.first_order,
-        light_start=grey / ALBEDO_START,
-        albedo_start=_triple((colour / grey * ALBEDO_START).clamp(0.02, 0.95).cpu().numpy()),
-        attenuation=settings.attenuation,
-        basis_inputs=settings.basis_inputs,
-        density=settings.density,
-        specular=settings.specular != "off",
-        shadows=settings.shadows,
-        calibrated=calibrated,
-        levels=settings.hash_levels,
-        log2_size=settings.hash_log2_size,
-        coarse=coarse,
-        fine=settings.hash_fine if coarse / 1024 < settings.hash_fine < coarse / 2 else coarse / 20,
-        width=settings.width,
-        depth=settings.depth,
-        appearance=settings.appearance,
-        shading=settings.shading,
-        light=settings.light,
-        integral=settings.integral,
-        basis_width=settings.basis_width,
-        basis_depth=settings.basis_depth,
-        prior=settings.prior,
-        prior_scale=settings.prior_scale,
-        prior_centre=settings.prior_centre,
-    )
-
-
-def _triple(v: npt.NDArray[np.floating]) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
-
-
 def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
     """Train to the last step, or raise Cancelled after writing a checkpoint."""
     if hooks.checkpoint is not None and hooks.checkpoint.is_file():
         trainer.load(hooks.checkpoint)
     saved = shown = time.monotonic()
     writing = 0.1  # seconds a checkpoint takes, until one was written
-    while trainer.step < trainer.settings.steps:
+    while trainer.share() < 1.0:
         try:
             trainer.advance()
         except StageError:
@@ -385,7 +351,7 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
                 trainer.save(hooks.checkpoint)
             raise Cancelled("stopped by the user; the fit goes on from its checkpoint next time")
         if now - shown > 0.5:
-            hooks.progress(trainer.step, trainer.settings.steps, "fitting", loss=trainer.loss, psnr=trainer.psnr)
+            hooks.progress(trainer.step, trainer.total(), "fitting", loss=trainer.loss, psnr=trainer.psnr)
             shown = now
         if hooks.checkpoint is not None and now - saved > writing / CHECKPOINT_SHARE:
             trainer.save(hooks.checkpoint)

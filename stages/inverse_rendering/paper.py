@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,8 @@ from pipeline.fields.face import FaceModel, FaceSpec
 from pipeline.fields.prior_imface import ImFacePrior
 from pipeline.fields.priors import HullPrior
 from pipeline.maths import losses
-from stages.inverse_rendering.fit import Start, Trainer, spec_for
+from stages.inverse_rendering.begin import spec_for
+from stages.inverse_rendering.fit import Start, Trainer
 from stages.inverse_rendering.objective import Terms, calibrated_colours
 from stages.inverse_rendering.paper_render import geometry_of, render_samples
 from stages.inverse_rendering.settings import FitSettings
@@ -110,33 +112,14 @@ class PaperTrainer(Trainer):
         """The width that was learnt last."""
         self.model.beta.copy_(geometry_of(self.model).beta().detach())
 
-    def save(self, path: Path) -> None:
-        """Write everything that the rest of the fit depends on."""
-        state = {
-            "settings": repr(self.settings),
-            "step": self.step,
-            "loss": self.loss,
-            "error": self.error,
-            "dropped": self.guard.causes,
-            "model": self.model.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-        }
-        torch.save(state, path.with_suffix(".new"))
-        path.with_suffix(".new").rename(path)
+    def parts(self) -> dict[str, Any]:
+        """Nothing but the model and the optimiser."""
+        return {"model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
 
-    def load(self, path: Path) -> bool:
-        """Go on from a checkpoint. False if there is none that can be read, or it is of other settings."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:  # a torn or foreign file: begin anew
-            return False
-        if state["settings"] != repr(self.settings):
-            return False
+    def restore(self, state: dict[str, Any]) -> None:
+        """Inverse of `parts`."""
         self.model.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.step, self.loss, self.error = (state[k] for k in ("step", "loss", "error"))
-        self.guard.causes = list(state["dropped"])
-        return True
 
 
 def paper_optimiser(model: FaceModel, settings: FitSettings) -> torch.optim.Optimizer:

@@ -20,6 +20,7 @@ class FitSettings:
     # size
     image_side: int = 512
     steps: int = 1300
+    seconds: float = 0.0
     batch: int = 4096
     samples: int = 10
     grid_cells: int = 288
@@ -76,6 +77,11 @@ class FitSettings:
     beta_end: float = 0.15
     # faults
     max_dropped: int = 20
+
+    @property
+    def by_clock(self) -> bool:
+        """Whether the fit ends when its time is up, not after so many steps."""
+        return self.seconds > 0
 
     @property
     def first_rank(self) -> int:

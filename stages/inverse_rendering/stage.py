@@ -30,7 +30,12 @@ class Config(StageConfig):
     preset: str = Field("draft", description="point on the curve of speed against accuracy")
     seed: int = Field(0, ge=0, description="seed of every random draw")
     image_side: int = Field(description="longest side of the photos in the fit's last phase, pixels", ge=32, le=16384)
-    steps: int = Field(description="optimisation steps", ge=1, le=10_000_000)
+    steps: int = Field(description="optimisation steps; not counted where seconds is set", ge=1, le=10_000_000)
+    seconds: float = Field(
+        description="length of the whole stage by the clock, every schedule with it; 0: by steps, which alone repeats",
+        ge=0,
+        le=1e7,
+    )
     batch: int = Field(description="rays a step", ge=16, le=1_048_576)
     samples: int = Field(description="samples a ray in the shell around the surface", ge=4, le=128)
     grid_cells: int = Field(description="cells of the final SDF grid along the subject's longest side", ge=16, le=2048)
@@ -128,6 +133,8 @@ class Config(StageConfig):
     def _possible(self) -> Config:
         if self.relief == "off" and self.method != "fast":
             raise ValueError("relief = off is for method fast; the paper's displacement is what its method fits")
+        if self.seconds > 0 and self.method != "fast":
+            raise ValueError("seconds is for method fast; the paper's schedule counts epochs")
         return self
 
     def settings(self) -> FitSettings:
@@ -137,15 +144,17 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
+    from stages.inverse_rendering.begin import new_trainer
+    from stages.inverse_rendering.clock import LEAST_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
-    from stages.inverse_rendering.fit import Hooks, new_trainer, run_fit
+    from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.gather import read_views
     from stages.inverse_rendering.paper import new_paper_trainer
     from stages.inverse_rendering.start import hull_start, sphere_start
     from stages.inverse_rendering.stereo import start_from_photos
 
-    settings = config.settings()
+    clock, settings = Clock(), config.settings()
     dropped = set(inputs.masks.artifact.dropped)
     held = {v.index for v in inputs.capture.artifact.views if v.holdout}
     usable = [c.index for c in inputs.poses.artifact.cameras if c.index not in held and c.index not in dropped]
@@ -174,9 +183,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     prior = start
     if settings.stereo and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")
-        start = start_from_photos(start, views, context.device)
+        start = start_from_photos(start, views, context.device, context.check)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
     trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device, prior)
+    if settings.by_clock:
+        held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
+        reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
+        trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, LEAST_TRAINING * settings.seconds)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)
@@ -195,7 +208,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(settings, model, trainer.guard, trainer.choices, looked),
+        model=model_facts(trainer, looked),
     )
 
 

@@ -10,6 +10,7 @@ normals, positive outwards; scores (N, J) of pipeline.maths.correlation.agreemen
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -67,15 +68,21 @@ class Photos:
     centre: Tensor
 
 
-def start_from_photos(hull: Start, views: list[PhotoView], device: str) -> Start:
-    """The hull's SDF moved to where the photos agree; unchanged where they do not tell, as on skin without a mark."""
+def start_from_photos(
+    hull: Start, views: list[PhotoView], device: str, check: Callable[[], None] = lambda: None
+) -> Start:
+    """The hull's SDF moved to where the photos agree; unchanged where they do not tell, as on skin without a mark.
+
+    check is called every second or so: it raises where the user has stopped the run.
+    """
     photos = photos_of(views, device)
     values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
     for sweep in SWEEPS:
+        check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
         offsets = np.arange(sweep.outward * side, -sweep.inward * side, -sweep.step * pixel)
-        scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos)
+        scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos, check)
         kept = scores.max(1) > -1
         if kept.sum() < sweep.voters:
             break
@@ -174,7 +181,14 @@ def _hidden(geometry: GridSdf, p: Tensor, distance: Tensor, centre: Tensor) -> T
 
 
 def sweep_scores(
-    points: F64, normals: F64, offsets: F64, order: Tensor, seen: Tensor, pixel: float, photos: Photos
+    points: F64,
+    normals: F64,
+    offsets: F64,
+    order: Tensor,
+    seen: Tensor,
+    pixel: float,
+    photos: Photos,
+    check: Callable[[], None] = lambda: None,
 ) -> F32:
     """(N, J) how well the photos agree on the patch around each point, moved along its normal by each offset."""
     device = photos.grey.device
@@ -190,6 +204,7 @@ def sweep_scores(
     grid = grid.flatten(3)
     out = []
     for offset in offsets:
+        check()
         q = grid + (centre + float(offset) * along_n)[..., None]
         patches = _look_up(photos, order, q[..., 0, :] / q[..., 2, :], q[..., 1, :] / q[..., 2, :])
         out.append(agreement(patches, seen))

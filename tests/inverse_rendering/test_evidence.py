@@ -16,8 +16,9 @@ import torch
 from pipeline.maths import sh
 from pipeline.transforms import F64
 from stages.inverse_rendering import evidence
+from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.choices import Choices, decide, restored, waiting_views
-from stages.inverse_rendering.fit import Start, Trainer, new_trainer
+from stages.inverse_rendering.fit import Start, Trainer
 from stages.inverse_rendering.footprint import footprint, supported
 from stages.inverse_rendering.settings import PRESETS, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points

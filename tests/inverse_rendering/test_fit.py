@@ -14,7 +14,8 @@ import torch
 
 from pipeline import transforms
 from pipeline.errors import Cancelled, StageError
-from stages.inverse_rendering.fit import Hooks, Start, Trainer, new_trainer, run_fit
+from stages.inverse_rendering.begin import new_trainer
+from stages.inverse_rendering.fit import Hooks, Start, Trainer, run_fit
 from stages.inverse_rendering.objective import objective
 from stages.inverse_rendering.predict import predict_view
 from stages.inverse_rendering.settings import FitSettings
