@@ -1,7 +1,7 @@
 """Every stage's settings from a preset, a file and single values: the one place where they are put together.
 
-Order, the later one wins: the stages' own defaults, the preset, the options that concern several stages (holdout,
-name, seed), the file, the single values.
+Order, the later one wins: the stages' own defaults, the preset, what a budget pays for, the options that concern
+several stages (holdout, name, seed), the file, the single values.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ def configs_for(
     name: str | None = None,
     seed: int | None = None,
     registry: Iterable[Stage[Any, Any, Any]] | None = None,
+    planned: Settings | None = None,
 ) -> dict[str, StageConfig]:
-    """The checked settings of every stage, by the stage's name.
+    """The checked settings of every stage, by the stage's name. planned: what a budget pays for, over the preset.
 
     Raises:
         UsageError: an unknown preset, stage or key, or a value outside its limits; says which and what is possible.
@@ -70,7 +71,7 @@ def configs_for(
     stages = {s.name: s for s in (_registry() if registry is None else registry)}
     known(preset, PRESETS, what="unknown preset", where="--preset")
     merged: dict[str, dict[str, Any]] = {n: {} for n in stages}
-    for source in (PRESETS[preset], _shared(stages, holdout, name, seed)):
+    for source in (PRESETS[preset], planned or {}, _shared(stages, holdout, name, seed)):
         for stage, own in source.items():
             if stage in merged:
                 merged[stage].update(own)

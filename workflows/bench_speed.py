@@ -9,28 +9,23 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pipeline.contract import peak_memory_mb
 from workflows import machine
+from workflows.ball import WHOLE, ball_trainer, ball_view
 from workflows.console import Console
 
 if TYPE_CHECKING:
-    from stages.inverse_rendering.fit import Start, Trainer
-    from stages.inverse_rendering.views import PhotoView
+    from stages.inverse_rendering.fit import Trainer
 
-RADIUS, HALF, DISTANCE = 0.1, 0.14, 0.5
 PICTURE = 1024
 SH_DIRECTIONS = 100_000
 AXES: dict[str, tuple[int, ...]] = {"views": (12, 24, 48), "side": (128, 256, 512), "cells": (72, 144, 288)}
 MIDDLE = {"views": 24, "side": 256, "cells": 144}
-WHOLE: dict[str, Any] = {"rank": 3, "light_order": 10, "specular": "on", "relief": "on", "calibration": "on"}
 PARTS: dict[str, dict[str, Any]] = {
     "the whole model": {},
     "k = 1": {"rank": 1},
@@ -98,55 +93,14 @@ def setups() -> list[dict[str, int]]:
     return out
 
 
-# ------------------------------------------------------------------ the scene
-def ball_view(index: int, count: int, side: int) -> PhotoView:
-    """A photo of a ball with waves of colour, one sample a pixel."""
-    from pipeline import transforms
-    from stages.inverse_rendering.views import PhotoView
-
-    angle = 2 * math.pi * index / count
-    o = DISTANCE * np.array([math.sin(angle), 0.5 * math.sin(5 * angle), math.cos(angle)])
-    z = -o / np.linalg.norm(o)
-    x = np.cross(z, [0, 1, 0])
-    x /= np.linalg.norm(x)
-    world_from_cam = transforms.rigid(np.stack([x, np.cross(z, x), z], 1), o)
-    f = 1.9 * side
-    K = np.array([[f, 0, side / 2], [0, f, side / 2], [0, 0, 1]])
-    _, d = transforms.rays(K, world_from_cam, np.zeros(5), transforms.pixel_centres(side, side))
-    b = d @ o
-    under = b * b - (o @ o - RADIUS**2)
-    hit = under > 0
-    n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d) / RADIUS
-    rgb = np.where(hit[:, None], 0.3 + 0.15 * np.sin(40 * n), 0).astype(np.float32)
-    shape = (side, side)
-    alpha = hit.astype(np.float32).reshape(shape)
-    return PhotoView(index, rgb.reshape(*shape, 3), alpha, K, world_from_cam, np.zeros(5))
-
-
-def ball_start(cells: int) -> Start:
-    """The SDF of the ball on a grid with so many cells a side."""
-    from stages.inverse_rendering.fit import Start
-
-    axis = np.linspace(-HALF, HALF, cells + 1, dtype=np.float32)
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
-    values = np.sqrt(x * x + y * y + z * z) - RADIUS
-    return Start(np.asarray(values, np.float32), np.full(3, -HALF, np.float32), 2 * HALF / cells)
-
-
+# ------------------------------------------------------------------ measuring
 def trainer(views: int, side: int, cells: int, batch: int, device: str, part: dict[str, Any] | None = None) -> Trainer:
-    """A fit of the ball with the draft's model on one grid, about to begin: whole, or without a part."""
-    from stages.inverse_rendering.begin import new_trainer
+    """A fit of the ball with the draft's model, whole or without a part."""
     from stages.inverse_rendering.settings import FitSettings
 
-    model = {**WHOLE, **(part or {})}
-    settings = FitSettings(steps=1_000_000, batch=batch, levels=1, image_side=side, shadows=False, **model)
-    photos = [ball_view(i, views, side) for i in range(views)]
-    t = new_trainer(photos, ball_start(cells), settings, settings.calibration == "on", device)
-    t.enter_level()
-    return t
+    return ball_trainer(views, side, cells, FitSettings(batch=batch, **{**WHOLE, **(part or {})}), device)
 
 
-# ------------------------------------------------------------------ measuring
 def measure(views: int, side: int, cells: int, batch: int, least: float, device: str) -> Point:
     """Train for about `least` seconds, after a few steps of a small fit that load what every fit needs."""
     import pipeline.threads  # noqa: F401  (before torch, as in the command line)

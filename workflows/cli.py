@@ -84,6 +84,12 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
     run.add_argument("--until", metavar="S", help="stop after this stage")
     run.add_argument(
+        "--budget",
+        type=batch_commands.a_time,
+        metavar="TIME",
+        help="time for the whole run, in place of a preset: 90s, 10m, 2h",
+    )
+    run.add_argument(
         "--stage-limit", type=batch_commands.a_time, metavar="TIME", help="time that one stage may take: 90s, 30m, 2h"
     )
     run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")

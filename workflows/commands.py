@@ -254,6 +254,7 @@ def request_from(options: argparse.Namespace) -> RunRequest:
         sets=tuple(options.set),
         config=config,
         store=options.store,
+        budget=options.budget,
         stage_limit=options.stage_limit,
     )
 

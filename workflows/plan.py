@@ -13,7 +13,8 @@ from pipeline.contract import Stage, StageConfig, inputs_from, key
 from pipeline.errors import StageError, UsageError
 from pipeline.store import MANIFEST, Store
 from stages import registry
-from stages.presets import DEFAULT_PRESET, configs_for, known, parse_sets
+from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_sets
+from workflows.budget import FIT
 
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -42,6 +43,11 @@ class RunRequest(BaseModel):
     sets: tuple[str, ...] = Field(default=(), description='single settings, "stage.key=value"')
     config: dict[str, dict[str, Any]] = Field(default={}, description="settings by stage, then by key")
     store: str | None = Field(default=None, description="folder of finished stages; OUT/.store by default")
+    budget: float | None = Field(
+        default=None,
+        gt=0,
+        description="seconds for the whole run: sizes and the length of the fit are planned on this machine",
+    )
     stage_limit: float | None = Field(
         default=None, gt=0, description="seconds that one stage may take; none by default"
     )
@@ -104,13 +110,21 @@ def make_plan(request: RunRequest) -> Plan:
     )
 
 
-def check_settings(request: RunRequest) -> dict[str, StageConfig]:
-    """The settings of every stage that a request makes, whatever its capture holds.
+def check_settings(request: RunRequest, planned: Settings | None = None) -> dict[str, StageConfig]:
+    """The settings of every stage that a request makes, whatever its capture holds. planned: what its budget pays for.
 
     Raises:
         UsageError: unknown names, or settings outside their limits.
     """
     _choose(request.until, request.from_stage)
+    if request.budget is not None and request.preset != DEFAULT_PRESET:
+        raise UsageError(
+            "a budget and a preset both say how large the fit is",
+            where="--budget and --preset",
+            value=request.preset,
+            limit="one of the two",
+            remedy="leave --preset out, or the budget",
+        )
     known(request.device, DEVICES, what="unknown device", where="--device")
     return configs_for(
         request.preset,
@@ -120,6 +134,7 @@ def check_settings(request: RunRequest) -> dict[str, StageConfig]:
         name=request.name,
         seed=request.seed,
         registry=registry.REGISTRY,
+        planned=planned,
     )
 
 
@@ -179,7 +194,8 @@ def preview(plan: Plan) -> list[Step]:
     finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
     steps: list[Step] = []
     for stage in plan.stages:
-        if not all(f in finished for f in stage.inputs.__dataclass_fields__):
+        unplanned = plan.request.budget is not None and stage.name == FIT  # its settings depend on the hour
+        if unplanned or not all(f in finished for f in stage.inputs.__dataclass_fields__):
             steps.append(Step(stage.name, None, "made"))
             continue
         k = key(stage, inputs_from(stage, finished), plan.configs[stage.name])

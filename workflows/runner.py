@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
 from stages import registry
-from workflows.plan import Plan
+from workflows.budget import FIT, START_UP, planned
+from workflows.plan import Plan, check_settings
 from workflows.session import current
 from workflows.watchdog import time_limit
 
@@ -31,6 +34,8 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         if watch.stop.is_set():
             raise Cancelled("stopped by the user; finished stages are kept")
         watch.observer.started(stage.name, number, len(plan.stages))
+        if stage.name == FIT and plan.request.budget is not None:
+            plan = within_budget(plan, finished, done)
         inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
@@ -40,6 +45,18 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         finished[stage.name] = result.located
         done.append(result)
     return done
+
+
+def within_budget(plan: Plan, finished: dict[str, Located[Artifact]], done: list[Done[Any]]) -> Plan:
+    """The plan with settings, from the fit on, that the rest of its budget pays for."""
+    assert plan.request.budget is not None
+    watch = current()
+    taken = sum(float(d.run.get("seconds", 0.0)) for d in done if not d.reused)
+    left = plan.request.budget - max(time.monotonic() - watch.begun, taken) - START_UP
+    request = plan.request.model_dump(mode="json", include={"budget", "sets", "config", "holdout", "seed", "device"})
+    found = planned(plan.store, {**request, "after": [d.key for d in done]}, left, plan.device)
+    watch.observer.note(found.told(plan.request.budget))
+    return replace(plan, configs=check_settings(plan.request, found.settings()))
 
 
 def run_here(plan: Plan) -> RunStage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -45,13 +46,14 @@ class Silent:
 class Session:
     """One run's watcher and its stop flags. `plan`: the one that was already made for these parameters, if any.
 
-    stop: the user's. late: the time limit's, of the stage at work.
+    stop: the user's. late: the time limit's, of the stage at work. begun: when, by time.monotonic().
     """
 
     observer: Observer = field(default_factory=Silent)
     stop: threading.Event = field(default_factory=threading.Event)
     plan: Any = None
     late: threading.Event = field(default_factory=threading.Event)
+    begun: float = field(default_factory=time.monotonic)
 
     def stopped(self) -> bool:
         """Whether the stage at work has to end: the user said so, or its time is over."""

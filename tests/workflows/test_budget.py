@@ -1,0 +1,109 @@
+"""`--budget`: what a time pays for, and that an interrupted run goes on with the same plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import UsageError
+from pipeline.store import Store
+from stages.presets import configs_for
+from workflows import budget
+from workflows.budget import DRAFT_RATE, FIT, LEAST_FIT, RUNGS, BudgetPlan, choose
+from workflows.cli import parser
+from workflows.commands import request_from
+from workflows.plan import RunRequest, check_settings, make_plan, preview
+from workflows.runner import run_here, run_plan
+
+NAMES = [r.name for r in RUNGS]
+
+
+def test_more_time_never_buys_less() -> None:
+    chosen = [choose(60.0 * 1.2**i, DRAFT_RATE) for i in range(50)]
+    ranks = [NAMES.index(c.rung) for c in chosen]
+    assert ranks == sorted(ranks) and ranks[0] == 0 and ranks[-1] == len(RUNGS) - 1
+    for lower, higher in zip(chosen, chosen[1:], strict=False):
+        assert higher.rung != lower.rung or higher.seconds >= lower.seconds
+
+
+def test_a_rung_is_filled_with_rays_and_all_stages_fit() -> None:
+    for left in (150.0, 300.0, 600.0, 1800.0, 36_000.0):
+        for pace in (DRAFT_RATE / 3, DRAFT_RATE, 20 * DRAFT_RATE):
+            plan = choose(left, pace)
+            rung = RUNGS[NAMES.index(plan.rung)]
+            slower = DRAFT_RATE / pace
+            if plan.fits:
+                assert plan.seconds + slower * rung.after == pytest.approx(left, abs=0.1)
+                assert (plan.seconds - slower * rung.before) * pace * rung.rate >= min(rung.rays, 1.0)
+
+
+def test_too_little_time_still_leaves_an_asset_and_is_told() -> None:
+    plan = choose(5.0, DRAFT_RATE)
+    assert plan.rung == "coarse" and plan.seconds == LEAST_FIT + RUNGS[0].before and not plan.fits
+    assert "longer than the budget" in plan.told(5.0) and "longer" not in choose(3600.0, DRAFT_RATE).told(3600.0)
+
+
+def test_every_rung_is_valid_settings() -> None:
+    for rung in RUNGS:
+        configs = configs_for("draft", {}, planned=BudgetPlan(rung.name, 12.5, 1.0, True).settings())
+        fit: Any = configs[FIT]
+        assert fit.seconds == 12.5 and fit.image_side == rung.settings[FIT]["image_side"]
+        assert configs["bake"].model_dump()["size"] == rung.settings["bake"]["size"]
+
+
+def test_a_users_own_setting_wins(tmp_path: Path) -> None:
+    planned = choose(1800.0, DRAFT_RATE).settings()
+    request = RunRequest(capture="c", out=str(tmp_path), budget=1800.0, sets=("bake.size=512",))
+    assert check_settings(request, planned)["bake"].model_dump()["size"] == 512
+
+
+def test_a_plan_is_kept_for_its_purpose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paces = iter([DRAFT_RATE, 2 * DRAFT_RATE, 3 * DRAFT_RATE])
+    monkeypatch.setattr(budget, "calibrate", lambda device: next(paces))
+    store = Store(tmp_path)
+    first = budget.planned(store, {"budget": 600, "after": ["a"]}, 500.0, "cpu")
+    assert budget.planned(store, {"budget": 600, "after": ["a"]}, 20.0, "cpu") == first
+    assert budget.planned(store, {"budget": 600, "after": ["b"]}, 500.0, "cpu").pace == 2 * DRAFT_RATE
+    for torn in (tmp_path / budget.PLANS).iterdir():
+        torn.write_text("{")
+    assert budget.planned(store, {"budget": 600, "after": ["a"]}, 500.0, "cpu").pace == 3 * DRAFT_RATE
+
+
+def test_budget_and_preset_exclude_each_other(photos: Path, toys: None) -> None:
+    request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), budget=60.0, preset="studio")
+    with pytest.raises(UsageError, match="both say how large"):
+        make_plan(request)
+
+
+def test_the_command_line_takes_times(tmp_path: Path) -> None:
+    options = parser().parse_args(["run", "c", "--out", str(tmp_path), "--budget", "10m"])
+    assert request_from(options).budget == 600.0
+    with pytest.raises(SystemExit):
+        parser().parse_args(["run", "c", "--out", str(tmp_path), "--budget", "soon"])
+
+
+def test_the_run_plans_before_the_fit_alone(
+    photos: Path, toys: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With toy stages, the second of which plays the fit."""
+    from workflows import plan as planning
+    from workflows import runner
+
+    asked: list[Any] = []
+
+    def found(store: Store, purpose: dict[str, Any], left: float, device: str) -> Any:
+        asked.append((purpose["after"], left))
+        return BudgetPlan("coarse", 30.0, 1.0, True)
+
+    monkeypatch.setattr(runner, "FIT", "second")
+    monkeypatch.setattr(planning, "FIT", "second")
+    monkeypatch.setattr(runner, "planned", found)
+    monkeypatch.setattr(BudgetPlan, "settings", lambda self: {})
+    monkeypatch.setattr(BudgetPlan, "told", lambda self, budget: "planned")
+    plan = make_plan(RunRequest(capture=str(photos), out=str(tmp_path / "out"), budget=60.0))
+    assert [s.key is None for s in preview(plan)] == [False, True, True]
+    done = run_plan(plan, run_here(plan))
+    assert asked[0][0] == [done[0].key] and 0 < asked[0][1] < 60.0 and len(asked) == 1
+    assert [s.key is None for s in preview(plan)] == [False, True, True]
