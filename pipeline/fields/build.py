@@ -10,8 +10,6 @@ prior        hull | sphere | imface          for displaced; a grid starts from a
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
@@ -23,9 +21,7 @@ from pipeline.fields.material import FEATURES, DirectIntegral, FeatureIntegral
 from pipeline.fields.prior_imface import ImFacePrior, under
 from pipeline.fields.priors import HullPrior, SpherePrior
 from pipeline.fields.sinusoidal import SinusoidalField
-
-if TYPE_CHECKING:
-    from pipeline.fields.face import FaceModel, FaceSpec
+from pipeline.fields.spec import FaceSpec
 
 
 def middle(spec: FaceSpec) -> tuple[Tensor, float]:
@@ -75,19 +71,15 @@ def displaced(spec: FaceSpec, prior: nn.Module) -> DisplacedSdf:
     return DisplacedSdf(prior, spec.displacement_width)
 
 
-def model_from_arrays(spec: FaceSpec, arrays: dict[str, Tensor], cell: float) -> FaceModel:
-    """The modules whose parameters are in `arrays` (to be loaded by the caller)."""
-    from pipeline.fields.face import FaceModel
-
-    if spec.geometry == "grid":
-        return FaceModel(spec, arrays["geometry.values"], arrays["geometry.lo"], cell)
-    prior: nn.Module
+def stored_displaced(spec: FaceSpec, arrays: dict[str, Tensor]) -> DisplacedSdf:
+    """The same over the prior whose arrays are given."""
     if spec.prior == "imface":
-        prior = ImFacePrior(under(arrays, "geometry.prior"), torch.tensor(spec.prior_centre), spec.prior_scale)
+        prior: nn.Module = ImFacePrior(
+            under(arrays, "geometry.prior"), torch.tensor(spec.prior_centre), spec.prior_scale
+        )
     elif spec.prior == "sphere":
         prior = sphere_prior(spec)
     else:
         named = under(arrays, "geometry.prior")
         prior = HullPrior(named["values"], named["lo"], float(named["edge"]))
-    none = torch.zeros(0)
-    return FaceModel(spec, none, none, cell, displaced(spec, prior))
+    return displaced(spec, prior)

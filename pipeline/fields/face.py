@@ -24,6 +24,7 @@ from pipeline.fields.geometry import GridSdf
 from pipeline.fields.light import ShLight
 from pipeline.fields.protocol import F32, Material
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
+from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf, split_sum
 from pipeline.maths.sdf import unit
 
@@ -33,53 +34,16 @@ DIELECTRIC = 0.04  # F0 of what is no metal
 
 
 @dataclass(frozen=True, slots=True)
-class FaceSpec:
-    """What is needed to build the modules before their parameters are read."""
-
-    lo: tuple[float, float, float]
-    hi: tuple[float, float, float]
-    views: int
-    rank: int = 3
-    light_order: int = 10
-    light_start: float = 1.0
-    albedo_start: tuple[float, float, float] = (0.4, 0.4, 0.4)
-    attenuation: str = "exponential"
-    basis_inputs: str = "cosine"
-    density: str = "crossing"
-    specular: bool = True
-    shadows: bool = False
-    calibrated: bool = False
-    levels: int = 10
-    log2_size: int = 17
-    coarse: float = 0.03
-    fine: float = 0.0006
-    width: int = 64
-    depth: int = 2
-    # which of the paper's systems; see pipeline.fields.build
-    appearance: str = "hash"
-    shading: str = "neural"
-    light: str = "sh"
-    integral: str = "low_rank"
-    cubemap_size: int = 12
-    basis_width: int = 64
-    basis_depth: int = 2
-    geometry: str = "grid"
-    prior: str = "hull"
-    prior_scale: float = 0.1
-    prior_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    displacement_width: int = 256
-
-
-@dataclass(frozen=True, slots=True)
 class Shaded:
     """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
-    calibration."""
+    calibration; strength (N,) of the lobe, rho c . B."""
 
     total: Tensor
     diffuse: Tensor
     specular: Tensor
     albedo: Tensor
     inv_kappa: Tensor
+    strength: Tensor
 
 
 class FaceModel(nn.Module):
@@ -114,11 +78,11 @@ class FaceModel(nn.Module):
             return self._disney(x, n, wo, albedo, rho, inv_kappa)
         diffuse = self._diffuse(albedo, x, n)
         if not self.spec.specular:
-            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
+            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa, torch.zeros_like(rho))
         incident = self.light.reflected(brdf.reflect(wo, n), inv_kappa, self.spec.attenuation)
         bound = torch.ones_like(rho) if self.spec.shading == "phong" else self.basis.integral(x, c, wo, n)
         specular = brdf.specular(rho, bound, incident)
-        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
+        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa, rho * bound)
 
     def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
         """L_d under what arrives of the light, (N, 3)."""
@@ -133,8 +97,9 @@ class FaceModel(nn.Module):
         f0 = DIELECTRIC * (1 - m) + albedo * m
         width = alpha if self.spec.light == "cubemap" else inv_kappa
         incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)
-        specular = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha) * incident
-        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
+        reflected = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha)
+        specular = reflected * incident
+        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa, reflected.mean(-1))
 
     def solve_shadows(self) -> None:
         """Bring the shadows up to date with the surface, the albedo and the light found so far."""
@@ -168,9 +133,17 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
     for k in ("lo", "hi", "albedo_start", "prior_centre"):
         if k in spec:
             spec[k] = tuple(spec[k])
-    model = build.model_from_arrays(FaceSpec(**spec), arrays, cell)
+    model = _unfilled(FaceSpec(**spec), arrays, cell)
     model.load_state_dict(arrays)
     return model.to(device)
+
+
+def _unfilled(spec: FaceSpec, arrays: dict[str, Tensor], cell: float) -> FaceModel:
+    """The modules whose parameters are in `arrays`."""
+    if spec.geometry == "grid":
+        return FaceModel(spec, arrays["geometry.values"], arrays["geometry.lo"], cell)
+    none = torch.zeros(0)
+    return FaceModel(spec, none, none, cell, build.stored_displaced(spec, arrays))
 
 
 class FittedField:

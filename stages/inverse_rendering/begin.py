@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.fields.face import FaceModel, FaceSpec
+from pipeline.fields.face import FaceModel
+from pipeline.fields.spec import FaceSpec
 from stages.inverse_rendering.fit import Start, Trainer
 from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import PhotoView, PixelTable

@@ -17,9 +17,10 @@ from torch import nn
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.fields import build
-from pipeline.fields.face import FaceModel, FaceSpec
+from pipeline.fields.face import FaceModel
 from pipeline.fields.prior_imface import ImFacePrior
 from pipeline.fields.priors import HullPrior
+from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
 from stages.inverse_rendering.begin import spec_for
 from stages.inverse_rendering.fit import Start, Trainer

@@ -12,8 +12,9 @@ from scipy import ndimage
 from pipeline.errors import StageError
 from pipeline.fields.appearance import IntegratedBasis
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.face import FaceModel, FaceSpec, FittedField, load_face, load_model
+from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
 from pipeline.fields.geometry import coarse_distance, largest_solid
+from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf
 
 LO, CELL = torch.tensor([-0.2, -0.2, -0.2]), 0.02
