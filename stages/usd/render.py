@@ -138,7 +138,7 @@ class Renderer:
 
     def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
         """Pixels in the rectangle around the mesh's picture; all where part of it lies beside or behind the camera."""
-        points = self._corners.reshape(-1, 3)
+        points = self.asset.mesh.vertices.astype(np.float64)
         distances = points @ view.world_from_cam[:3, 2] - view.world_from_cam[:3, 2] @ view.world_from_cam[:3, 3]
         if distances.min() <= 0 or np.any(view.distortion):
             return np.arange(width * height)
@@ -266,4 +266,5 @@ def _sample_positions(pixel: npt.NDArray[np.int64], width: int, filtered: Filter
 
 
 def _unit(x: npt.NDArray[np.floating]) -> F64:
-    return np.asarray(x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12), np.float64)
+    length = np.sqrt(np.einsum("...c,...c->...", x, x))[..., None]
+    return np.asarray(x / np.maximum(length, 1e-12), np.float64)
