@@ -35,6 +35,7 @@ LEAST_VIEWS = 8  # fewer can spare none
 WAITING_SHARE, MOST_WAITING = 0.12, 6
 DIFFUSE_ORDER = 3  # what diffuse skin tells of a light [NeuFace eq. 15]
 DIFFERENT = 0.02  # of the mean radiance: cameras that differ by less are not told from what the lobe leaves
+TELLING = 0.75  # of the lobe's own size: with a larger rest, bases are not told apart (docs/model.md)
 SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
 
 Facts = dict[str, dict[str, str | float | bool]]
@@ -138,9 +139,11 @@ def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -
         facts["rank"]["why"] = "no lobe, so that its bases are not used"
     if s.rank == AUTO and specular:
         ranks = evidence.by_rank(t, order, used, given.rank)
-        k = evidence.least_rank(ranks)
+        clear = min(ranks) < TELLING * more(dull, best)
+        k = evidence.least_rank(ranks) if clear else given.rank
         columns = strongest(model, t, k)
-        facts["rank"] = {"k": k, "why": "evidence", "error_of_rank": _listed(ranks)}
+        why = "evidence" if clear else "the rest is too large beside the lobe to tell; fewer would save no time"
+        facts["rank"] = {"k": k, "why": why, "error_of_rank": _listed(ranks)}
     return Choices(specular, order, columns, calibrated, given.relief, facts)
 
 

@@ -120,6 +120,18 @@ def test_one_lobe_needs_one_basis_and_two_need_more() -> None:
     assert chosen(Ball(two)).rank >= 2  # a third is taken for the seam, where boxes hold both
 
 
+@pytest.mark.slow
+def test_bases_stay_where_noise_hides_what_they_do() -> None:
+    """One angular profile, under noise as large as the lobe's own differences: nothing tells that one is enough."""
+    even, noise = gloss(4, 0.25), np.random.default_rng(0)
+
+    def grainy(n: F64, wo: F64) -> F64:
+        return even(n, wo) + noise.normal(0, 0.3, len(n))
+
+    got = chosen(Ball(grainy))
+    assert got.specular and got.rank == 3 and "too large" in str(got.facts["rank"]["why"])
+
+
 # ------------------------------------------------------------------ settings
 def test_settings_are_never_overruled() -> None:
     got = chosen(
