@@ -105,10 +105,9 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {},
     "studio": {
         "image_side": 1024,
-        "steps": 12000,
+        "steps": 5500,
         "batch": 8192,
         "grid_cells": 448,
-        "levels": 3,
         "hash_fine": 0.0005,
         "hash_log2_size": 18,
     },
