@@ -46,6 +46,8 @@ KNOBS = (
     Knob("no specular lobe", {"specular": "off"}),
     Knob("exact attenuation", {"attenuation": "exact"}),
     Knob("Laplace density", {"density": "laplace"}),
+    Knob("every sample shaded", {"volumetric": True}),
+    Knob("bfloat16", {"precision": "bfloat16"}),
     Knob("no shadows", {"shadows": False}),
     Knob("decided by evidence", {"rank": "auto", "light_order": "auto", "specular": "auto", "calibration": "auto"}),
     Knob("another seed", {"seed": 1}),

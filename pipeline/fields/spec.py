@@ -19,6 +19,7 @@ class FaceSpec:
     attenuation: str = "exponential"
     basis_inputs: str = "cosine"
     density: str = "crossing"
+    volumetric: bool = False
     specular: bool = True
     shadows: bool = False
     calibrated: bool = False

@@ -51,6 +51,7 @@ def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibr
         attenuation=settings.attenuation,
         basis_inputs=settings.basis_inputs,
         density=settings.density,
+        volumetric=settings.volumetric,
         specular=settings.specular != "off",
         shadows=settings.shadows,
         calibrated=calibrated,

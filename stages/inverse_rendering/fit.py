@@ -236,8 +236,10 @@ class Trainer:
         return self.compute_terms(batch, generator)
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
-        """The parts of the loss."""
-        return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+        """The parts of the loss. With bfloat16 the networks' products are short; the maths holds its own precision."""
+        kind, short = torch.device(self.device).type, self.settings.precision == "bfloat16"
+        with torch.autocast(kind, torch.bfloat16, enabled=short):
+            return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients that the optimiser does not know of are finite."""

@@ -4,12 +4,13 @@ Symbols: t_0 hit or closest approach; samples at t_0 +- w, w so wide that the sh
 angle; tau optical depth; x_s, n the point and normal averaged by the weights of [NeuFace eq. 18].
 
 Differs: shading is evaluated once a ray, at x_s, and not at every sample: over a shell of under a millimetre the
-radiance is close to linear, so that the mean of the values is the value at the mean; 10 times cheaper.
+radiance is close to linear, so that the mean of the values is the value at the mean. `volumetric` shades every sample
+and takes the mean, as the paper does; docs/benchmarks.md has what that costs and brings.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -29,7 +30,8 @@ REACH_BETAS = 12.0  # beyond this closest approach a ray's opacity is below e^-1
 @dataclass(frozen=True, slots=True)
 class Shell:
     """Samples of M kept rays of a batch of N: kept (M,) indices, tau (M,), x (M, 3), n (M, 3), hit (M,), end (M,) the t
-    behind the last sample, and the raw gradient at every sample (M * S, 3) for the eikonal term."""
+    behind the last sample, the raw gradient at every sample (M * S, 3) for the eikonal term, and all samples' t and
+    shares of the ray's weight (M, S)."""
 
     kept: Tensor
     tau: Tensor
@@ -38,6 +40,8 @@ class Shell:
     n: Tensor
     hit: Tensor
     gradient: Tensor
+    t: Tensor
+    share: Tensor
 
 
 def sample_shell(
@@ -63,7 +67,7 @@ def sample_shell(
     share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-8)
     x_s = o + (share * t).sum(-1, keepdim=True) * d
     n = unit((share[..., None] * g.reshape(*t.shape, 3)).sum(1))
-    return Shell(kept, tau, t0 + w, x_s, n, hit, g)
+    return Shell(kept, tau, t0 + w, x_s, n, hit, g, t, share)
 
 
 def _weigh(model: FaceModel, s: Tensor, w: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,7 +88,21 @@ def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
 
 def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Shaded:
     """Radiance of some of a shell's rays (`pick` indexes the shell)."""
-    return model.shade(shell.x[pick], shell.n[pick], -rays.d[shell.kept[pick]])
+    wo = -rays.d[shell.kept[pick]]
+    if not model.spec.volumetric:
+        return model.shade(shell.x[pick], shell.n[pick], wo)
+    t, share = shell.t[pick], shell.share[pick]
+    samples = t.shape[1]
+    x = rays.o[shell.kept[pick]][:, None] - t[..., None] * wo[:, None]
+    n = unit(shell.gradient.reshape(-1, samples, 3)[pick])
+    every = model.shade(x.reshape(-1, 3), n.reshape(-1, 3), wo.repeat_interleave(samples, 0))
+    return Shaded(**{f.name: _mean(getattr(every, f.name), share) for f in fields(Shaded)})
+
+
+def _mean(values: Tensor, share: Tensor) -> Tensor:
+    """Weighted mean over the samples: (M * S, ...), (M, S) -> (M, ...)."""
+    every = values.reshape(*share.shape, *values.shape[1:])
+    return (share.reshape(*share.shape, *[1] * (values.dim() - 1)) * every).sum(1)
 
 
 def solid_behind(model: FaceModel, shell: Shell, rays: Rays) -> Tensor:

@@ -36,6 +36,8 @@ class FitSettings:
     relief: str = AUTO
     resolution: str = AUTO
     shadows: bool = True
+    volumetric: bool = False
+    precision: str = "float32"
     calibration: str = AUTO
     hash_levels: int = 10
     hash_log2_size: int = 17

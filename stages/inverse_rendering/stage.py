@@ -60,6 +60,10 @@ class Config(StageConfig):
         description="auto: grid_cells and hash_fine no finer than the photos' pixels on the surface"
     )
     shadows: bool = Field(description="model what the surface itself hides and reflects of the light")
+    volumetric: bool = Field(
+        description="shade every sample of a ray as the paper does, not once a ray at the expected surface point"
+    )
+    precision: Literal["float32", "bfloat16"] = Field(description="of the networks' products while fitting")
     calibration: Literal["auto", "on", "off"] = Field(
         description="per-image colour matrices [NeuFace eq. 19]; auto: "
         "by evidence; until it is in, where the capture has more than one kind of camera"

@@ -270,3 +270,37 @@ def test_what_lies_behind_an_edge_shows() -> None:
     assert (shell.tau[:2] < 3.5).all() and (behind[:2] > 0).all() and behind[3] == 0
     _, opacity = render_rays(t.model, rays, 16)
     assert (opacity[:3] > 0.95).all() and opacity[3] < 0.2
+
+
+def test_shading_every_sample_is_the_mean_of_the_samples(fitted: Trainer) -> None:
+    """Against a plain loop over one ray's samples; and close to shading once, which the shell is thin enough for."""
+    from stages.inverse_rendering.render import sample_shell, shade_shell
+
+    model, rays = fitted.model, image_rays(ball_view(5), 1, "cpu")
+    shell = sample_shell(model, rays, 8, None, None)
+    pick = torch.nonzero(shell.hit).squeeze(-1)[::97]
+    once = shade_shell(model, shell, rays, pick)
+    model.spec = replace(model.spec, volumetric=True)
+    try:
+        every = shade_shell(model, shell, rays, pick)
+    finally:
+        model.spec = replace(model.spec, volumetric=False)
+    i = int(pick[3])
+    d = rays.d[shell.kept[i]]
+    by_hand = torch.zeros(3)
+    for s in range(8):
+        g = shell.gradient[8 * i + s]
+        at = rays.o[shell.kept[i]] + shell.t[i, s] * d
+        by_hand += shell.share[i, s] * model.shade(at[None], (g / g.norm())[None], -d[None]).total[0]
+    assert torch.allclose(every.total[3], by_hand, rtol=1e-4, atol=1e-6)
+    assert every.strength.shape == once.strength.shape
+    assert float((every.total - once.total).abs().median()) < 0.01 * float(once.total.mean())
+
+
+def test_short_products_find_the_same_ball() -> None:
+    """bfloat16 for the networks alone: finite, and the surface where float32 has it."""
+    t = trainer(replace(SMALL, precision="bfloat16"))
+    run_fit(t, hooks())
+    d = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    s = t.model.geometry(RADIUS * d[d[:, 1].abs() < 0.6])[0]
+    assert t.guard.dropped == 0 and float(s.abs().mean()) < 0.0015
