@@ -8,7 +8,7 @@ from torch import Tensor
 from pipeline.colour import srgb_from_linear
 from pipeline.maths.precision import full_precision
 
-DULL = 2e-3  # a lobe's strength, a twentieth of skin's, under which nothing is told apart
+FAINT = 1e-4  # a lobe's strength, below all that reflects: keeps the quotient finite where there is none
 
 
 @full_precision
@@ -61,15 +61,14 @@ def albedo_parsimony(albedo: Tensor) -> Tensor:
 
 @full_precision
 def specular_parsimony(strength: Tensor) -> Tensor:
-    """|ln q - median of ln q| of the lobe's strength q = rho c . B: (N,) in [0, inf) -> (N,). Not in the paper.
+    """|q / median of q - 1| of the lobe's strength q = rho c . B: (N,) in [0, inf) -> (N,). Not in the paper.
 
     Differs: where the albedo alone is kept even, freckles and hair hide in the lobe, whose strength nothing holds. A
     lobe moves with the eye and paint does not, but from a few dozen views under a soft light the two are hard to tell
-    apart; of the splits that the photos allow this prefers the one with an even gloss. DULL keeps dull spots from
-    weighing more than glossy ones: below it all is dull.
+    apart; of the splits that the photos allow this prefers the one with an even gloss. A ratio, so that nothing is
+    gained by a weaker lobe: with logarithms above a floor the whole lobe went out (docs/model.md).
     """
-    log = torch.log(strength + DULL)
-    return (log - log.detach().median()).abs()
+    return (strength / strength.detach().median().clamp(min=FAINT) - 1).abs()
 
 
 @full_precision
