@@ -170,7 +170,6 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
         "resolution": "given",
         "shadows": False,
         "parsimony": 0.0,
-        "specular_parsimony": 0.0,
         "even_until": 0.0,
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}

@@ -36,14 +36,13 @@ DIELECTRIC = 0.04  # F0 of what is no metal
 @dataclass(frozen=True, slots=True)
 class Shaded:
     """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
-    calibration; strength (N,) of the lobe, rho c . B."""
+    calibration."""
 
     total: Tensor
     diffuse: Tensor
     specular: Tensor
     albedo: Tensor
     inv_kappa: Tensor
-    strength: Tensor
 
 
 class FaceModel(nn.Module):
@@ -78,11 +77,11 @@ class FaceModel(nn.Module):
             return self._disney(x, n, wo, albedo, rho, inv_kappa)
         diffuse = self._diffuse(albedo, x, n)
         if not self.spec.specular:
-            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa, torch.zeros_like(rho))
+            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
         incident = self.light.reflected(brdf.reflect(wo, n), inv_kappa, self.spec.attenuation)
         bound = torch.ones_like(rho) if self.spec.shading == "phong" else self.basis.integral(x, c, wo, n)
         specular = brdf.specular(rho, bound, incident)
-        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa, rho * bound)
+        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
 
     def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
         """L_d under what arrives of the light, (N, 3)."""
@@ -97,9 +96,8 @@ class FaceModel(nn.Module):
         f0 = DIELECTRIC * (1 - m) + albedo * m
         width = alpha if self.spec.light == "cubemap" else inv_kappa
         incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)
-        reflected = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha)
-        specular = reflected * incident
-        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa, reflected.mean(-1))
+        specular = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha) * incident
+        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
 
     def solve_shadows(self) -> None:
         """Bring the shadows up to date with the surface, the albedo and the light found so far."""

@@ -8,8 +8,6 @@ from torch import Tensor
 from pipeline.colour import srgb_from_linear
 from pipeline.maths.precision import full_precision
 
-FAINT = 1e-4  # a lobe's strength, below all that reflects: keeps the quotient finite where there is none
-
 
 @full_precision
 def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
@@ -57,18 +55,6 @@ def albedo_parsimony(albedo: Tensor) -> Tensor:
     """
     log = torch.log(albedo.clamp(min=1e-3))
     return (log - log.detach().median(0).values).abs().mean(-1)
-
-
-@full_precision
-def specular_parsimony(strength: Tensor) -> Tensor:
-    """|q / median of q - 1| of the lobe's strength q = rho c . B: (N,) in [0, inf) -> (N,). Not in the paper.
-
-    Differs: where the albedo alone is kept even, freckles and hair hide in the lobe, whose strength nothing holds. A
-    lobe moves with the eye and paint does not, but from a few dozen views under a soft light the two are hard to tell
-    apart; of the splits that the photos allow this prefers the one with an even gloss. A ratio, so that nothing is
-    gained by a weaker lobe: with logarithms above a floor the whole lobe went out (docs/model.md).
-    """
-    return (strength / strength.detach().median().clamp(min=FAINT) - 1).abs()
 
 
 @full_precision

@@ -86,8 +86,6 @@ def terms(
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
-        patchy = losses.specular_parsimony(shaded.strength)
-        out.add("specular_parsimony", settings.specular_parsimony * patchy.mean(), patchy, rays)
     if model.geometry.values.requires_grad:  # a surface that rests is as smooth as it is
         out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():

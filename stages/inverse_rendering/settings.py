@@ -68,7 +68,6 @@ class FitSettings:
     specular_energy: float = 0.02
     shininess: float = 1e-3
     parsimony: float = 0.01
-    specular_parsimony: float = 0.01
     eikonal: float = 0.1
     smooth: float = 0.03
     embedding: float = 1e3
@@ -137,7 +136,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "white": 5e-3,
         "specular_energy": 8e-3,
         "parsimony": 0.0,
-        "specular_parsimony": 0.0,
         "even_until": 0.0,
         "image_side": 1024,
         "steps": 129_000,

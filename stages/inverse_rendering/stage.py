@@ -99,7 +99,6 @@ class Config(StageConfig):
     specular_energy: float = Field(description="lambda 3 [NeuFace eq. 23]", ge=0)
     shininess: float = Field(description="weight of the gauge that holds 1 / kappa near skin's", ge=0)
     parsimony: float = Field(description="weight of the gauge that gives shading to the light and not to albedo", ge=0)
-    specular_parsimony: float = Field(description="weight of the gauge that keeps the lobe's strength even", ge=0)
     eikonal: float = Field(description="lambda 5 [NeuFace eq. 24]", ge=0)
     smooth: float = Field(description="weight of the normals' consistency", ge=0)
     embedding: float = Field(description="lambda 4 [NeuFace eq. 24], for prior imface", ge=0)

@@ -62,10 +62,6 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
         lambda a: losses.albedo_parsimony(torch.cat([a, torch.full((20, 3), 0.5, dtype=torch.float64)]))[:5],
         (draw(5, 3),),
     ),
-    "losses.specular_parsimony": (
-        lambda q: losses.specular_parsimony(torch.cat([q, torch.full((20,), 0.04, dtype=torch.float64)]))[:5],
-        (draw(5, low=0.05),),
-    ),
     "losses.eikonal": (lambda g: (losses.eikonal(g), losses.eikonal(g, False)), (draw(4, 3, high=0.4),)),
     "losses.displacement": (losses.displacement, (draw(4),)),
     "losses.embedding": (losses.embedding, (draw(2, 8),)),
