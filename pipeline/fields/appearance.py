@@ -7,6 +7,7 @@ Symbols: x -> (a, rho, c, 1/kappa) is the Spatial MLP and (wo, n, wo . n) -> B t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,9 @@ from torch.nn import functional
 
 from pipeline.fields.encodings import HashEncoding
 
+SKIN_F0 = 0.03  # reflectance at normal incidence; index of refraction 1.42
 START_RHO = 0.05
+LESSONS, LESSON_RATE = 500, 1e-2
 TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: skin's middle
 
 
@@ -32,6 +35,15 @@ def start_heads(last: nn.Linear, albedo: tuple[float, float, float]) -> None:
         last.weight *= 0.1
         last.bias[:3] = torch.logit(torch.tensor(albedo))
         last.bias[3] = math.log(START_RHO / (1 - START_RHO))
+        last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
+        last.bias[5:] = math.log(math.expm1(1.0))
+
+
+def restart_lobe(last: nn.Linear, rho: float) -> None:
+    """Set the last layer so that the lobe is everywhere skin's usual one again; the albedo stays."""
+    with torch.no_grad():
+        last.weight[3:] = 0.0
+        last.bias[3] = math.log(rho / (1 - rho))
         last.bias[4] = math.log(math.expm1(TYPICAL_INV_KAPPA))
         last.bias[5:] = math.log(math.expm1(1.0))
 
@@ -95,6 +107,18 @@ class IntegratedBasis(nn.Module):
         cosine = (wo * n).sum(-1, keepdim=True).clamp(min=0)
         out: Tensor = functional.softplus(self.net(cosine if self.cosine_only else torch.cat([wo, n, cosine], -1)))
         return out
+
+    def learn(self, target: Callable[[Tensor], Tensor]) -> None:
+        """Make the bases' sum a function of n . wo, (N,) -> (N,), as closely as they can."""
+        cosine = torch.linspace(0.0, 1.0, 101, device=next(self.net.parameters()).device)[:, None]
+        wanted = target(cosine[:, 0])
+        optimiser = torch.optim.Adam(self.net.parameters(), lr=LESSON_RATE)
+        for _ in range(LESSONS):
+            optimiser.zero_grad(set_to_none=True)
+            loss = ((functional.softplus(self.net(cosine)).sum(-1) - wanted) ** 2 / wanted).mean()
+            loss.backward()
+            optimiser.step()
+        self.zero_grad(set_to_none=True)
 
     def integral(self, x: Tensor, c: Tensor, wo: Tensor, n: Tensor) -> Tensor:
         """c(x) . B(wo, n): the material integral under the low-rank prior, (N,). [NeuFace eq. 8]"""

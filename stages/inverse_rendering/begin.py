@@ -8,6 +8,7 @@ import torch
 
 from pipeline.fields.face import FaceModel
 from pipeline.fields.spec import FaceSpec
+from stages.inverse_rendering.choices import teach
 from stages.inverse_rendering.fit import Start, Trainer
 from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import PhotoView, PixelTable
@@ -29,6 +30,8 @@ def new_trainer(
     spec = spec_for(views, start, settings, calibrated, device)
     values = torch.from_numpy(start.values.copy())  # a start that is the prior stays what it was
     model = FaceModel(spec, values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    if settings.judges and settings.basis_inputs == "cosine":
+        teach(model.basis)
     model.to(device)
     model.geometry.to_device(device)
     return Trainer(views, settings, device, model, prior or start)

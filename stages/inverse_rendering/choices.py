@@ -16,11 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from pipeline.fields.appearance import START_RHO, IntegratedBasis, SpatialField, restart_lobe
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths import sh
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.evidence import NEGLIGIBLE, Trial, more
+from stages.inverse_rendering.lamp import Lamp, light_from_lobe, reflectance
 from stages.inverse_rendering.settings import AUTO, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
 from stages.inverse_rendering.views import PixelTable
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 EVIDENCE_AT = 0.3  # share of the steps: the surface is found to a millimetre, most of the work is still to come
 RAYS = 1500
+MOST_LAMP_ORDER = 6  # beyond, a lobe of skin's width lets nothing through
 SEED = 715_517
 LEAST_VIEWS = 8  # fewer can spare none
 WAITING_SHARE, MOST_WAITING = 0.12, 6
@@ -43,7 +46,8 @@ Facts = dict[str, dict[str, str | float | bool]]
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """What is modelled from now on. columns: the bases that stay. facts: how each was decided, for the report."""
+    """What is modelled from now on. columns: the bases that stay. facts: how each was decided, for the report. lit: the
+    light is known from the lobe (lamp.py)."""
 
     specular: bool
     light_order: int
@@ -51,6 +55,7 @@ class Choices:
     calibrated: bool
     relief: bool
     facts: Facts
+    lit: bool = False
 
     @property
     def rank(self) -> int:
@@ -81,8 +86,8 @@ def waiting_views(count: int, settings: FitSettings) -> tuple[int, ...]:
 
 
 # ------------------------------------------------------------------ deciding
-def decide(trainer: Trainer) -> Choices:
-    """Judge what is open with the waiting views."""
+def decide(trainer: Trainer) -> tuple[Choices, Lamp | None]:
+    """Judge what is open with the waiting views; and the light, if what changes with the view tells it."""
     s, model = trainer.settings, trainer.model
     given = Choices(
         s.specular != "off",
@@ -92,18 +97,56 @@ def decide(trainer: Trainer) -> Choices:
         s.relief != "off",
         {},
     )
-    if not trainer.waiting:
-        why = "setting" if not open_questions(s) else f"fewer than {LEAST_VIEWS} views: nothing to judge by"
-        return replace(given, facts=_facts(given, s, why))
+    wanted = s.judges and s.light_from == "lobe" and s.specular != "off" and s.appearance == "hash"
+    why = "setting" if not open_questions(s) else f"fewer than {LEAST_VIEWS} views: nothing to judge by"
+    out = replace(given, facts=_facts(given, s, why))
+    if not trainer.waiting and not wanted:
+        return out, None
     shots = pictures(trainer.views)
     rays = _table(trainer).draw(RAYS, 0.0, SEED + s.seed).rays
-    found = evidence.trial(sight(model.geometry, shots, *surface_points(model.geometry, rays)), trainer.waiting, model)
-    if found is None:
-        return replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
-    out = _judge_colours(given, s, found, model)
-    if s.relief == AUTO and trainer.prior is not None:
-        out = _judge_relief(out, trainer, found, shots)
-    return out
+    seen = sight(model.geometry, shots, *surface_points(model.geometry, rays))
+    found = evidence.trial(seen, trainer.waiting, model) if trainer.waiting else None
+    gain = np.ones((len(trainer.views), 3))
+    if found is not None:
+        out = _judge_colours(given, s, found, model)
+        if out.calibrated:
+            gain = evidence.solve_response(found, out.light_order, gain=True).gain
+        if s.relief == AUTO and trainer.prior is not None:
+            out = _judge_relief(out, trainer, found, shots)
+    elif trainer.waiting:
+        out = replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
+    lamp = None
+    if wanted and out.specular:
+        lamp = light_from_lobe(seen, min(out.light_order, MOST_LAMP_ORDER), gain, model.spec.attenuation)
+    return _told(out, lamp), lamp
+
+
+def _told(c: Choices, lamp: Lamp | None) -> Choices:
+    """The choices with where the light came from."""
+    light: dict[str, str | float | bool] = {"from": "even skin"}
+    if lamp is not None:
+        told = {"explained": round(lamp.explained, 4), "band_0_over_band_1": round(lamp.ratio, 3)}
+        light = {"from": "what changes with the view", **told}
+    return replace(c, lit=lamp is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
+
+
+def light_up(model: FaceModel, lamp: Lamp) -> list[nn.Parameter]:
+    """Put the light into the model, and a lobe that is skin's usual one everywhere. Hands back what was overwritten."""
+    spatial, last = model.spatial, model.spatial.net[-1]
+    assert isinstance(last, nn.Linear) and isinstance(spatial, SpatialField)
+    with torch.no_grad():
+        model.light.coefficients.zero_()
+        model.light.coefficients[: len(lamp.coefficients)] = torch.from_numpy(lamp.coefficients).to(last.weight)[
+            :, None
+        ]
+    restart_lobe(last, START_RHO)
+    teach(model.basis)
+    return [*last.parameters(), *model.basis.parameters(), model.light.coefficients]
+
+
+def teach(basis: IntegratedBasis) -> None:
+    """Make the bases together reflect as rough skin does, where the strength is START_RHO and all c are 1."""
+    basis.learn(lambda cosine: torch.from_numpy(reflectance(cosine.cpu().numpy())).to(cosine) / START_RHO)
 
 
 def _table(trainer: Trainer) -> PixelTable:

@@ -24,6 +24,7 @@ from stages.inverse_rendering.choices import (
     EVIDENCE_AT,
     Choices,
     decide,
+    light_up,
     prior_surface,
     restored,
     take_over,
@@ -39,6 +40,7 @@ LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.
 BAND_EVERY = 250
 EVEN_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
 EVEN_LIGHT_RATE = 10.0  # times the light's rate
+LIT_RATE = 0.1  # times the light's rate once it is known from the lobe
 SETTLING = 0.03  # share of the fit after it in which the surface rests
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
@@ -136,7 +138,10 @@ class Trainer:
     def decide(self) -> None:
         """Find out what the scene requires, and leave out the rest."""
         assert self.table is not None
-        self.take(decide(self))
+        choices, lamp = decide(self)
+        self.take(choices)
+        for parameter in light_up(self.model, lamp) if lamp is not None else ():
+            self.optimiser.state.pop(parameter, None)
         self.table.wait(())
 
     def take(self, choices: Choices) -> None:
@@ -162,18 +167,23 @@ class Trainer:
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
 
-        Between `even_from` and `even_until` everything rests but the light, and the skin is even: the light, which
-        began as the same from everywhere, explains what it can of the shading that the albedo had taken up until then.
-        Any earlier, and a surface that is still the hull bends to the wrong shading.
+        Between `even_from` and `even_until` a light that the lobe has told (lamp.py) rests with the surface while the
+        skin takes up what it leaves; then it moves slowly. Where no lobe tells it, everything rests but the light, and
+        the skin is even: the light, which began as the same from everywhere, explains what it can of the shading that
+        the albedo had taken up until then. Any earlier, and a surface that is still the hull bends to the wrong shading.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
-        self.model.even = even = s.even_from <= p < s.even_until
+        interlude, lit = s.even_from <= p < s.even_until, self.choices is not None and self.choices.lit
+        self.model.even = interlude and not lit
         for group in self.optimiser.param_groups:
+            light = group["params"][0] is next(self.model.light.parameters())
             group["lr"] = group["start"] * decay * warm
-            if even:
-                group["lr"] *= EVEN_LIGHT_RATE if group["params"][0] is next(self.model.light.parameters()) else 0.0
+            if interlude and not lit:
+                group["lr"] *= EVEN_LIGHT_RATE if light else 0.0
+            elif lit and light:
+                group["lr"] *= 0.0 if interlude else LIT_RATE
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))

@@ -53,6 +53,7 @@ class FitSettings:
     appearance: str = "hash"
     shading: str = "neural"
     light: str = "sh"
+    light_from: str = "lobe"
     integral: str = "low_rank"
     basis_width: int = 64
     basis_depth: int = 2

@@ -47,6 +47,9 @@ class Config(StageConfig):
     light_order: Annotated[int, Field(ge=0, le=10)] | Literal["auto"] = Field(
         description="SH order of the light [NeuFace eq. 2]; auto: by evidence"
     )
+    light_from: Literal["lobe", "even"] = Field(
+        description="what tells the light in mid-fit: what changes with the view, in closed form; or even skin alone"
+    )
     attenuation: Literal["exponential", "exact", "phong"] = Field(
         description="of the light under the lobe [NeuFace eq. 11]"
     )

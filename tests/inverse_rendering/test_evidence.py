@@ -47,7 +47,7 @@ def trainer(ball: Ball, radius: float = RADIUS, **settings: Any) -> Trainer:
 
 
 def chosen(ball: Ball, radius: float = RADIUS, **settings: Any) -> Choices:
-    return decide(trainer(ball, radius, **settings))
+    return decide(trainer(ball, radius, **settings))[0]
 
 
 @pytest.fixture(scope="module")

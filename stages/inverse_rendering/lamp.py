@@ -1,0 +1,123 @@
+"""The light in closed form, from what changes with the view alone.
+
+    c_pv = D_p + w(n . wo) sum_lm A_l(1 / kappa) L_lm Y_lm(w_r)
+
+Symbols as in evidence.py; w(n . wo) = F0 A + B is what rough skin of index 1.42 reflects of an even light at that angle
+(split-sum table of a GGX lobe), so that L comes out in the photos' own units and no albedo enters: D_p is free for every
+point and drops out with its mean over the views. L_lm is then one linear least-squares problem. On two heads whose
+light is known its radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth and its level is within 3 %
+(docs/model.md), where a fit from even light ends at 0.6 to 0.8.
+
+What changes least with the view, band 0 against band 1, is told least well. So the bands from 1 on are scaled to the
+ratio for which the albedo pi D_p / E(n_p) is most even; their shape and band 0 stay.
+
+Differs: not in the paper, which learns light, albedo and lobe together from a white start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline.fields.appearance import SKIN_F0, TYPICAL_INV_KAPPA
+from pipeline.maths import sh
+from pipeline.maths.split_sum import alpha_from_inv_kappa, environment_brdf
+from pipeline.maths.vmf import ATTENUATIONS
+from stages.inverse_rendering.sightings import Sightings
+
+F64 = npt.NDArray[np.float64]
+RIDGE = 1e-3  # of the mean eigenvalue
+LEAST_VIEWS = 3  # of a point
+LEAST_POINTS = 200
+LEAST_EXPLAINED = 0.15  # of what changes with the view: less is noise, not a lobe under a light
+RATIOS = np.geomspace(0.3, 12, 70)  # |band 0| / |band 1|
+DARKEST = 0.02  # of the mean irradiance: no light leaves a side of the head darker
+LIT_SHARE = 0.9  # of the points that must be above that, and have a positive D
+
+
+@dataclass(frozen=True, slots=True)
+class Lamp:
+    """coefficients ((L + 1)^2,) of a white light in the photos' units; explained: share of the variance within points
+    that it accounts for; ratio: |band 0| / |band 1|."""
+
+    coefficients: F64
+    explained: float
+    ratio: float
+
+
+def reflectance(cosine: F64) -> F64:
+    """w(n . wo) (N,): share of an even light that skin's lobe sends to the eye, n . wo in [0, 1]."""
+    c = torch.from_numpy(np.asarray(cosine, np.float64))
+    alpha = alpha_from_inv_kappa(torch.full_like(c, TYPICAL_INV_KAPPA))
+    return np.asarray(
+        environment_brdf(torch.full((len(c), 1), SKIN_F0, dtype=c.dtype), c, alpha)[:, 0].numpy(), np.float64
+    )
+
+
+def light_from_lobe(seen: Sightings, order: int, gain: F64, attenuation: str) -> Lamp | None:
+    """The light up to `order` from sightings of any number of points; None where too little changes with the view.
+
+    gain: (V, 3) of each view's camera, 1 where all are alike.
+    """
+    counts = np.bincount(seen.point, minlength=len(seen.x))
+    often = counts >= LEAST_VIEWS
+    if order < 1 or often.sum() < LEAST_POINTS:
+        return None
+    keep = often[seen.point]
+    point, cosine = seen.point[keep], seen.cosine[keep]
+    colour = (seen.colour[keep] / gain[seen.view[keep]]).mean(1)
+    normal, wo = seen.normal[keep], seen.wo[keep]
+    mirror = 2 * cosine[:, None] * normal - wo
+    weight = reflectance(cosine)
+    f = _bands(mirror, order, attenuation) * weight[:, None]
+
+    def mean(values: F64) -> F64:
+        return np.bincount(point, values, len(counts)) / np.maximum(counts, 1)
+
+    inside = f - np.stack([mean(column) for column in f.T], -1)[point]
+    y = colour - mean(colour)[point]
+    gram = inside.T @ inside
+    gram += RIDGE * max(float(np.trace(gram)) / len(gram), 1e-300) * np.eye(len(gram))
+    b = np.linalg.solve(gram, inside.T @ y)
+    explained = 1 - float(((y - inside @ b) ** 2).sum() / max((y * y).sum(), 1e-300))
+    if explained < LEAST_EXPLAINED or b[0] <= 0:
+        return None
+    ratio = _evenest(seen, b, mean(colour), mean(f[:, 1:] @ b[1:]), mean(f[:, 0]), often)
+    if ratio is None:
+        return None
+    out = b.copy()
+    out[1:] *= b[0] / (ratio * max(float(np.linalg.norm(b[1:4])), 1e-300))
+    return Lamp(out, explained, ratio)
+
+
+def _bands(direction: F64, order: int, attenuation: str) -> F64:
+    """A_l Y_lm (M, (L + 1)^2) through the usual lobe."""
+    s = torch.full((1,), TYPICAL_INV_KAPPA, dtype=torch.float64)
+    falls = ATTENUATIONS[attenuation](s, order).numpy()[0]
+    widths = [2 * band + 1 for band in range(order + 1)]
+    return np.asarray(sh.sh_basis(torch.from_numpy(direction), order).numpy() * np.repeat(falls, widths), np.float64)
+
+
+def _evenest(seen: Sightings, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]) -> float | None:
+    """|band 0| / |band 1| with the least spread of ln albedo. total, glow, even (P,): means over the views of the
+    colour, of the lobe's bands from 1 on, and of its band 0 per unit of L_00."""
+    light = np.zeros((len(b), 3))
+    light[1:] = b[1:, None]
+    sides = sh.irradiance(torch.from_numpy(light), seen.n.detach().cpu().double()).numpy()[:, 0]
+    first = float(np.linalg.norm(b[1:4]))
+    best, found = np.inf, None
+    for ratio in RATIOS:
+        level = b[0] / (ratio * first) if first > 0 else 1.0  # bands from 1 on are scaled to the ratio, band 0 stays
+        mean = float(np.pi * b[0] / np.sqrt(4 * np.pi))
+        e, d = mean + level * sides, total - level * glow - even * b[0]
+        good = often & (e > DARKEST * mean) & (d > 0)
+        if good.sum() < LIT_SHARE * often.sum():
+            continue
+        log = np.log(d[good] / e[good])
+        spread = float(np.abs(log - np.median(log)).mean())
+        if spread < best:
+            best, found = spread, float(ratio)
+    return found
