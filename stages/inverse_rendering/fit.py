@@ -170,7 +170,7 @@ class Trainer:
         Between `even_from` and `even_until` a light that the lobe has told (lamp.py) rests with the surface while the
         skin takes up what it leaves; then it moves slowly. Where no lobe tells it, everything rests but the light, and
         the skin is even: the light, which began as the same from everywhere, explains what it can of the shading that
-        the albedo had taken up until then. Any earlier, and a surface that is still the hull bends to the wrong shading.
+        the albedo had taken up until then. Any earlier, and a surface that is still the hull bends to what is wrong.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)

@@ -2,11 +2,11 @@
 
     c_pv = D_p + w(n . wo) sum_lm A_l(1 / kappa) L_lm Y_lm(w_r)
 
-Symbols as in evidence.py; w(n . wo) = F0 A + B is what rough skin of index 1.42 reflects of an even light at that angle
-(split-sum table of a GGX lobe), so that L comes out in the photos' own units and no albedo enters: D_p is free for every
-point and drops out with its mean over the views. L_lm is then one linear least-squares problem. On two heads whose
-light is known its radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth and its level is within 3 %
-(docs/model.md), where a fit from even light ends at 0.6 to 0.8.
+Symbols as in evidence.py; w(n . wo) = F0 A + B is what rough skin of index 1.42 reflects of an even light at that
+angle (split-sum table of a GGX lobe), so that L comes out in the photos' own units and no albedo enters: D_p is free
+for every point and drops out with its mean over the views. L_lm is then one linear least-squares problem. On two heads
+whose light is known its radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth, and its level
+is within 3 % (docs/model.md), where a fit from even light ends at 0.6 to 0.8.
 
 What changes least with the view, band 0 against band 1, is told least well. So the bands from 1 on are scaled to the
 ratio for which the albedo pi D_p / E(n_p) is most even; their shape and band 0 stay.
