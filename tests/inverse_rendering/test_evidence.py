@@ -126,7 +126,7 @@ def test_bases_stay_where_noise_hides_what_they_do() -> None:
     even, noise = gloss(4, 0.25), np.random.default_rng(0)
 
     def grainy(n: F64, wo: F64) -> F64:
-        return even(n, wo) + noise.normal(0, 0.3, len(n))
+        return even(n, wo) + noise.normal(0, 0.9, len(n))
 
     got = chosen(Ball(grainy))
     assert got.specular and got.rank == 3 and "too large" in str(got.facts["rank"]["why"])

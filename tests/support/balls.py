@@ -14,6 +14,7 @@ from pipeline import transforms
 from pipeline.maths import sh
 from pipeline.transforms import F64
 from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.lamp import reflectance
 from stages.inverse_rendering.views import PhotoView
 
 RADIUS, SIDE, FOCAL, DISTANCE = 0.1, 96, 170.0, 0.5
@@ -74,12 +75,15 @@ def _photos(ball: Ball) -> tuple[PhotoView, ...]:
 
 
 def gloss(band: int, strength: float = 0.1) -> Callable[[F64, F64], F64]:
-    """A lobe under a light of bands 0 and `band` alone: strength (1 + 0.7 Y_band,1(w_r) / max)."""
+    """A lobe of skin under a light of bands 0 and `band` alone: strength (1 + 0.7 Y_band,1(w_r) / max), and stronger
+    towards grazing angles as rough dielectrics are."""
 
     def lobe(n: F64, wo: F64) -> F64:
-        mirror = 2 * (n * wo).sum(1, keepdims=True) * n - wo
+        cosine = (n * wo).sum(1)
+        mirror = 2 * cosine[:, None] * n - wo
+        rim = reflectance(cosine.clip(0, 1)) / reflectance(np.ones(1))
         y = sh.sh_basis(torch.from_numpy(mirror), max(band, 1))[:, band * (band + 1) + 1].numpy()
-        return np.asarray(strength * (1 + 0.7 * y / math.sqrt((2 * band + 1) / (4 * math.pi))), np.float64)
+        return np.asarray(rim * strength * (1 + 0.7 * y / math.sqrt((2 * band + 1) / (4 * math.pi))), np.float64)
 
     return lobe
 
