@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -249,7 +249,12 @@ class Trainer:
         """The parts of the loss. With bfloat16 the networks' products are short; the maths holds its own precision."""
         kind, short = torch.device(self.device).type, self.settings.precision == "bfloat16"
         with torch.autocast(kind, torch.bfloat16, enabled=short):
-            return terms(self.model, batch, self.settings, generator, 1.0 - 0.8 * self.share())
+            return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
+
+    def weights(self) -> FitSettings:
+        """The settings; once the light is known, even skin is asked for no longer: it would drive paint into the lobe."""
+        lit = self.choices is not None and self.choices.lit
+        return replace(self.settings, parsimony=0.0) if lit else self.settings
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients that the optimiser does not know of are finite."""
