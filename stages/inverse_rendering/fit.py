@@ -252,7 +252,7 @@ class Trainer:
             return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
 
     def weights(self) -> FitSettings:
-        """The settings; once the light is known, even skin is asked for no longer: it would drive paint into the lobe."""
+        """The settings; once the light is known, skin need not be even: that would drive paint into the lobe."""
         lit = self.choices is not None and self.choices.lit
         return replace(self.settings, parsimony=0.0) if lit else self.settings
 
