@@ -18,8 +18,7 @@ from pipeline.errors import StageError, UsageError
 from tests.support.toy_stages import TOYS, source
 from workflows import adapter, batch_prefect, flows
 from workflows.alone import alone
-from workflows.batch import Summary
-from workflows.batch_ledger import Entry
+from workflows.batch_ledger import Entry, Summary
 from workflows.batch_prefect import Pool
 from workflows.batch_request import BatchRequest
 from workflows.plan import RunRequest, make_plan
