@@ -162,16 +162,23 @@ def test_no_secret_is_written_down(repo: Path) -> None:
             assert allowed, line
 
 
-def test_compose_deploys_what_prefect_yaml_has(compose: dict[str, Any], repo: Path) -> None:
+def test_compose_and_the_documented_commands_deploy_what_prefect_yaml_has(compose: dict[str, Any], repo: Path) -> None:
     deployed = yaml.safe_load((repo / "workflows/prefect.yaml").read_text())["deployments"]
     names = {(d["entrypoint"], d["name"]): d["work_pool"]["name"] for d in deployed}
-    assert len(names) == 6
     command = compose["services"]["deploy"]["command"][2]
-    for (_, name), pool in names.items():
-        if name.endswith("local"):
-            assert f"work-pool create {pool} " in command
+    local = {n for _, n in names if n.endswith("local")}
+    assert set(re.findall(r"-n (\S+)", command)) == local  # by name: Prefect's `*local` does not match `local`
+    assert [pool for (_, n), pool in names.items() if n in local and f"work-pool create {pool} " not in command] == []
     for service, flow, name in (
         ("worker", "capture_to_asset", "local"),
         ("batch-worker", "facescape_batch", "batch-local"),
     ):
         assert compose["services"][service]["command"][4] == names[f"workflows.flows.{flow}", name]
+    lines = [x for x in (repo / "docs/operations.md").read_text().splitlines() if "prefect --no-prompt deploy" in x]
+    told = [set(re.findall(r"-n (\S+)", line)) for line in lines]
+    assert sorted(n for names in told for n in names) == sorted(n for _, n in names) and len(names) == 6
+
+
+def test_the_server_has_its_page_though_its_root_is_read_only(compose: dict[str, Any]) -> None:
+    place = compose["services"]["server"]["environment"]["PREFECT_SERVER_UI_STATIC_DIRECTORY"]
+    assert place.startswith("/tmp/")

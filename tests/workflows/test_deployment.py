@@ -70,7 +70,8 @@ def test_deployment_run_on_a_server_with_a_worker(
         for kind, end in (("process", ""), ("docker", "-docker"), ("kubernetes", "-kubernetes")):
             for pool in ("heads", "batches"):
                 call(environment, "work-pool", "create", f"{pool}{end}", "--type", kind, cwd=repo)
-        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        names = [x for end in ("local", "docker", "kubernetes") for x in ("-n", end, "-n", f"batch-{end}")]
+        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", *names, cwd=repo)
         deployed = {d["name"]: d for d in ask(url, "/deployments/filter", {})}
         with running(
             environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
@@ -107,6 +108,8 @@ def test_deployment_run_on_a_server_with_a_worker(
     ends = ("local", "docker", "kubernetes")
     assert set(deployed) == {*ends, *(f"batch-{e}" for e in ends)}
     for name, deployment in deployed.items():
+        steps = deployment["pull_steps"]  # no folder of the machine that deployed: others do not have it
+        assert steps == [{"prefect.deployments.steps.set_working_directory": {"directory": "/tmp"}}]
         fields = deployment["parameter_openapi_schema"]["properties"]
         model = BatchRequest if name.startswith("batch-") else RunRequest
         assert list(fields) == list(model.model_fields)
@@ -146,7 +149,7 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
         assert json.loads((tmp_path / "out/batch/summary.json").read_text())["counts"]["done"] == 1
         runs = ask(url, "/flow_runs/filter", {})
         assert [r["state_type"] for r in runs] == ["COMPLETED"] * 2, (tmp_path / "log").read_text()
-        assert len([r for r in runs if r["idempotency_key"].startswith("neuface-")]) == 1
+        assert len([r for r in runs if (r["idempotency_key"] or "").startswith("neuface-")]) == 1
         os.kill(child.pid, signal.SIGINT)
         assert child.wait(60) == 0, (tmp_path / "log").read_text()
         with pytest.raises(OSError):
