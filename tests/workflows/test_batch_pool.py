@@ -11,10 +11,13 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pipeline.artifacts import sha256_of
 from tests.support.facescape_tree import write_heads, write_tree
 from tests.support.servers import (
     PREFECT,
@@ -50,6 +53,25 @@ def counts(tally: Path) -> Counter[str]:
 def in_mid_stage(store: Path) -> bool:
     """Whether a stage wrote a checkpoint just now."""
     return any(time.time() - p.stat().st_mtime < 1 for p in store.glob(IN_MID_STAGE))
+
+
+def damaged(store: Path) -> list[Path]:
+    """Files of finished artifacts that are not what their manifests say."""
+    found = []
+    for manifest in store.glob("*/*/manifest.json"):
+        for path, digest in hashes(json.loads(manifest.read_text())):
+            if sha256_of(manifest.parent / path) != digest:
+                found.append(manifest.parent / path)
+    return found
+
+
+def hashes(content: Any) -> Iterator[tuple[str, str]]:
+    """(path, sha256) of every file that a manifest names."""
+    if isinstance(content, dict) and {"path", "sha256"} <= content.keys():
+        yield content["path"], content["sha256"]
+    elif isinstance(content, dict | list):
+        for value in content.values() if isinstance(content, dict) else content:
+            yield from hashes(value)
 
 
 def by_stage(tally: Counter[str]) -> Counter[str]:
@@ -124,6 +146,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
     assert failed["name"] == "2/1_neutral" and PHOTO in failed["fault"]
     assert "2/1_neutral: trying again" not in said and said.count("2/1_neutral: FAILED") == failed["attempts"]
     assert len(list((tmp_path / "out").glob("*/*/asset/*.usd"))) == 5
+    assert len(list(store.glob("*/*/manifest.json"))) == 5 * STAGES and damaged(store) == []
     assert max(c["attempts"] for c in summary["captures"]) >= 2, "the killed worker's capture was tried again"
     assert all(r["idempotency_key"].startswith("neuface-") for r in runs)
     assert len(runs) == sum(c["attempts"] for c in summary["captures"]), "the batch that was killed joined its runs"
