@@ -43,7 +43,7 @@ SETTINGS = {
 SETS = [x for k, v in SETTINGS.items() for x in ("--set", f"{k}={v}")]
 IN_MID_STAGE = "inverse_rendering/*.scratch/checkpoint.pt" if REAL else "work/*.scratch/step.txt"
 PHOTO = "1.png" if REAL else "1.jpg"  # the one that is cut off
-PATIENCE = 1500 if REAL else 240  # seconds
+PATIENCE = 1500 if REAL else 480  # seconds
 
 
 def counts(tally: Path) -> Counter[str]:
@@ -114,7 +114,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
         workers = [Process(environment, tmp_path / f"worker{i}.log", tmp_path, PREFECT, "worker", "start", "--pool",
                            "heads", "--name", f"w{i}", "--limit", 1) for i in (1, 2)]  # fmt: skip
         batch = Process(environment, tmp_path / "batch.log", tmp_path, sys.executable, TOY, "batch", tree, "--out",
-                        tmp_path / "out", "--server", "--lost-after", "6s", "--priority", "high", "--gpus", "2",
+                        tmp_path / "out", "--server", "--lost-after", "10s", "--priority", "high", "--gpus", "2",
                         *SETS)  # fmt: skip
         with server:
             wait_healthy(url)
