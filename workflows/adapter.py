@@ -30,10 +30,11 @@ from pipeline.store import MANIFEST
 from workflows.plan import Plan
 from workflows.runner import RunStage
 from workflows.session import current
+from workflows.slots import slot
+from workflows.watchdog import time_limit
 
 log = logging.getLogger(__name__)
 FIT = "inverse_rendering"  # the stage that a GPU is for
-LEASE = 600.0  # seconds until the slot of a dead process is free again; a server may restart within it
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
 
 
@@ -81,7 +82,7 @@ def _execute(work: _Sealed) -> Done[Any]:
             shown(done, total, message, figures)
 
     plan = work.plan
-    with _slot(work):
+    with _slot(work), time_limit(work.stage.name, plan.request.stage_limit, watch.late):  # a wait for a slot is no hang
         done = execute(
             work.stage,
             work.inputs,
@@ -101,22 +102,18 @@ def _execute(work: _Sealed) -> Done[Any]:
 
 @contextmanager
 def _slot(work: _Sealed) -> Iterator[None]:
-    """Hold a slot of the limit that the request names while the fit runs; a fit that the store has needs none.
-
-    Strict: a limit that does not exist would otherwise mean no limit. A lease that can't be renewed because the server
-    is away does not end the fit: hours of work weigh more than two fits on one GPU for a while.
-    """
-    limit, stage, plan = work.plan.request.fit_slots, work.stage, work.plan
-    if limit is None or stage.name != FIT:
+    """Hold a slot of the limit that the request names while the fit runs; a fit that the store has needs none."""
+    limit = work.plan.request.fit_slots
+    if limit is None or work.stage.name != FIT or _is_stored(work):
         yield
         return
-    if (plan.store.folder(stage.name, key(stage, work.inputs, work.config)) / MANIFEST).is_file():
+    with slot(limit, current().stopped):
         yield
-        return
-    from prefect.concurrency.sync import concurrency
 
-    with concurrency(limit, strict=True, lease_duration=LEASE, raise_on_lease_renewal_failure=False):
-        yield
+
+def _is_stored(work: _Sealed) -> bool:
+    folder = work.plan.store.folder(work.stage.name, key(work.stage, work.inputs, work.config))
+    return (folder / MANIFEST).is_file()
 
 
 class _Published:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +19,8 @@ from workflows import batch_captures
 from workflows.alone import alone
 from workflows.batch_captures import Item
 from workflows.batch_faults import Fault, back_off, smaller
-from workflows.batch_ledger import Entry, Ledger, fingerprint
+from workflows.batch_ledger import Entry, Ledger, Summary, fingerprint
+from workflows.batch_page import write_page
 from workflows.batch_request import BatchRequest
 from workflows.folders import writable
 from workflows.plan import RunRequest, check_settings
@@ -63,28 +64,6 @@ class Work:
     not_before: float = 0.0
 
 
-@dataclass(slots=True)
-class Summary:
-    """The end of a batch."""
-
-    entries: list[Entry] = field(default_factory=list)
-    held: Fault | None = None  # why captures were left waiting
-
-    @property
-    def total(self) -> int:
-        """Captures asked for."""
-        return len(self.entries)
-
-    @property
-    def failed(self) -> int:
-        """Captures that have no asset, for whatever reason."""
-        return sum(e.state != "done" for e in self.entries)
-
-    def counts(self) -> dict[str, int]:
-        """Captures by state."""
-        return {s: sum(e.state == s for e in self.entries) for s in ("done", "failed", "submitted", "waiting")}
-
-
 def run_batch(
     request: BatchRequest,
     runner: Runner,
@@ -97,8 +76,6 @@ def run_batch(
     Raises:
         StageError: no captures, folders that can't be written. UsageError: a wrong request. Cancelled: Ctrl-C.
     """
-    from workflows.batch_page import write_page
-
     items = batch_captures.find(Path(request.root), request.subjects, request.expressions)
     out, store, ledger = Path(request.out).absolute(), request.store_path, Ledger(request.folder)
     _not_inside(out, Path(request.root))

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import uuid
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +39,28 @@ class Entry(BaseModel):
     fault: Fault | None = None
     earlier: tuple[Fault, ...] = ()
     asset: RelativePath | None = None
+
+
+@dataclass(slots=True)
+class Summary:
+    """The end of a batch."""
+
+    entries: list[Entry] = field(default_factory=list)
+    held: Fault | None = None  # why captures were left waiting
+
+    @property
+    def total(self) -> int:
+        """Captures asked for."""
+        return len(self.entries)
+
+    @property
+    def failed(self) -> int:
+        """Captures that have no asset, for whatever reason."""
+        return sum(e.state != "done" for e in self.entries)
+
+    def counts(self) -> dict[str, int]:
+        """Captures by state."""
+        return {s: sum(e.state == s for e in self.entries) for s in ("done", "failed", "submitted", "waiting")}
 
 
 class Ledger:

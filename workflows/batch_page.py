@@ -16,9 +16,8 @@ from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined, Template
 
-from workflows.batch import Summary
 from workflows.batch_captures import natural
-from workflows.batch_ledger import Entry
+from workflows.batch_ledger import Entry, Summary
 from workflows.batch_request import BatchRequest
 
 # figure -> where run.json or metrics.json has it

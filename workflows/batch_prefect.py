@@ -30,6 +30,7 @@ from workflows.batch import Ended
 from workflows.batch_faults import Fault, fault_in
 from workflows.batch_ledger import Entry, idempotency_key
 from workflows.batch_request import PRIORITIES, BatchRequest
+from workflows.environment import SLOTS_ON_DISK
 from workflows.plan import RunRequest, make_plan
 
 log = logging.getLogger(__name__)
@@ -163,6 +164,13 @@ class Pool:
 
     def _limit(self, name: str, slots: int) -> None:
         self._patiently(lambda c: c.upsert_global_concurrency_limit_by_name(name, slots))
+        if self._patiently(_forgets_slots):
+            log.warning(
+                "the server keeps in its memory who holds a slot of %s: should it restart, slots in use stay taken. "
+                "Start it with %s=%s",
+                name,
+                *SLOTS_ON_DISK,
+            )
 
     def _patiently(self, ask: Callable[[SyncPrefectClient], T]) -> T:
         """Ask the server; while it is away (restarting, say), ask again."""
@@ -182,6 +190,13 @@ class Pool:
 
 def _runs_among(some: FlowRunFilter, client: SyncPrefectClient) -> list[FlowRun]:
     return client.read_flow_runs(flow_run_filter=some, limit=AT_A_TIME)
+
+
+def _forgets_slots(client: SyncPrefectClient) -> bool:
+    """Whether a restart of the server loses slots of global limits for good."""
+    settings: Any = client.request("GET", "/admin/settings").json()
+    storage = settings.get("server", {}).get("concurrency", {}).get("lease_storage", "")
+    return str(storage).endswith(".memory")
 
 
 def _crash(run: _Run, message: str, now: float) -> Fault:

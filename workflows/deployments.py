@@ -53,6 +53,7 @@ def _server(host: str, port: int, home: Path) -> Iterator[None]:
     """A Prefect server as a child. It listens on this machine alone unless another address is asked for."""
     home.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("PREFECT_HOME", str(home))
+    os.environ.setdefault(*environment.SLOTS_ON_DISK)
     command = [sys.executable, "-m", "prefect", "server", "start", "--host", host, "--port", str(port)]
     log = home / "server.log"
     with log.open("ab") as stream, deaf_children():

@@ -16,6 +16,8 @@ OFFLINE = {
     "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
     "PREFECT_CLI_PROMPT": "false",
 }
+# Of a server: who holds a slot of a global limit. In memory, the default, a restart forgets it: the slot stays taken.
+SLOTS_ON_DISK = ("PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE", "prefect.server.concurrency.lease_storage.filesystem")
 
 
 def defaults() -> None:

@@ -39,8 +39,7 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
-        with time_limit(stage.name, plan.request.stage_limit, watch.late):
-            result = run_stage(stage, inputs, config)
+        result = run_stage(stage, inputs, config)
         watch.observer.finished(result)
         finished[stage.name] = result.located
         done.append(result)
@@ -64,14 +63,15 @@ def run_here(plan: Plan) -> RunStage:
 
     def run_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> Done[Any]:
         watch = current()
-        return execute(
-            stage,
-            inputs,
-            config,
-            plan.store,
-            device=plan.device,
-            progress=watch.observer.progress,
-            cancelled=watch.stopped,
-        )
+        with time_limit(stage.name, plan.request.stage_limit, watch.late):
+            return execute(
+                stage,
+                inputs,
+                config,
+                plan.store,
+                device=plan.device,
+                progress=watch.observer.progress,
+                cancelled=watch.stopped,
+            )
 
     return run_stage

@@ -209,12 +209,14 @@ def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
 def _image_fault(resolved: str) -> str:
     import numpy as np
 
-    from pipeline.images import read_encoded, read_exr
+    from pipeline.images import MAX_BYTES, read_encoded, read_exr
 
     member = re.fullmatch(r"(.*\.usdz)\[(.*)\]", resolved)
     try:
         if member:
             with zipfile.ZipFile(member[1]) as z, tempfile.TemporaryDirectory() as scratch:
+                if z.getinfo(member[2]).file_size > MAX_BYTES:  # a package from outside may hold a bomb
+                    return f"is larger than {MAX_BYTES / 1e9:.0f} GB"
                 copy = Path(scratch) / Path(member[2]).name
                 copy.write_bytes(z.read(member[2]))
                 return _image_fault(str(copy))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+import zipfile
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +13,10 @@ import pytest
 import torch
 
 from pipeline.artifacts import FileRef
+from pipeline.images import MAX_BYTES
+from stages.capture.scan import scan_capture
+from stages.usd.validate import _image_fault
+from tests.support.facescape_tree import write_tree
 
 SOURCES = [p for top in ("pipeline", "stages", "workflows") for p in sorted(Path(top).rglob("*.py"))]
 
@@ -44,6 +50,7 @@ def test_no_code_from_data(repo: Path) -> None:
               "torch.hub.load", "shutil.unpack_archive", "tarfile.open")  # fmt: skip
     assert [(at, name) for at, name, _ in calls(repo) if name in banned] == []
     assert [at for at, _, c in calls(repo) if keyword_is_true(c, "shell")] == []
+    assert [at for at, name, _ in calls(repo) if name.endswith(".extractall")] == []  # archives are read, not unpacked
 
 
 def keyword_is_true(call: ast.Call, name: str) -> bool:
@@ -67,6 +74,31 @@ def test_a_checkpoint_that_would_run_code_is_refused(tmp_path: Path) -> None:
 def test_paths_in_manifests_stay_in_their_folder(path: str) -> None:
     with pytest.raises(ValueError):
         FileRef(path=path, sha256="0" * 64, size=1)
+
+
+def test_names_in_params_json_stay_in_their_folder(tmp_path: Path) -> None:
+    """Views are numbers, and photos are found by listing the folder: no word of the file ever becomes a path."""
+    write_tree(tmp_path, {"1/1_neutral": True})
+    folder, secret = tmp_path / "1/1_neutral", tmp_path / "secret.jpg"
+    secret.write_bytes((folder / "0.jpg").read_bytes())
+    params = json.loads((folder / "params.json").read_text())
+    params |= {f"../../secret_{k.partition('_')[2]}": v for k, v in params.items() if k.startswith("0_")}
+    params |= {"0_ori": "../../secret.jpg", "0_sn": "../../secret", "1_ori": str(secret)}
+    (folder / "params.json").write_text(json.dumps(params))
+    scanned = scan_capture(folder).artifact
+    assert [p.path for p in scanned.photos] == ["0.jpg", "1.jpg", "2.jpg"]
+    assert "secret" not in scanned.model_dump_json()
+
+
+def test_a_member_of_an_archive_lands_nowhere_else_and_bombs_are_not_unpacked(tmp_path: Path) -> None:
+    package, mark = tmp_path / "x.usdz", tmp_path / "mark"
+    with zipfile.ZipFile(package, "w") as z:
+        z.writestr(f"../../../../../../{mark}.png", b"no picture")
+        z.writestr("/bomb.png", b"")
+        z.getinfo("/bomb.png").file_size = MAX_BYTES + 1  # what its header would declare
+    assert _image_fault(f"{package}[../../../../../../{mark}.png]")
+    assert list(tmp_path.iterdir()) == [package]
+    assert "larger than 4 GB" in _image_fault(f"{package}[/bomb.png]")
 
 
 def test_servers_listen_on_this_machine_unless_asked(repo: Path) -> None:

@@ -1,16 +1,33 @@
-"""The container files, as far as they can be checked without an engine: what they promise, and that they add up."""
+"""The container files without an engine: what they promise, and that they add up. docs/operations.md says what was
+built and started."""
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-INSTRUCTIONS = {"ARG", "FROM", "ENV", "RUN", "WORKDIR", "COPY", "USER", "VOLUME", "ENTRYPOINT", "CMD"}
+from workflows.environment import SLOTS_ON_DISK
+
+INSTRUCTIONS = {
+    "ARG",
+    "FROM",
+    "ENV",
+    "RUN",
+    "WORKDIR",
+    "COPY",
+    "USER",
+    "VOLUME",
+    "CMD",
+}  # no ENTRYPOINT: pools start theirs
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +87,50 @@ def test_what_runs_has_no_root_no_compiler_and_no_package_manager_leftovers(step
     assert "gcc" not in installs and "pip" not in installs and "rm -rf /var/lib/apt/lists" in installs
 
 
+@pytest.mark.skipif(shutil.which("hadolint") is None, reason="hadolint is not installed")
+def test_the_linter_of_dockerfiles_has_nothing_to_say(repo: Path) -> None:
+    done = subprocess.run(["hadolint", repo / "docker/Dockerfile"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@pytest.mark.skipif(shutil.which("docker-compose") is None, reason="docker-compose is not installed")
+def test_compose_reads_its_file_and_asks_for_the_password(repo: Path) -> None:
+    command = ["docker-compose", "-f", repo / "docker/compose.yaml", "config"]
+    environment = {k: v for k, v in os.environ.items() if k != "POSTGRES_PASSWORD"}
+    without = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert without.returncode != 0 and "set it in the environment" in without.stderr
+    done = subprocess.run(command, env={**environment, "POSTGRES_PASSWORD": "x"}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert set(yaml.safe_load(done.stdout)["services"]) == {"database", "server", "deploy", "worker", "batch-worker"}
+
+
+@pytest.mark.skipif(shutil.which("jq") is None, reason="jq is not installed")
+def test_a_job_of_a_cluster_mounts_what_prefect_yaml_says_and_has_no_root(repo: Path) -> None:
+    container = {"name": "prefect-job", "image": "{{ image }}", "args": "{{ command }}"}
+    base = {"job_configuration": {"job_manifest": {"spec": {"template": {"spec": {"containers": [container]}}}}}}
+    done = subprocess.run(["jq", "-f", repo / "docker/kubernetes-pool.jq"], input=json.dumps(base), check=True,
+                          capture_output=True, text=True)  # fmt: skip
+    pod = json.loads(done.stdout)["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
+    made = pod["containers"][0]
+    assert made.items() >= container.items()
+    assert {m["name"]: m["mountPath"] for m in made["volumeMounts"]} == {
+        "photos": "/photos",
+        "runs": "/runs",
+        "tmp": "/tmp",
+    }
+    assert {v["name"] for v in pod["volumes"]} == {"photos", "runs", "tmp"}
+    assert pod["securityContext"]["runAsNonRoot"] and pod["securityContext"]["runAsUser"] == 10001
+    assert made["securityContext"]["readOnlyRootFilesystem"] and not made["securityContext"]["allowPrivilegeEscalation"]
+
+
+def test_a_restart_forgets_no_slot(compose: dict[str, Any]) -> None:
+    server = compose["services"]["server"]
+    name, value = SLOTS_ON_DISK
+    assert server["environment"][name] == value
+    home = server["environment"]["PREFECT_HOME"]
+    assert home in [v.split(":")[1] for v in server["volumes"]] and not home.startswith("/tmp")
+
+
 def test_every_service_is_pinned_hardened_and_watched(compose: dict[str, Any]) -> None:
     for name, service in compose["services"].items():
         tag = service["image"].partition(":")[2]
@@ -101,12 +162,23 @@ def test_no_secret_is_written_down(repo: Path) -> None:
             assert allowed, line
 
 
-def test_compose_deploys_what_prefect_yaml_has(compose: dict[str, Any], repo: Path) -> None:
+def test_compose_and_the_documented_commands_deploy_what_prefect_yaml_has(compose: dict[str, Any], repo: Path) -> None:
     deployed = yaml.safe_load((repo / "workflows/prefect.yaml").read_text())["deployments"]
     names = {(d["entrypoint"], d["name"]): d["work_pool"]["name"] for d in deployed}
-    assert len(names) == 6
-    command = compose["services"]["deploy"]["command"][0]
-    for (_, name), pool in names.items():
-        if name.endswith("local"):
-            assert f"work-pool create {pool} " in command
-    assert compose["services"]["worker"]["entrypoint"][4] == names["workflows.flows.capture_to_asset", "local"]
+    command = compose["services"]["deploy"]["command"][2]
+    local = {n for _, n in names if n.endswith("local")}
+    assert set(re.findall(r"-n (\S+)", command)) == local  # by name: Prefect's `*local` does not match `local`
+    assert [pool for (_, n), pool in names.items() if n in local and f"work-pool create {pool} " not in command] == []
+    for service, flow, name in (
+        ("worker", "capture_to_asset", "local"),
+        ("batch-worker", "facescape_batch", "batch-local"),
+    ):
+        assert compose["services"][service]["command"][4] == names[f"workflows.flows.{flow}", name]
+    lines = [x for x in (repo / "docs/operations.md").read_text().splitlines() if "prefect --no-prompt deploy" in x]
+    told = [set(re.findall(r"-n (\S+)", line)) for line in lines]
+    assert sorted(n for names in told for n in names) == sorted(n for _, n in names) and len(names) == 6
+
+
+def test_the_server_has_its_page_though_its_root_is_read_only(compose: dict[str, Any]) -> None:
+    place = compose["services"]["server"]["environment"]["PREFECT_SERVER_UI_STATIC_DIRECTORY"]
+    assert place.startswith("/tmp/")

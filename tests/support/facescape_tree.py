@@ -9,6 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.demo.capture import write_demo_capture
+
 
 def write_tree(root: Path, captures: dict[str, bool], side: int = 64) -> None:
     """FaceScape's layout: ID/EXPRESSION/params.json and three photos; False: one photo is cut off."""
@@ -35,3 +37,12 @@ def write_tree(root: Path, captures: dict[str, bool], side: int = 64) -> None:
                 f"{view}_sn": "1",
             }
         (folder / "params.json").write_text(json.dumps(params))
+
+
+def write_heads(root: Path, captures: dict[str, bool], side: int = 72) -> None:
+    """The same layout with heads that can be fitted, nine small photos of each; False: one photo is cut off."""
+    for seed, (name, whole) in enumerate(captures.items()):
+        write_demo_capture(root / name, views=9, size=side, samples=4, mesh_step=0.004, seed=seed)
+        photo = root / name / "1.png"
+        if not whole:
+            photo.write_bytes(photo.read_bytes()[: photo.stat().st_size // 2])

@@ -1,7 +1,8 @@
 """A batch whose stages are the real capture, a toy that works in steps with checkpoints, and a toy asset.
 
 As a module it offers the flow to a Prefect worker; as a program it is `neuface` (or, with --child, one capture's
-process) with these stages. Every stage that comes to its end adds a line to the file $NEUFACE_TALLY.
+process) with these stages; with NEUFACE_REAL_STAGES in the environment, with all the real ones. Every stage that comes
+to its end adds a line, its name and its key, to the file $NEUFACE_TALLY.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import ctypes
 import os
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
 from pipeline.contract import Context, Stage, StageConfig
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
-from workflows import batch_local
+from workflows import adapter, batch_local
 
 
 class Worked(Artifact):
@@ -48,19 +49,6 @@ class UsdConfig(StageConfig):
     name: str = "head"
 
 
-def tally(stage: str, inputs: str) -> None:
-    path = os.environ.get("NEUFACE_TALLY")
-    if path:
-        with Path(path).open("a") as f:
-            f.write(f"{stage} {inputs}\n")
-
-
-def run_capture(inputs: Any, config: Any, context: Context) -> Capture:
-    made = CAPTURE.run(inputs, config, context)
-    tally("capture", inputs.source.artifact.digest()[:16])
-    return made
-
-
 def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked:
     """As many steps as asked, a checkpoint after each; ends as its setting says."""
     checkpoint = context.scratch / "step.txt"
@@ -83,7 +71,6 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         (context.scratch / "killed").write_text("")
         os.kill(os.getpid(), 9)
     (context.workdir / "w.bin").write_bytes(inputs.capture.artifact.digest().encode() * 1000)
-    tally("work", inputs.capture.artifact.digest()[:16])
     return Worked(file=context.file("w.bin"))
 
 
@@ -92,16 +79,34 @@ def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
     root = context.workdir / "asset" / f"{config.name}.usd"
     root.parent.mkdir()
     root.write_text(f'#usda 1.0\ndef "x" {{}} # {inputs.work.artifact.file.sha256}\n')
-    tally("usd", inputs.work.artifact.digest()[:16])
     return UsdAsset(name=config.name, root=f"asset/{config.name}.usd", files=(context.file(root),), checks=0)
 
 
 TOYS: tuple[Stage[Any, Any, Any], ...] = (
-    Stage("capture", CAPTURE.version, CAPTURE.inputs, CAPTURE.config, Capture, run_capture),
+    CAPTURE,
     Stage("work", 1, WorkInputs, WorkConfig, Worked, run_work),
     Stage("usd", 1, UsdInputs, UsdConfig, UsdAsset, run_usd),
 )
-registry.REGISTRY = TOYS
+
+
+def counted(stage: Stage[Any, Any, Any]) -> Stage[Any, Any, Any]:
+    """The stage, with a line in the tally for each time that it comes to its end."""
+
+    def run(inputs: Any, config: Any, context: Context) -> Artifact:
+        made: Artifact = stage.run(inputs, config, context)
+        path = os.environ.get("NEUFACE_TALLY")
+        if path:
+            with Path(path).open("a") as f:
+                f.write(f"{stage.name} {context.workdir.name.partition('.')[0]}\n")
+        return made
+
+    return replace(stage, run=run)
+
+
+REAL = bool(os.environ.get("NEUFACE_REAL_STAGES"))
+if not REAL:
+    adapter.FIT = "work"  # what holds a slot of the pool's GPUs
+registry.REGISTRY = tuple(counted(s) for s in (registry.REGISTRY if REAL else TOYS))
 batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
 
 

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import Cancelled, DiskError, StageError, TimeLimitError, UsageError
-from workflows import batch, batch_captures, batch_faults
+from workflows import batch_captures, batch_faults
 from workflows.batch import Ended, run_batch
 from workflows.batch_captures import NAME, find, ranges
 from workflows.batch_commands import seconds
 from workflows.batch_faults import Fault, fault_in, fault_of, smaller
-from workflows.batch_ledger import Entry, Ledger, fingerprint, idempotency_key
-from workflows.batch_page import ODD, Row, ranked
+from workflows.batch_ledger import Entry, Ledger, Summary, fingerprint, idempotency_key
+from workflows.batch_page import ODD, Row, ranked, write_page
 from workflows.batch_request import BatchRequest, asset_name
 from workflows.plan import RunRequest
 
@@ -369,12 +369,10 @@ def test_the_page_escapes_and_links(tree: Path) -> None:
 
 def test_a_table_of_the_whole_data_set_is_quick(tmp_path: Path) -> None:
     """7,180 captures: the page is written every few seconds while the batch runs."""
-    from workflows.batch_page import write_page
-
     entries = [Entry(name=f"{s}/{e}", capture="/c") for s in range(359) for e in range(20)]
     asked = BatchRequest(root=str(tmp_path), out=str(tmp_path / "out"))
     begin = time.perf_counter()
-    write_page(asked, batch.Summary(entries))
+    write_page(asked, Summary(entries))
     assert time.perf_counter() - begin < 5
     assert (asked.folder / "index.html").stat().st_size < 8e6
 

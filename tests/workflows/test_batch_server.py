@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,16 +12,13 @@ import httpx
 import pytest
 from prefect.client.schemas.objects import StateType
 
-from pipeline.contract import inputs_from, key
 from pipeline.errors import StageError, UsageError
-from tests.support.toy_stages import TOYS, source
-from workflows import adapter, batch_prefect, flows
+from workflows import batch_prefect, flows
 from workflows.alone import alone
-from workflows.batch import Summary
-from workflows.batch_ledger import Entry
+from workflows.batch_ledger import Entry, Summary
 from workflows.batch_prefect import Pool
 from workflows.batch_request import BatchRequest
-from workflows.plan import RunRequest, make_plan
+from workflows.environment import SLOTS_ON_DISK
 
 
 class Clock:
@@ -151,6 +147,32 @@ def test_a_server_that_is_away_is_asked_again_and_not_for_ever(
     assert batch_prefect.AWAY <= clock.now - begin < batch_prefect.AWAY + 60
 
 
+def test_a_server_that_forgets_who_holds_a_slot_is_told(
+    pool: Pool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Client:
+        def request(self, *_: str) -> Any:
+            return SimpleNamespace(json=lambda: {"server": {"concurrency": {"lease_storage": f"prefect.{self.kept}"}}})
+
+        def upsert_global_concurrency_limit_by_name(self, name: str, slots: int) -> None:
+            assert (name, slots) == ("neuface-fits", 2)
+
+        kept = "memory"
+
+    client = Client()
+    monkeypatch.setattr(Pool, "_patiently", lambda self, ask: ask(client))
+    pool._limit("neuface-fits", 2)
+    assert SLOTS_ON_DISK[0] in caplog.text
+    caplog.clear()
+    client.kept = "filesystem"
+    pool._limit("neuface-fits", 2)
+    assert caplog.text == ""
+
+
+def test_as_many_runs_at_a_time_as_a_chunk_has(pool: Pool) -> None:
+    assert pool.slots == pool.request.chunk == 50
+
+
 def test_without_a_server_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_prefect, "get_current_settings", lambda: SimpleNamespace(api=SimpleNamespace(url=None)))
     with pytest.raises(UsageError, match="PREFECT_API_URL"):
@@ -174,34 +196,3 @@ def test_the_batch_flow_fails_when_a_capture_has_no_asset(
     else:
         assert flows.facescape_batch.fn(root="/r", out=str(tmp_path), gpus=2)["done"] == 2
     assert asked[0].gpus == 2 and asked[0].fit_slots == "neuface-fits"
-
-
-# ------------------------------------------------------------------ slots
-@pytest.mark.usefixtures("toys")
-def test_the_fit_holds_a_slot_and_nothing_else_does(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    held: list[tuple[str, bool]] = []
-
-    @contextmanager
-    def concurrency(name: str, strict: bool, **_: Any) -> Any:
-        held.append((name, strict))
-        yield
-
-    monkeypatch.setattr("prefect.concurrency.sync.concurrency", concurrency)
-    monkeypatch.setattr(adapter, "FIT", "first")
-    request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), fit_slots="gpus")
-    plan = make_plan(request)
-    finished = {"source": source(photos)}
-    inputs = inputs_from(TOYS[0], finished)
-    work = adapter._Sealed(TOYS[0], inputs, plan.configs["first"], plan)
-    with adapter._slot(work):
-        assert held == [("gpus", True)]  # strict: a limit that is not there would be no limit
-    stored = plan.store.folder("first", key(TOYS[0], inputs, plan.configs["first"]))
-    stored.mkdir(parents=True)
-    (stored / "manifest.json").write_text("{}")
-    with adapter._slot(work):  # nothing will be computed
-        assert len(held) == 1
-    for other in (adapter._Sealed(TOYS[1], inputs, plan.configs["second"], plan),
-                  adapter._Sealed(TOYS[0], inputs, plan.configs["first"], replace(plan, request=request.model_copy(
-                      update={"fit_slots": None})))):  # fmt: skip
-        with adapter._slot(other):
-            assert len(held) == 1

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from pipeline.images import write_png
+from tests.support.facescape_tree import write_tree
 from tests.support.servers import ask, free_port, wait_for, wait_healthy
 from workflows.batch_request import BatchRequest
 from workflows.plan import RunRequest
@@ -27,6 +28,12 @@ def call(environment: dict[str, str], *arguments: object, cwd: Path) -> str:
                           timeout=240)  # fmt: skip
     assert done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
     return done.stdout
+
+
+def submit(environment: dict[str, str], deployment: str, asked: dict[str, object], *options: str, cwd: Path) -> None:
+    """`prefect deployment run` with these parameters; text as it is, the rest as JSON."""
+    words = [f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in asked.items()]
+    call(environment, "deployment", "run", deployment, *(x for w in words for x in ("--param", w)), *options, cwd=cwd)
 
 
 @contextmanager
@@ -63,34 +70,52 @@ def test_deployment_run_on_a_server_with_a_worker(
         for kind, end in (("process", ""), ("docker", "-docker"), ("kubernetes", "-kubernetes")):
             for pool in ("heads", "batches"):
                 call(environment, "work-pool", "create", f"{pool}{end}", "--type", kind, cwd=repo)
-        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", "--all", cwd=repo)
+        names = [x for end in ("local", "docker", "kubernetes") for x in ("-n", end, "-n", f"batch-{end}")]
+        call(environment, "--no-prompt", "deploy", "--prefect-file", "workflows/prefect.yaml", *names, cwd=repo)
         deployed = {d["name"]: d for d in ask(url, "/deployments/filter", {})}
         with running(
             environment, tmp_path / "worker.log", "worker", "start", "--pool", "heads", "--limit", 1, cwd=tmp_path
         ):
-            good = {"capture": photos, "out": out, "until": "capture", "sets": '["capture.min_views=4"]'}
-            parameters = [x for k, v in good.items() for x in ("--param", f"{k}={v}")]
-            call(environment, "deployment", "run", "capture-to-asset/local", *parameters, "--watch", cwd=tmp_path)
+            good = {
+                "capture": str(photos), "out": str(out), "preset": "studio", "holdout": "every:4:3", "name": "anna",
+                "seed": 7, "device": "cpu", "until": "capture", "from_stage": "capture", "fit_slots": "gpus",
+                "sets": ["capture.min_views=3"], "config": {"capture": {"drop_blurred": False}},
+                "store": str(tmp_path / "store"), "stage_limit": 600.0,
+            }  # fmt: skip
+            submit(environment, "capture-to-asset/local", good, "--watch", cwd=tmp_path)
+            many = {
+                "root": "/photos", "out": "/runs", "subjects": "1-40", "expressions": "1,2", "preset": "film",
+                "holdout": "every:5:2", "seed": 3, "device": "cuda", "until": "bake", "sets": ["bake.size=512"],
+                "config": {"uv": {"padding": 8}}, "store": "/runs/.store", "stage_limit": 60.0, "attempts": 5,
+                "deployment": "capture-to-asset/docker", "chunk": 9, "priority": "low", "gpus": 8, "lost_after": 30.0,
+            }  # fmt: skip
+            submit(environment, "facescape-batch/batch-local", many, cwd=tmp_path)  # no worker takes it
             bad = subprocess.run([PREFECT, "deployment", "run", "capture-to-asset/local", "--param", "capture=/nowhere",
                                   "--param", f"out={tmp_path / 'bad'}", "--watch"], env=environment, cwd=tmp_path,
                                  text=True, capture_output=True, timeout=240)  # fmt: skip
         assert list(json.loads((out / "run.json").read_text())["stages"]) == ["capture"]
-        failed, completed = sorted(ask(url, "/flow_runs/filter", {}), key=lambda r: str(r["state_type"]), reverse=True)
+        runs = {r["state_type"]: r for r in ask(url, "/flow_runs/filter", {})}
         tasks = ask(url, "/task_runs/filter", {})
         artifacts = {a["key"]: a for a in ask(url, "/artifacts/filter", {})}
-    assert completed["state_type"] == "COMPLETED", (tmp_path / "worker.log").read_text()
-    assert failed["state_type"] == "FAILED"
-    assert "/nowhere" in failed["state"]["message"]
+    assert set(runs) == {"COMPLETED", "FAILED", "SCHEDULED"}, (tmp_path / "worker.log").read_text()
+    assert "/nowhere" in runs["FAILED"]["state"]["message"]
+    assert set(good) == set(RunRequest.model_fields) and set(many) == set(BatchRequest.model_fields)
+    assert runs["COMPLETED"]["parameters"] == good == json.loads((out / "run.json").read_text())["request"]
+    assert runs["SCHEDULED"]["parameters"] == many == BatchRequest(**many).model_dump(mode="json")  # type: ignore[arg-type]
     assert bad.returncode != 0
     assert not (tmp_path / "bad").exists()
     assert [(t["name"], t["state_type"]) for t in tasks] == [("capture", "COMPLETED")]
     ends = ("local", "docker", "kubernetes")
     assert set(deployed) == {*ends, *(f"batch-{e}" for e in ends)}
     for name, deployment in deployed.items():
+        steps = deployment["pull_steps"]  # no folder of the machine that deployed: others do not have it
+        assert steps == [{"prefect.deployments.steps.set_working_directory": {"directory": "/tmp"}}]
         fields = deployment["parameter_openapi_schema"]["properties"]
         model = BatchRequest if name.startswith("batch-") else RunRequest
         assert list(fields) == list(model.model_fields)
         assert all(fields[n]["description"] == f.description for n, f in model.model_fields.items())
+        defaults = {n: f.default for n, f in model.model_fields.items() if not f.is_required()}
+        assert {n: f["default"] for n, f in fields.items() if "default" in f} == json.loads(json.dumps(defaults))
         assert fields["preset"]["default"] == "draft" and deployment["enforce_parameter_schema"]
     assert deployed["docker"]["job_variables"]["volumes"] == ["/photos:/photos:ro", "/runs:/runs"]
     assert deployed["kubernetes"]["work_pool_name"] == "heads-kubernetes"
@@ -117,6 +142,14 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
         assert listening == [f"0100007F:{port:04X}"]
         entrypoints = {d["entrypoint"] for d in ask(url, "/deployments/filter", {})}
         assert entrypoints == {"workflows.flows.capture_to_asset", "workflows.flows.facescape_batch"}
+        write_tree(tmp_path / "tree", {"1/1_neutral": True})
+        asked = {"root": str(tmp_path / "tree"), "out": str(tmp_path / "out"), "until": "capture", "gpus": 1}
+        environment = {**child_environment, "PREFECT_API_URL": url}
+        submit(environment, "facescape-batch/batch-local", asked, "--watch", cwd=tmp_path)
+        assert json.loads((tmp_path / "out/batch/summary.json").read_text())["counts"]["done"] == 1
+        runs = ask(url, "/flow_runs/filter", {})
+        assert [r["state_type"] for r in runs] == ["COMPLETED"] * 2, (tmp_path / "log").read_text()
+        assert len([r for r in runs if (r["idempotency_key"] or "").startswith("neuface-")]) == 1
         os.kill(child.pid, signal.SIGINT)
         assert child.wait(60) == 0, (tmp_path / "log").read_text()
         with pytest.raises(OSError):

@@ -1,0 +1,170 @@
+"""Slots of the server's limit: who holds one, what a server that is away costs, what a wait is not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from uuid import UUID, uuid4
+
+import httpx
+import pytest
+
+from pipeline.contract import inputs_from, key
+from pipeline.errors import Cancelled, StageError
+from tests.support.servers import wait_for
+from tests.support.toy_stages import TOYS, source
+from workflows import adapter, slots
+from workflows.plan import RunRequest, make_plan
+from workflows.session import Session, session
+
+
+def refused(status: int) -> httpx.HTTPStatusError:
+    request = httpx.Request("POST", "http://x")
+    return httpx.HTTPStatusError("no", request=request, response=httpx.Response(status, request=request))
+
+
+class Server:
+    """Answers as its script says, and as a server with a free slot once that is over."""
+
+    def __init__(self, *script: Exception) -> None:
+        self.script, self.lease, self.asked = list(script), uuid4(), list[str]()
+
+    def _answer(self, what: str) -> None:
+        self.asked.append(what)
+        if self.script:
+            raise self.script.pop(0)
+
+    def increment_concurrency_slots_with_lease(self, names: list[str], slots: int, mode: str, lease: float) -> Any:
+        self._answer("take")
+        found = [{"name": n} for n in names if n != "none"]
+        return SimpleNamespace(json=lambda: {"lease_id": str(self.lease), "limits": found})
+
+    def renew_concurrency_lease(self, lease: UUID, seconds: float) -> None:
+        assert lease == self.lease
+        self._answer("renew")
+
+    def release_concurrency_slots_with_lease(self, lease: UUID) -> None:
+        assert lease == self.lease
+        self._answer("give back")
+
+
+@pytest.fixture
+def serving(monkeypatch: pytest.MonkeyPatch) -> Any:
+    for name, value in {"ASK": 0.01, "RENEW": 0.02, "GIVE_BACK": 0.3, "AWAY": 0.2}.items():
+        monkeypatch.setattr(slots, name, value)
+
+    def begin(*script: Exception) -> Server:
+        server = Server(*script)
+
+        @contextmanager
+        def client(sync_client: bool) -> Iterator[Server]:
+            yield server
+
+        monkeypatch.setattr(slots, "get_client", client)
+        return server
+
+    return begin
+
+
+AWAY, TAKEN = httpx.ConnectError("refused"), refused(423)
+
+
+def test_a_slot_is_waited_for_kept_and_given_back(serving: Any) -> None:
+    server = serving(TAKEN, AWAY, refused(503), TAKEN)
+    with slots.slot("gpus", lambda: False):
+        assert server.asked == ["take"] * 5
+        wait_for(lambda: server.asked.count("renew") >= 2, 10)
+    assert server.asked[-1] == "give back"
+    seen = len(server.asked)
+    time.sleep(0.1)
+    assert len(server.asked) == seen, "nobody renews what was given back"
+
+
+def test_a_server_that_is_away_costs_neither_the_slot_nor_the_fit(serving: Any) -> None:
+    server = serving()
+    with slots.slot("gpus", lambda: False):
+        server.script = [AWAY] * 4
+        wait_for(lambda: server.asked.count("renew") >= 6, 10)
+        server.script = [refused(410)]  # it took the slot back: the fit goes on
+        wait_for(lambda: not server.script, 10)
+        server.script = [AWAY, AWAY]
+    assert server.asked[-3:] == ["give back"] * 3
+
+
+def test_a_server_that_stays_away_is_not_waited_for_for_ever(serving: Any, caplog: pytest.LogCaptureFixture) -> None:
+    server = serving()
+    with slots.slot("gpus", lambda: False):
+        server.script = [AWAY] * 10_000
+    assert "free again in 300 s" in caplog.text
+    with pytest.raises(httpx.ConnectError), slots.slot("gpus", lambda: False):
+        pytest.fail("there was no slot")
+
+
+def test_no_such_limit_is_no_leave_to_run_without(serving: Any) -> None:
+    serving()
+    with pytest.raises(StageError, match="does not exist"), slots.slot("none", lambda: False):
+        pytest.fail("there was no slot")
+    serving(refused(401))
+    with pytest.raises(httpx.HTTPStatusError), slots.slot("gpus", lambda: False):
+        pytest.fail("there was no slot")
+
+
+def test_ctrl_c_ends_the_wait(serving: Any) -> None:
+    server = serving(*[TAKEN] * 1000)
+    with pytest.raises(Cancelled), slots.slot("gpus", lambda: len(server.asked) > 3):
+        pytest.fail("there was no slot")
+
+
+# ------------------------------------------------------------------ in a run
+@pytest.mark.usefixtures("toys")
+def test_the_fit_holds_a_slot_and_nothing_else_does(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held: list[str] = []
+
+    @contextmanager
+    def slot(name: str, stopped: Any) -> Iterator[None]:
+        held.append(name)
+        yield
+
+    monkeypatch.setattr(adapter, "slot", slot)
+    monkeypatch.setattr(adapter, "FIT", "first")
+    request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), fit_slots="gpus")
+    plan = make_plan(request)
+    inputs = inputs_from(TOYS[0], {"source": source(photos)})
+    work = adapter._Sealed(TOYS[0], inputs, plan.configs["first"], plan)
+    with adapter._slot(work):
+        assert held == ["gpus"]
+    stored = plan.store.folder("first", key(TOYS[0], inputs, plan.configs["first"]))
+    stored.mkdir(parents=True)
+    (stored / "manifest.json").write_text("{}")
+    with adapter._slot(work):  # nothing will be computed
+        assert len(held) == 1
+    for other in (adapter._Sealed(TOYS[1], inputs, plan.configs["second"], plan),
+                  adapter._Sealed(TOYS[0], inputs, plan.configs["first"], replace(plan, request=request.model_copy(
+                      update={"fit_slots": None})))):  # fmt: skip
+        with adapter._slot(other):
+            assert len(held) == 1
+
+
+@pytest.mark.usefixtures("toys")
+def test_the_wait_for_a_slot_does_not_count_as_a_hang(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @contextmanager
+    def slot(name: str, stopped: Any) -> Iterator[None]:
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            assert not stopped()
+            time.sleep(0.01)
+        yield
+
+    monkeypatch.setattr(adapter, "slot", slot)
+    monkeypatch.setattr(adapter, "FIT", "first")
+    monkeypatch.setattr(adapter, "get_run_logger", lambda: adapter.log)
+    request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), fit_slots="gpus", stage_limit=0.4)
+    plan = make_plan(request)
+    inputs = inputs_from(TOYS[0], {"source": source(photos)})
+    with session(Session()):
+        assert not adapter._execute(adapter._Sealed(TOYS[0], inputs, plan.configs["first"], plan)).reused
