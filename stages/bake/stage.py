@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
 from pipeline.contract import Context, Stage, StageConfig
 
 F64 = npt.NDArray[np.float64]
@@ -18,6 +18,7 @@ F64 = npt.NDArray[np.float64]
 class Inputs:
     """The mesh, the field, the cameras and masks that say which texels were seen, and the photos with their detail."""
 
+    surface: Located[Surface]
     uv: Located[UvMesh]
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
@@ -38,6 +39,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline.fields.face import load_face
     from stages.bake.build import Photos, build
     from stages.bake.confidence import seen_by
+    from stages.bake.deviation import zero_set_rms
     from stages.bake.write import write_maps
 
     uv, fitted = inputs.uv, inputs.inverse_rendering
@@ -53,6 +55,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     baked = build(field, mesh, charts, views, config.size, step, photos, context.scratch)
     maps = write_maps(baked, context)
+    levels = {"render": mesh, "high": meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))}
+    if uv.artifact.proxy is not None:
+        levels["proxy"] = meshes.load(uv.path(uv.artifact.proxy))
     # every texel between the charts is filled, so the padding reaches across the whole picture
     return TextureSet(
         size=config.size,
@@ -60,6 +65,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         maps=maps,
         coverage=baked.coverage,
         zero_set_rms_mm=1000 * baked.samples.deviation(),
+        lod_rms_mm={name: round(1000 * zero_set_rms(field, level), 5) for name, level in levels.items()},
         figures=baked.figures,
         warnings=baked.warnings,
     )

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, UvMesh, ViewMask
+from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, UvMesh, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from pipeline.images import read_encoded, read_exr, write_png
@@ -47,7 +47,13 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
     )  # fmt: skip
     write_png(tmp_path / "mask.png", np.ones((64, 64)))
     mask = ViewMask(index=1, mask=FileRef.of(tmp_path, "mask.png"), source="given", coverage=1.0)
+    meshes.save(tmp_path / "surface.npz", mesh)
+    surface = Surface(
+        mesh=FileRef.of(tmp_path, "surface.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), watertight=True,
+        components=1, removed_components=0, cell=0.005,
+    )  # fmt: skip
     return Inputs(
+        Located(surface, tmp_path),
         Located(uv, tmp_path),
         fitted(tmp_path, field, monkeypatch, views=3),
         poses(tmp_path),
@@ -78,6 +84,9 @@ def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
         assert image.shape == ((1, 64, 3) if name == "basis_lut" else (256, 256, found.channels))
         assert np.isfinite(image).all() and found.minimum <= found.mean <= found.maximum
     assert read_encoded(tmp_path / "textures/f0.png").dtype == np.uint16
+    # chords of 800 triangles on a ball of 80 mm: the sagitta of a triangle's side of 14 mm is 0.3 mm
+    assert set(textures.lod_rms_mm) == {"render", "high"} and 0.05 < textures.lod_rms_mm["render"] < 0.4
+    assert textures.lod_rms_mm["render"] == pytest.approx(textures.zero_set_rms_mm, rel=0.1)
     assert textures.maps["albedo"].space == "srgb_png" and textures.maps["normal"].space == "raw"
     covered = read_exr(tmp_path / "textures/coverage.exr")[0][..., 0] > 0
     rho = read_exr(tmp_path / "textures/specular_intensity.exr")[0][covered]

@@ -21,7 +21,7 @@ from stages.usd.stage import STAGE, Config, Inputs
 
 
 def run(inputs: SyntheticInputs, folder: Path, **config: object):
-    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
     small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
     return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))
 
@@ -163,7 +163,7 @@ from pipeline.contract import Context
 from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
-named = {n: getattr(made, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+named = {n: getattr(made, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
 work = Path(sys.argv[2]) / "work"
 asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), Context(work, work / "scratch"))
 print(asset.digest())
@@ -287,7 +287,7 @@ def test_broken_lights_are_refused(tmp_path: Path, light: np.ndarray) -> None:
 def test_a_cancelled_export_stops(inputs: SyntheticInputs, tmp_path: Path) -> None:
     from pipeline.errors import Cancelled
 
-    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
     context = Context(tmp_path / "w", tmp_path / "s", cancelled=lambda: True)
     with pytest.raises(Cancelled):
         STAGE.run(Inputs(**named), Config(), context)
@@ -340,12 +340,39 @@ def test_looks_choose_the_surface(exported, look: str, preview: str, materialx: 
     assert (surface_of(stage, ""), surface_of(stage, "mtlx")) == (preview, materialx)
 
 
-def test_levels_of_detail(exported) -> None:
+@pytest.mark.parametrize("level", ["high", "render", "proxy"])
+def test_levels_of_detail(exported, inputs: SyntheticInputs, level: str) -> None:
     stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
-    stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection("proxy")
+    levels = stage.GetDefaultPrim().GetVariantSet("lod")
+    assert sorted(levels.GetVariantNames()) == ["high", "proxy", "render"] and levels.GetVariantSelection() == "render"
+    levels.SetVariantSelection(level)
     shown = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
-    assert [p.GetName() for p in shown] == ["proxy"]
-    assert UsdGeom.Imageable(shown[0]).ComputePurpose() == "default"
+    assert [p.GetName() for p in shown] == (["render", "proxy"] if level == "render" else [level])
+    if level != "render":
+        assert UsdGeom.Imageable(shown[0]).ComputePurpose() == "default"
+    material = UsdShade.MaterialBindingAPI(shown[0]).ComputeBoundMaterial()[0]
+    assert material.GetPath() == "/head/mtl/captured"
+
+
+def test_dense_mesh_keeps_its_points_and_takes_the_charts(exported, inputs: SyntheticInputs) -> None:
+    """Its texture coordinates are those of the textured mesh: at the same place of the ball, the same texel."""
+    stage = Usd.Stage.Open(str(exported[0] / "asset/high.usdc"))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
+    with np.load(inputs.surface.path(inputs.surface.artifact.mesh)) as given:
+        assert np.array_equal(np.array(mesh.GetPointsAttr().Get()), given["vertices"])
+        assert len(mesh.GetFaceVertexCountsAttr().Get()) == len(given["faces"])
+    points = np.array(mesh.GetPointsAttr().Get())[np.array(mesh.GetFaceVertexIndicesAttr().Get())]
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened())
+    longitude = np.arctan2(points[:, 0], points[:, 2])
+    inner = (np.abs(longitude) < 2.8) & (np.abs(points[:, 1]) < 0.12)
+    assert np.abs(st[inner, 0] - (0.02 + 0.96 * (longitude[inner] / (2 * np.pi) + 0.5))).max() < 0.01
+
+
+def test_a_dense_mesh_is_left_out_where_nobody_wants_it(inputs: SyntheticInputs, tmp_path: Path) -> None:
+    run(inputs, tmp_path / "work", render_views=False, high=False)
+    assert not (tmp_path / "work/asset/high.usdc").exists()
+    stage = Usd.Stage.Open(str(tmp_path / "work/asset/head.usd"))
+    assert sorted(stage.GetDefaultPrim().GetVariantSet("lod").GetVariantNames()) == ["proxy", "render"]
 
 
 def test_only_what_the_user_said_is_recorded(exported, inputs: SyntheticInputs, tmp_path: Path) -> None:
