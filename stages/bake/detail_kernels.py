@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit, prange
 
 ROW = 43
-MOST = 12  # photos that have a say in one texel: those of the largest weight
+MOST = 8  # photos that have a say in one texel: those of the largest weight
 LEAST_COSINE = 0.2  # photos that look along the surface further than that have no say
 DEPTH_SLACK = 0.0015  # of the distance: how far behind the depth picture still counts as the same place
 LEAST_SPREAD = 0.004  # of albedo: differences below it are noise of the photos
@@ -32,8 +32,11 @@ BLOCK = 1024  # points worked off in a row
 def _look(camera, depth, x, n):
     """cosine, distance, column, row of point x with normal n in a photo; cosine 0 where the photo does not see it."""
     dx, dy, dz = camera[27] - x[0], camera[28] - x[1], camera[29] - x[2]
+    height = dx * n[0] + dy * n[1] + dz * n[2]
+    if height <= 0:
+        return 0.0, 0.0, 0.0, 0.0
     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-    cosine = (dx * n[0] + dy * n[1] + dz * n[2]) / distance
+    cosine = height / distance
     if cosine < LEAST_COSINE:
         return 0.0, distance, 0.0, 0.0
     a = camera[0] * x[0] + camera[1] * x[1] + camera[2] * x[2] + camera[3]
