@@ -284,3 +284,12 @@ def _capture(folder: Path, rig: CameraSet, held_out: tuple[int, ...]) -> Located
             )
         )
     return Located(Capture(kind="facescape", views=tuple(views)), folder)
+
+
+def run_stage(inputs: SyntheticInputs, folder: Path, **config: object):
+    from pipeline.contract import Context
+    from stages.usd.stage import STAGE, Config, Inputs
+
+    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
+    return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))
