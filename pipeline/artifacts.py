@@ -272,13 +272,17 @@ class TextureMap(Artifact):
 
 class TextureSet(Artifact):
     """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1). zero_set_rms_mm: root mean square distance of the
-    mesh from the SDF's zero set, over the texels that have one near them."""
+    mesh from the SDF's zero set, over the texels that have one near them; lod_rms_mm: that of
+    each level of detail, over its area. figures: shares of the covered texels that no
+    photo saw (`unseen`), whose albedo was clamped (`albedo_clamped`), that have photo detail (`detail_support`)."""
 
     size: int
     padding: int
     maps: dict[str, TextureMap]
     coverage: float
     zero_set_rms_mm: float = 0.0
+    lod_rms_mm: dict[str, float] = {}
+    figures: dict[str, float] = {}
     warnings: tuple[str, ...] = ()
 
 

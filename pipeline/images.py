@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from pipeline.picture_size import declared_size
 
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
+ROWS_TEXELS = 1 << 20  # converted at once
 MAX_BYTES = 4_000_000_000  # 250 megapixels of RGBA in 32-bit floats, uncompressed
 MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
 
@@ -95,20 +97,34 @@ def read_alpha(path: Path) -> F32:
     return (plane.astype(np.float32) / peak).clip(0, 1)
 
 
-def write_png(path: Path, image: npt.NDArray[Any], bits: int = 8) -> None:
-    """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] as they are (no transfer curve)."""
-    peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
-    data = np.asarray(image, np.float64)
-    data = data[..., 0] if data.ndim == 3 and data.shape[2] == 1 else data
-    whole = np.round(np.nan_to_num(data).clip(0, 1) * peak).astype(kind)
-    if whole.ndim == 3:
-        whole = whole[..., [2, 1, 0, 3][: whole.shape[2]]]
-    _encode(path, ".png", whole)
+def write_png(path: Path, image: npt.NDArray[Any], bits: int = 8, *, signed: bool = False) -> None:
+    """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] as they are (no transfer curve).
+
+    signed: values in [-1, 1], stored as v / 2 + 1 / 2.
+    """
+    shift: Callable[[npt.NDArray[Any]], npt.NDArray[Any]] = (lambda v: 0.5 * v + 0.5) if signed else (lambda v: v)
+    _encode(path, ".png", _whole(image, bits, shift))
 
 
 def write_png_from_linear(path: Path, image: F32) -> None:
     """Write linear (H, W, 3) as 8-bit sRGB."""
-    write_png(path, srgb_from_linear(np.asarray(image, np.float32).clip(0, 1)))
+    _encode(path, ".png", _whole(image, 8, lambda v: srgb_from_linear(np.asarray(v, np.float32).clip(0, 1))))
+
+
+def _whole(
+    image: npt.NDArray[Any], bits: int, shown: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
+) -> npt.NDArray[Any]:
+    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held in float64."""
+    data = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
+    order = [2, 1, 0, 3][: data.shape[2]] if data.ndim == 3 else None
+    out = np.empty(data.shape, kind)
+    rows = max(1, ROWS_TEXELS // max(data.shape[1], 1))
+    for first in range(0, len(data), rows):
+        values = np.nan_to_num(np.asarray(shown(data[first : first + rows]), np.float64)).clip(0, 1)
+        whole = np.round(values * peak).astype(kind)
+        out[first : first + rows] = whole if order is None else whole[..., order]
+    return out
 
 
 def _encode(path: Path, kind: str, data: npt.NDArray[Any]) -> None:

@@ -55,14 +55,17 @@ def rasterise(corners: F64, size: int, first: int, last: int, reach: float = 0.7
     With a reach of 0.71 or more every texel that a chart touches is among them. Where triangles compete, the nearest
     wins, then the one with the lower index.
     """
-    parts = [_near(*window, corners, size, reach) for window in _windows(corners, size, first, last, reach)]
-    if not parts:
-        none = np.zeros(0, np.int64)
-        return Hits(none, none, np.zeros((0, 3), np.float32), np.zeros(0, np.float32))
-    texel, face, weights, distance = (np.concatenate([p[i] for p in parts]) for i in range(4))
-    order = np.lexsort((face, distance, texel))
-    best = order[np.flatnonzero(np.diff(texel[order], prepend=-1))]
-    return Hits(texel[best], face[best], weights[best], distance[best])
+    from pipeline import raster_kernels
+
+    rows = last - first
+    low, high = corners[..., 1].min(1) - 0.5 - reach, corners[..., 1].max(1) - 0.5 + reach
+    candidates = np.flatnonzero((np.floor(low) < last) & (np.ceil(high) >= first))
+    distance, face = np.full((rows, size), np.inf, np.float32), np.zeros((rows, size), np.int32)
+    weights = np.zeros((rows, size, 3), np.float32)
+    raster_kernels.nearest_triangles(corners, candidates, size, first, last, reach, distance, face, weights)
+    near = np.isfinite(distance)
+    texel = np.flatnonzero(near.ravel()) + first * size
+    return Hits(texel, face[near].astype(np.int64), weights[near], distance[near])
 
 
 def layers(corners: F64, size: int, margin: float = 1e-3) -> npt.NDArray[np.uint8]:
@@ -113,43 +116,3 @@ def _windows(
         beyond = (columns >= high[group, :1]) | (rows >= high[group, 1:])
         yield group, np.where(beyond, size, columns), np.where(beyond, size, rows)
         start = stop
-
-
-def _near(
-    faces: Indices, columns: Indices, rows: Indices, corners: F64, size: int, reach: float
-) -> tuple[Indices, Indices, F32, F32]:
-    pair, slot = np.nonzero((columns < size) & (rows < size))
-    column, row = columns[pair, slot], rows[pair, slot]
-    face = faces[pair]
-    distance, weights = nearest_on_triangles(np.stack([column + 0.5, row + 0.5], -1), corners[face])
-    keep = distance <= reach
-    return (
-        (row * size + column)[keep],
-        face[keep],
-        weights[keep].astype(np.float32),
-        distance[keep].astype(np.float32),
-    )
-
-
-def nearest_on_triangles(p: F64, corners: F64) -> tuple[F64, F64]:
-    """(N,) distance from points (N, 2) to their own triangles (N, 3, 2), and weights (N, 3) of the nearest point."""
-    area = doubled_areas(corners)
-    safe = np.where(np.abs(area) > 1e-12, area, 1.0)
-    weights = np.empty((len(p), 3))
-    for i in range(3):
-        a, b = corners[:, (i + 1) % 3] - p, corners[:, (i + 2) % 3] - p
-        weights[:, i] = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / safe
-    inside = (weights >= 0).all(1) & (np.abs(area) > 1e-12)
-    best = np.where(inside, 0.0, np.inf)
-    for i in range(3):
-        out = ~inside
-        start, end = corners[out, i], corners[out, (i + 1) % 3]
-        side, offset = end - start, p[out] - start
-        t = ((offset * side).sum(1) / np.maximum((side * side).sum(1), 1e-30)).clip(0, 1)
-        away = np.linalg.norm(offset - t[:, None] * side, axis=1)
-        nearer = away < best[out]
-        index = np.flatnonzero(out)[nearer]
-        best[index] = away[nearer]
-        weights[index] = 0
-        weights[index, i], weights[index, (i + 1) % 3] = 1 - t[nearer], t[nearer]
-    return best, weights

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import torch
-from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -28,6 +27,7 @@ from pipeline.fields.geometry import GridSdf
 from pipeline.maths import sh
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
+from pipeline.nearest import filled
 
 CELLS = 64  # of the grid along the longest side
 NEAR_CELLS = 1.8  # nodes within this of the surface are solved: every corner of a cell that the surface crosses
@@ -183,11 +183,10 @@ def _ratio(arriving: F64, opened: F64, floor: float) -> F64:
 def _spread(shadowing: Shadowing, index: Tensor, values: F64) -> Tensor:
     """A grid (3, X, Y, Z) with values (M, 3) at the solved nodes and at every other node that of the nearest."""
     shape = tuple(shadowing.ratio.shape[1:])
-    empty = np.ones(int(np.prod(shape)), bool)
     flat = index.cpu().numpy()
-    empty[flat] = False
-    grid = np.zeros((len(empty), 3), np.float32)
+    known = np.zeros(math.prod(shape), bool)
+    known[flat] = True
+    grid = np.zeros((len(known), 3), np.float32)
     grid[flat] = values
-    nearest = ndimage.distance_transform_edt(empty.reshape(shape), return_distances=False, return_indices=True)
-    filled = grid.reshape(*shape, 3)[tuple(nearest)]
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(filled, -1, 0))).to(shadowing.ratio)
+    every = filled(grid.reshape(*shape, 3), known.reshape(shape))
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(every, -1, 0))).to(shadowing.ratio)

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline import raster
-from pipeline.artifacts import Camera, CameraSet, FittedFace, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, Capture, FittedFace, Located, MaskSet
 from pipeline.meshes import F32, F64, Charts, Mask, Mesh
+from pipeline.nearest import filled
 from pipeline.transforms import inverse_rigid, matrix, project
 
 SIZE = 512  # texels: visibility has no finer detail than the photos' geometry, and rays cost
@@ -29,17 +30,21 @@ OPAQUE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A fitted photo's camera and, if there is one, its mask."""
+    """A fitted photo, its camera and, if there is one, its mask."""
 
     camera: Camera
     mask: Path | None
+    photo: Path | None = None
 
 
-def seen_by(fitted: FittedFace, poses: CameraSet, masks: Located[MaskSet]) -> tuple[View, ...]:
-    """The views that the field was fitted to."""
-    used = set(fitted.fitted_views)
+def seen_by(
+    fitted: FittedFace, poses: CameraSet, masks: Located[MaskSet], capture: Located[Capture]
+) -> tuple[View, ...]:
+    """The views that the field was fitted to, in the order of its colour responses. None that was held out."""
+    used = set(fitted.fitted_views) - {v.index for v in capture.artifact.views if v.holdout}
     alpha = {m.index: masks.path(m.mask) for m in masks.artifact.masks}
-    return tuple(View(c, alpha.get(c.index)) for c in poses.cameras if c.index in used)
+    photo = {v.index: capture.path(v.image) for v in capture.artifact.views}
+    return tuple(View(c, alpha.get(c.index), photo.get(c.index)) for c in poses.cameras if c.index in used)
 
 
 class Occluder:
@@ -54,6 +59,12 @@ class Occluder:
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, (mesh.vertices * self._scale).astype(np.float32), mesh.faces)
 
+    def distance(self, origin: F64, directions: F64) -> F64:
+        """(N,) to the mesh along unit directions (N, 3) from one origin (3,); infinite where they miss it."""
+        starts = np.broadcast_to((origin * self._scale).astype(np.float32), directions.shape)
+        found = self._scene.run(np.ascontiguousarray(starts), np.ascontiguousarray(directions, np.float32), output=True)
+        return np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
+
     def blocks(self, origins: F64, directions: F64) -> Mask:
         """(N,) True where a ray meets the mesh."""
         o = np.ascontiguousarray(origins * self._scale, np.float32)
@@ -62,10 +73,16 @@ class Occluder:
         return out
 
 
+def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occluder) -> F64:
+    """(N,) w: the cosines towards all views that see each point, summed."""
+    total = np.zeros(len(points))
+    for view in views:
+        total += weight_of(view, points, normals, occluder)
+    return total
+
+
 def confidence(mesh: Mesh, charts: Charts, views: Sequence[View], size: int, step: Callable[[int, int], None]) -> F32:
     """(S, S) confidence at S = min(size, SIZE), gutters filled from the nearest chart."""
-    from stages.bake.gutter import nearest_filled, nearest_index
-
     small = min(size, SIZE)
     hits = raster.rasterise(raster.texel_corners(charts, small), small, 0, small)
     weights = hits.weights.astype(np.float64)[..., None]
@@ -81,7 +98,7 @@ def confidence(mesh: Mesh, charts: Charts, views: Sequence[View], size: int, ste
     covered[hits.texel] = True
     image = np.zeros(small * small, np.float32)
     image[hits.texel] = 1 - 2.0**-total
-    return nearest_filled(image.reshape(small, small), nearest_index(covered.reshape(small, small)))
+    return filled(image.reshape(small, small), covered.reshape(small, small))
 
 
 def weight_of(view: View, points: F64, normals: F64, occluder: Occluder) -> F64:

@@ -5,22 +5,20 @@ With that no mip level can mix a chart with black: each coarse texel is a mean o
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
+from pipeline.meshes import Indices, Mask
+from pipeline.nearest import nearest_known
 
-from pipeline.meshes import F32, Indices, Mask
+HALO = 512  # rows above and below a band in which the nearest texel is looked for
 
 
-def nearest_index(covered: Mask) -> Indices:
-    """(H, W) flat index of the nearest covered texel, its own where covered. At least one texel must be covered."""
-    from scipy.ndimage import distance_transform_edt
+def nearest_rows(covered: Mask, first: int, last: int) -> Indices:
+    """(last - first, W) flat index of the nearest covered texel for rows first..last-1, its own where covered.
 
-    row, column = distance_transform_edt(~covered, return_distances=False, return_indices=True)
-    out: Indices = row.astype(np.int64) * covered.shape[1] + column
+    Looks at most HALO rows beyond the band, further only where these hold none. At least one texel must be covered.
+    """
+    width = covered.shape[1]
+    low, high = max(0, first - HALO), min(len(covered), last + HALO)
+    while not covered[low:high].any():
+        low, high = max(0, low - HALO), min(len(covered), high + HALO)
+    out: Indices = nearest_known(covered[low:high])[first - low : last - low] + low * width
     return out
-
-
-def nearest_filled(image: F32, index: npt.NDArray[np.integer]) -> F32:
-    """(H, W) or (H, W, C) with every texel taken from where `index` says."""
-    flat = image.reshape(-1, *image.shape[2:])
-    return np.asarray(flat[index], np.float32)

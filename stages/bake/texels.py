@@ -21,6 +21,7 @@ from pipeline.maths import microfacet
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.raster import Hits
 from pipeline.tangents import Frames
+from stages.bake.detail import Detail, Points, shade
 
 NEWTON_STEPS = 3
 LEAST_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
@@ -28,15 +29,18 @@ REACH_CELLS = 1.5  # of the field's cells: the decimated mesh is never further f
 LEAST_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
 LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
+ALBEDO_RANGE = (0.005, 0.95)  # soot and fresh snow: nothing on a head is darker or brighter
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
     """One row a texel, in the order of its Hits. All float32.
 
-    albedo (N, 3); rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); irradiance_ratio (N, 3); f0 (N,);
-    normal (N, 3) in tangent space, unit; displacement (N,) metres. landed (N,): False where the mesh has no zero set
-    near it (the cap).
+    albedo (N, 3), photo detail included; rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,);
+    irradiance_ratio (N, 3); f0 (N,); normal (N, 3) in tangent space, unit; displacement (N,) metres; ambient (N,)
+    occlusion. landed (N,): False where the mesh has no zero set near it (the cap). support (N,): weight of the photos
+    in the detail. unseen (N,): 1 where no photo saw the place. clamped (N,): how far the albedo was moved into
+    ALBEDO_RANGE, the channel that moved most.
     """
 
     albedo: F32
@@ -47,7 +51,11 @@ class Samples:
     f0: F32
     normal: F32
     displacement: F32
+    ambient: F32
     landed: Mask
+    support: F32
+    unseen: F32
+    clamped: F32
 
     def deviation(self) -> float:
         """Root mean square distance (m) of the mesh from the zero set, where there is one."""
@@ -55,30 +63,85 @@ class Samples:
         return float(np.sqrt((d * d).mean())) if len(d) else 0.0
 
 
-def sample(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Samples:
-    """Everything that the maps need. Raises StageError where the field is not finite."""
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What is known at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo saw one; albedo (V, 3), where
+    unseen that of the surface around."""
+
+    ambient: F32
+    unseen: F32
+    albedo: F32
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Texels on the true surface. x (N, 3); world (N, 3) its unit normal; t, b, n (N, 3) the mesh's frame; moved (N,)
+    metres along n; landed (N,)."""
+
+    x: F64
+    world: F64
+    t: F64
+    b: F64
+    n: F64
+    moved: F64
+    landed: Mask
+
+
+def place(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Placed:
+    """Where the texels lie."""
     weights = hits.weights.astype(np.float64)
     start = (mesh.vertices.astype(np.float64)[mesh.faces[hits.face]] * weights[..., None]).sum(1)
     t, b, n = tangents.at(frame, mesh, hits.face, weights)
     moved, gradient, landed = land(field, start, n)
-    x = (start + moved[:, None] * n).astype(np.float32)
     world = _unit(np.where(landed[:, None], gradient, n))
+    return Placed(start + moved[:, None] * n, world, t, b, n, moved, landed)
+
+
+def points(field: Field, mesh: Mesh, hits: Hits, at: Placed, albedo: F32, ratio: F32) -> Points:
+    """The same texels as the photo detail takes them."""
+    lit = shade(field.light, at.world, ratio)
+    return Points(at.x, at.world, mesh.faces[hits.face], hits.weights, np.asarray(albedo, np.float32), lit)
+
+
+def sample(
+    field: Field, mesh: Mesh, frame: Frames, hits: Hits, known: Known | None = None, detail: Detail | None = None
+) -> Samples:
+    """Everything that the maps need. Raises StageError where the field is not finite."""
+    at = place(field, mesh, frame, hits)
+    x, straight = at.x.astype(np.float32), at.world.astype(np.float32)
     material = field.material(x)
-    straight = world.astype(np.float32)
+    ratio = np.asarray(field.irradiance_ratio(x), np.float32)
     strength = material.rho * (material.coefficients * field.basis(straight, straight)).sum(1)
     f0 = microfacet.f0_from_lobe(strength, material.inv_kappa)
+    albedo, support = np.asarray(material.albedo, np.float32), np.zeros(len(x), np.float32)
+    _check("albedo", albedo)
+    if detail is not None:
+        more, support = detail.added(points(field, mesh, hits, at, albedo, ratio))
+        albedo = albedo + more
+    around, unseen = np.ones(len(x), np.float32), np.zeros(len(x), np.float32)
+    if known is not None:
+        corner = mesh.faces[hits.face]
+        around, unseen = ((a[corner] * hits.weights).sum(1) for a in (known.ambient, known.unseen))
+        nearby = (known.albedo[corner] * hits.weights[..., None]).sum(1)
+        albedo = albedo + unseen[:, None] * (nearby - albedo)
+    physical = albedo.clip(*ALBEDO_RANGE)
     found = Samples(
-        np.asarray(material.albedo, np.float32),
-        np.asarray(material.rho, np.float32),
-        np.asarray(material.coefficients, np.float32),
-        np.asarray(material.inv_kappa, np.float32),
-        np.asarray(field.irradiance_ratio(x), np.float32),
-        f0.astype(np.float32),
-        in_frame(world, t, b, n),
-        moved.astype(np.float32),
-        landed,
+        albedo=physical,
+        rho=np.asarray(material.rho, np.float32),
+        coefficients=np.asarray(material.coefficients, np.float32),
+        inv_kappa=np.asarray(material.inv_kappa, np.float32),
+        irradiance_ratio=ratio,
+        f0=f0.astype(np.float32),
+        normal=in_frame(at.world, at.t, at.b, at.n),
+        displacement=at.moved.astype(np.float32),
+        ambient=around,
+        landed=at.landed,
+        support=support,
+        unseen=unseen,
+        clamped=np.abs(albedo - physical).max(1),
     )
-    _check(found)
+    for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
+        _check(name, getattr(found, name))
     return found
 
 
@@ -120,14 +183,12 @@ def _unit(v: npt.NDArray[np.floating]) -> F64:
     return out
 
 
-def _check(s: Samples) -> None:
-    for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
-        values = getattr(s, name)
-        if not np.isfinite(values).all():
-            raise StageError(
-                "the fitted field is not finite on the surface",
-                where=f"bake: {name}",
-                value=f"{(~np.isfinite(values)).sum()} of {values.size} values",
-                limit="finite everywhere",
-                remedy="fit the model again with another seed",
-            )
+def _check(name: str, values: F32) -> None:
+    if not np.isfinite(values).all():
+        raise StageError(
+            "the fitted field is not finite on the surface",
+            where=f"bake: {name}",
+            value=f"{(~np.isfinite(values)).sum()} of {values.size} values",
+            limit="finite everywhere",
+            remedy="fit the model again with another seed",
+        )

@@ -1,4 +1,4 @@
-"""Maps to files, one after the other, so that only one full picture is in memory.
+"""Maps to files, one after the other, so that only one full picture is held at a time.
 
 Every map is float32 EXR; those that preview shaders and people look at are PNG too.
 """
@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.artifacts import FileRef, TextureMap
 from pipeline.colour import REC709
@@ -17,20 +19,26 @@ from pipeline.contract import Context
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.maths import microfacet
 from pipeline.meshes import F32
-from stages.bake.build import Baked
+from stages.bake.build import Baked, bands
+from stages.bake.spool import blank
 from stages.bake.texels import Samples
 
 FOLDER = "textures"
 MM = 1000.0
 LEAST_INV_KAPPA = 1e-6
+UNSEEN = 0.5  # value of the coverage of a chart's texel that no photo saw
+IN_MEMORY = 1 << 28  # numbers of a picture; a larger one is put together in a file
+
+Function = Callable[..., npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class MapKind:
-    """How a map is made from the samples (N, ...) and stored. png: bits, 0 for none; encoded: png holds v/2 + 1/2.
-    colour: its three channels are colours; units: of its values, for the EXR's header."""
+    """How a map is made from some of the samples' arrays (N, ...) and stored. png: bits, 0 for none; encoded: png
+    holds v/2 + 1/2. colour: its three channels are colours; units: of its values, for the EXR's header."""
 
-    values: Callable[[Samples], F32]
+    sources: tuple[str, ...]
+    function: Function = lambda values: values
     png: int = 0
     encoded: bool = False
     numbered: bool = False
@@ -38,18 +46,26 @@ class MapKind:
     colour: bool = False
     units: str = ""
 
+    def values(self, samples: Samples, rows: Any = slice(None)) -> F32:
+        """(N, channels) of all samples, or of some rows."""
+        found = np.asarray(self.function(*(getattr(samples, s)[rows] for s in self.sources)), np.float32)
+        return found[..., None] if found.ndim == np.ndim(samples.rho[rows]) else found
+
 
 KINDS: dict[str, MapKind] = {
-    "albedo": MapKind(lambda s: s.albedo, png=8, space="srgb_png", colour=True),
-    "specular_coefficients": MapKind(lambda s: s.rho[:, None] * s.coefficients, numbered=True),
-    "specular_intensity": MapKind(lambda s: s.rho, png=8),
-    "shininess": MapKind(lambda s: (1 / np.maximum(s.inv_kappa, LEAST_INV_KAPPA)).astype(np.float32)),
-    "inv_kappa": MapKind(lambda s: s.inv_kappa),
-    "roughness": MapKind(lambda s: microfacet.roughness_from_inv_kappa(s.inv_kappa).astype(np.float32), png=8),
-    "f0": MapKind(lambda s: s.f0, png=16),  # about 0.03: 8 bits would leave 8 steps
-    "normal": MapKind(lambda s: s.normal, png=8, encoded=True),
-    "irradiance_ratio": MapKind(lambda s: s.irradiance_ratio, png=8, colour=True),
-    "displacement": MapKind(lambda s: s.displacement * np.float32(MM), units="mm"),
+    "albedo": MapKind(("albedo",), png=8, space="srgb_png", colour=True),
+    "specular_coefficients": MapKind(("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True),
+    "lobe_coefficients": MapKind(("coefficients",), numbered=True),
+    "specular_intensity": MapKind(("rho",), png=8),
+    "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, LEAST_INV_KAPPA)),
+    "inv_kappa": MapKind(("inv_kappa",)),
+    "roughness": MapKind(("inv_kappa",), microfacet.roughness_from_inv_kappa, png=8),
+    "f0": MapKind(("f0",), png=16),  # about 0.03: 8 bits would leave 8 steps
+    "normal": MapKind(("normal",), png=8, encoded=True),
+    "irradiance_ratio": MapKind(("irradiance_ratio",), png=8, colour=True),
+    "ambient_occlusion": MapKind(("ambient",), png=8),
+    "displacement": MapKind(("displacement",), lambda d: d * np.float32(MM), units="mm"),
+    "clamped": MapKind(("clamped",), lambda c: (c > 0).astype(np.float32), png=8),
 }
 
 
@@ -58,17 +74,18 @@ def write_maps(baked: Baked, context: Context) -> dict[str, TextureMap]:
     maps = {}
     for name, kind in KINDS.items():
         context.check()
-        values = kind.values(baked.samples)
-        values = values[:, None] if values.ndim == 1 else values
-        image = values[baked.nearest]
-        maps[name] = _store(name, image, values, kind, context)
+        if name == "clamped" and not baked.figures["albedo_clamped"]:
+            continue
+        maps[name] = _from_samples(name, kind, baked, context)
     covered = baked.covered()
+    plain = MapKind((), png=8)
     seen = resized(baked.confidence, baked.size)[..., None]
-    flags = covered.astype(np.float32)[..., None]
-    maps["confidence"] = _store("confidence", seen, seen[covered], MapKind(_none, png=8), context)
-    maps["coverage"] = _store("coverage", flags, flags, MapKind(_none, png=8), context)
-    flat = baked.lut.reshape(-1, baked.lut.shape[2])
-    maps["basis_lut"] = _store("basis_lut", baked.lut, flat, MapKind(_none, numbered=True), context)
+    maps["confidence"] = _store("confidence", seen, _range(seen[covered]), plain, context)
+    flags = np.zeros((baked.size * baked.size, 1), np.float32)
+    flags[baked.texel, 0] = np.where(baked.samples.unseen > 0.5, UNSEEN, 1)
+    maps["coverage"] = _store("coverage", flags.reshape(*covered.shape, 1), _range(flags), plain, context)
+    lut = MapKind((), numbered=True)
+    maps["basis_lut"] = _store("basis_lut", baked.lut, _range(baked.lut), lut, context)
     return maps
 
 
@@ -81,11 +98,33 @@ def resized(image: F32, size: int) -> F32:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _none(samples: Samples) -> F32:
-    raise NotImplementedError("this map is not made from samples")
+def _from_samples(name: str, kind: MapKind, baked: Baked, context: Context) -> TextureMap:
+    low, high, total = np.inf, -np.inf, 0.0
+    first = kind.values(baked.samples, slice(0, 1))
+    shape = (baked.size, baked.size, first.shape[-1])
+    image = _picture(shape, context.scratch)
+    for start, stop in bands(baked.size):
+        image[start:stop] = kind.values(baked.samples, baked.nearest[start:stop])
+    rows = len(baked.texel)
+    for start in range(0, rows, 1 << 20):
+        part = kind.values(baked.samples, slice(start, start + (1 << 20)))
+        low, high = min(low, float(part.min())), max(high, float(part.max()))
+        total += float(part.sum(dtype=np.float64))
+    return _store(name, image, (low, total / (rows * shape[2]), high), kind, context)
 
 
-def _store(name: str, image: F32, values: F32, kind: MapKind, context: Context) -> TextureMap:
+def _picture(shape: tuple[int, int, int], folder: Path) -> F32:
+    """Channel after channel in memory, so that each is one piece for the EXR's writer, seen as (H, W, C)."""
+    planes = (shape[2], *shape[:2])
+    made = np.empty(planes, np.float32) if np.prod(shape) < IN_MEMORY else blank(folder, planes, np.float32)
+    return np.moveaxis(made, 0, -1)
+
+
+def _range(values: F32) -> tuple[float, float, float]:
+    return float(values.min()), float(values.mean(dtype=np.float64)), float(values.max())
+
+
+def _store(name: str, image: F32, figures: tuple[float, float, float], kind: MapKind, context: Context) -> TextureMap:
     folder = context.workdir / FOLDER
     channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
     primaries = REC709 if kind.colour else None
@@ -96,14 +135,15 @@ def _store(name: str, image: F32, values: F32, kind: MapKind, context: Context) 
         if kind.space == "srgb_png":
             write_png_from_linear(path, image)
         else:
-            write_png(path, 0.5 * image + 0.5 if kind.encoded else image, kind.png)
+            write_png(path, image, kind.png, signed=kind.encoded)
         files["png"] = context.file(f"{FOLDER}/{name}.png")
+    minimum, mean, maximum = figures
     return TextureMap(
         name=name,
         channels=image.shape[2],
         files=files,
         space=kind.space,
-        minimum=float(values.min()),
-        mean=float(values.mean(dtype=np.float64)),
-        maximum=float(values.max()),
+        minimum=minimum,
+        mean=mean,
+        maximum=maximum,
     )

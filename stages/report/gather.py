@@ -86,6 +86,8 @@ def figures(r: Results) -> dict[str, Any]:
             "size": bake.size,
             "covered_share": bake.coverage,
             "zero_set_rms_mm": bake.zero_set_rms_mm,
+            **{f"zero_set_rms_mm_{name}": value for name, value in sorted(bake.lod_rms_mm.items())},
+            **bake.figures,
             **{
                 n: {"channels": m.channels, "minimum": m.minimum, "mean": m.mean, "maximum": m.maximum}
                 for n, m in sorted(bake.maps.items())

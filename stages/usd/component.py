@@ -1,8 +1,9 @@
 """The component's layers: root, payload, and the single layer of the preview package.
 
 Structure (ASWF asset-structure guidelines): root = Xform of kind component with assetInfo and a class to inherit;
-payload = geo/render, geo/proxy and mtl. One material has three ways to the same look (shading.py, materialx.py); the
-variant sets `look` and `lod` on the root choose among them, and among the meshes.
+payload = geo/render, geo/proxy and mtl; high.usdc = the dense mesh, loaded where asked for. One material has three
+ways to the same look (shading.py, materialx.py); the variant sets `look` and `lod` on the root choose among them, and
+among the meshes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from stages.usd.mesh import UvSurface
 from stages.usd.shading import MATERIAL, Look, preview_networks
 
 STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
-FULL, PROXY = "full", "proxy"
+HIGH, RENDER, PROXY = "high", "render", "proxy"
+HIGH_FILE = "high.usdc"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,9 @@ def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
     return prim
 
 
-def root_layer(who: Identity, extents: list[Gf.Vec3f], look: Look, *, proxy: bool, thumbnail: str | None) -> Sdf.Layer:
+def root_layer(
+    who: Identity, extents: list[Gf.Vec3f], look: Look, *, high: bool, proxy: bool, thumbnail: str | None
+) -> Sdf.Layer:
     """NAME.usd: the file that others reference. `extents`: the box of each purpose present, for display unloaded."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
@@ -81,17 +85,15 @@ def root_layer(who: Identity, extents: list[Gf.Vec3f], look: Look, *, proxy: boo
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    _variants(stage, prim, look, proxy=proxy)
+    _looks(stage, prim, look)
+    _levels(stage, prim, high=high, proxy=proxy)
     return detached(stage)
 
 
-def _variants(stage: Usd.Stage, prim: Usd.Prim, look: Look, *, proxy: bool) -> None:
-    """`look`: which network of the material is its surface. `lod`: the full mesh (with its proxy), or the proxy alone.
-
-    Each holds only what differs, so that the payload alone is what the first variants show.
-    """
-    path = prim.GetPath()
-    material = path.AppendPath(f"mtl/{MATERIAL}")
+def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
+    """`look`: which network of the material is its surface. Each variant holds only what differs, so that the payload
+    alone is what the first one shows."""
+    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
     outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
     if not look.specular:
         del outputs[SPECULAR]
@@ -107,23 +109,51 @@ def _variants(stage: Usd.Stage, prim: Usd.Prim, look: Look, *, proxy: bool) -> N
                 attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
                 attribute.SetConnections([material.AppendPath(source)])
     looks.SetVariantSelection(STANDARD)
+
+
+def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> None:
+    """`lod`: the mesh that is textured (with its proxy), the dense mesh alone, or the proxy alone."""
+    path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
-    for variant in (FULL, PROXY) if proxy else (FULL,):
+    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
+        if not made:
+            continue
         lods.AddVariant(variant)
         lods.SetVariantSelection(variant)
-        if variant == PROXY:
-            with lods.GetVariantEditContext():
-                stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
+        if variant == RENDER:
+            continue
+        with lods.GetVariantEditContext():
+            stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
+            if variant == HIGH:
+                if proxy:
+                    stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
+                dense = stage.OverridePrim(path.AppendPath("geo/high"))
+                dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
+                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
+                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
+            else:
                 shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
                 purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
                 purpose.Set(UsdGeom.Tokens.default_)
-    lods.SetVariantSelection(FULL)
+    lods.SetVariantSelection(RENDER)
 
 
 def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
     """payload.usdc: what is heavy. With a proxy the full mesh has purpose render, else it is shown always."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look)
+    return detached(stage)
+
+
+def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
+    """high.usdc: the dense mesh as /high. It is bound to the material where it is loaded."""
+    stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    made = _mesh(stage, "/high", mesh, None)
+    made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    stage.SetDefaultPrim(made.GetPrim())
+    stage.GetRootLayer().documentation = "The captured head's surface before decimation."
     return detached(stage)
 
 
@@ -151,7 +181,7 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None,
         render.SetProxyPrim(stand_in)
 
 
-def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material) -> UsdGeom.Mesh:
+def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:
     """A triangle mesh. Vertices without a face are left out; normals are made unit length."""
     used, faces = np.unique(mesh.faces, return_inverse=True)
     uv_used, uv_faces = np.unique(mesh.uv_faces, return_inverse=True)
@@ -172,5 +202,6 @@ def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Mater
     # xatlas may put a border vertex a rounding error outside of the square
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs[uv_used].clip(0, 1), np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))
-    UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
+    if material is not None:
+        UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
     return out

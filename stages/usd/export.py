@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, Surface, TextureSet, UvMesh
 from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd import component
@@ -26,6 +26,7 @@ from stages.usd.package import bounded_png, write_package
 from stages.usd.shading import Look
 
 F32 = npt.NDArray[np.float32]
+NEAR_HIGH = 4  # triangles looked at for each of the dense mesh, which is finer than what it lies on
 THUMBNAIL = "./thumbnails/default.png"  # made by the stage once there is something to render
 
 
@@ -38,6 +39,7 @@ class Settings(Protocol):
     glb: bool
     obj: bool
     proxy: bool
+    high: bool
     environment_width: int
     divide_shadows: bool
     acescg: bool
@@ -57,6 +59,7 @@ class Export:
 
 
 def export(
+    surface: Located[Surface],
     uv: Located[UvMesh],
     bake: Located[TextureSet],
     face: Located[FittedFace],
@@ -70,6 +73,8 @@ def export(
     name = settings.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
     proxy, notes = _proxy(uv, mesh) if settings.proxy else (None, [])
+    high, left_out = _high(surface, mesh) if settings.high else (None, [])
+    notes += left_out
     check()
     light = read_light(face.path(face.artifact.light))
     maps = write_maps(bake, mesh, light, name, folder, check, divide=settings.divide_shadows, acescg=settings.acescg)
@@ -80,10 +85,15 @@ def export(
     holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
     cameras = tuple(sorted(poses.artifact.cameras, key=lambda c: c.index))
     layers = {
-        f"{name}.usd": (component.root_layer(who, hints, look, proxy=proxy is not None, thumbnail=THUMBNAIL), "usda"),
+        f"{name}.usd": (
+            component.root_layer(who, hints, look, high=high is not None, proxy=proxy is not None, thumbnail=THUMBNAIL),
+            "usda",
+        ),
         "payload.usdc": (component.payload_layer(name, mesh, proxy, look), "usdc"),
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
     }
+    if high is not None:
+        layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
     for file, (layer, form) in layers.items():
         _write_layer(layer, folder / file, form)
     dome = environment(light, settings.environment_width)
@@ -137,6 +147,13 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
     proxy = without_overlap(with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh))
     fault = uv_fault(proxy, mesh)
     return (None, [f"the proxy mesh was left out: {fault}"]) if fault else (proxy, [])
+
+
+def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
+    """The dense mesh with the textured mesh's coordinates. At charts' edges its corners are drawn onto the edge."""
+    high = with_uvs_from(read_mesh(surface.path(surface.artifact.mesh), with_uvs=False), mesh, NEAR_HIGH)
+    fault = uv_fault(high, mesh)
+    return (None, [f"the dense mesh was left out: {fault}"]) if fault else (high, [])
 
 
 def attenuation_of(face: FittedFace) -> str:

@@ -18,6 +18,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
 from pipeline.maths import sh
 from pipeline.meshes import Charts
+from pipeline.nearest import filled
 from stages.usd.exported import numbered
 from stages.usd.lamps import lamps
 from stages.usd.light import environment
@@ -167,17 +168,14 @@ def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F32, check: Callable[[
 
 def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
     """(size, size, C) values (V, C) of the vertices on the texture, every texel filled from the nearest chart."""
-    from scipy.ndimage import distance_transform_edt
-
     charts = Charts(mesh.uvs, mesh.uv_faces)
     hits = raster.rasterise(raster.texel_corners(charts, size), size, 0, size)
     image = np.zeros((size * size, values.shape[1]), np.float32)
     corners = values[mesh.faces[hits.face]].astype(np.float32)
     image[hits.texel] = np.einsum("nic,ni->nc", corners, hits.weights)
-    empty = np.ones(size * size, np.bool_)
-    empty[hits.texel] = False
-    nearest = distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True)
-    return np.ascontiguousarray(image.reshape(size, size, -1)[nearest[0], nearest[1]])
+    known = np.zeros(size * size, np.bool_)
+    known[hits.texel] = True
+    return filled(image.reshape(size, size, -1), known.reshape(size, size))
 
 
 def _write_fit(fit: LobeFit, name: str, folder: Path) -> Path:
@@ -217,14 +215,14 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
 
 
 def covered_texels(bake: Located[TextureSet]) -> Mask:
-    """(H, W) texels that a chart touches; all where that was not baked."""
+    """(H, W) texels that a chart touches, seen by a photo (1) or not (0.5); all where that was not baked."""
     size = bake.artifact.size
     files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
     found: Mask | None = None
     if "exr" in files:
-        found = np.asarray(read_exr(bake.path(files["exr"]))[0][..., 0] > 0.5)
+        found = np.asarray(read_exr(bake.path(files["exr"]))[0][..., 0] > 0.25)
     elif "png" in files:
-        found = np.asarray(read_alpha(bake.path(files["png"])) > 0.5)
+        found = np.asarray(read_alpha(bake.path(files["png"])) > 0.25)
     if found is None or found.shape != (size, size) or not found.any():
         return np.ones((size, size), np.bool_)
     return found

@@ -88,7 +88,7 @@ def charts_of(uv_faces: I32, count: int) -> I32:
     return np.asarray(labels[uv_faces[:, 0]], np.int32)
 
 
-def with_uvs_from(proxy: UvSurface, full: UvSurface) -> UvSurface:
+def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATES) -> UvSurface:
     """The proxy with texture coordinates of the full mesh, so that one material serves both.
 
     Each proxy triangle takes the chart that lies nearest to its centroid, and each of its corners the texture
@@ -101,7 +101,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface) -> UvSurface:
     chart = charts_of(full.uv_faces, len(full.uvs))
     corners, t = full.vertices[full.faces].astype(np.float64), full.uvs[full.uv_faces].astype(np.float64)
     ends = proxy.vertices[proxy.faces].astype(np.float64)
-    hit, weights = _nearest(ends.mean(1), corners, cKDTree(corners.mean(1)).query(ends.mean(1), CANDIDATES)[1])
+    hit, weights = _nearest(ends.mean(1), corners, cKDTree(corners.mean(1)).query(ends.mean(1), candidates)[1])
     scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres a unit of texture
     expected = _continued(ends, corners[hit], t[hit], weights)
     places = np.concatenate([corners.mean(1), scale * t.mean(1)], 1)
@@ -110,7 +110,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface) -> UvSurface:
     for number in np.unique(chart[hit]):
         rows, inside = np.flatnonzero(chart[hit] == number), np.flatnonzero(chart == number)
         query = wanted[rows].reshape(-1, 5)
-        near = cKDTree(places[inside]).query(query, min(CANDIDATES, len(inside)))[1].reshape(len(query), -1)
+        near = cKDTree(places[inside]).query(query, min(candidates, len(inside)))[1].reshape(len(query), -1)
         face, weights = _nearest(query[:, :3], corners[inside], near)
         uvs[rows] = (t[inside[face]] * weights[..., None]).sum(1).reshape(-1, 3, 2)
     values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)

@@ -8,7 +8,7 @@ from pipeline.errors import UsageError
 
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 LONGEST = 64
-RESERVED = ("payload", "lookdev", "environment", "light")  # names of files beside the component
+RESERVED = ("payload", "lookdev", "environment", "light", "high")  # names of files beside the component
 
 
 def check_name(name: str) -> str:

@@ -14,6 +14,7 @@ from pipeline.artifacts import (
     FittedFace,
     HeldOutView,
     Located,
+    Surface,
     TextureSet,
     UsdAsset,
     UvMesh,
@@ -25,6 +26,7 @@ from pipeline.contract import Context, Stage, StageConfig
 class Inputs:
     """What is exported."""
 
+    surface: Located[Surface]
     uv: Located[UvMesh]
     bake: Located[TextureSet]
     inverse_rendering: Located[FittedFace]
@@ -48,6 +50,7 @@ class Config(StageConfig):
     )
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
+    high: bool = Field(True, description="write the dense mesh as high.usdc, for the variant lod=high")
     environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
     samples: int = Field(
@@ -67,6 +70,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     total = 4
     context.progress(0, total, "writing the component")
     made = export(
+        inputs.surface,
         inputs.uv,
         inputs.bake,
         inputs.inverse_rendering,
@@ -115,4 +119,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=3, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=4, inputs=Inputs, config=Config, output=UsdAsset, run=run)

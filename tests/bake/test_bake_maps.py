@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from pipeline import meshes, raster, tangents
 from pipeline.contract import Context
@@ -14,8 +15,10 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.maths import microfacet
 from pipeline.meshes import Charts, Mesh
+from stages.bake.ambient import ambient
 from stages.bake.build import Baked, build
 from stages.bake.confidence import Occluder, View, confidence, weight_of
+from stages.bake.gutter import nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
 from stages.surface.build import build as surface_build
@@ -104,15 +107,22 @@ def checked(mesh_and_charts: tuple[Mesh, Charts], baked: Baked) -> tuple[np.ndar
         ("albedo", analytic.linear_albedo),
         ("specular_intensity", analytic.linear_rho),
         ("specular_coefficients", lambda p: analytic.linear_rho(p)[:, None] * analytic.linear_coefficients(p)),
+        ("lobe_coefficients", analytic.linear_coefficients),
         ("inv_kappa", analytic.linear_inv_kappa),
         ("shininess", lambda p: 1 / analytic.linear_inv_kappa(p)),
     ],
 )
-def test_material_is_that_of_the_true_surface(folder: Path, checked: tuple, name: str, formula: object) -> None:
+def test_material_is_that_of_the_true_surface(
+    folder: Path, checked: tuple, baked: Baked, name: str, formula: object
+) -> None:
     texel, points = checked
     image, channels = read_exr(folder / f"{name}.exr")
     expected = np.atleast_2d(formula(points).T).T  # type: ignore[operator]
     got = image.reshape(-1, image.shape[2])[texel]
+    if name == "albedo":  # where no photo saw the surface, it follows what is around
+        use = baked.samples.unseen[np.searchsorted(baked.texel, texel)] == 0
+        got, expected = got[use], expected[use]
+        assert len(got) > 200
     assert np.abs(got / expected - 1).max() < 1e-3
     if name == "specular_coefficients":
         assert channels == ("c0", "c1", "c2")
@@ -242,6 +252,55 @@ def test_each_empty_texel_repeats_the_nearest_chart(baked: Baked) -> None:
         square = (rows - r) ** 2 + (columns - c) ** 2
         source = baked.texel[baked.nearest[r, c]]
         assert (source // SIZE - r) ** 2 + (source % SIZE - c) ** 2 == square.min()
+
+
+def test_nearest_texels_are_found_across_bands_and_holes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Band by band as over the whole picture; and where a band's surroundings are empty, further away."""
+    rng = np.random.default_rng(2)
+    covered = rng.random((96, 64)) < 0.02
+    covered[40:70] = False
+    rows, columns = np.nonzero(covered)
+    for halo in (512, 4):
+        monkeypatch.setattr("stages.bake.gutter.HALO", halo)
+        for first in range(0, 96, 8):
+            got = nearest_rows(covered, first, first + 8)
+            for r, c in ((0, 0), (3, 31), (7, 63)):
+                away = (rows - first - r) ** 2 + (columns - c) ** 2
+                y, x = divmod(int(got[r, c]), 64)
+                assert covered[y, x]
+                if halo == 512:
+                    assert (y - first - r) ** 2 + (x - c) ** 2 == away.min()
+
+
+def test_ambient_occlusion_of_a_groove() -> None:
+    """On the floor of a long groove of half width a and depth d the sky fills sin(atan(a / d)) of the cosine."""
+    box = trimesh.creation.box((0.4, 0.02, 4.0))
+    walls = [trimesh.creation.box((0.02, 0.1, 4.0)).apply_translation((x, 0.05, 0)) for x in (-0.06, 0.06)]
+    both = trimesh.util.concatenate([box, *walls])
+    floor = np.array([[0, 0.0101, 0], [0.001, 0.0101, 0], [0, 0.0101, 0.001]], np.float32)
+    vertices = np.concatenate([both.vertices, floor]).astype(np.float32)
+    normals = np.concatenate([both.vertex_normals, np.tile([0, 1, 0], (3, 1))]).astype(np.float32)
+    mesh = Mesh(vertices, normals, both.faces.astype(np.int32))
+    got = ambient(mesh, Occluder(mesh), lambda done, total: None)[-3:]
+    lifted = 0.1 - 0.0101 - 0.002 * 4.0
+    assert np.allclose(got, np.sin(np.arctan(0.05 / lifted)), atol=0.03)
+
+
+def test_albedo_is_clamped_to_what_skin_can_be(field: AnalyticField, mesh_and_charts: tuple, tmp_path: Path) -> None:
+    class Glowing(AnalyticField):
+        def material(self, points: np.ndarray) -> object:  # type: ignore[override]
+            found = super().material(points)
+            found.albedo[points[:, 0] > 0.05] = 1.0
+            return found
+
+    baked = build(Glowing(ellipsoid()), *mesh_and_charts, VIEWS, SIZE, quiet)
+    albedo, clamped = np.asarray(baked.samples.albedo), np.asarray(baked.samples.clamped)
+    assert albedo.max() == np.float32(0.95) and clamped.max() == pytest.approx(0.05, abs=1e-6)
+    assert baked.figures["albedo_clamped"] == pytest.approx((clamped > 0).mean(), abs=1e-6) and (clamped > 0).any()
+    assert any("was clamped" in w for w in baked.warnings)
+    maps = write_maps(baked, Context(tmp_path, tmp_path))
+    marked = read_exr(tmp_path / "textures/clamped.exr")[0][..., 0]
+    assert np.array_equal(marked.reshape(-1)[baked.texel] > 0, clamped > 0) and "clamped" in maps
 
 
 def test_coverage_holds_every_touched_texel(mesh_and_charts: tuple[Mesh, Charts], baked: Baked) -> None:

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import FileRef, Located, MaskSet, UvMesh, ViewMask
+from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, UvMesh, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from pipeline.images import read_encoded, read_exr, write_png
@@ -21,8 +21,18 @@ from stages.uv.unwrap import Options, unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.field_artifacts import fitted, poses
 
-PNG = {"albedo", "irradiance_ratio", "specular_intensity", "roughness", "f0", "normal", "confidence", "coverage"}
-ALL = PNG | {"specular_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
+PNG = {
+    "albedo",
+    "irradiance_ratio",
+    "specular_intensity",
+    "roughness",
+    "f0",
+    "normal",
+    "confidence",
+    "coverage",
+    "ambient_occlusion",
+}
+ALL = PNG | {"specular_coefficients", "lobe_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
 
 
 @pytest.fixture
@@ -37,12 +47,31 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
     )  # fmt: skip
     write_png(tmp_path / "mask.png", np.ones((64, 64)))
     mask = ViewMask(index=1, mask=FileRef.of(tmp_path, "mask.png"), source="given", coverage=1.0)
+    meshes.save(tmp_path / "surface.npz", mesh)
+    surface = Surface(
+        mesh=FileRef.of(tmp_path, "surface.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), watertight=True,
+        components=1, removed_components=0, cell=0.005,
+    )  # fmt: skip
     return Inputs(
+        Located(surface, tmp_path),
         Located(uv, tmp_path),
         fitted(tmp_path, field, monkeypatch, views=3),
         poses(tmp_path),
         Located(MaskSet(masks=(mask,)), tmp_path),
+        photographed(tmp_path),
     )
+
+
+def photographed(folder: Path) -> Located[Capture]:
+    """Photos of the four cameras in plain grey; the fourth is held out, and its file is missing."""
+    for i in range(4):
+        write_png(folder / f"{i}.png", np.full((64, 64, 3), 0.5))
+    views = tuple(
+        CaptureView(index=i, name=f"{i}.png", image=FileRef.of(folder, f"{i}.png"), width=64, height=64, holdout=i == 3)
+        for i in range(4)
+    )
+    (folder / "3.png").unlink()
+    return Located(Capture(kind="facescape", views=views), folder)
 
 
 def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
@@ -55,8 +84,11 @@ def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
         assert image.shape == ((1, 64, 3) if name == "basis_lut" else (256, 256, found.channels))
         assert np.isfinite(image).all() and found.minimum <= found.mean <= found.maximum
     assert read_encoded(tmp_path / "textures/f0.png").dtype == np.uint16
+    # chords of 800 triangles on a ball of 80 mm: the sagitta of a triangle's side of 14 mm is 0.3 mm
+    assert set(textures.lod_rms_mm) == {"render", "high"} and 0.05 < textures.lod_rms_mm["render"] < 0.4
+    assert textures.lod_rms_mm["render"] == pytest.approx(textures.zero_set_rms_mm, rel=0.1)
     assert textures.maps["albedo"].space == "srgb_png" and textures.maps["normal"].space == "raw"
-    covered = read_exr(tmp_path / "textures/coverage.exr")[0][..., 0] > 0.5
+    covered = read_exr(tmp_path / "textures/coverage.exr")[0][..., 0] > 0
     rho = read_exr(tmp_path / "textures/specular_intensity.exr")[0][covered]
     assert textures.maps["specular_intensity"].mean == pytest.approx(float(rho.mean()), rel=1e-5)
     png = read_encoded(tmp_path / "textures/roughness.png")[..., 0] / 255
@@ -69,9 +101,29 @@ def test_manifest_is_the_same_twice(inputs: Inputs, tmp_path: Path) -> None:
 
 
 def test_views_are_the_fitted_ones_with_their_masks(inputs: Inputs, tmp_path: Path) -> None:
-    views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks)
+    views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
+    assert [v.photo for v in views] == [tmp_path / f"{i}.png" for i in range(3)]
     assert [v.camera.index for v in views] == [0, 1, 2]
     assert [v.mask for v in views] == [None, tmp_path / "mask.png", None]
+
+
+def test_no_photo_that_was_held_out_is_ever_a_view(inputs: Inputs) -> None:
+    """Not even if the fit should name it."""
+    face = inputs.inverse_rendering.artifact.model_copy(update={"fitted_views": (0, 1, 2, 3)})
+    views = seen_by(face, inputs.poses.artifact, inputs.masks, inputs.capture)
+    assert [v.camera.index for v in views] == [0, 1, 2]
+
+
+def test_photo_detail_can_be_left_out(inputs: Inputs, tmp_path: Path) -> None:
+    made = {}
+    for wanted in (True, False):
+        folder = tmp_path / str(wanted)
+        found = run(inputs, Config(size=256, detail=wanted), Context(folder, tmp_path))
+        assert ("detail_support" in found.figures) == wanted and 0 < found.figures["unseen"] < 1
+        made[wanted] = read_exr(folder / "textures/albedo.exr")[0]
+        coverage = read_exr(folder / "textures/coverage.exr")[0]
+        assert set(np.unique(coverage)) == {0, 0.5, 1}
+    assert not np.array_equal(made[True], made[False])
 
 
 def test_run_can_be_stopped(inputs: Inputs, tmp_path: Path) -> None:
@@ -79,7 +131,7 @@ def test_run_can_be_stopped(inputs: Inputs, tmp_path: Path) -> None:
         run(inputs, Config(size=256), Context(tmp_path, tmp_path, cancelled=lambda: True))
 
 
-@pytest.mark.parametrize("size", [0, 255, 8193])
+@pytest.mark.parametrize("size", [0, 255, 16385])
 def test_size_limits(size: int) -> None:
     with pytest.raises(ValidationError):
         Config(size=size)

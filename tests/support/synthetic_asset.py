@@ -19,6 +19,7 @@ from pipeline.artifacts import (
     FittedFace,
     HeldOutView,
     Located,
+    Surface,
     TextureMap,
     TextureSet,
     UvMesh,
@@ -34,6 +35,7 @@ RANK = 3
 class SyntheticInputs:
     """The usd stage's inputs by name."""
 
+    surface: Located[Surface]
     uv: Located[UvMesh]
     bake: Located[TextureSet]
     inverse_rendering: Located[FittedFace]
@@ -189,9 +191,20 @@ def write_inputs(
     scale: int = 1,
 ) -> SyntheticInputs:
     """All inputs of the usd stage. The fit's predictions of held-out views are grey cards."""
-    made = {n: folder / n for n in ("uv", "bake", "face", "poses", "capture")}
+    made = {n: folder / n for n in ("surface", "uv", "bake", "face", "poses", "capture")}
     for f in made.values():
         f.mkdir(parents=True, exist_ok=True)
+    dense = ball(72, 36)
+    np.savez(made["surface"] / "surface.npz", **{k: dense[k] for k in ("vertices", "normals", "faces")})
+    surface = Surface(
+        mesh=FileRef.of(made["surface"], "surface.npz"),
+        vertices=len(dense["vertices"]),
+        faces=len(dense["faces"]),
+        watertight=True,
+        components=1,
+        removed_components=0,
+        cell=0.001,
+    )
     mesh = mesh or ball()
     np.savez(made["uv"] / "mesh.npz", **mesh)
     refs = {"mesh": FileRef.of(made["uv"], "mesh.npz")}
@@ -241,6 +254,7 @@ def write_inputs(
         model={"specular": {"rank": 3, "modelled": True, "evidence": "synthetic"}},
     )
     return SyntheticInputs(
+        Located(surface, made["surface"]),
         Located(uv, made["uv"]),
         write_textures(made["bake"], arrays or texture_arrays()),
         Located(face, made["face"]),
@@ -270,3 +284,12 @@ def _capture(folder: Path, rig: CameraSet, held_out: tuple[int, ...]) -> Located
             )
         )
     return Located(Capture(kind="facescape", views=tuple(views)), folder)
+
+
+def run_stage(inputs: SyntheticInputs, folder: Path, **config: object):
+    from pipeline.contract import Context
+    from stages.usd.stage import STAGE, Config, Inputs
+
+    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
+    return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))

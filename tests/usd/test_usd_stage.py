@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
-from support.synthetic_asset import SyntheticInputs, ball, cameras, texture_arrays, write_inputs
+from support.synthetic_asset import SyntheticInputs, ball, cameras, run_stage, texture_arrays, write_inputs
 
 from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
@@ -20,18 +20,13 @@ from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 
 
-def run(inputs: SyntheticInputs, folder: Path, **config: object):
-    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
-    small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
-    return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))
-
-
 def test_files_are_those_of_the_interface(exported) -> None:
     folder, asset = exported
     listed = {f.path for f in asset.files}
     assert {
         "asset/head.usd",
         "asset/payload.usdc",
+        "asset/high.usdc",
         "asset/lookdev.usda",
         "asset/head.usdz",
         "asset/environment.exr",
@@ -136,11 +131,11 @@ def test_two_exports_have_the_same_bytes(inputs: SyntheticInputs, tmp_path: Path
     """In other folders, and years apart by the clock."""
     import time
 
-    first = run(inputs, tmp_path / "a" / "work")
+    first = run_stage(inputs, tmp_path / "a" / "work")
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 1e8)
     monkeypatch.setenv("TZ", "Asia/Tokyo")
-    second = run(inputs, tmp_path / "b/other/work")
+    second = run_stage(inputs, tmp_path / "b/other/work")
     assert first.digest() == second.digest()
     assert {f.path: f.sha256 for f in first.files} == {f.path: f.sha256 for f in second.files}
 
@@ -163,7 +158,7 @@ from pipeline.contract import Context
 from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
-named = {n: getattr(made, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+named = {n: getattr(made, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
 work = Path(sys.argv[2]) / "work"
 asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), Context(work, work / "scratch"))
 print(asset.digest())
@@ -210,7 +205,7 @@ def test_package_aligns_names_of_any_length(tmp_path: Path, length: int) -> None
 
 def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
     """A viewer that shows proxies would otherwise show nothing."""
-    run(write_inputs(tmp_path / "in", proxy=False, held_out=()), tmp_path / "work", usdz=False)
+    run_stage(write_inputs(tmp_path / "in", proxy=False, held_out=()), tmp_path / "work", usdz=False)
     stage = Usd.Stage.Open(str(tmp_path / "work/asset/head.usd"))
     assert UsdGeom.Mesh.Get(stage, "/head/geo/render").ComputePurpose() == "default"
     assert not stage.GetPrimAtPath("/head/geo/proxy")
@@ -218,7 +213,7 @@ def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
 
 
 def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
-    asset = run(write_inputs(tmp_path / "in", scale=2), tmp_path / "work")
+    asset = run_stage(write_inputs(tmp_path / "in", scale=2), tmp_path / "work")
     assert [(v.index, v.scale) for v in asset.views] == [(3, 2), (9, 2)]
     image, names = read_exr(tmp_path / "work" / asset.views[0].exr.path)
     assert image.shape == (60, 48, 4)
@@ -228,7 +223,7 @@ def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
 
 
 def test_without_held_out_views_a_few_fitted_ones_are_rendered(tmp_path: Path) -> None:
-    asset = run(write_inputs(tmp_path / "in", held_out=()), tmp_path / "work")
+    asset = run_stage(write_inputs(tmp_path / "in", held_out=()), tmp_path / "work")
     assert [(v.index, v.scale) for v in asset.views] == [(0, 1), (6, 1), (12, 1)]
 
 
@@ -243,16 +238,18 @@ def test_large_fitted_views_are_rendered_smaller() -> None:
 
 
 def test_name_goes_into_prim_files_and_textures(inputs: SyntheticInputs, tmp_path: Path) -> None:
-    asset = run(inputs, tmp_path / "work", name="anna_02", render_views=False)
+    asset = run_stage(inputs, tmp_path / "work", name="anna_02", render_views=False)
     assert asset.root == "asset/anna_02.usd"
     assert (tmp_path / "work/asset/textures/anna_02_albedo.png").is_file()
     assert Usd.Stage.Open(str(tmp_path / "work/asset/anna_02.usd")).GetDefaultPrim().GetName() == "anna_02"
 
 
-@pytest.mark.parametrize("name", ["", "2head", "my head", "a/b", "tête", "payload", "lookdev2", "Light", "x" * 65])
+@pytest.mark.parametrize(
+    "name", ["", "2head", "my head", "a/b", "tête", "payload", "lookdev2", "Light", "high", "x" * 65]
+)
 def test_bad_names_are_refused_and_mended(inputs: SyntheticInputs, tmp_path: Path, name: str) -> None:
     with pytest.raises(UsageError, match="name"):
-        run(inputs, tmp_path / "work", name=name)
+        run_stage(inputs, tmp_path / "work", name=name)
     assert check_name(name_from(name)) == name_from(name)
 
 
@@ -260,7 +257,7 @@ def test_missing_maps_are_named(tmp_path: Path) -> None:
     arrays = texture_arrays()
     del arrays["inv_kappa"]
     with pytest.raises(StageError, match="maps are missing"):
-        run(write_inputs(tmp_path / "in", arrays=arrays), tmp_path / "work")
+        run_stage(write_inputs(tmp_path / "in", arrays=arrays), tmp_path / "work")
 
 
 @pytest.mark.parametrize("key, value", [("faces", -1), ("faces", 10**6), ("uv_faces", 10**6), ("vertices", np.nan)])
@@ -268,26 +265,26 @@ def test_broken_meshes_are_refused(tmp_path: Path, key: str, value: float) -> No
     mesh = ball()
     mesh[key][5, 1] = value
     with pytest.raises(StageError, match="mesh can't be exported"):
-        run(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
+        run_stage(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
 
 
 def test_mesh_without_uvs_is_refused(tmp_path: Path) -> None:
     mesh = ball()
     del mesh["uvs"]
     with pytest.raises(StageError, match="no array uvs"):
-        run(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
+        run_stage(write_inputs(tmp_path / "in", mesh=mesh), tmp_path / "work")
 
 
 @pytest.mark.parametrize("light", [np.zeros((120, 3)), np.zeros((121, 4)), np.full((121, 3), np.nan)])
 def test_broken_lights_are_refused(tmp_path: Path, light: np.ndarray) -> None:
     with pytest.raises(StageError, match="light can't be used"):
-        run(write_inputs(tmp_path / "in", light=light.astype(np.float32)), tmp_path / "work")
+        run_stage(write_inputs(tmp_path / "in", light=light.astype(np.float32)), tmp_path / "work")
 
 
 def test_a_cancelled_export_stops(inputs: SyntheticInputs, tmp_path: Path) -> None:
     from pipeline.errors import Cancelled
 
-    named = {n: getattr(inputs, n) for n in ("uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
     context = Context(tmp_path / "w", tmp_path / "s", cancelled=lambda: True)
     with pytest.raises(Cancelled):
         STAGE.run(Inputs(**named), Config(), context)
@@ -314,170 +311,3 @@ def test_ior(f0: float, ior: float) -> None:
 
 def test_ior_of_implausible_reflectance_stays_finite() -> None:
     assert 1 < ior_from_f0(-1.0) < ior_from_f0(5.0) < 3
-
-
-# ------------------------------------------------------------------ looks and levels of detail
-def surface_of(stage: Usd.Stage, context: str) -> str:
-    material = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/head/geo/render")).ComputeBoundMaterial()[0]
-    output = material.GetSurfaceOutput(context) if context else material.GetSurfaceOutput()
-    return str(output.GetConnectedSources()[0][0].source.GetPrim().GetPath()).removeprefix("/head/mtl/captured/")
-
-
-@pytest.mark.parametrize(
-    "look, preview, materialx",
-    [
-        ("standard", "preview", "openpbr/surface"),
-        ("specular_workflow", "preview_specular", "openpbr/surface"),
-        ("neuface_basis", "preview", "neuface_basis/surface"),
-    ],
-)
-def test_looks_choose_the_surface(exported, look: str, preview: str, materialx: str) -> None:
-    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
-    looks = stage.GetDefaultPrim().GetVariantSet("look")
-    assert sorted(looks.GetVariantNames()) == ["neuface_basis", "specular_workflow", "standard"]
-    assert looks.GetVariantSelection() == "standard"
-    looks.SetVariantSelection(look)
-    assert (surface_of(stage, ""), surface_of(stage, "mtlx")) == (preview, materialx)
-
-
-def test_levels_of_detail(exported) -> None:
-    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
-    stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection("proxy")
-    shown = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
-    assert [p.GetName() for p in shown] == ["proxy"]
-    assert UsdGeom.Imageable(shown[0]).ComputePurpose() == "default"
-
-
-def test_only_what_the_user_said_is_recorded(exported, inputs: SyntheticInputs, tmp_path: Path) -> None:
-    plain = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
-    assert "capture" not in plain.GetDefaultPrim().GetAssetInfo()
-    assert exported[1].stated == {}
-    said = {"author": "Anna", "license": "CC BY 4.0", "subject_consent": "research, until 2030"}
-    made = run(inputs, tmp_path / "work", render_views=False, **said)
-    wanted = {"author": "Anna", "license": "CC BY 4.0", "subjectConsent": "research, until 2030"}
-    for file in ("head.usd", "head.usdz"):
-        stage = Usd.Stage.Open(str(tmp_path / "work/asset" / file))
-        assert dict(stage.GetDefaultPrim().GetAssetInfo()["capture"]) == wanted
-        assert dict(stage.GetRootLayer().customLayerData["capture"]) == wanted
-    assert made.stated == wanted
-
-
-def test_opening_lookdev_shows_a_held_out_photo(exported, inputs: SyntheticInputs) -> None:
-    from stages.usd.exported import read_cameras
-
-    path = exported[0] / "asset/lookdev.usda"
-    stage = Usd.Stage.Open(str(path))
-    main = next(p for p in stage.Traverse() if p.GetName() == "main_cam")
-    cameras = read_cameras(path)
-    held_out = [i for i, (_, out) in cameras.items() if out]
-    assert held_out == [3, 9]
-    poses = {c.index: matrix(c.world_from_cam) for c in inputs.poses.artifact.cameras}
-    first = max(held_out, key=lambda i: poses[i][2, 3])
-    world = UsdGeom.Xformable(main).ComputeLocalToWorldTransform(Usd.TimeCode.Default())
-    np.testing.assert_allclose(np.array(world).T[:3, 3], poses[first][:3, 3], atol=1e-9)
-    settings = stage.GetPrimAtPath(stage.GetMetadata("renderSettingsPrimPath"))
-    assert settings.GetRelationship("camera").GetTargets() == [main.GetPath()]
-
-
-def test_cameras_are_read_back_as_they_were(exported, inputs: SyntheticInputs) -> None:
-    from stages.usd.exported import read_cameras
-
-    found = read_cameras(exported[0] / "asset/lookdev.usda")
-    for camera in inputs.poses.artifact.cameras:
-        view = found[camera.index][0]
-        np.testing.assert_allclose(view.K, matrix(camera.K), atol=1e-3)
-        np.testing.assert_allclose(view.world_from_cam, matrix(camera.world_from_cam), atol=1e-9)
-        np.testing.assert_allclose(view.distortion, camera.distortion, atol=1e-9)
-        assert (view.width, view.height) == (camera.width, camera.height)
-
-
-def test_proxy_texture_lies_on_no_texel_twice(exported) -> None:
-    from pipeline import raster
-    from pipeline.meshes import Charts
-
-    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
-    st = np.array(UsdGeom.PrimvarsAPI(UsdGeom.Mesh.Get(stage, "/head/geo/proxy")).GetPrimvar("st").ComputeFlattened())
-    flat = Charts(st.astype(np.float32), np.arange(len(st), dtype=np.int32).reshape(-1, 3))
-    layers = raster.layers(raster.texel_corners(flat, 512), 512)
-    assert (layers > 1).sum() < 0.005 * (layers > 0).sum()
-
-
-# ------------------------------------------------------------------ other formats
-def test_glb_holds_the_same_mesh_and_look(exported, inputs: SyntheticInputs) -> None:
-    import trimesh
-
-    content = (exported[0] / "asset/head.glb").read_bytes()
-    assert content[:4] == b"glTF" and int.from_bytes(content[8:12], "little") == len(content)
-    length = int.from_bytes(content[12:16], "little")
-    document = json.loads(content[20 : 20 + length])
-    mesh = trimesh.load(exported[0] / "asset/head.glb", force="mesh", process=False)
-    wanted = ball()
-    np.testing.assert_allclose(mesh.vertices[mesh.faces], wanted["vertices"][wanted["faces"]], atol=1e-6)
-    np.testing.assert_allclose(mesh.visual.uv[mesh.faces], wanted["uvs"][wanted["uv_faces"]], atol=1e-6)
-    material = document["materials"][0]
-    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
-    factor = material["extensions"]["KHR_materials_specular"]["specularColorFactor"][0]
-    picture = document["images"][material["extensions"]["KHR_materials_specular"]["specularColorTexture"]["index"]]
-    view = document["bufferViews"][picture["bufferView"]]
-    import cv2
-
-    start = 20 + length + 8 + view["byteOffset"]
-    stored = cv2.imdecode(np.frombuffer(content[start : start + view["byteLength"]], np.uint8), -1)[..., 0] / 255
-    linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(0.04 * factor * linear, texture_arrays()["f0"][..., 0], atol=5e-4)
-
-
-def test_obj_reads_back(exported) -> None:
-    import trimesh
-
-    folder = exported[0] / "asset"
-    mesh = trimesh.load(folder / "head.obj", force="mesh", process=False)
-    wanted = ball()
-    assert len(mesh.faces) == len(wanted["faces"])
-    np.testing.assert_allclose(mesh.vertices[mesh.faces], wanted["vertices"][wanted["faces"]], atol=1e-6)
-    names = [line.split()[1] for line in (folder / "head.mtl").read_text().splitlines() if ".png" in line]
-    assert names and all((folder / n).is_file() for n in names)
-
-
-def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
-    import cv2
-
-    from pipeline.images import write_png
-    from stages.usd.package import AR_SIDE, bounded_png
-
-    big = np.zeros((4096, 4096, 3), np.float32)
-    big[:, 2048:] = [1.0, 0.5, 0.25]
-    write_png(tmp_path / "x.png", big, 16)
-    read = cv2.imdecode(np.frombuffer(bounded_png(tmp_path / "x.png"), np.uint8), -1)
-    assert read.shape == (AR_SIDE, AR_SIDE, 3) and read.dtype == np.uint8
-    assert read[5, 5].tolist() == [0, 0, 0] and read[5, 2000].tolist() == [64, 128, 255]
-
-
-def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path) -> None:
-    """The fit's own share of the light stands where the export's would."""
-    from stages.usd.exported import load_exported
-
-    arrays = texture_arrays()
-    ratio = np.full_like(arrays["albedo"], 0.8)
-    ratio[:64] = 0.6
-    run(write_inputs(tmp_path / "in", arrays={**arrays, "irradiance_ratio": ratio}), tmp_path / "work", usdz=False)
-    read = load_exported(tmp_path / "work/asset/head.usd")
-    np.testing.assert_allclose(read.albedo, arrays["albedo"], atol=1e-6)
-    np.testing.assert_allclose(read.occlusion, ratio, atol=1e-6)
-    assert not (tmp_path / "work/asset/textures/head_occlusion.exr").exists()
-
-
-def test_acescg_albedo_on_request(exported, tmp_path: Path) -> None:
-    """The same colours in other primaries; what the networks read stays linear Rec.709."""
-    import OpenEXR
-
-    from pipeline.colour import ACESCG, REC709, rgb_from_rgb
-
-    assert not (exported[0] / "asset/textures/head_albedo_acescg.exr").exists()
-    made = run(write_inputs(tmp_path / "in"), tmp_path / "out", acescg=True, usdz=False, glb=False, obj=False)
-    assert "asset/textures/head_albedo_acescg.exr" in {f.path for f in made.files}
-    textures = tmp_path / "out/asset/textures"
-    plain, wide = (read_exr(textures / f"head_albedo{s}.exr")[0][..., :3] for s in ("", "_acescg"))
-    np.testing.assert_allclose(wide, plain @ rgb_from_rgb(ACESCG, REC709).T, atol=1e-5)
-    with OpenEXR.File(str(textures / "head_albedo_acescg.exr")) as f:
-        np.testing.assert_allclose(f.header()["chromaticities"], ACESCG, atol=1e-6)

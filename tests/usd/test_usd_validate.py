@@ -263,7 +263,7 @@ def test_a_variant_without_a_mesh(asset: Path) -> None:
     found = [f for f in validate(asset / "head.usd") if f.level == "error"]
     assert any(f.check == "mesh" and "lod=proxy" in f.message for f in found), found
     stage = Usd.Stage.Open(str(asset / "head.usd"))  # validation leaves the file as it was
-    assert stage.GetDefaultPrim().GetVariantSet("lod").GetVariantSelection() == "full"
+    assert stage.GetDefaultPrim().GetVariantSet("lod").GetVariantSelection() == "render"
 
 
 def test_without_the_materialx_package_that_is_said(asset: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,119 @@
+"""Fine detail of the albedo from the photos: what they show beyond the field, in the band that the field lacks.
+
+Symbols
+    a       albedo of the field; S = irradiance_ratio E(n) / pi, radiance of a surface of albedo 1 under its light
+    g_v     specular radiance towards camera v
+    a_v     albedo as photo v has it: (A_v^-1 I_v - g_v) / S        [NeuFace eq. 4, 12, 16, 19] solved for it
+    r_v     a_v - a, the residual
+    F r     mean of r over the surface with a kernel of width WIDTH, over what photo v sees
+    h       robust mean over photos of r_v - F r_v, s their root mean square difference from it, W their weight
+
+    added = h / (1 + (s / DISAGREEMENT)^2) W / (W + HALF_WEIGHT)
+
+Each photo loses its own low band before photos are blended: errors of the light, the lobe, the exposure and the shadows
+stay out of the albedo, and there is no seam where the set of photos changes. Where photos disagree (ears, nostrils, a
+wrong surface) or hardly see the place, less is added.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline.fields.protocol import Field
+from pipeline.maths import brdf, sh
+from pipeline.meshes import F32, F64, Mesh
+from stages.bake import detail_kernels as kernels
+from stages.bake.detail_views import Photos
+from stages.bake.smooth import Smoother
+
+WIDTH = 0.004  # metres: what the field itself resolves
+EDGES = 1.5  # mean edges of the mesh: the low band lives on its vertices, so that WIDTH is at least that
+DISAGREEMENT = 0.015  # of albedo
+HALF_WEIGHT = 0.1  # of one sharp photo from straight ahead
+LEAST_LIGHT = 0.1  # of the mean of S over all directions: darker places tell nothing of the albedo
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """N points of the surface. x, n (N, 3); corner (N, 3) vertices and their weights; albedo, shade (N, 3): a, S."""
+
+    x: F64
+    n: F64
+    corner: npt.NDArray[np.int32]
+    weights: F32
+    albedo: F32
+    shade: F32
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """What the fine band is made from. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices."""
+
+    photos: Photos
+    gloss: F32
+    low: F32
+
+    def added(self, p: Points) -> tuple[F32, F32]:
+        """(N, 3) what photos add to the albedo, and (N,) their weight: 1 for one sharp photo from straight ahead."""
+        mean, support = np.zeros((len(p.x), 3), np.float32), np.zeros((len(p.x), 2), np.float32)
+        photos = self.photos
+        kernels.fine(
+            photos.cameras, photos.pixels, photos.depth, p.x, p.n, p.corner, p.weights, self.gloss, self.low,
+            p.albedo, p.shade, mean, support,
+        )  # fmt: skip
+        weight, spread = support.T
+        trust = weight / (weight + HALF_WEIGHT) / (1 + (spread / DISAGREEMENT) ** 2)
+        return np.asarray(mean * trust[:, None], np.float32), np.ascontiguousarray(weight)
+
+
+def prepare(
+    field: Field, mesh: Mesh, sparse: Points, photos: Photos, attenuation: str, step: Callable[[int, int], None]
+) -> Detail:
+    """The low bands, from points spread over the surface about as densely as vertices."""
+    gloss = _gloss(field, mesh, photos, attenuation)
+    x = mesh.vertices.astype(np.float64)[mesh.faces]
+    edge = float(np.linalg.norm(x[:, 1] - x[:, 0], axis=1).mean())
+    smooth = Smoother(mesh, max(WIDTH, EDGES * edge))
+    low = np.zeros_like(gloss)
+    for v in range(len(gloss)):
+        step(v, len(gloss))
+        values, cosines = np.zeros((len(sparse.x), 3), np.float32), np.zeros(len(sparse.x), np.float32)
+        kernels.residual(
+            photos.cameras[v], photos.pixels, photos.depth, sparse.x, sparse.n, sparse.corner, sparse.weights,
+            gloss[v], sparse.albedo, sparse.shade, values, cosines,
+        )  # fmt: skip
+        sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
+        kernels.splat(sparse.corner, sparse.weights, values, cosines**2, sums, total)
+        low[v] = smooth.mean(sums / np.maximum(total, 1e-9)[:, None], total)
+    return Detail(photos, gloss, low)
+
+
+def shade(light: F32, normals: F64, ratio: F32) -> F32:
+    """(N, 3) S. Dark places are held up, so that noise there is not blown up."""
+    coefficients = torch.from_numpy(np.asarray(light, np.float32))
+    e = sh.irradiance(coefficients, torch.from_numpy(np.ascontiguousarray(normals, np.float32))).numpy()
+    # the mean of E over all normals is pi times that of the radiance, c_00 Y_00
+    floor = LEAST_LIGHT * float(light[0].mean()) / np.sqrt(4 * np.pi)
+    return np.asarray(np.maximum(e * ratio / np.pi, max(floor, 1e-6)), np.float32)
+
+
+def _gloss(field: Field, mesh: Mesh, photos: Photos, attenuation: str) -> F32:
+    """(views, V, 3) g_v = rho c . B(wo, n) L(w_r). [NeuFace eq. 12]"""
+    material = field.material(mesh.vertices)
+    light = torch.from_numpy(np.asarray(field.light, np.float32))
+    out = np.zeros((len(photos.cameras), len(mesh.vertices), 3), np.float32)
+    for v, centre in enumerate(photos.cameras[:, 27:30]):
+        away = centre - mesh.vertices
+        wo = (away / np.linalg.norm(away, axis=1, keepdims=True)).astype(np.float32)
+        rows = np.flatnonzero((wo * mesh.normals).sum(1) > 0)
+        n, w = mesh.normals[rows], wo[rows]
+        bound = material.rho[rows] * (material.coefficients[rows] * field.basis(w, n)).sum(1)
+        mirror = brdf.reflect(torch.from_numpy(w), torch.from_numpy(n))
+        incident = brdf.light_integral(mirror, torch.from_numpy(material.inv_kappa[rows]), light, attenuation)
+        out[v, rows] = bound[:, None] * incident.numpy()
+    return out

@@ -1,0 +1,217 @@
+"""Compiled inner loops of the photo detail: what each photo shows under a point of the surface, and their robust mean.
+
+Photos lie one after the other in one flat array as the square root of linear radiance in 16 bits, so that dark skin
+keeps its steps and decoding is one product. A camera is a row of numbers:
+
+    0..11   rows of [R t], camera from asset          18..21  columns and rows of the photo, of its depth picture
+    12..17  fx, skew, cx, fy, cy, pixels of depth per pixel of the photo
+    22..26  k1 k2 p1 p2 k3                            27..29  camera's centre
+    30..38  colours before the calibration from colours after it, row by row
+    39      radiance of code 65535                    40      weight of the photo: its sharpness
+    41, 42  where its pixels and its depths start
+"""
+
+# mypy: disable-error-code=no-untyped-def
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+ROW = 43
+MOST = 8  # photos that have a say in one texel: those of the largest weight
+LEAST_COSINE = 0.2  # photos that look along the surface further than that have no say
+DEPTH_SLACK = 0.0015  # of the distance: how far behind the depth picture still counts as the same place
+LEAST_SPREAD = 0.004  # of albedo: differences below it are noise of the photos
+OUTLIER = 0.25  # of albedo: no detail of a skin differs more from its surroundings
+HUBER = 1.5  # spreads beyond which a photo counts as an outlier
+ROUNDS = 3
+BLOCK = 1024  # points worked off in a row
+
+
+@njit(error_model="numpy", cache=True)
+def _look(camera, depth, x, n):
+    """cosine, distance, column, row of point x with normal n in a photo; cosine 0 where the photo does not see it."""
+    dx, dy, dz = camera[27] - x[0], camera[28] - x[1], camera[29] - x[2]
+    height = dx * n[0] + dy * n[1] + dz * n[2]
+    if height <= 0:
+        return 0.0, 0.0, 0.0, 0.0
+    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+    cosine = height / distance
+    if cosine < LEAST_COSINE:
+        return 0.0, distance, 0.0, 0.0
+    a = camera[0] * x[0] + camera[1] * x[1] + camera[2] * x[2] + camera[3]
+    b = camera[4] * x[0] + camera[5] * x[1] + camera[6] * x[2] + camera[7]
+    c = camera[8] * x[0] + camera[9] * x[1] + camera[10] * x[2] + camera[11]
+    if c <= 0:
+        return 0.0, distance, 0.0, 0.0
+    a, b = a / c, b / c
+    r2 = a * a + b * b
+    radial = 1 + r2 * (camera[22] + r2 * (camera[23] + r2 * camera[26]))
+    u = a * radial + 2 * camera[24] * a * b + camera[25] * (r2 + 2 * a * a)
+    v = b * radial + camera[24] * (r2 + 2 * b * b) + 2 * camera[25] * a * b
+    column = camera[12] * u + camera[13] * v + camera[14]
+    row = camera[15] * v + camera[16]
+    if not (1 <= column < camera[18] - 1 and 1 <= row < camera[19] - 1):
+        return 0.0, distance, 0.0, 0.0
+    i, j = int(column * camera[17]), int(row * camera[17])
+    i, j = min(i, int(camera[20]) - 1), min(j, int(camera[21]) - 1)
+    # within one pixel of the depth picture a tilted surface comes nearer and goes further
+    slack = 1 + DEPTH_SLACK + np.sqrt(max(1 - cosine * cosine, 0.0)) / (cosine * camera[12] * camera[17])
+    if distance > depth[int(camera[42]) + j * int(camera[20]) + i] * slack:
+        return 0.0, distance, 0.0, 0.0
+    return cosine, distance, column, row
+
+
+@njit(error_model="numpy", cache=True)
+def _colour(camera, pixels, column, row, out):
+    """Writes the linear colour (3,) at a place of a photo, before its calibration; bilinear between pixel centres."""
+    x, y = column - 0.5, row - 0.5
+    x0, y0 = int(x), int(y)
+    fx, fy = x - x0, y - y0
+    width, start = int(camera[18]), int(camera[41])
+    first = start + y0 * width + x0
+    scale = camera[39] / (65535.0 * 65535.0)
+    r0, r1, r2 = 0.0, 0.0, 0.0
+    for k in range(4):
+        p = first + (k & 1) + (k >> 1) * width
+        w = (fx if k & 1 else 1 - fx) * (fy if k >> 1 else 1 - fy) * scale
+        a, b, c = float(pixels[p, 0]), float(pixels[p, 1]), float(pixels[p, 2])
+        r0, r1, r2 = r0 + w * a * a, r1 + w * b * b, r2 + w * c * c
+    for i in range(3):
+        out[i] = camera[30 + 3 * i] * r0 + camera[31 + 3 * i] * r1 + camera[32 + 3 * i] * r2
+
+
+@njit(error_model="numpy", cache=True)
+def residual(camera, pixels, depth, x, n, corner, weights, gloss, albedo, shade, out, cosines):
+    """One photo's albedo less the field's at N points (N, 3), no larger than OUTLIER, and the cosines (N,), 0 where it
+    does not see them.
+
+    gloss (V, 3): specular radiance at the mesh's vertices; corner, weights (N, 3); shade (N, 3): radiance of albedo 1.
+    """
+    found = np.empty(3)
+    for i in range(len(x)):
+        cosine, _, column, row = _look(camera, depth, x[i], n[i])
+        cosines[i] = cosine
+        if cosine > 0:
+            _colour(camera, pixels, column, row, found)
+            for k in range(3):
+                g = 0.0
+                for j in range(3):
+                    g += weights[i, j] * gloss[corner[i, j], k]
+                out[i, k] = min(max((found[k] - g) / shade[i, k] - albedo[i, k], -OUTLIER), OUTLIER)
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+    """The finest band at N points: a robust mean over photos of their albedo less the field's, without their low band.
+
+    gloss, low (views, V, 3): specular radiance, and the low band of the photo's residual, at the mesh's vertices.
+    Writes out (N, 3), and support (N, 2): the summed weights, 1 for one sharp photo from straight ahead, and the
+    root mean square by which photos differ from their mean.
+    """
+    for block in prange((len(x) + BLOCK - 1) // BLOCK):
+        rows = slice(block * BLOCK, min((block + 1) * BLOCK, len(x)))
+        _fine(
+            cameras, pixels, depth, x[rows], n[rows], corner[rows], weights[rows], gloss, low,
+            albedo[rows], shade[rows], out[rows], support[rows],
+        )  # fmt: skip
+
+
+@njit(error_model="numpy", cache=True)
+def _fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+    """A block of `fine`: a function of its own, because the compiler takes long over bodies of parallel loops."""
+    values, chosen, found = np.empty((MOST, 3)), np.empty(MOST), np.empty(3)
+    views, places = np.empty(MOST, np.int64), np.empty((MOST, 2))
+    for i in range(len(x)):
+        count = 0
+        for v in range(len(cameras)):
+            camera = cameras[v]
+            cosine, distance, column, row = _look(camera, depth, x[i], n[i])
+            if cosine == 0:
+                continue
+            # what a photo resolves across the line of sight falls with the cosine and the distance
+            w = cosine * camera[40] / distance
+            w = w * w * w * w
+            slot = count
+            if count < MOST:
+                count += 1
+            else:
+                slot = 0
+                for j in range(1, MOST):
+                    if chosen[j] < chosen[slot]:
+                        slot = j
+                if chosen[slot] >= w:
+                    continue
+            chosen[slot], views[slot], places[slot, 0], places[slot, 1] = w, v, column, row
+        total = 0.0
+        for j in range(count):
+            v = views[j]
+            _colour(cameras[v], pixels, places[j, 0], places[j, 1], found)
+            for k in range(3):
+                g, b = 0.0, 0.0
+                for c in range(3):
+                    g += weights[i, c] * gloss[v, corner[i, c], k]
+                    b += weights[i, c] * low[v, corner[i, c], k]
+                values[j, k] = (found[k] - g) / shade[i, k] - albedo[i, k] - b
+                if abs(values[j, k]) > OUTLIER:  # a highlight, or something in front of the head
+                    chosen[j] = 0.0
+            total += chosen[j]
+        support[i, 0] = total
+        if total == 0:
+            continue
+        _robust_mean(values, chosen, count, out[i])
+        square = 0.0
+        for j in range(count):
+            for k in range(3):
+                square += chosen[j] * (values[j, k] - out[i, k]) ** 2
+        support[i, 1] = np.sqrt(square / (3 * total))
+
+
+@njit(error_model="numpy", cache=True)
+def _weighted_median(values, weights, count, k):
+    """The median of a column of values, the lower one between two: the value with half of the weight up to it."""
+    half, best = 0.0, np.inf
+    for j in range(count):
+        half += 0.5 * weights[j]
+    for j in range(count):
+        below = 0.0
+        for other in range(count):
+            if values[other, k] <= values[j, k]:
+                below += weights[other]
+        if below >= half and values[j, k] < best:
+            best = values[j, k]
+    return best
+
+
+@njit(error_model="numpy", cache=True)
+def _robust_mean(values, weights, count, out):
+    """Writes the Huber mean (3,) of values (count, 3), not all of weight 0: their weighted median, then reweighted."""
+    for k in range(3):
+        centre = _weighted_median(values, weights, count, k)
+        spread, total = 0.0, 0.0
+        for j in range(count):
+            spread += weights[j] * abs(values[j, k] - centre)
+            total += weights[j]
+        limit = HUBER * max(1.2533 * spread / total, LEAST_SPREAD)  # of a normal distribution: sigma / mean |x|
+        for _ in range(ROUNDS):
+            total, mean = 0.0, 0.0
+            for j in range(count):
+                far = abs(values[j, k] - centre) / limit
+                w = weights[j] if far <= 1 else weights[j] / far
+                total += w
+                mean += w * values[j, k]
+            centre = mean / total
+        out[k] = centre
+
+
+@njit(error_model="numpy", cache=True)
+def splat(corner, weights, values, share, sums, total):
+    """Adds values (N, 3) with their shares (N,) to the corners' vertices: sums (V, 3), total (V,). In order."""
+    for i in range(len(corner)):
+        if share[i] > 0:
+            for j in range(3):
+                w = share[i] * weights[i, j]
+                v = corner[i, j]
+                total[v] += w
+                for k in range(3):
+                    sums[v, k] += w * values[i, k]

@@ -1,0 +1,132 @@
+"""Photos, their depths and cameras in the flat arrays that stages.bake.detail_kernels reads.
+
+Only fitted views come here: a photo that was held out must not find its way into a map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.images import read_alpha, read_linear, shrink
+from pipeline.meshes import F32, F64, Mask, Mesh
+from pipeline.transforms import inverse_rigid, matrix, rays
+from stages.bake import detail_kernels as kernels
+from stages.bake.confidence import Occluder, View
+
+DEPTH_SIDE = 768  # pixels of a depth picture's longer side, at most: rays cost
+JUMP = 12.0  # pixels of depth over a pixel's neighbours, from which a place is the edge of something
+OPAQUE = 0.99  # of a mask: the edge of the head mixes with what is behind it
+CODE = 65535.0
+
+U16 = npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True)
+class Photos:
+    """cameras (views, ROW) as detail_kernels describes them; pixels (P, 3); depth (D,) metres, 0 where a photo is of no
+    use."""
+
+    cameras: F64
+    pixels: U16
+    depth: F32
+
+
+def read_photos(
+    views: Sequence[View], responses: F64, mesh: Mesh, texel: float, step: Callable[[int, int], None]
+) -> Photos:
+    """All fitted photos, no finer than `texel` (metres of surface), and what each of them sees of the mesh.
+
+    responses (views, 3, 3): the fitted colour response A_n of each photo. [NeuFace eq. 19]
+    """
+    occluder = Occluder(mesh)
+    rows, pixels, depths = [], [], []
+    places = [0, 0]
+    for i, view in enumerate(views):
+        step(i, len(views))
+        assert view.photo is not None
+        photo = read_linear(view.photo)
+        alpha = np.ones(photo.shape[:2], np.float32) if view.mask is None else read_alpha(view.mask)
+        factor = _factor(view, mesh, texel)
+        photo = shrink(_whole(photo, factor), factor)
+        depth = _depth(view, alpha, occluder)
+        peak = max(float(photo.max()), 1e-6)
+        rows.append(_row(view, responses[i], factor, photo.shape, depth.shape, peak, places))
+        pixels.append(np.round(np.sqrt(photo.clip(0) / peak) * CODE).astype(np.uint16).reshape(-1, 3))
+        depths.append(depth.ravel())
+        places = [places[0] + len(pixels[-1]), places[1] + depth.size]
+    cameras = np.array(rows)
+    # weight 1: a sharp photo from straight ahead at the median distance and focal length
+    centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
+    reach = np.linalg.norm(cameras[:, 27:30] - centre, axis=1)
+    cameras[:, 40] *= _sharpness(pixels, cameras) / np.median(cameras[:, 40] / reach)
+    return Photos(cameras, np.concatenate(pixels), np.concatenate(depths))
+
+
+def _whole(image: F32, factor: int) -> F32:
+    h, w = (s // factor * factor for s in image.shape[:2])
+    return image[:h, :w]
+
+
+def _factor(view: View, mesh: Mesh, texel: float) -> int:
+    """Photo pixels along the side of a block that is no wider than a texel where the camera is nearest."""
+    origin = matrix(view.camera.world_from_cam)[:3, 3]
+    distance = float(np.linalg.norm(mesh.vertices - origin, axis=1).min())
+    return max(1, int(texel * matrix(view.camera.K)[0, 0] / max(distance, 1e-9)))
+
+
+def _row(
+    view: View,
+    response: F64,
+    factor: int,
+    photo: tuple[int, ...],
+    depth: tuple[int, ...],
+    peak: float,
+    starts: list[int],
+) -> F64:
+    """One camera's numbers in the order of detail_kernels."""
+    K, world_from_cam = matrix(view.camera.K), matrix(view.camera.world_from_cam)
+    row = np.zeros(kernels.ROW)
+    row[:12] = inverse_rigid(world_from_cam)[:3].ravel()
+    row[12:17] = np.array([K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2]]) / factor
+    row[17] = depth[1] / (view.camera.width / factor)
+    row[18:22] = photo[1], photo[0], depth[1], depth[0]
+    row[22:27] = view.camera.distortion
+    row[27:30] = world_from_cam[:3, 3]
+    row[30:39] = np.linalg.inv(response).ravel()
+    row[39:43] = peak, K[0, 0] / factor, *starts
+    return row
+
+
+def _depth(view: View, alpha: F32, occluder: Occluder) -> F32:
+    """(h, w) distance to the mesh through each pixel's centre; 0 beside the mesh, beyond the mask and near edges."""
+    camera = view.camera
+    shrunk = max(1, -(-max(camera.width, camera.height) // DEPTH_SIDE))
+    h, w = camera.height // shrunk, camera.width // shrunk
+    place = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).reshape(-1, 2)
+    place *= np.array([camera.width / w, camera.height / h])
+    origin, directions = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), place)
+    distance = occluder.distance(origin, directions).reshape(h, w)
+    far = np.where(np.isfinite(distance), distance, 1e9).astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    jump = JUMP * shrunk / matrix(camera.K)[0, 0]
+    uneven = cv2.dilate(far, window) - cv2.erode(far, window) > jump * far
+    solid = cv2.erode(cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA), window) > OPAQUE
+    return np.where(solid & ~uneven & np.isfinite(distance), far, 0).astype(np.float32)
+
+
+def _sharpness(pixels: list[U16], cameras: F64) -> F64:
+    """(views,) how sharp each photo is, the sharpest third 1: the strength of its finest differences over that of
+    differences twice as wide, which falls with blur whatever the photo shows."""
+    found = []
+    for codes, camera in zip(pixels, cameras, strict=True):
+        green = codes[:, 1].reshape(int(camera[19]), int(camera[18])).astype(np.float32)
+        once, twice = cv2.GaussianBlur(green, (0, 0), 0.7), cv2.GaussianBlur(green, (0, 0), 1.4)
+        seen: Mask = green > 0.02 * CODE
+        fine, coarse = np.abs(green - once)[seen], np.abs(once - twice)[seen]
+        found.append(float(fine.mean() / max(coarse.mean(), 1e-6)) if seen.any() else 0.0)
+    return np.asarray((np.array(found) / max(float(np.quantile(found, 2 / 3)), 1e-9)).clip(0.1, 1.0))

@@ -1,0 +1,67 @@
+"""Means and continuations over a mesh's surface, by heat flow on its vertices.
+
+Symbols: M vertex areas (m^2); K the cotangent Laplacian, its weights held above zero so that means stay means.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+from scipy.sparse.linalg import splu
+
+from pipeline.meshes import F64, Mask, Mesh
+
+COTANGENTS = (1e-3, 1e3)
+STIFF, SOFT = 1e8, 1e-2  # 1/m^2: known vertices keep their values, others follow their neighbours
+
+
+def laplacian(mesh: Mesh) -> tuple[F64, Any]:
+    """M (V,) and K (V, V), sparse: K u = 0 for constant u, positive semidefinite."""
+    x, count = mesh.vertices.astype(np.float64)[mesh.faces], len(mesh.vertices)
+    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
+    mass = np.maximum(np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), count), 1e-14)
+    rows, columns, values = [], [], []
+    for i in range(3):
+        a, b = x[:, (i + 1) % 3] - x[:, i], x[:, (i + 2) % 3] - x[:, i]
+        cotangent = (a * b).sum(1) / np.maximum(np.linalg.norm(np.cross(a, b), axis=1), 1e-14)
+        rows.append(mesh.faces[:, (i + 1) % 3])
+        columns.append(mesh.faces[:, (i + 2) % 3])
+        values.append(0.5 * cotangent.clip(*COTANGENTS))
+    where = (np.concatenate(rows), np.concatenate(columns))
+    half = coo_array((np.concatenate(values), where), shape=(count, count))
+    off = (half + half.T).tocsc()
+    return mass, diags_array(off.sum(0)) - off
+
+
+class Smoother:
+    """Means over a mesh with a kernel of standard deviation `width` (m): (M + width^2 / 4 K)^-1 M, twice."""
+
+    def __init__(self, mesh: Mesh, width: float) -> None:
+        self._mass, k = laplacian(mesh)
+        self._solve = splu(csc_array(diags_array(self._mass) + width**2 / 4 * k))
+
+    def __call__(self, values: F64) -> F64:
+        """(V, C) smoothed."""
+        for _ in range(2):
+            values = self._solve.solve(self._mass[:, None] * values)
+        return values
+
+    def mean(self, values: F64, weights: F64) -> F64:
+        """(V, C) mean of values (V, C) by weights (V,); about 0 far from all weights."""
+        both = self(np.concatenate([values * weights[:, None], weights[:, None]], 1))
+        return np.asarray(both[:, :-1] / np.maximum(both[:, -1:], 1e-9))
+
+
+def continued(mesh: Mesh, values: F64, known: Mask) -> F64:
+    """(V, C) values (V, C) at known vertices (V,), and between them the smoothest continuation: K u = 0.
+
+    Pieces without any known vertex take the mean of all.
+    """
+    if known.all() or not known.any():
+        return values
+    mass, k = laplacian(mesh)
+    pull = mass * np.where(known, STIFF, SOFT)
+    wanted = np.where(known[:, None], values, values[known].mean(0))
+    return np.asarray(splu(csc_array(k + diags_array(pull))).solve(pull[:, None] * wanted))
