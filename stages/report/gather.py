@@ -17,8 +17,8 @@ from pipeline.artifacts import (
 )
 
 
-class Results(Protocol):
-    """The artifacts that the report is about."""
+class Started(Protocol):
+    """What the reconstruction started from."""
 
     @property
     def capture(self) -> Located[Capture]: ...
@@ -26,6 +26,11 @@ class Results(Protocol):
     def poses(self) -> Located[CameraSet]: ...
     @property
     def masks(self) -> Located[MaskSet]: ...
+
+
+class Results(Started, Protocol):
+    """The artifacts that the report is about."""
+
     @property
     def inverse_rendering(self) -> Located[FittedFace]: ...
     @property
