@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -13,6 +14,8 @@ from pipeline.errors import StageError, UsageError
 
 if TYPE_CHECKING:
     from stages.poses.normalise import Normalisation
+    from stages.poses.photogrammetry import Settings
+    from stages.poses.solve import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,9 @@ class Config(StageConfig):
     patience: int = Field(
         3, ge=1, le=3, description="tries while photos lack a place: 1 plain, 2 without noise, 3 also as if seen askew"
     )
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto", description="place photos one after the other, or all at once; auto: all at once from 200 photos on"
+    )
     shared_intrinsics: Literal["auto", "yes", "no"] = Field(
         "auto", description="one lens for all photos of equal size and EXIF; auto: unless far more photos fit without"
     )
@@ -49,6 +55,14 @@ class Config(StageConfig):
     )
     use_masks: bool = Field(True, description="look for features on the subject only, where the capture has masks")
     check: bool = Field(True, description="hold given cameras against the photos; leave out views that contradict")
+    given: Literal["keep", "triangulate", "refine"] = Field(
+        "keep",
+        description="given cameras: keep them; triangulate: find points on the subject too; refine: and move the "
+        "cameras to where the photos say, their centres held near the given ones",
+    )
+    given_deviation: float = Field(
+        0.005, gt=0, le=0.2, description="how far given centres may be off, of their distance from the subject (refine)"
+    )
     unit: Literal["auto", "metres", "centimetres", "millimetres", "unknown"] = Field(
         "auto",
         description="unit of the given cameras; auto: FaceScape's from the subject's size, other formats' unknown",
@@ -85,7 +99,7 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
     """The capture's own cameras, moved to asset coordinates; without views that their photos contradict."""
     from pipeline.transforms import inverse_rigid, matrix
     from stages.poses.normalise import Unit, normalise
-    from stages.poses.place import camera_of, in_asset
+    from stages.poses.place import camera_of, in_asset, save_points
 
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
@@ -97,10 +111,20 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
     unit: Unit = auto if config.unit == "auto" else config.unit
     wrong = _contradicted(capture, cameras, config, context) if config.check else []
     names = tuple(cameras[i].name for i in wrong)
-    cameras = [c for i, c in enumerate(cameras) if i not in wrong]
-    found = normalise(cameras, given=True, unit=unit)
+    right = [i for i in range(len(cameras)) if i not in wrong]
+    cameras = [cameras[i] for i in right]
     told = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
             for n in names]  # fmt: skip
+    model = None
+    if config.given != "keep":
+        model, cameras, doubtful = _held_against_photos(capture, right, cameras, config, context)
+        if doubtful:
+            told.append(
+                "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
+            )
+    found = normalise(cameras, given=True, unit=unit)
+    if model is not None:
+        save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     return CameraSet(
         source="given",
         metric=found.metric,
@@ -108,8 +132,68 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
         unregistered=names,
+        reprojection_error_px=None if model is None else model.reprojection_error_px,
+        view_errors_px={} if model is None else _view_errors(model, [c.name for c in cameras]),
+        points=None if model is None else context.file("points.npz"),
         warnings=(*told, *found.warnings),
     )
+
+
+def _held_against_photos(
+    capture: Located[Capture], right: list[int], cameras: list[Camera], config: Config, context: Context
+) -> tuple[Model, list[Camera], list[str]]:
+    """Points triangulated from the given cameras `right` of the capture; the cameras, moved if asked for; names of
+    those that should have been and were not.
+
+    Raises:
+        StageError: the photos share no point under these cameras.
+    """
+    from stages.poses.normalise import nearest_point, viewing_rays
+    from stages.poses.photogrammetry import triangulate_given
+    from stages.poses.photos import photos_of
+    from stages.poses.place import camera_of
+
+    photos = photos_of(capture, config.use_masks)
+    centres, axes = viewing_rays(cameras)
+    distance = float(((centres - nearest_point(centres, axes)) ** 2).sum(1).mean() ** 0.5)
+    found = triangulate_given(
+        [photos[i] for i in right], cameras, _settings(capture, config), context.scratch, _progress(context),
+        refine=config.given == "refine", deviation=config.given_deviation * distance,
+    )  # fmt: skip
+    if found is None:
+        raise StageError("no point is seen by two photos", where="poses", value="0 points",
+                         limit="features that neighbouring photos share",
+                         remedy="set poses.given=keep to use the cameras as they are")  # fmt: skip
+    model, doubtful = found
+    names = [cameras[n].name for n in doubtful]
+    if config.given == "refine":
+        views, poses = [capture.artifact.views[i] for i in right], model.poses
+        cameras = [camera_of(v, poses[n].K, poses[n].world_from_cam, c.distortion)
+                   for n, (v, c) in enumerate(zip(views, cameras, strict=True))]  # fmt: skip
+    return model, cameras, names
+
+
+def _progress(context: Context) -> Callable[[int, int, str], None]:
+    def progress(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, message)
+
+    return progress
+
+
+def _settings(capture: Located[Capture], config: Config) -> Settings:
+    from stages.poses.adjust import Refine
+    from stages.poses.photogrammetry import Settings
+
+    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
+    return Settings(
+        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
+        config.camera_model, refine, config.patience, config.mapper, capture.artifact.kind == "video",
+    )  # fmt: skip
+
+
+def _view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
+    return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}
 
 
 def _contradicted(
@@ -120,16 +204,14 @@ def _contradicted(
     Raises:
         StageError: most of them do.
     """
-    from stages.poses.check import check_cameras, features_of
+    from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
     from stages.poses.photos import photos_of
 
-    def progress(done: int, total: int, message: str) -> None:
-        context.check()
-        context.progress(done, total, message)
-
+    progress = _progress(context)
     photos = photos_of(capture, config.use_masks)
     features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
-    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"))
+    far = IMPERFECT if config.given == "refine" else FAR
+    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
     if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
         raise StageError(
             "the cameras do not belong to the photos",
@@ -146,22 +228,12 @@ def _contradicted(
 def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """Cameras from the photos alone."""
     from stages.poses.normalise import normalise
-    from stages.poses.photogrammetry import Settings, solve
+    from stages.poses.photogrammetry import solve
     from stages.poses.photos import photos_of
     from stages.poses.place import camera_of, in_asset, save_points
-    from stages.poses.solve import Refine
-
-    def progress(done: int, total: int, message: str) -> None:
-        context.check()
-        context.progress(done, total, message)
 
     views = capture.artifact.views
-    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
-    settings = Settings(
-        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
-        config.camera_model, refine, config.patience,
-    )  # fmt: skip
-    model = solve(photos_of(capture, config.use_masks), settings, context.scratch, progress)
+    model = solve(photos_of(capture, config.use_masks), _settings(capture, config), context.scratch, _progress(context))
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
     strangers = {i for group in (model.others if model is not None else ()) for i in group} - set(placed)
@@ -187,7 +259,7 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
         cameras=in_asset(cameras, found.capture_from_asset),
         unregistered=missing,
         reprojection_error_px=model.reprojection_error_px,
-        view_errors_px={views[i].name: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e},
+        view_errors_px=_view_errors(model, [v.name for v in views]),
         points=context.file("points.npz"),
         warnings=tuple(warnings),
     )

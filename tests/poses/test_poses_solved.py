@@ -214,7 +214,7 @@ def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -
     settings = Settings(0, 200, 150, 4, "yes", "SIMPLE_RADIAL", Refine())
     plain = detect_all(photos, settings, PLAIN, lambda *_: None)
     verified = match_all(photos, plain, settings, PLAIN, lambda *_: None)
-    both, joint = _askew(photos, plain, verified, settings, lambda *_: None)
+    both, joint = _askew(photos, plain, verified, settings, lambda *_: None, [0])
     first, second = joint[0, 1].matches.T
     assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
     new = joint[0, 1].matches[first >= len(plain[0].uv)]
