@@ -112,7 +112,10 @@ class GivenCamera(Artifact):
 
 class CaptureView(Artifact):
     """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
-    same view without the subject."""
+    same view without the subject.
+
+    place_m: east, north and up in metres of the capture's first photo with a GPS position.
+    """
 
     index: int
     name: str
@@ -124,6 +127,7 @@ class CaptureView(Artifact):
     plate: FileRef | None = None
     focal_px: float | None = None
     camera_group: str = ""
+    place_m: tuple[float, float, float] | None = None
     holdout: bool = False
 
 
@@ -157,11 +161,13 @@ class CameraSet(Artifact):
     """Cameras around the subject.
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
-    reprojection error of each solved view, by its photo's name.
+    reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
+    makes it metres.
     """
 
     source: Literal["given", "colmap"]
     metric: bool
+    scale: str = ""
     capture_from_asset: Matrix
     roi_radius: float
     cameras: tuple[Camera, ...]

@@ -91,6 +91,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     _enough(len(candidates) - len(held), len(held), found.left_out, config.min_views)
     views = [_view(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
+    views = _with_places(views, photos)
     warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), left_out=tuple(found.left_out),
                    warnings=tuple(warnings))  # fmt: skip
@@ -216,6 +217,17 @@ def _view(
     )  # fmt: skip
 
 
+def _with_places(views: list[CaptureView], photos: list[Gathered]) -> list[CaptureView]:
+    """The views with their GPS positions, relative to the first: where on earth it was is nobody's business."""
+    from stages.capture.exif import metres_from
+
+    origin = next((p.exif.place for p in photos if p.exif.place is not None), None)
+    if origin is None:
+        return views
+    return [v if p.exif.place is None else v.model_copy(update={"place_m": metres_from(p.exif.place, origin)})
+            for v, p in zip(views, photos, strict=True)]  # fmt: skip
+
+
 def _plate(
     source: Located[CaptureSource], candidate: _Candidate, photo: Gathered, warnings: list[str], context: Context
 ) -> FileRef | None:
@@ -265,4 +277,4 @@ def _partly_masked(views: list[CaptureView]) -> list[str]:
     return [f"only {masked} of {len(views)} views have a mask"] if 0 < masked < len(views) else []
 
 
-STAGE = Stage(name="capture", version=2, inputs=Inputs, config=Config, output=Capture, run=run)
+STAGE = Stage(name="capture", version=3, inputs=Inputs, config=Config, output=Capture, run=run)

@@ -17,8 +17,10 @@ from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
+from stages.poses.scale import Scale
 
 NOMINAL_ROI = 0.18  # metres: a head with some air around it
+NOMINAL = f"not known: the subject is made a nominal {NOMINAL_ROI} m in radius"
 PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
 UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 Unit = Literal["guess", "unknown", "metres", "centimetres", "millimetres"]
@@ -34,21 +36,24 @@ AROUND = 2.5  # radii within which the support is looked for
 
 @dataclass(frozen=True, slots=True)
 class Normalisation:
-    """capture_from_asset: 4x4 similarity. roi_radius: asset units, around the origin. metric: units are metres."""
+    """capture_from_asset: 4x4 similarity. roi_radius: asset units, around the origin. metric: units are metres.
+    scale: where the unit is from, in words."""
 
     capture_from_asset: F64
     roi_radius: float
     metric: bool
+    scale: str
     warnings: tuple[str, ...]
 
 
 def normalise(
-    cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess"
-) -> Normalisation:
+    cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
+    known: Scale | None = None,
+) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
-    unit: of a given world; guess: the one under which the subject has a head's size.
+    unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both.
     Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
     centres, axes = viewing_rays(cameras)
@@ -68,9 +73,23 @@ def normalise(
     rotation = (
         given_axes(poses, warnings) if given else solved_axes(poses, centre, _floor(points, centres, centre, radius))
     )
-    scale, metric = given_scale(radius, warnings, unit) if given else (NOMINAL_ROI / radius, False)
+    if known is not None:
+        scale, metric, told = _checked_scale(known, radius, warnings), True, known.told
+    elif given:
+        scale, metric, told = given_scale(radius, warnings, unit)
+    else:
+        scale, metric, told = NOMINAL_ROI / radius, False, NOMINAL
     inverse = similarity(1.0 / scale, rotation.T, centre)
-    return Normalisation(inverse, radius * scale, metric, tuple(warnings))
+    return Normalisation(inverse, radius * scale, metric, told, tuple(warnings))
+
+
+def _checked_scale(known: Scale, radius: float, warnings: list[str]) -> float:
+    """Metres per unit. A subject of no head's size is told, and taken as it is."""
+    low, high = PLAUSIBLE_ROI
+    if not low <= radius * known.metres_per_unit <= high:
+        warnings.append(f"with the scale {known.told} the views see {radius * known.metres_per_unit:.3g} m around the "
+                        f"subject, where a head is {low} to {high} m; check it")  # fmt: skip
+    return known.metres_per_unit
 
 
 def viewing_rays(cameras: Sequence[Camera]) -> tuple[F64, F64]:
@@ -233,24 +252,25 @@ def least_turn(a: F64, b: F64) -> F64:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + c), np.float64)
 
 
-def given_scale(radius: float, warnings: list[str], unit: Unit = "guess") -> tuple[float, bool]:
-    """(asset units per capture unit, metric). Guessed: the one under which the region of interest has a head's size."""
+def given_scale(radius: float, warnings: list[str], unit: Unit = "guess") -> tuple[float, bool, str]:
+    """(asset units per capture unit, metric, where from). Guessed: the one under which the region of interest has a
+    head's size."""
     if unit == "unknown":
         warnings.append(f"the cameras' unit is not known; the asset is scaled to a nominal {NOMINAL_ROI} m around the "
                         "subject; say poses.unit=metres (centimetres, millimetres) if you know it")  # fmt: skip
-        return NOMINAL_ROI / radius, False
+        return NOMINAL_ROI / radius, False, NOMINAL
     if unit != "guess":
-        return UNITS[unit], True
+        return UNITS[unit], True, f"{unit}, as poses.unit says"
     low, high = PLAUSIBLE_ROI
     fitting = [u for u, factor in UNITS.items() if low <= radius * factor <= high]
     if not fitting:
         warnings.append(f"the cameras' unit is not known (the views see {radius:.4g} units around the subject); the "
                         f"asset is scaled to a nominal {NOMINAL_ROI} m")  # fmt: skip
-        return NOMINAL_ROI / radius, False
+        return NOMINAL_ROI / radius, False, NOMINAL
     likely = min(fitting, key=lambda u: abs(np.log(radius * UNITS[u] / NOMINAL_ROI)))
     if likely != "metres":
         warnings.append(f"the cameras' unit is taken as {likely} (the views see {radius:.4g} units around the subject)")
-    return UNITS[likely], True
+    return UNITS[likely], True, f"{likely}: the given cameras' unit under which the subject has a head's size"
 
 
 def _in_front(cameras: Sequence[Camera], centres: F64, axes: F64, centre: F64, warnings: list[str]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context, Stage, StageConfig
@@ -67,7 +67,24 @@ class Config(StageConfig):
         "auto",
         description="unit of the given cameras; auto: FaceScape's from the subject's size, other formats' unknown",
     )
+    scale: Literal["auto", "none", "distance", "markers", "gps"] = Field(
+        "auto", description="where metres are from; auto: the first of these that the settings and photos give"
+    )
+    distance: str = Field(
+        "", description='a known distance: "1.jpg to 5.jpg = 0.42" (metres; cameras, or points as PHOTO@X,Y+PHOTO@X,Y)'
+    )
+    marker_mm: float = Field(0.0, ge=0, le=10000, description="edge of the black squares of markers; 0: there are none")
+    marker_kind: Literal["aruco_4x4", "aruco_5x5", "aruco_6x6", "apriltag_16h5", "apriltag_25h9", "apriltag_36h11"] = (
+        Field("aruco_4x4", description="family of the markers")
+    )
     min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
+
+    @field_validator("distance")
+    @classmethod
+    def _grammar(cls, spec: str) -> str:
+        from stages.poses.scale import check_distance
+
+        return check_distance(spec)
 
 
 MIN_FITTED = 3
@@ -98,6 +115,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
 def _given(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """The capture's own cameras, moved to asset coordinates; without views that their photos contradict."""
     from pipeline.transforms import inverse_rigid, matrix
+    from stages.poses.measure import known_scale
     from stages.poses.normalise import Unit, normalise
     from stages.poses.place import camera_of, in_asset, save_points
 
@@ -122,12 +140,14 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
             told.append(
                 "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
             )
-    found = normalise(cameras, given=True, unit=unit)
+    known = known_scale(capture, cameras, config, told)
+    found = normalise(cameras, given=True, unit=unit, known=known)
     if model is not None:
         save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     return CameraSet(
         source="given",
         metric=found.metric,
+        scale=found.scale,
         capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
@@ -227,6 +247,7 @@ def _contradicted(
 
 def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """Cameras from the photos alone."""
+    from stages.poses.measure import known_scale
     from stages.poses.normalise import normalise
     from stages.poses.photogrammetry import solve
     from stages.poses.photos import photos_of
@@ -241,9 +262,10 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     if model is None or len(placed) < config.min_registered * (len(views) - len(strangers)) or fitted < MIN_FITTED:
         raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
-    found = normalise(cameras, model.points, given=False)
+    warnings: list[str] = []
+    found = normalise(cameras, model.points, given=False, known=known_scale(capture, cameras, config, warnings))
     save_points(context.workdir / "points.npz", model, found.capture_from_asset)
-    warnings = [*found.warnings]
+    warnings += found.warnings
     if missing:
         warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {', '.join(missing)}; "
                         "they show something else, are mirrored or blurred, or stand too far from the others: "
@@ -254,6 +276,7 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     return CameraSet(
         source="colmap",
         metric=found.metric,
+        scale=found.scale,
         capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
@@ -288,4 +311,4 @@ def _not_placed(total: int, placed: int, fitted: int, missing: tuple[str, ...], 
     )
 
 
-STAGE = Stage(name="poses", version=2, inputs=Inputs, config=Config, output=CameraSet, run=run)
+STAGE = Stage(name="poses", version=3, inputs=Inputs, config=Config, output=CameraSet, run=run)

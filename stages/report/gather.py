@@ -63,6 +63,7 @@ def figures(r: Results) -> dict[str, Any]:
         "cameras": {
             "source": cameras.source,
             "metric": cameras.metric,
+            "scale": cameras.scale,
             "registered": len(cameras.cameras),
             "unregistered": len(cameras.unregistered),
             "reprojection_error_px": cameras.reprojection_error_px,
