@@ -114,7 +114,9 @@ class CaptureView(Artifact):
     """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
     same view without the subject.
 
-    place_m: east, north and up in metres of the capture's first photo with a GPS position.
+    place_m: east, north and up in metres of the capture's first photo with a GPS position. clipped: picture of the
+    pixels (255) whose value is at the end of the file's range, and so only a lower bound. exposure: what a grey's
+    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell.
     """
 
     index: int
@@ -128,14 +130,18 @@ class CaptureView(Artifact):
     focal_px: float | None = None
     camera_group: str = ""
     place_m: tuple[float, float, float] | None = None
+    clipped: FileRef | None = None
+    exposure: float = 1.0
     holdout: bool = False
 
 
 class Capture(Artifact):
-    """The photos that take part, checked and in one place."""
+    """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
+    anew for each photo, so that one colour is not one value."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
+    colours_drift: bool = False
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 

@@ -91,10 +91,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     _enough(len(candidates) - len(held), len(held), found.left_out, config.min_views)
     views = [_view(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
-    views = _with_places(views, photos)
+    views = _with_exposures(_with_places(views, photos), photos, found.warnings)
+    drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
-    return Capture(kind=source.artifact.kind, views=tuple(views), left_out=tuple(found.left_out),
-                   warnings=tuple(warnings))  # fmt: skip
+    return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift,
+                   left_out=tuple(found.left_out), warnings=tuple(warnings))  # fmt: skip
 
 
 def _photos_of_film(source: Located[CaptureSource], config: Config, context: Context) -> Located[CaptureSource]:
@@ -187,8 +188,15 @@ def _useful(
         else:
             kept.append((candidate, photo))
             continue
-        photo.image.unlink()
+        _remove(photo)
     return [c for c, _ in kept], [p for _, p in kept]
+
+
+def _remove(photo: Gathered) -> None:
+    """A photo that takes no part after all leaves nothing behind."""
+    photo.image.unlink()
+    if photo.clipped is not None:
+        photo.clipped.unlink()
 
 
 def _view(
@@ -213,6 +221,7 @@ def _view(
         focal_px=round(focal, 6) if focal else None,
         camera_group=_group(photo.width, photo.height, candidate.serial, photo.exif.body,
                             photo.exif.focal_mm or photo.exif.focal_35mm),
+        clipped=context.file(photo.clipped) if photo.clipped else None,
         holdout=held,
     )  # fmt: skip
 
@@ -228,6 +237,18 @@ def _with_places(views: list[CaptureView], photos: list[Gathered]) -> list[Captu
             for v, p in zip(views, photos, strict=True)]  # fmt: skip
 
 
+def _with_exposures(views: list[CaptureView], photos: list[Gathered], warnings: list[str]) -> list[CaptureView]:
+    """The views with their exposures, where EXIF tells them and the photos bear it out."""
+    from stages.capture.photometry import exposures
+
+    found = exposures([p.exif.exposure for p in photos], [p.light for p in photos])
+    if found is None:
+        return views
+    warnings.append(f"exposures differ by a factor of {max(found) / min(found):.3g}; the photos are brought to one by "
+                    "their EXIF; set the exposure by hand for truer colours")  # fmt: skip
+    return [v.model_copy(update={"exposure": round(e, 6)}) for v, e in zip(views, found, strict=True)]
+
+
 def _plate(
     source: Located[CaptureSource], candidate: _Candidate, photo: Gathered, warnings: list[str], context: Context
 ) -> FileRef | None:
@@ -239,6 +260,8 @@ def _plate(
     path = source.path(candidate.plate)
     target = context.workdir / "plates" / f"{candidate.index}_{path.name}"
     plate = gather_photo(path, candidate.plate, target, candidate.size)
+    if plate.clipped is not None:
+        plate.clipped.unlink()  # of the subject's photo alone
     if (plate.width, plate.height) == (photo.width, photo.height):
         return context.file(plate.image)
     plate.image.unlink()
