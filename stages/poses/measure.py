@@ -1,14 +1,24 @@
-"""Which of the ways to a scale a capture takes: a distance that is known, markers in view, GPS positions."""
+"""Which of the ways to a scale a capture takes: a distance that is known, markers in view, a face, GPS positions."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
+
 from pipeline.artifacts import Camera, Capture, CaptureView, Located
 from pipeline.errors import StageError
+from pipeline.faces.find import find_face
 from pipeline.images import read_encoded
+from pipeline.transforms import F64
 from stages.poses.features import U8, grey8
-from stages.poses.scale import Scale, by_distance, by_markers, by_positions, find_markers
+from stages.poses.scale import Scale, by_distance, by_markers, by_positions, by_pupils, find_markers
+
+NEEDS = {
+    "markers": "markers of poses.marker_kind and poses.marker_mm in view",
+    "pupils": "poses.pupils_mm, and a face in three photos or more",
+    "gps": "GPS positions in EXIF, spread wider than they are wrong",
+}
 
 
 class Wanted(Protocol):
@@ -22,6 +32,8 @@ class Wanted(Protocol):
     def marker_mm(self) -> float: ...
     @property
     def marker_kind(self) -> str: ...
+    @property
+    def pupils_mm(self) -> float: ...
 
 
 def known_scale(
@@ -44,19 +56,36 @@ def known_scale(
             return found
         count = len({n for _, corners in seen for n in corners})
         why = f"{count} markers of the kind {config.marker_kind} are seen, none of them whole and square by two photos"
+    if wanted == "pupils" or (wanted == "auto" and not why and config.pupils_mm):
+        found = by_pupils(_pupils(capture, cameras), config.pupils_mm / 1e3) if config.pupils_mm else None
+        if found is not None:
+            return found
+        why = "no face is seen alike in three photos" if config.pupils_mm else "poses.pupils_mm is not set"
     places = {v.index: v.place_m for v in capture.artifact.views if v.place_m is not None}
     if wanted == "gps" or (wanted == "auto" and not why and places):
         found, why = by_positions(cameras, places)
         if found is not None:
             return found
-    if wanted in ("markers", "gps"):
+    if wanted in NEEDS:
         raise StageError("the scale can't be told", where=f"poses.scale={wanted}", value=why,
-                         limit="markers of poses.marker_kind and poses.marker_mm in view" if wanted == "markers" else
-                         "GPS positions in EXIF, spread wider than they are wrong",
+                         limit=NEEDS[wanted],
                          remedy="check these settings, or give poses.distance")  # fmt: skip
     if why:
         warnings.append(f"the scale is not taken from the photos: {why}")
     return None
+
+
+def _pupils(capture: Located[Capture], cameras: list[Camera]) -> list[tuple[Camera, tuple[F64, F64]]]:
+    """Right and left pupil in the photos whose middle part shows a face."""
+    photos = {v.index: v for v in capture.artifact.views}
+    out = []
+    for c in cameras:
+        image = read_encoded(capture.path(photos[c.index].image))
+        grey = grey8(image, max(c.width, c.height))
+        face = find_face(np.repeat(grey[..., None], 3, 2), c.width / 2, c.height / 2, max(c.width, c.height) / 2)
+        if face is not None:
+            out.append((c, face.pupils))
+    return out
 
 
 def _grey(capture: Located[Capture], view: CaptureView) -> U8:

@@ -3,6 +3,7 @@
 Symbols: cameras in the capture's world; s metres per unit. Each way gives s and says how; none is ever assumed.
     distance   s = d / |a - b|, a and b camera centres or points seen in photos
     markers    s = edge / median of the measured edges of all markers
+    pupils     s = interpupillary distance / |a - b|, a and b the eyes' middles seen in photos
     positions  least squares s of  s R c_i + t = p_i  (Umeyama, 1991), p_i from EXIF
 """
 
@@ -33,6 +34,7 @@ MET = 0.004  # of the photo's longest edge: rays to one spot may miss it by so m
 SQUARE = 0.05  # of the longer edge: a marker whose edges differ more is two markers, or bent
 TOLD_APART = 5.0  # positions must be spread so many times wider than they are wrong
 MIN_POSITIONS = 5
+MIN_FACES, EYE_MET = 3, 0.1  # photos; of the pupils' distance in the photo: rays to an eye miss it by so much at most
 _SPEC = re.compile(r"(?P<a>[^=]+?)\s+to\s+(?P<b>[^=]+?)\s*=\s*(?P<d>[0-9.eE+-]+)")
 _GRAMMAR = "A to B = METRES, where A and B are photos, or points as PHOTO@X,Y+PHOTO@X,Y"
 U8 = npt.NDArray[np.uint8]
@@ -112,21 +114,28 @@ def meeting_point(sights: Sequence[tuple[Camera, F64]]) -> F64 | None:
     """
     if len(sights) < 2:
         return None
+    x = _nearest(sights)
+    met = all(_miss(camera, x, uv) <= MET * max(camera.width, camera.height) for camera, uv in sights)
+    return x if met else None
+
+
+def _nearest(sights: Sequence[tuple[Camera, F64]]) -> F64:
+    """(3,) the point nearest to the rays; NaN where they are as good as parallel."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera, uv in sights:
         o, d = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv[None])
         across = np.eye(3) - np.outer(d[0], d[0])
         A, b = A + across, b + across @ o
     if np.linalg.eigvalsh(A)[0] < 1e-4 * len(sights):  # a sixth of a degree between two rays
-        return None
-    x = np.linalg.solve(A, b)
-    for camera, uv in sights:
-        seen, z = project(
-            matrix(camera.K), inverse_rigid(matrix(camera.world_from_cam)), np.array(camera.distortion), x[None]
-        )
-        if not (z[0] > 0 and np.linalg.norm(seen[0] - uv) <= MET * max(camera.width, camera.height)):
-            return None
-    return np.asarray(x, np.float64)
+        return np.full(3, np.nan)
+    return np.asarray(np.linalg.solve(A, b), np.float64)
+
+
+def _miss(camera: Camera, x: F64, uv: F64) -> float:
+    """Pixels between where a camera sees x (3,) and uv (2,); infinite if x is behind it, or none."""
+    cam_from_world = inverse_rigid(matrix(camera.world_from_cam))
+    seen, z = project(matrix(camera.K), cam_from_world, np.array(camera.distortion), x[None])
+    return float(np.linalg.norm(seen[0] - uv)) if z[0] > 0 and np.isfinite(seen).all() else float("inf")
 
 
 def find_markers(grey: U8, dictionary: str) -> dict[int, F64]:
@@ -163,6 +172,26 @@ def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) ->
     spread = float(np.std(lengths) / np.median(lengths))
     return Scale(edge / float(np.median(lengths)), f"from {len(used)} markers of {1e3 * edge:g} mm (numbers "
                  f"{', '.join(map(str, used[:8]))}), whose edges agree to {spread:.1%}")  # fmt: skip
+
+
+def by_pupils(seen: Sequence[tuple[Camera, tuple[F64, F64]]], metres: float) -> Scale | None:
+    """From the distance of the pupils, right and left (2,) pixels of each photo with a face; None if too few agree.
+
+    Photos in which a face was seen wrongly, or from the side, are left out one by one, the worst first.
+    """
+    left = list(seen)
+    while len(left) >= MIN_FACES:
+        eyes = [_nearest([(c, pair[k]) for c, pair in left]) for k in range(2)]
+        wide = [max(float(np.hypot(*(pair[1] - pair[0]))), 1e-9) for _, pair in left]
+        missed = [max(_miss(c, x, uv) for x, uv in zip(eyes, pair, strict=True)) for c, pair in left]
+        off = np.array(missed) / wide
+        if off.max() <= EYE_MET:
+            told = (f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {len(left)} photos to "
+                    f"{np.median(off):.1%}")  # fmt: skip
+            return Scale(metres / float(np.linalg.norm(eyes[1] - eyes[0])), told)
+        # by its share of the frame: a face seen wrongly may be seen as wide as it likes
+        left.pop(int(np.argmax([m / max(c.width, c.height) for m, (c, _) in zip(missed, left, strict=True)])))
+    return None
 
 
 def by_positions(

@@ -67,7 +67,7 @@ class Config(StageConfig):
         "auto",
         description="unit of the given cameras; auto: FaceScape's from the subject's size, other formats' unknown",
     )
-    scale: Literal["auto", "none", "distance", "markers", "gps"] = Field(
+    scale: Literal["auto", "none", "distance", "markers", "pupils", "gps"] = Field(
         "auto", description="where metres are from; auto: the first of these that the settings and photos give"
     )
     distance: str = Field(
@@ -76,6 +76,9 @@ class Config(StageConfig):
     marker_mm: float = Field(0.0, ge=0, le=10000, description="edge of the black squares of markers; 0: there are none")
     marker_kind: Literal["aruco_4x4", "aruco_5x5", "aruco_6x6", "apriltag_16h5", "apriltag_25h9", "apriltag_36h11"] = (
         Field("aruco_4x4", description="family of the markers")
+    )
+    pupils_mm: float = Field(
+        0.0, ge=0, le=100, description="distance between the subject's pupils, if you know it; 0: it is not used"
     )
     min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
 

@@ -11,7 +11,15 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
 from pipeline.transforms import F64, inverse_rigid, matrix, project, rows
-from stages.poses.scale import DICTIONARIES, by_distance, by_markers, by_positions, check_distance, find_markers
+from stages.poses.scale import (
+    DICTIONARIES,
+    by_distance,
+    by_markers,
+    by_positions,
+    by_pupils,
+    check_distance,
+    find_markers,
+)
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
 SIZE = (640, 480)
@@ -87,6 +95,21 @@ def test_markers_of_a_known_size(kind: str) -> None:
     assert find_markers(photo_of_markers(flat[0], kind, 0.05 * WORLD, (3, 3)), kind) == {}  # which is which?
 
 
+def test_pupils_seen_in_photos() -> None:
+    rng = np.random.default_rng(0)
+    eyes = [[-0.0315 * WORLD, 0.02, 0.08], [0.0315 * WORLD, 0.02, 0.08]]
+    sights = [(c, (seen(eyes[0], c) + rng.normal(size=2), seen(eyes[1], c) + rng.normal(size=2))) for c in CAMERAS]
+    found = by_pupils(sights, 0.063)
+    assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
+    assert "63 mm between the pupils, seen in 5 photos" in found.told
+    swapped = [*sights[:4], (sights[4][0], (sights[4][1][0] + 90, sights[4][1][1] - 90))]  # another face
+    found = by_pupils(swapped, 0.063)
+    assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
+    assert "seen in 4 photos" in found.told and by_pupils(swapped[2:], 0.063) is None
+    assert by_pupils(sights[:2], 0.063) is None
+    assert by_pupils([sights[0]] * 4, 0.063) is None  # one view sees no depth
+
+
 def test_positions_tell_where_they_are_spread_wider_than_wrong() -> None:
     turn = cv2.Rodrigues(np.array([0.3, -1.0, 0.4]))[0]
     rng = np.random.default_rng(0)
@@ -121,7 +144,10 @@ def test_the_stage_says_where_the_scale_is_from(tmp_path: Path, capture_of, plac
     assert found.metric and "known distance of 5 m" in found.scale and "a head is" in found.warnings[-1]
     found = place(capture, marker_mm=50, marker_kind="apriltag_16h5", **given).artifact
     assert not found.metric and found.scale.startswith("not known") and "markers of the kind" in found.warnings[0]
-    with pytest.raises(StageError, match="scale can't be told"):
-        place(capture, scale="gps", **given)
+    found = place(capture, pupils_mm=63, **given).artifact  # no face anywhere
+    assert not found.metric and "no face is seen" in found.warnings[0]
+    for asked in ("gps", "pupils", "markers"):
+        with pytest.raises(StageError, match="scale can't be told"):
+            place(capture, scale=asked, **given)
     with pytest.raises(UsageError, match="not understood"):
         place(capture, distance="a lot", **given)
