@@ -186,13 +186,17 @@ class CameraSet(Artifact):
 
 # ------------------------------------------------------------------ masks
 class ViewMask(Artifact):
-    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull."""
+    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
+
+    labels: where a face was found, PNG of 0 background, 1 subject, 2 face, 3 eyes.
+    """
 
     index: int
     mask: FileRef
     source: str
     coverage: float
     hull_iou: float | None = None
+    labels: FileRef | None = None
 
 
 class MaskSet(Artifact):

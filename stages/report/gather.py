@@ -68,6 +68,11 @@ def figures(r: Results) -> dict[str, Any]:
             "unregistered": len(cameras.unregistered),
             "reprojection_error_px": cameras.reprojection_error_px,
         },
+        "masks": {
+            "views": len(r.masks.artifact.masks),
+            "dropped": len(r.masks.artifact.dropped),
+            "faces": sum(m.labels is not None for m in r.masks.artifact.masks),
+        },
         "surface": {
             "vertices": surface.vertices,
             "faces": surface.faces,
