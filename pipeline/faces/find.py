@@ -28,8 +28,6 @@ SURE, PRESENT = 0.6, 0.8  # probabilities from which a find, and landmarks, coun
 ROOM = 0.75  # half-edge of the landmarks' square in edges of the found box
 RIGHT_EYE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246)  # along the lids
 LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
-OVAL = (10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377, 152, 148, 176, 149,
-        150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109)  # fmt: skip
 _local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
 
 

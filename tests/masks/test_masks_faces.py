@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage import data
 
-from pipeline.faces.find import LEFT_EYE, OVAL, RIGHT_EYE, Face
+from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face
 from stages.masks.face_labels import EYES, FACE, SUBJECT, face_labels, on_subject
 from stages.masks.region import Disc
 
@@ -39,8 +39,8 @@ def test_labels_fill_the_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
     points, turn = np.full((468, 2), 50.0), np.arange(16) / 16 * 2 * np.pi
     for eye, x in ((RIGHT_EYE, 30.0), (LEFT_EYE, 70.0)):
         points[list(eye)] = np.stack([x + 8 * np.cos(turn), 40 + 4 * np.sin(turn)], 1)
-    turn = np.arange(len(OVAL)) / len(OVAL) * 2 * np.pi
-    points[list(OVAL)] = np.stack([50 + 40 * np.cos(turn), 50 + 45 * np.sin(turn)], 1)
+    turn = np.arange(36) / 36 * 2 * np.pi
+    points[200:236] = np.stack([50 + 40 * np.cos(turn), 50 + 45 * np.sin(turn)], 1)
     monkeypatch.setattr("stages.masks.face_labels.find_face", lambda *_: Face(points, 1.0))
     alpha = np.ones((100, 100), np.float32)
     labels = face_labels(np.zeros((100, 100, 3), np.uint8), alpha, Disc(50, 50, 50, 0.0))
