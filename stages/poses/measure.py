@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -10,9 +11,8 @@ from pipeline.artifacts import Camera, Capture, CaptureView, Located
 from pipeline.errors import StageError
 from pipeline.faces.find import find_face
 from pipeline.images import read_encoded
-from pipeline.transforms import F64
 from stages.poses.features import U8, grey8
-from stages.poses.scale import Scale, by_distance, by_markers, by_positions, by_pupils, find_markers
+from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, eyes_of, find_markers
 
 NEEDS = {
     "markers": "markers of poses.marker_kind and poses.marker_mm in view",
@@ -37,7 +37,7 @@ class Wanted(Protocol):
 
 
 def known_scale(
-    capture: Located[Capture], cameras: list[Camera], config: Wanted, warnings: list[str]
+    capture: Located[Capture], cameras: list[Camera], config: Wanted, eyes: Eyes | None, warnings: list[str]
 ) -> Scale | None:  # fmt: skip
     """Metres per unit of the cameras' world from what the user or the photos say of it, or None.
 
@@ -57,9 +57,8 @@ def known_scale(
         count = len({n for _, corners in seen for n in corners})
         why = f"{count} markers of the kind {config.marker_kind} are seen, none of them whole and square by two photos"
     if wanted == "pupils" or (wanted == "auto" and not why and config.pupils_mm):
-        found = by_pupils(_pupils(capture, cameras), config.pupils_mm / 1e3) if config.pupils_mm else None
-        if found is not None:
-            return found
+        if config.pupils_mm and eyes is not None:
+            return by_pupils(eyes, config.pupils_mm / 1e3)
         why = "no face is seen alike in three photos" if config.pupils_mm else "poses.pupils_mm is not set"
     places = {v.index: v.place_m for v in capture.artifact.views if v.place_m is not None}
     if wanted == "gps" or (wanted == "auto" and not why and places):
@@ -75,17 +74,19 @@ def known_scale(
     return None
 
 
-def _pupils(capture: Located[Capture], cameras: list[Camera]) -> list[tuple[Camera, tuple[F64, F64]]]:
-    """Right and left pupil in the photos whose middle part shows a face."""
+def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]) -> Eyes | None:
+    """The subject's eyes in the cameras' world, or None if no face is seen alike in three photos. check: raises to
+    stop."""
     photos = {v.index: v for v in capture.artifact.views}
     out = []
     for c in cameras:
+        check()
         image = read_encoded(capture.path(photos[c.index].image))
         grey = grey8(image, max(c.width, c.height))
         face = find_face(np.repeat(grey[..., None], 3, 2), c.width / 2, c.height / 2, max(c.width, c.height) / 2)
         if face is not None:
             out.append((c, face.pupils))
-    return out
+    return eyes_of(out)
 
 
 def _grey(capture: Located[Capture], view: CaptureView) -> U8:

@@ -17,7 +17,7 @@ from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
-from stages.poses.scale import Scale
+from stages.poses.scale import Eyes, Scale
 
 NOMINAL_ROI = 0.18  # metres: a head with some air around it
 NOMINAL = f"not known: the subject is made a nominal {NOMINAL_ROI} m in radius"
@@ -25,6 +25,7 @@ PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
 UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 Unit = Literal["guess", "unknown", "metres", "centimetres", "millimetres"]
 ONE_SPOT = 0.02  # of the cameras' distance: nearer together than this they turn on the spot, and see no depth
+LEVEL = 0.7  # of the eyes' distance must be level: a head that lies on its side has no front
 UP_LIMIT = np.cos(np.radians(45.0))
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points, air around them
 POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head have few points, and must stay inside
@@ -48,12 +49,13 @@ class Normalisation:
 
 def normalise(
     cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
-    known: Scale | None = None,
+    known: Scale | None = None, eyes: Eyes | None = None,
 ) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
-    unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both.
+    unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both. eyes: of
+    a solved world's subject, who then looks along +Z.
     Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
     centres, axes = viewing_rays(cameras)
@@ -71,7 +73,9 @@ def normalise(
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
     rotation = (
-        given_axes(poses, warnings) if given else solved_axes(poses, centre, _floor(points, centres, centre, radius))
+        given_axes(poses, warnings)
+        if given
+        else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
     )
     if known is not None:
         scale, metric, told = _checked_scale(known, radius, warnings), True, known.told
@@ -203,8 +207,18 @@ def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 
     return support.normal if support is not None and is_level(support, centres - centre) else None
 
 
-def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
-    """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z towards the side with the cameras.
+def _facing(eyes: Eyes | None, centre: F64, radius: float) -> F64 | None:
+    """The person's left (3,), if their eyes are where the cameras look and not on a picture behind."""
+    if eyes is None or np.linalg.norm((eyes.left + eyes.right) / 2 - centre) > radius:
+        return None
+    return eyes.left - eyes.right
+
+
+def solved_axes(poses: F64, centre: F64, floor: F64 | None = None, left: F64 | None = None) -> F64:
+    """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z where the face looks, or without one
+    towards the side with the cameras.
+
+    floor: what is up (3,), left: what is left to the subject (3,), where known.
 
     Up is the direction that the cameras' x axes are square to (a photographer tilts a camera more than he rolls it,
     so that the mean of the up vectors alone leans back), held near the mean of their up vectors.
@@ -225,6 +239,8 @@ def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
     if np.linalg.norm(side) < 1e-6 * np.linalg.norm(poses[:, :3, 3] - centre, axis=1).mean():
         side = poses[0, :3, 3] - centre  # cameras evenly all around: the first one's side will do
         side = side - (side @ up) * up
+    if left is not None and np.linalg.norm(np.cross(left, up)) > LEVEL * np.linalg.norm(left):
+        side = np.cross(left, up)
     z = side / np.linalg.norm(side)
     return np.stack([np.cross(up, z), up, z])
 

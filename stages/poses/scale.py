@@ -174,8 +174,19 @@ def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) ->
                  f"{', '.join(map(str, used[:8]))}), whose edges agree to {spread:.1%}")  # fmt: skip
 
 
-def by_pupils(seen: Sequence[tuple[Camera, tuple[F64, F64]]], metres: float) -> Scale | None:
-    """From the distance of the pupils, right and left (2,) pixels of each photo with a face; None if too few agree.
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """right, left: (3,) middles of the person's own eyes. photos: in how many they were seen; off: by what share of
+    their distance there the photos disagree."""
+
+    right: F64
+    left: F64
+    photos: int
+    off: float
+
+
+def eyes_of(seen: Sequence[tuple[Camera, tuple[F64, F64]]]) -> Eyes | None:
+    """From the right and left pupil (2,) pixels of each photo with a face; None if fewer than MIN_FACES agree.
 
     Photos in which a face was seen wrongly, or from the side, are left out one by one, the worst first.
     """
@@ -186,12 +197,16 @@ def by_pupils(seen: Sequence[tuple[Camera, tuple[F64, F64]]], metres: float) -> 
         missed = [max(_miss(c, x, uv) for x, uv in zip(eyes, pair, strict=True)) for c, pair in left]
         off = np.array(missed) / wide
         if off.max() <= EYE_MET:
-            told = (f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {len(left)} photos to "
-                    f"{np.median(off):.1%}")  # fmt: skip
-            return Scale(metres / float(np.linalg.norm(eyes[1] - eyes[0])), told)
+            return Eyes(eyes[0], eyes[1], len(left), float(np.median(off)))
         # by its share of the frame: a face seen wrongly may be seen as wide as it likes
         left.pop(int(np.argmax([m / max(c.width, c.height) for m, (c, _) in zip(missed, left, strict=True)])))
     return None
+
+
+def by_pupils(eyes: Eyes, metres: float) -> Scale:
+    """From the distance of the pupils."""
+    told = f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {eyes.photos} photos to {eyes.off:.1%}"
+    return Scale(metres / float(np.linalg.norm(eyes.left - eyes.right)), told)
 
 
 def by_positions(

@@ -118,7 +118,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
 def _given(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """The capture's own cameras, moved to asset coordinates; without views that their photos contradict."""
     from pipeline.transforms import inverse_rigid, matrix
-    from stages.poses.measure import known_scale
+    from stages.poses.measure import find_eyes, known_scale
     from stages.poses.normalise import Unit, normalise
     from stages.poses.place import camera_of, in_asset, save_points
 
@@ -143,7 +143,8 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
             told.append(
                 "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
             )
-    known = known_scale(capture, cameras, config, told)
+    eyes = find_eyes(capture, cameras, context.check) if config.pupils_mm else None
+    known = known_scale(capture, cameras, config, eyes, told)
     found = normalise(cameras, given=True, unit=unit, known=known)
     if model is not None:
         save_points(context.workdir / "points.npz", model, found.capture_from_asset)
@@ -250,7 +251,7 @@ def _contradicted(
 
 def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """Cameras from the photos alone."""
-    from stages.poses.measure import known_scale
+    from stages.poses.measure import find_eyes, known_scale
     from stages.poses.normalise import normalise
     from stages.poses.photogrammetry import solve
     from stages.poses.photos import photos_of
@@ -266,7 +267,9 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
         raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     warnings: list[str] = []
-    found = normalise(cameras, model.points, given=False, known=known_scale(capture, cameras, config, warnings))
+    eyes = find_eyes(capture, cameras, context.check)
+    known = known_scale(capture, cameras, config, eyes, warnings)
+    found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
     save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     warnings += found.warnings
     if missing:

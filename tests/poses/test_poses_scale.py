@@ -13,11 +13,13 @@ from pipeline.errors import StageError, UsageError
 from pipeline.transforms import F64, inverse_rigid, matrix, project, rows
 from stages.poses.scale import (
     DICTIONARIES,
+    Scale,
     by_distance,
     by_markers,
     by_positions,
     by_pupils,
     check_distance,
+    eyes_of,
     find_markers,
 )
 from tests.support.textured_ball import camera_on_orbit, write_facescape
@@ -95,19 +97,24 @@ def test_markers_of_a_known_size(kind: str) -> None:
     assert find_markers(photo_of_markers(flat[0], kind, 0.05 * WORLD, (3, 3)), kind) == {}  # which is which?
 
 
+def pupils(sights: list) -> Scale | None:
+    eyes = eyes_of(sights)
+    return None if eyes is None else by_pupils(eyes, 0.063)
+
+
 def test_pupils_seen_in_photos() -> None:
     rng = np.random.default_rng(0)
     eyes = [[-0.0315 * WORLD, 0.02, 0.08], [0.0315 * WORLD, 0.02, 0.08]]
     sights = [(c, (seen(eyes[0], c) + rng.normal(size=2), seen(eyes[1], c) + rng.normal(size=2))) for c in CAMERAS]
-    found = by_pupils(sights, 0.063)
+    found = pupils(sights)
     assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
     assert "63 mm between the pupils, seen in 5 photos" in found.told
     swapped = [*sights[:4], (sights[4][0], (sights[4][1][0] + 90, sights[4][1][1] - 90))]  # another face
-    found = by_pupils(swapped, 0.063)
+    found = pupils(swapped)
     assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
-    assert "seen in 4 photos" in found.told and by_pupils(swapped[2:], 0.063) is None
-    assert by_pupils(sights[:2], 0.063) is None
-    assert by_pupils([sights[0]] * 4, 0.063) is None  # one view sees no depth
+    assert "seen in 4 photos" in found.told and pupils(swapped[2:]) is None
+    assert pupils(sights[:2]) is None
+    assert pupils([sights[0]] * 4) is None  # one view sees no depth
 
 
 def test_positions_tell_where_they_are_spread_wider_than_wrong() -> None:
