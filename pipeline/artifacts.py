@@ -89,7 +89,8 @@ class CaptureSource(Artifact):
     """What was found in the user's folder, by content; the folder itself is not part of it.
 
     photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
-    plates: photos of the same views without the subject.
+    plates: photos of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the
+    face along +Z, where a file beside the capture says it.
     """
 
     kind: CaptureKind
@@ -97,6 +98,7 @@ class CaptureSource(Artifact):
     cameras: tuple[FileRef, ...] = ()
     masks: tuple[FileRef, ...] = ()
     plates: tuple[FileRef, ...] = ()
+    metres_from_world: Matrix | None = None
 
 
 class GivenCamera(Artifact):
@@ -137,11 +139,12 @@ class CaptureView(Artifact):
 
 class Capture(Artifact):
     """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
-    anew for each photo, so that one colour is not one value."""
+    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
     colours_drift: bool = False
+    metres_from_world: Matrix | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 

@@ -95,6 +95,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift,
+                   metres_from_world=source.artifact.metres_from_world,
                    left_out=tuple(found.left_out), warnings=tuple(warnings))  # fmt: skip
 
 

@@ -49,20 +49,20 @@ class Normalisation:
 
 def normalise(
     cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
-    known: Scale | None = None, eyes: Eyes | None = None,
+    known: Scale | None = None, eyes: Eyes | None = None, axes: F64 | None = None,
 ) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
     unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both. eyes: of
-    a solved world's subject, who then looks along +Z.
+    a solved world's subject, who then looks along +Z. axes: (3, 3) asset_from_capture of a given world, if known.
     Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
-    centres, axes = viewing_rays(cameras)
+    centres, directions = viewing_rays(cameras)
     warnings: list[str] = []
     _not_in_one_spot(cameras, centres)
-    centre = nearest_point(centres, axes)
-    _in_front(cameras, centres, axes, centre, warnings)
+    centre = nearest_point(centres, directions)
+    _in_front(cameras, centres, directions, centre, warnings)
     radius = frame_radius(cameras, centres, centre)
     if points is not None and len(points) >= MIN_POINTS:
         centre = points_centre(points, centre, radius)
@@ -73,7 +73,9 @@ def normalise(
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
     rotation = (
-        given_axes(poses, warnings)
+        axes
+        if given and axes is not None
+        else given_axes(poses, warnings)
         if given
         else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
     )

@@ -174,6 +174,12 @@ def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) ->
                  f"{', '.join(map(str, used[:8]))}), whose edges agree to {spread:.1%}")  # fmt: skip
 
 
+def by_world(metres_from_world: F64) -> tuple[Scale, F64]:
+    """From a published similarity (4, 4): the scale, and the rotation (3, 3) to upright axes."""
+    s = float(np.cbrt(np.linalg.det(metres_from_world[:3, :3])))
+    return Scale(s, "from FaceScape's scale dictionary"), np.asarray(metres_from_world[:3, :3] / s, np.float64)
+
+
 @dataclass(frozen=True, slots=True)
 class Eyes:
     """right, left: (3,) middles of the person's own eyes. photos: in how many they were seen; off: by what share of

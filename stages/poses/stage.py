@@ -121,6 +121,7 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
     from stages.poses.measure import find_eyes, known_scale
     from stages.poses.normalise import Unit, normalise
     from stages.poses.place import camera_of, in_asset, save_points
+    from stages.poses.scale import by_world
 
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
@@ -145,7 +146,11 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
             )
     eyes = find_eyes(capture, cameras, context.check) if config.pupils_mm else None
     known = known_scale(capture, cameras, config, eyes, told)
-    found = normalise(cameras, given=True, unit=unit, known=known)
+    world, axes = capture.artifact.metres_from_world, None
+    if world is not None and config.unit == "auto":
+        published, axes = by_world(matrix(world))
+        known = published if known is None and config.scale == "auto" else known
+    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
     if model is not None:
         save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     return CameraSet(

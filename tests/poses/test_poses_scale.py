@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,7 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
-from pipeline.transforms import F64, inverse_rigid, matrix, project, rows
+from pipeline.transforms import F64, inverse_rigid, matrix, project, rows, similarity
 from stages.poses.scale import (
     DICTIONARIES,
     Scale,
@@ -158,3 +159,31 @@ def test_the_stage_says_where_the_scale_is_from(tmp_path: Path, capture_of, plac
             place(capture, scale=asked, **given)
     with pytest.raises(UsageError, match="not understood"):
         place(capture, distance="a lot", **given)
+
+
+def test_the_published_scale_dictionary(tmp_path: Path, capture_of, place) -> None:
+    """A world with Z up and an odd unit, whose dictionary makes it millimetres, upright, the face along +Z."""
+    turn = cv2.Rodrigues(np.array([np.pi / 2, 0, 0]))[0]  # world from upright axes
+    shift = np.array([0.4, -1.0, 2.0]) * WORLD
+    folder = tmp_path / "tree" / "17" / "4_anger"
+    moved = [similarity(1.0, turn, shift) @ p for p in POSES]
+    write_facescape(folder, moved, K, SIZE, pictures=False)
+    mm = 1e3 / WORLD
+    Rt = np.concatenate([turn.T, (-turn.T @ shift * mm)[:, None]], 1)
+    table = tmp_path / "tree" / "Rt_scale_dict.json"
+    table.write_text(json.dumps({"17": {"4": [mm, Rt.tolist()], "1": [1.0, Rt.tolist()]}}))
+    capture = capture_of(folder, drop_blurred=False)
+    np.testing.assert_allclose(matrix(capture.artifact.metres_from_world) @ moved[2] @ [0, 0, 0, 1],
+                               [*POSES[2][:3, 3] / WORLD, 1], atol=1e-9)  # fmt: skip
+    found = place(capture, check=False).artifact
+    assert found.metric and found.scale == "from FaceScape's scale dictionary" and found.warnings == ()
+    assert matrix(found.cameras[2].world_from_cam)[:3, 3] == pytest.approx(POSES[2][:3, 3] / WORLD, abs=1e-6)
+    told = place(capture, check=False, unit="metres").artifact  # what is said goes first
+    assert told.scale.startswith("metres")
+    for entry, says in (([0.0, Rt.tolist()], "no scale"), ([mm], "not understood"), ([mm, [[1]]], "wrong shape")):
+        table.write_text(json.dumps({"17": {"4": entry}}))
+        with pytest.raises(StageError, match=says):
+            capture_of(folder, drop_blurred=False)
+    for other in ({"17": {"1": [1, Rt.tolist()]}}, {"9": {}}, []):
+        table.write_text(json.dumps(other))
+        assert capture_of(folder, drop_blurred=False).artifact.metres_from_world is None
