@@ -1,7 +1,7 @@
 """Bundle adjustment: cameras, lenses and points moved together until the photos are explained best.
 
 Symbols: r_ij distance in pixels of sighting i of point j from the point's projection; s its typical size. Minimised is
-    sum rho(r_ij^2),   rho(x) = s^2 log(1 + x / s^2)
+    sum rho(r_ij^2),   rho(x) = c^2 log(1 + x / c^2),   c = 2 s
 so that the few matches that are wrong count little (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section
 3.3). With plain squares they pull a camera of 67 real ones 0.36 % of its distance away, with this 0.28 %.
 """
@@ -16,6 +16,7 @@ import pycolmap
 
 from pipeline.transforms import F64
 
+ROBUST = 2.0  # c / s: less wastes what good matches say, more lets wrong ones speak
 LEAST_SCALE = 0.1  # pixels: exact matches, which only drawn ones are, must not make the loss a spike
 TOLERANCE = 1e-6  # of the cost: ten times less moves no camera by a hundredth of its error
 
@@ -31,7 +32,7 @@ class Refine:
 
 def settle(reconstruction: Any, refine: Refine, *, principal_point: bool) -> None:
     """Everything is moved once more, wrong matches without weight. In place."""
-    options, config = _problem(reconstruction)
+    options, config, _ = _problem(reconstruction)
     options.refine_focal_length, options.refine_extra_params = refine.focal, refine.distortion
     options.refine_principal_point = principal_point
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -45,9 +46,8 @@ def settle_near(reconstruction: Any, centres: dict[int, F64], deviation: float) 
     centres: (3,) by image id. deviation: standard deviation of each coordinate, units of the world. Sightings enter the
     sum in pixels and not in their own deviation s, so the prior's has to be divided by s to keep the ratio of the two.
     """
-    options, config = _problem(reconstruction)
+    options, config, noise = _problem(reconstruction)
     options.refine_focal_length = options.refine_extra_params = options.refine_principal_point = False
-    noise = options.ceres.loss_function_scale
     priors = []
     for number, centre in sorted(centres.items()):
         if config.has_image(number):
@@ -65,18 +65,19 @@ def settle_near(reconstruction: Any, centres: dict[int, F64], deviation: float) 
     reconstruction.update_point_3d_errors()
 
 
-def _problem(reconstruction: Any) -> tuple[Any, Any]:
-    """Options and the placed photos. The loss' scale is the median error of the points so far."""
+def _problem(reconstruction: Any) -> tuple[Any, Any, float]:
+    """Options, the placed photos, and s: the median error of the points so far."""
     reconstruction.update_point_3d_errors()
     errors = [p.error for p in reconstruction.points3D.values()]
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.loss_function_scale = max(float(np.median(errors)), LEAST_SCALE) if errors else 1.0
+    typical = max(float(np.median(errors)), LEAST_SCALE) if errors else 1.0
+    options.ceres.loss_function_scale = ROBUST * typical
     options.ceres.solver_options.function_tolerance = TOLERANCE
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for number, image in reconstruction.images.items():
         if image.has_pose:
             config.add_image(number)
-    return options, config
+    return options, config, typical

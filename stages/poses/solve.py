@@ -93,8 +93,10 @@ def reconstruct(
     # the most photos; of equally large ones the one with more points
     ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
     largest, of_lens = ranked[0], np.array(lens_of, np.int64)
-    free = refine.principal_point == "auto" and _tells_principal_points(largest, numbers, of_lens)
-    settle(largest, refine, principal_point=free or refine.principal_point == "yes")
+    told = _tells_principal_points(largest, numbers, of_lens)
+    # lenses that the photos hardly tell drift under a loss that gives up a part of what the photos say
+    own = refine if told else Refine(focal=False, distortion=False)
+    settle(largest, own, principal_point={"auto": told, "yes": True, "no": False}[refine.principal_point])
     return model_of(largest, numbers, ranked[1:])
 
 
