@@ -89,7 +89,8 @@ class CaptureSource(Artifact):
     """What was found in the user's folder, by content; the folder itself is not part of it.
 
     photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
-    plates: photos of the same views without the subject.
+    plates: photos of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the
+    face along +Z, where a file beside the capture says it.
     """
 
     kind: CaptureKind
@@ -97,6 +98,7 @@ class CaptureSource(Artifact):
     cameras: tuple[FileRef, ...] = ()
     masks: tuple[FileRef, ...] = ()
     plates: tuple[FileRef, ...] = ()
+    metres_from_world: Matrix | None = None
 
 
 class GivenCamera(Artifact):
@@ -112,7 +114,12 @@ class GivenCamera(Artifact):
 
 class CaptureView(Artifact):
     """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
-    same view without the subject."""
+    same view without the subject.
+
+    place_m: east, north and up in metres of the capture's first photo with a GPS position. clipped: picture of the
+    pixels (255) whose value is at the end of the file's range, and so only a lower bound. exposure: what a grey's
+    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell.
+    """
 
     index: int
     name: str
@@ -124,14 +131,20 @@ class CaptureView(Artifact):
     plate: FileRef | None = None
     focal_px: float | None = None
     camera_group: str = ""
+    place_m: tuple[float, float, float] | None = None
+    clipped: FileRef | None = None
+    exposure: float = 1.0
     holdout: bool = False
 
 
 class Capture(Artifact):
-    """The photos that take part, checked and in one place."""
+    """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
+    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
+    colours_drift: bool = False
+    metres_from_world: Matrix | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -157,11 +170,13 @@ class CameraSet(Artifact):
     """Cameras around the subject.
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
-    reprojection error of each solved view, by its photo's name.
+    reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
+    makes it metres.
     """
 
     source: Literal["given", "colmap"]
     metric: bool
+    scale: str = ""
     capture_from_asset: Matrix
     roi_radius: float
     cameras: tuple[Camera, ...]
@@ -174,13 +189,17 @@ class CameraSet(Artifact):
 
 # ------------------------------------------------------------------ masks
 class ViewMask(Artifact):
-    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull."""
+    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
+
+    labels: where a face was found, PNG of 0 background, 1 subject, 2 face, 3 eyes.
+    """
 
     index: int
     mask: FileRef
     source: str
     coverage: float
     hull_iou: float | None = None
+    labels: FileRef | None = None
 
 
 class MaskSet(Artifact):

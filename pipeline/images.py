@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy.typing as npt
 
 from pipeline.colour import REC709, Chromaticities, linear_from_srgb, srgb_from_linear
 from pipeline.errors import StageError
-from pipeline.picture_size import declared_size
+from pipeline.picture_size import declared_size_of
 
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
@@ -48,8 +47,7 @@ def refuse_bombs(path: Path, size: int) -> None:
     if size > MAX_BYTES:
         raise _too_large(path, f"{size / 1e9:.1f} GB")
     if size:
-        with path.open("rb") as f, mmap.mmap(f.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            declared = declared_size(data)
+        declared = declared_size_of(path)
         if declared is not None and abs(declared[0] * declared[1]) > MAX_PIXELS:
             raise _too_large(path, f"{declared[0]} x {declared[1]}")
 

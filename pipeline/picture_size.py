@@ -7,7 +7,8 @@ them is trusted beyond the bytes that are there. Sources: PNG (ISO 15948), JPEG 
 from __future__ import annotations
 
 import struct
-from mmap import mmap
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
 
 Data = bytes | mmap
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others in that range are tables
@@ -29,6 +30,14 @@ def declared_size(data: Data) -> tuple[int, int] | None:
     except (struct.error, ValueError, IndexError):  # the header ends before it should: the decoder will say so
         return None
     return None
+
+
+def declared_size_of(path: Path) -> tuple[int, int] | None:
+    """`declared_size` of a file, of which no more than the header is read; None of an empty one."""
+    if not path.stat().st_size:
+        return None
+    with path.open("rb") as f, mmap(f.fileno(), 0, access=ACCESS_READ) as data:
+        return declared_size(data)
 
 
 def _jpeg(data: Data) -> tuple[int, int] | None:

@@ -1,7 +1,8 @@
 """What a photo says of the camera that took it: a minimal reader of TIFF tags, which EXIF is made of.
 
-Only what the pipeline uses: orientation, focal length, make, model, lens. A file with damaged or no metadata gives
-an empty `Exif`, never an error: metadata is a help, not a condition. Source: EXIF 2.32 (CIPA DC-008), TIFF 6.0.
+Only what the pipeline uses: orientation, focal length, make, model, lens, exposure, white balance, place. A file with
+damaged or no metadata gives an empty `Exif`, never an error: metadata is a help, not a condition. Source: EXIF 2.32
+(CIPA DC-008), TIFF 6.0.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ Tags = dict[int, tuple[float, ...] | str]
 MAKE, MODEL, ORIENTATION, EXIF_IFD = 0x10F, 0x110, 0x112, 0x8769
 FOCAL_MM, FOCAL_35MM, PIXEL_X, LENS = 0x920A, 0xA405, 0xA002, 0xA434
 PLANE_X_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
+GPS_IFD, LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT = 0x8825, 1, 2, 3, 4, 5, 6
+EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE = 0x829A, 0x829D, 0x8827, 0xA403
+WHITE_BALANCES: dict[tuple[float, ...], str] = {(0,): "auto", (1,): "manual"}
+EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8)}
@@ -24,7 +29,11 @@ _MAX_TAGS, _MAX_VALUES = 1000, 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Exif:
-    """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown."""
+    """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
+
+    exposure: seconds x ISO / f-number^2, what a grey's linear value is proportional to; None if not all are known.
+    white_balance: auto, or manual, or "" if it is not said. place: degrees north, degrees east, metres up.
+    """
 
     orientation: int = 1
     body: str = ""
@@ -32,6 +41,9 @@ class Exif:
     focal_35mm: float | None = None
     pixels_per_mm: float | None = None
     recorded_width: int | None = None
+    exposure: float | None = None
+    white_balance: str = ""
+    place: tuple[float, float, float] | None = None
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Focal length in pixels of an image of width x height, or None."""
@@ -63,7 +75,44 @@ def read_exif(data: bytes) -> Exif:
         focal_35mm=_number(tags, FOCAL_35MM),
         pixels_per_mm=resolution / unit if resolution and unit else None,
         recorded_width=int(width) if width else None,
+        exposure=_exposure(tags),
+        white_balance=WHITE_BALANCES.get(_values_of(tags, WHITE_BALANCE)[:1], ""),
+        place=_place(_ifd(block, int(_values_of(tags, GPS_IFD)[0])) if _values_of(tags, GPS_IFD) else {}),
     )
+
+
+def metres_from(place: tuple[float, float, float], origin: tuple[float, float, float]) -> tuple[float, float, float]:
+    """East, north and up in metres of a place near another (degrees north, east; metres up), on the ellipsoid WGS 84.
+
+    m = a (1 - e^2) / w^3,  n = a / w,  w^2 = 1 - e^2 sin^2(lat); north = m dlat, east = n cos(lat) dlon
+    """
+    lat, eccentricity = math.radians(origin[0]), FLATTENING * (2 - FLATTENING)
+    w = math.sqrt(1 - eccentricity * math.sin(lat) ** 2)
+    around = (place[1] - origin[1] + 180) % 360 - 180
+    east = EARTH_M / w * math.cos(lat) * math.radians(around)
+    north = EARTH_M * (1 - eccentricity) / w**3 * math.radians(place[0] - origin[0])
+    return east, north, place[2] - origin[2]
+
+
+def _exposure(tags: Tags) -> float | None:
+    seconds, stop, iso = (_number(tags, t) for t in (EXPOSURE_S, F_NUMBER, ISO))
+    return seconds * iso / stop**2 if seconds and stop and iso else None
+
+
+def _place(gps: Tags) -> tuple[float, float, float] | None:
+    """Degrees north and east, metres up; None without both angles, or if they are none of this world."""
+    angles = []
+    for tag, ref, negative, limit in ((LAT, LAT_REF, "S", 90), (LON, LON_REF, "W", 180)):
+        dms = _values_of(gps, tag)
+        if len(dms) != 3 or not all(math.isfinite(v) for v in dms):
+            return None
+        angle = dms[0] + dms[1] / 60 + dms[2] / 3600
+        if not 0 <= angle <= limit:
+            return None
+        angles.append(-angle if _text(gps, ref).startswith(negative) else angle)
+    below = _values_of(gps, ALT_REF) == (1,)
+    up = _number(gps, ALT) or 0.0
+    return angles[0], angles[1], -up if below else up
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -144,6 +193,11 @@ def _number(tags: Tags, tag: int) -> float | None:
     if not isinstance(value, tuple) or not value or not math.isfinite(value[0]) or value[0] <= 0:
         return None
     return float(value[0])
+
+
+def _values_of(tags: Tags, tag: int) -> tuple[float, ...]:
+    value = tags.get(tag)
+    return value if isinstance(value, tuple) else ()
 
 
 def _text(tags: Tags, tag: int) -> str:

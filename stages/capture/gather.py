@@ -18,6 +18,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, refuse_bombs
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
+from stages.capture.photometry import clipped, mean_light
 from stages.capture.profile import profile_name
 from stages.capture.suspects import detail, is_blank, small_grey
 
@@ -29,7 +30,8 @@ _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True
 @dataclass(frozen=True, slots=True)
 class Gathered:
     """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
-    stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one."""
+    stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one.
+    clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance."""
 
     image: Path
     width: int
@@ -38,6 +40,8 @@ class Gathered:
     turned: bool
     detail: float | None = None
     profile: str | None = None
+    clipped: Path | None = None
+    light: float = 0.0
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
@@ -85,7 +89,19 @@ def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, in
         target.write_bytes(data)
     grey = small_grey(image)
     sharpness = None if is_blank(grey) else detail(grey)
-    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data))
+    ends = _write_clipped(turn_upright(image, exif.orientation) if turn else image, target)
+    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data), ends, mean_light(grey))
+
+
+def _write_clipped(image: Image, photo: Path) -> Path | None:
+    """The picture of a photo's clipped pixels (255) in clipped/ beside its folder, or None if there are none."""
+    where = clipped(image)
+    if not where.any():
+        return None
+    path = photo.parent.parent / "clipped" / f"{photo.stem}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_png(path, where[..., None].astype(np.uint8) * 255)
+    return path
 
 
 def gather_mask(path: Path, ref: FileRef, target: Path, photo: Gathered) -> str | None:

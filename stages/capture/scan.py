@@ -12,8 +12,10 @@ from pathlib import Path
 
 from pipeline.artifacts import CaptureKind, CaptureSource, FileRef, Located
 from pipeline.errors import StageError
+from pipeline.transforms import rows
 from stages.capture.readers import describe, find_reader
 from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key
+from stages.capture.readers.facescape_scale import metres_from_world
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp")
@@ -76,7 +78,9 @@ def _source(
     plates: Sequence[Path],
 ) -> CaptureSource:
     refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
-    return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3])
+    world = metres_from_world(folder) if kind == "facescape" else None
+    return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
+                         metres_from_world=None if world is None else rows(world))  # fmt: skip
 
 
 def _film(path: Path) -> Located[CaptureSource]:

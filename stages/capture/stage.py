@@ -91,9 +91,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     _enough(len(candidates) - len(held), len(held), found.left_out, config.min_views)
     views = [_view(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
+    views = _with_exposures(_with_places(views, photos), photos, found.warnings)
+    drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
-    return Capture(kind=source.artifact.kind, views=tuple(views), left_out=tuple(found.left_out),
-                   warnings=tuple(warnings))  # fmt: skip
+    return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift,
+                   metres_from_world=source.artifact.metres_from_world,
+                   left_out=tuple(found.left_out), warnings=tuple(warnings))  # fmt: skip
 
 
 def _photos_of_film(source: Located[CaptureSource], config: Config, context: Context) -> Located[CaptureSource]:
@@ -186,8 +189,15 @@ def _useful(
         else:
             kept.append((candidate, photo))
             continue
-        photo.image.unlink()
+        _remove(photo)
     return [c for c, _ in kept], [p for _, p in kept]
+
+
+def _remove(photo: Gathered) -> None:
+    """A photo that takes no part after all leaves nothing behind."""
+    photo.image.unlink()
+    if photo.clipped is not None:
+        photo.clipped.unlink()
 
 
 def _view(
@@ -212,8 +222,32 @@ def _view(
         focal_px=round(focal, 6) if focal else None,
         camera_group=_group(photo.width, photo.height, candidate.serial, photo.exif.body,
                             photo.exif.focal_mm or photo.exif.focal_35mm),
+        clipped=context.file(photo.clipped) if photo.clipped else None,
         holdout=held,
     )  # fmt: skip
+
+
+def _with_places(views: list[CaptureView], photos: list[Gathered]) -> list[CaptureView]:
+    """The views with their GPS positions, relative to the first: where on earth it was is nobody's business."""
+    from stages.capture.exif import metres_from
+
+    origin = next((p.exif.place for p in photos if p.exif.place is not None), None)
+    if origin is None:
+        return views
+    return [v if p.exif.place is None else v.model_copy(update={"place_m": metres_from(p.exif.place, origin)})
+            for v, p in zip(views, photos, strict=True)]  # fmt: skip
+
+
+def _with_exposures(views: list[CaptureView], photos: list[Gathered], warnings: list[str]) -> list[CaptureView]:
+    """The views with their exposures, where EXIF tells them and the photos bear it out."""
+    from stages.capture.photometry import exposures
+
+    found = exposures([p.exif.exposure for p in photos], [p.light for p in photos])
+    if found is None:
+        return views
+    warnings.append(f"exposures differ by a factor of {max(found) / min(found):.3g}; the photos are brought to one by "
+                    "their EXIF; set the exposure by hand for truer colours")  # fmt: skip
+    return [v.model_copy(update={"exposure": round(e, 6)}) for v, e in zip(views, found, strict=True)]
 
 
 def _plate(
@@ -227,6 +261,8 @@ def _plate(
     path = source.path(candidate.plate)
     target = context.workdir / "plates" / f"{candidate.index}_{path.name}"
     plate = gather_photo(path, candidate.plate, target, candidate.size)
+    if plate.clipped is not None:
+        plate.clipped.unlink()  # of the subject's photo alone
     if (plate.width, plate.height) == (photo.width, photo.height):
         return context.file(plate.image)
     plate.image.unlink()
@@ -265,4 +301,4 @@ def _partly_masked(views: list[CaptureView]) -> list[str]:
     return [f"only {masked} of {len(views)} views have a mask"] if 0 < masked < len(views) else []
 
 
-STAGE = Stage(name="capture", version=2, inputs=Inputs, config=Config, output=Capture, run=run)
+STAGE = Stage(name="capture", version=3, inputs=Inputs, config=Config, output=Capture, run=run)

@@ -38,6 +38,7 @@ def predict_held_out(
     """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
     held = {v.index: v for v in capture.views if v.holdout}
     known = [c for c in poses.cameras if c.index in held]
+    exposure = {v.index: v.exposure for v in capture.views}
     out = []
     for n, c in enumerate(known):
         context.check()
@@ -45,6 +46,7 @@ def predict_held_out(
         factor = factor_for((c.width, c.height), side, exact=True)
         view = camera_only(c)
         rgba = predict_view(model, view, factor, samples, context.device)
+        rgba[..., :3] *= exposure[c.index]
         exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
         write_exr(context.workdir / exr, rgba)
         write_png_from_linear(context.workdir / png, rgba[..., :3])

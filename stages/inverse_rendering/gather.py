@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import transforms
-from pipeline.artifacts import Camera, CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, Capture, FileRef, Located, MaskSet
 from pipeline.images import read_alpha, read_linear, shrink
-from stages.inverse_rendering.views import PhotoView, factor_for, whole_blocks
+from stages.inverse_rendering.views import F32, PhotoView, factor_for, whole_blocks
 
 
 def read_views(
     capture: Located[Capture], poses: CameraSet, masks: Located[MaskSet], indices: list[int], side: int
 ) -> list[PhotoView]:
-    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`."""
+    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`.
+
+    Photos are divided by their exposures: the start of what the per-image calibration then refines.
+    """
     cameras = {c.index: c for c in poses.cameras}
     alphas = {m.index: m for m in masks.artifact.masks}
     photos = {v.index: v for v in capture.artifact.views}
@@ -26,11 +29,12 @@ def read_views(
             shrunk(
                 PhotoView(
                     i,
-                    read_linear(capture.path(photos[i].image)),
+                    read_linear(capture.path(photos[i].image)) / np.float32(photos[i].exposure),
                     read_alpha(masks.path(alphas[i].mask)),
                     transforms.matrix(c.K),
                     transforms.matrix(c.world_from_cam),
                     np.array(c.distortion),
+                    _clipped(capture, photos[i].clipped),
                 ),
                 side,
             )
@@ -48,7 +52,13 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
         return view
     K = view.K.copy()
     K[:2] /= f
-    return replace(view, rgb=shrink(whole_blocks(view.rgb, f), f), alpha=shrink(whole_blocks(view.alpha, f), f), K=K)
+    clipped = None if view.clipped is None else shrink(whole_blocks(view.clipped, f), f)
+    rgb, alpha = shrink(whole_blocks(view.rgb, f), f), shrink(whole_blocks(view.alpha, f), f)
+    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, K=K)
+
+
+def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
+    return None if file is None else read_alpha(capture.path(file))
 
 
 def camera_only(c: Camera) -> PhotoView:

@@ -223,7 +223,8 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     """Whether per-image colour matrices are fitted."""
     if config.calibration != "auto":
         return config.calibration == "on"
-    return len({v.camera_group for v in inputs.capture.artifact.views if v.index in set(usable)}) > 1
+    capture = inputs.capture.artifact
+    return capture.colours_drift or len({v.camera_group for v in capture.views if v.index in set(usable)}) > 1
 
 
 STAGE = Stage(name="inverse_rendering", version=2, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -29,7 +29,10 @@ WHOLE = 0.99  # alpha from which a pixel shows the subject alone
 
 @dataclass(frozen=True, slots=True)
 class PhotoView:
-    """A photo with its camera: rgb (H, W, 3) linear, alpha (H, W) in [0, 1], at the photo's size."""
+    """A photo with its camera: rgb (H, W, 3) linear, alpha (H, W) in [0, 1], at the photo's size.
+
+    clipped: (H, W) share of each pixel that is at the end of the camera's range, None if none is.
+    """
 
     index: int
     rgb: F32
@@ -37,6 +40,7 @@ class PhotoView:
     K: F64
     world_from_cam: F64
     distortion: F64
+    clipped: F32 | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -161,6 +165,8 @@ def _pixels_of(
     far = np.zeros_like(near)
     far.reshape(-1)[n % FAR_EVERY :: FAR_EVERY] = True
     take = inside | near | far
+    if view.clipped is not None:  # what is clipped shows a lower bound; of the background it still shows that it is one
+        take &= ~(inside & (shrink(whole_blocks(view.clipped, factor), factor) > 0))
     return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
 
 

@@ -19,6 +19,7 @@ from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
+from stages.masks.face_labels import face_labels
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, distinct, find_solid
@@ -48,6 +49,7 @@ class Settings:
     mend: bool
     seed: int
     model: UserModel | None = None
+    faces: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +96,10 @@ def segment(
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
     dropped = _dropped(masked, settings, warnings)
-    return MaskSet(masks=tuple(_manifest(m, context) for m in masked), dropped=tuple(dropped), warnings=tuple(warnings))
+    faces = _each(lambda m: _labels(m, context), masked, context, "looking for a face") if settings.faces else []
+    seen = {m.view.index: f for m, f in zip(masked, faces, strict=False) if f is not None}
+    made = tuple(_manifest(m, seen.get(m.view.index), context) for m in masked)
+    return MaskSet(masks=made, dropped=tuple(dropped), warnings=tuple(warnings))
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
@@ -265,6 +270,17 @@ def _enough(left: int, views: int, warnings: list[str]) -> None:
                          "choose another masks.method")  # fmt: skip
 
 
-def _manifest(m: Masked, context: Context) -> ViewMask:
+def _labels(m: Masked, context: Context) -> Path | None:
+    """The file of the labels of a photo that shows the subject's face, else None."""
+    labels = face_labels(m.view.read(), read_alpha(_path(m.view.index, context)), m.view.disc)
+    if labels is None:
+        return None
+    path = context.workdir / "labels" / f"{m.view.index}.png"
+    write_png(path, labels / 255)
+    return path
+
+
+def _manifest(m: Masked, labels: Path | None, context: Context) -> ViewMask:
     return ViewMask(index=m.view.index, mask=context.file(_path(m.view.index, context)), source=m.source,
-                    coverage=round(m.coverage, 6), hull_iou=None if m.iou is None else round(m.iou, 4))  # fmt: skip
+                    coverage=round(m.coverage, 6), hull_iou=None if m.iou is None else round(m.iou, 4),
+                    labels=None if labels is None else context.file(labels))  # fmt: skip

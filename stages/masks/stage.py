@@ -43,6 +43,7 @@ class Config(StageConfig):
     max_deviation: float = Field(
         0.05, gt=0, le=1, description="IoU below the median from which a mask may be an outlier"
     )
+    faces: bool = Field(True, description="label face and eyes in the photos that show them")
     mend: bool = Field(True, description="cut a computed mask out anew where the other views contradict it")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
 
@@ -82,9 +83,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
         max_deviation=config.max_deviation,
         mend=config.mend,
         seed=config.seed,
+        faces=config.faces,
         model=UserModel(Path(config.model), config.model_side, config.model_imagenet) if config.model else None,
     )
     return segment(inputs.capture, inputs.poses, settings, context)
 
 
-STAGE = Stage(name="masks", version=2, inputs=Inputs, config=Config, output=MaskSet, run=run)
+STAGE = Stage(name="masks", version=3, inputs=Inputs, config=Config, output=MaskSet, run=run)

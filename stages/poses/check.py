@@ -21,6 +21,7 @@ from stages.poses.photos import StoredPhoto
 EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
 PARTNERS = 4  # photos that each is held against
 FAR = 0.01  # of the longest edge: farther from its epipolar line a match speaks against the cameras
+IMPERFECT = 0.03  # the same for cameras that are known not to be exact, and mended afterwards
 AGREE = 0.3  # share of a view's matches that must agree with its camera
 MIN_MATCHES = 20  # of a view over all its pairs, to judge it
 
@@ -43,10 +44,11 @@ class Verdict:
 
 
 def check_cameras(
-    cameras: Sequence[Camera], features: Sequence[Features], seed: int, tick: Callable[[int, int], None]
-) -> Verdict:
+    cameras: Sequence[Camera], features: Sequence[Features], seed: int, tick: Callable[[int, int], None],
+    far: float = FAR,
+) -> Verdict:  # fmt: skip
     """Hold each view against its nearest ones. A wrong view spoils its pairs: it is found first, and its pairs no
-    longer count against its neighbours. tick: done, total."""
+    longer count against its neighbours. tick: done, total. far: of the longest edge, see FAR."""
     pairs = near_pairs(cameras)
     counts: dict[tuple[int, int], tuple[int, int]] = {}
     for n, (i, j) in enumerate(pairs):
@@ -58,7 +60,7 @@ def check_cameras(
             continue
         uv_i = np.asarray(features[i].uv[pair.matches[:, 0]], np.float64)
         uv_j = np.asarray(features[j].uv[pair.matches[:, 1]], np.float64)
-        good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < FAR * edge
+        good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < far * edge
         counts[i, j] = (int(good.sum()), len(good))
     return Verdict(_shares(counts, len(cameras)))
 

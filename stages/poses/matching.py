@@ -51,11 +51,14 @@ def match(a: F32, b: F32, ratio: float) -> U32:
 
 
 def promising_pairs(
-    features: Sequence[Features], ratio: float, neighbours: int = NEIGHBOURS, tick: Callable[[], None] = lambda: None
-) -> list[Pair]:
+    features: Sequence[Features], ratio: float, neighbours: int = NEIGHBOURS, tick: Callable[[], None] = lambda: None,
+    in_order: bool = False,
+) -> list[Pair]:  # fmt: skip
     """Pairs (i < j) worth a full match: each photo's partners with the most matches among the strongest features.
 
-    Few photos are all paired. Cost: SCOUTS^2 x 128 products per pair, about a second for 50 photos.
+    Few photos are all paired. in_order: the photos are frames of a film, so that the next ones are partners whatever
+    the features say; they take half the places, and the film's return to where it was finds its place in the other
+    half. Cost: SCOUTS^2 x 128 products per pair, about a second for 50 photos.
     """
     n = len(features)
     if n <= EXHAUSTIVE_UP_TO:
@@ -67,9 +70,10 @@ def promising_pairs(
     for i in range(n - 1):
         tick()
         votes[i, i + 1 :] = votes[i + 1 :, i] = _votes(scouts[i], scouts[i + 1 :], ratio)
-    pairs: set[Pair] = set()
+    following = max(1, neighbours // 4) if in_order else 0
+    pairs = {(i, j) for i in range(n) for j in range(i + 1, min(i + 1 + following, n))}
     for i in range(n):
-        order = [int(j) for j in np.argsort(-votes[i], kind="stable") if j != i][:neighbours]
+        order = [int(j) for j in np.argsort(-votes[i], kind="stable") if j != i][: neighbours - 2 * following]
         pairs |= {(min(i, j), max(i, j)) for j in order}
     return sorted(pairs)
 

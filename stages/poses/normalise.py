@@ -17,12 +17,15 @@ from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
+from stages.poses.scale import Eyes, Scale
 
 NOMINAL_ROI = 0.18  # metres: a head with some air around it
+NOMINAL = f"not known: the subject is made a nominal {NOMINAL_ROI} m in radius"
 PLAUSIBLE_ROI = (0.05, 0.6)  # metres, for a head
 UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 Unit = Literal["guess", "unknown", "metres", "centimetres", "millimetres"]
 ONE_SPOT = 0.02  # of the cameras' distance: nearer together than this they turn on the spot, and see no depth
+LEVEL = 0.7  # of the eyes' distance must be level: a head that lies on its side has no front
 UP_LIMIT = np.cos(np.radians(45.0))
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points, air around them
 POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head have few points, and must stay inside
@@ -34,28 +37,32 @@ AROUND = 2.5  # radii within which the support is looked for
 
 @dataclass(frozen=True, slots=True)
 class Normalisation:
-    """capture_from_asset: 4x4 similarity. roi_radius: asset units, around the origin. metric: units are metres."""
+    """capture_from_asset: 4x4 similarity. roi_radius: asset units, around the origin. metric: units are metres.
+    scale: where the unit is from, in words."""
 
     capture_from_asset: F64
     roi_radius: float
     metric: bool
+    scale: str
     warnings: tuple[str, ...]
 
 
 def normalise(
-    cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess"
-) -> Normalisation:
+    cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
+    known: Scale | None = None, eyes: Eyes | None = None, axes: F64 | None = None,
+) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
-    unit: of a given world; guess: the one under which the subject has a head's size.
+    unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both. eyes: of
+    a solved world's subject, who then looks along +Z. axes: (3, 3) asset_from_capture of a given world, if known.
     Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
-    centres, axes = viewing_rays(cameras)
+    centres, directions = viewing_rays(cameras)
     warnings: list[str] = []
     _not_in_one_spot(cameras, centres)
-    centre = nearest_point(centres, axes)
-    _in_front(cameras, centres, axes, centre, warnings)
+    centre = nearest_point(centres, directions)
+    _in_front(cameras, centres, directions, centre, warnings)
     radius = frame_radius(cameras, centres, centre)
     if points is not None and len(points) >= MIN_POINTS:
         centre = points_centre(points, centre, radius)
@@ -66,11 +73,29 @@ def normalise(
         radius = float(np.clip(reach, POINTS_SHRINK * radius, radius))
     poses = np.stack([matrix(c.world_from_cam) for c in cameras])
     rotation = (
-        given_axes(poses, warnings) if given else solved_axes(poses, centre, _floor(points, centres, centre, radius))
+        axes
+        if given and axes is not None
+        else given_axes(poses, warnings)
+        if given
+        else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
     )
-    scale, metric = given_scale(radius, warnings, unit) if given else (NOMINAL_ROI / radius, False)
+    if known is not None:
+        scale, metric, told = _checked_scale(known, radius, warnings), True, known.told
+    elif given:
+        scale, metric, told = given_scale(radius, warnings, unit)
+    else:
+        scale, metric, told = NOMINAL_ROI / radius, False, NOMINAL
     inverse = similarity(1.0 / scale, rotation.T, centre)
-    return Normalisation(inverse, radius * scale, metric, tuple(warnings))
+    return Normalisation(inverse, radius * scale, metric, told, tuple(warnings))
+
+
+def _checked_scale(known: Scale, radius: float, warnings: list[str]) -> float:
+    """Metres per unit. A subject of no head's size is told, and taken as it is."""
+    low, high = PLAUSIBLE_ROI
+    if not low <= radius * known.metres_per_unit <= high:
+        warnings.append(f"with the scale {known.told} the views see {radius * known.metres_per_unit:.3g} m around the "
+                        f"subject, where a head is {low} to {high} m; check it")  # fmt: skip
+    return known.metres_per_unit
 
 
 def viewing_rays(cameras: Sequence[Camera]) -> tuple[F64, F64]:
@@ -184,8 +209,18 @@ def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 
     return support.normal if support is not None and is_level(support, centres - centre) else None
 
 
-def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
-    """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z towards the side with the cameras.
+def _facing(eyes: Eyes | None, centre: F64, radius: float) -> F64 | None:
+    """The person's left (3,), if their eyes are where the cameras look and not on a picture behind."""
+    if eyes is None or np.linalg.norm((eyes.left + eyes.right) / 2 - centre) > radius:
+        return None
+    return eyes.left - eyes.right
+
+
+def solved_axes(poses: F64, centre: F64, floor: F64 | None = None, left: F64 | None = None) -> F64:
+    """(3, 3) asset_from_capture for a world whose axes mean nothing: +Y up, +Z where the face looks, or without one
+    towards the side with the cameras.
+
+    floor: what is up (3,), left: what is left to the subject (3,), where known.
 
     Up is the direction that the cameras' x axes are square to (a photographer tilts a camera more than he rolls it,
     so that the mean of the up vectors alone leans back), held near the mean of their up vectors.
@@ -206,6 +241,8 @@ def solved_axes(poses: F64, centre: F64, floor: F64 | None = None) -> F64:
     if np.linalg.norm(side) < 1e-6 * np.linalg.norm(poses[:, :3, 3] - centre, axis=1).mean():
         side = poses[0, :3, 3] - centre  # cameras evenly all around: the first one's side will do
         side = side - (side @ up) * up
+    if left is not None and np.linalg.norm(np.cross(left, up)) > LEVEL * np.linalg.norm(left):
+        side = np.cross(left, up)
     z = side / np.linalg.norm(side)
     return np.stack([np.cross(up, z), up, z])
 
@@ -233,24 +270,25 @@ def least_turn(a: F64, b: F64) -> F64:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + c), np.float64)
 
 
-def given_scale(radius: float, warnings: list[str], unit: Unit = "guess") -> tuple[float, bool]:
-    """(asset units per capture unit, metric). Guessed: the one under which the region of interest has a head's size."""
+def given_scale(radius: float, warnings: list[str], unit: Unit = "guess") -> tuple[float, bool, str]:
+    """(asset units per capture unit, metric, where from). Guessed: the one under which the region of interest has a
+    head's size."""
     if unit == "unknown":
         warnings.append(f"the cameras' unit is not known; the asset is scaled to a nominal {NOMINAL_ROI} m around the "
                         "subject; say poses.unit=metres (centimetres, millimetres) if you know it")  # fmt: skip
-        return NOMINAL_ROI / radius, False
+        return NOMINAL_ROI / radius, False, NOMINAL
     if unit != "guess":
-        return UNITS[unit], True
+        return UNITS[unit], True, f"{unit}, as poses.unit says"
     low, high = PLAUSIBLE_ROI
     fitting = [u for u, factor in UNITS.items() if low <= radius * factor <= high]
     if not fitting:
         warnings.append(f"the cameras' unit is not known (the views see {radius:.4g} units around the subject); the "
                         f"asset is scaled to a nominal {NOMINAL_ROI} m")  # fmt: skip
-        return NOMINAL_ROI / radius, False
+        return NOMINAL_ROI / radius, False, NOMINAL
     likely = min(fitting, key=lambda u: abs(np.log(radius * UNITS[u] / NOMINAL_ROI)))
     if likely != "metres":
         warnings.append(f"the cameras' unit is taken as {likely} (the views see {radius:.4g} units around the subject)")
-    return UNITS[likely], True
+    return UNITS[likely], True, f"{likely}: the given cameras' unit under which the subject has a head's size"
 
 
 def _in_front(cameras: Sequence[Camera], centres: F64, axes: F64, centre: F64, warnings: list[str]) -> None:

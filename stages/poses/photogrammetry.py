@@ -17,8 +17,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from stages.poses.adjust import Refine
 from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.known import triangulate
 from stages.poses.matching import (
     MIN_INLIERS,
     Pair,
@@ -30,13 +33,14 @@ from stages.poses.matching import (
     verify,
     without_repeats,
 )
-from stages.poses.solve import MIN_POINTS, Lens, Model, Refine, reconstruct
+from stages.poses.solve import MIN_POINTS, Lens, Mapper, Model, reconstruct
 
 WORKERS = 2  # the result does not depend on it: each photo is a task of its own
 GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth a second, slower look at the photos
 POOR_SHARE = 0.75  # and with fewer than this it is worth doubting that they share a lens
 REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends are one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
+GLOBAL_FROM = 200  # photos: from here on all are placed at once, which takes minutes where one by one takes hours
 BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
 
 
@@ -80,6 +84,8 @@ class Settings:
     camera_model: str
     refine: Refine
     patience: int = 3
+    mapper: Literal["auto", "incremental", "global"] = "auto"
+    in_order: bool = False
 
 
 Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
@@ -99,7 +105,8 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
         if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
             break
     if settings.patience >= 3 and (best is None or len(best.poses) < GOOD_SHARE * len(photos)):
-        features, verified = _askew(photos, features, verified, settings, progress)
+        lost = [i for i in range(len(photos)) if best is None or i not in best.poses]
+        features, verified = _askew(photos, features, verified, settings, progress, lost)
         best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
     if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):
         separate = _place(photos, features, verified, settings, False, scratch, progress)
@@ -110,14 +117,41 @@ def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: 
     return best
 
 
+def triangulate_given(
+    photos: Sequence[Photo], cameras: Sequence[Camera], settings: Settings, scratch: Path, progress: Progress,
+    *, refine: bool, deviation: float,
+) -> tuple[Model, list[int]] | None:  # fmt: skip
+    """Sparse points from given cameras, and with `refine` better poses; None if no point is seen twice. Second: the
+    views that were not mended. deviation: of the given centres, in the world's unit."""
+    features = detect_all(photos, settings, PLAIN, progress)
+    verified = match_all(photos, features, settings, PLAIN, progress)
+    if not verified:
+        return None
+    progress(0, 1, "finding points")
+    folder = scratch / "mapper"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        return triangulate(folder, cameras, features, verified, refine=refine, deviation=deviation, seed=settings.seed)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
 def _askew(
     photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], settings: Settings,
-    progress: Progress,
+    progress: Progress, lost: Sequence[int],
 ) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
-    """The features and matches so far, and those of photos seen as if from farther round."""
+    """The features and matches so far, and those of the `lost` photos and their likeliest neighbours seen as if from
+    farther round; the others have found their place without."""
     more = replace(settings, max_features=MORE_ASKEW * settings.max_features)
-    askew = detect_all(photos, more, ASKEW, progress)
-    found = match_all(photos, askew, more, ASKEW, progress)
+    near = promising_pairs(features, ASKEW.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"))
+    pairs = [p for p in near if set(p) & set(lost)]
+    wanted = sorted({i for p in pairs for i in p})
+    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+    askew = [nothing] * len(photos)
+    for i, f in zip(wanted, detect_all([photos[i] for i in wanted], more, ASKEW, progress), strict=True):
+        askew[i] = f
+    found = match_pairs(photos, askew, pairs, more, ASKEW, progress)
     single = {}
     for (i, j), pair in found.items():
         cell = REPEAT * max(photos[i].width, photos[i].height)
@@ -185,7 +219,16 @@ def match_all(
     photos: Sequence[Photo], features: Sequence[Features], settings: Settings, effort: Effort, progress: Progress
 ) -> dict[Pair, Verified]:
     """Verified matches by pair of photos."""
-    pairs = promising_pairs(features, effort.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"))
+    pairs = promising_pairs(features, effort.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"),
+                            settings.in_order)  # fmt: skip
+    return match_pairs(photos, features, pairs, settings, effort, progress)
+
+
+def match_pairs(
+    photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair], settings: Settings, effort: Effort,
+    progress: Progress,
+) -> dict[Pair, Verified]:  # fmt: skip
+    """Verified matches of the given pairs."""
     found = {}
     with _single_threaded_cv2():
         for n, (i, j) in enumerate(pairs):
@@ -213,8 +256,6 @@ def _place(
         focals = [p.focal for p in members if p.focal is not None]
         lenses.append(Lens(members[0].width, members[0].height, float(np.median(focals)) if focals else None))
     folder = scratch / "mapper"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
     stopped: list[BaseException] = []
     placed = 0
 
@@ -228,14 +269,28 @@ def _place(
         placed += 1
         return bool(stopped)
 
-    model = reconstruct(
-        folder, lenses, lens_of, features, verified, camera_model=settings.camera_model, refine=settings.refine,
-        seed=settings.seed, next_image=next_image,
-    )  # fmt: skip
-    shutil.rmtree(folder, ignore_errors=True)
-    if stopped:
-        raise stopped[0]
+    model = None
+    for mapper in mappers(len(photos), settings.mapper):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        found = reconstruct(
+            folder, lenses, lens_of, features, verified, camera_model=settings.camera_model, mapper=mapper,
+            refine=settings.refine, seed=settings.seed, next_image=next_image,
+        )  # fmt: skip
+        shutil.rmtree(folder, ignore_errors=True)
+        if stopped:
+            raise stopped[0]
+        model = _larger(model, found)
+        if model is not None and len(model.poses) >= GOOD_SHARE * len(photos):
+            break
     return model
+
+
+def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tuple[Mapper, ...]:
+    """The ways to place so many photos, the likeliest first; the next is taken where one leaves too many out."""
+    if wanted != "auto":
+        return (wanted,)
+    return ("global", "incremental") if photos >= GLOBAL_FROM else ("incremental",)
 
 
 def _larger(a: Model | None, b: Model | None) -> Model | None:

@@ -1,6 +1,7 @@
-"""Structure from motion: features and matches in, cameras and sparse points out, by COLMAP's incremental mapper.
+"""Structure from motion: features and matches in, cameras and sparse points out, by COLMAP's mappers.
 
-The same input gives the same cameras: every sampler is seeded and the mapper runs on one thread, because the order of
+The incremental mapper places photo after photo; the global one turns and places all at once, which many photos need.
+The same input gives the same cameras: every sampler is seeded and the mappers run on one thread, because the order of
 a parallel sum is not fixed. COLMAP has the first pixel's centre at (0.5, 0.5), as everything here has.
 """
 
@@ -16,6 +17,7 @@ import numpy.typing as npt
 import pycolmap
 
 from pipeline.transforms import F64, inverse_rigid, project, rigid
+from stages.poses.adjust import Refine, settle
 from stages.poses.features import Features
 from stages.poses.matching import Pair, Verified
 
@@ -24,6 +26,7 @@ MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
 MIN_POINTS = 100
+Mapper = Literal["incremental", "global"]
 PRINCIPAL_POINT_LIMIT = (
     1.5e-3  # of the longest edge, standard deviation: it turns a view by less than a tenth of a degree
 )
@@ -36,15 +39,6 @@ class Lens:
     width: int
     height: int
     focal: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Refine:
-    """What bundle adjustment may move, besides poses and points. principal_point: auto: where the photos tell it."""
-
-    focal: bool = True
-    distortion: bool = True
-    principal_point: Literal["auto", "yes", "no"] = "auto"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,17 +73,36 @@ def reconstruct(
     verified: Mapping[Pair, Verified],
     *,
     camera_model: str,
+    mapper: Mapper,
     refine: Refine,
     seed: int,
     next_image: Callable[[], bool],
 ) -> Model | None:
     """The largest model that COLMAP finds, or None. lens_of: for each photo, its place in `lenses`.
 
-    next_image: called before each photo is placed; True stops the mapper. scratch: an empty folder.
+    next_image: called before each photo is placed (by the global mapper, before all); True stops the mapper. scratch:
+    an empty folder.
     """
     pycolmap.logging.minloglevel = GLOG_ERROR
     database = scratch / "matches.db"
-    numbers = _write_database(database, lenses, lens_of, features, verified, camera_model)
+    cameras = [_start(lens, camera_model) for lens in lenses]
+    numbers = write_database(database, cameras, lens_of, features, verified)
+    found = (_all_at_once if mapper == "global" else _one_by_one)(database, scratch, refine, seed, next_image)
+    if not found:
+        return None
+    # the most photos; of equally large ones the one with more points
+    ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
+    largest, of_lens = ranked[0], np.array(lens_of, np.int64)
+    told = _tells_principal_points(largest, numbers, of_lens)
+    # lenses that the photos hardly tell drift under a loss that gives up a part of what the photos say
+    own = refine if told else Refine(focal=False, distortion=False)
+    settle(largest, own, principal_point={"auto": told, "yes": True, "no": False}[refine.principal_point])
+    return model_of(largest, numbers, ranked[1:])
+
+
+def _one_by_one(
+    database: Path, scratch: Path, refine: Refine, seed: int, next_image: Callable[[], bool]
+) -> dict[int, Any]:  # fmt: skip
     token = pycolmap.CancellationToken()
 
     def tick() -> None:
@@ -97,21 +110,36 @@ def reconstruct(
             token.cancel()
 
     try:
-        found = pycolmap.incremental_mapping(
-            database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
-            cancellation_token=token,
+        return dict(
+            pycolmap.incremental_mapping(
+                database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
+                cancellation_token=token,
+            )
         )  # fmt: skip
     except InterruptedError:  # what a cancelled token raises; whoever cancelled knows why
-        return None
-    if not found:
-        return None
-    # the most photos; of equally large ones the one with more points
-    ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
-    largest = ranked[0]
-    of_lens = np.array(lens_of, np.int64)
-    if refine.principal_point == "auto" and _tells_principal_points(largest, numbers, of_lens):
-        _adjust(largest, refine)
-    return _model(largest, numbers, ranked[1:])
+        return {}
+
+
+def _all_at_once(
+    database: Path, scratch: Path, refine: Refine, seed: int, next_image: Callable[[], bool]
+) -> dict[int, Any]:  # fmt: skip
+    if next_image():
+        return {}
+    options = pycolmap.GlobalPipelineOptions()
+    options.num_threads = options.mapper.num_threads = 1
+    options.random_seed = options.mapper.random_seed = seed
+    options.min_model_size = MIN_MODEL
+    options.mapper.bundle_adjustment.refine_focal_length = refine.focal
+    options.mapper.bundle_adjustment.refine_extra_params = refine.distortion
+    return dict(pycolmap.global_mapping(database, scratch, scratch / "models", options))
+
+
+def _start(lens: Lens, camera_model: str) -> Any:
+    """COLMAP's camera to begin with."""
+    focal = lens.focal or DEFAULT_FOCAL * max(lens.width, lens.height)
+    camera = pycolmap.Camera.create_from_model_name(0, camera_model, focal, lens.width, lens.height)
+    camera.has_prior_focal_length = lens.focal is not None
+    return camera
 
 
 def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float, float, float, float]:
@@ -121,6 +149,9 @@ def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float
     if model == "OPENCV":  # fx, fy, cx, cy, k1, k2, p1, p2
         k1, k2, p1, p2 = (float(p) for p in params[4:8])
         return (k1, k2, p1, p2, 0.0)
+    if model == "FULL_OPENCV" and not any(params[9:]):  # ..., k3, then k4 k5 k6 of a rational lens
+        k1, k2, p1, p2, k3 = (float(p) for p in params[4:9])
+        return (k1, k2, p1, p2, k3)
     raise ValueError(f"camera model {model} has no exact k1 k2 p1 p2 k3")
 
 
@@ -157,21 +188,6 @@ def _sightings(image: Any) -> tuple[list[int], F64]:
     return [k for k, _ in found], np.array([uv for _, uv in found], np.float64).reshape(-1, 2)
 
 
-def _adjust(reconstruction: Any, refine: Refine) -> None:
-    """Bundle adjustment of everything, principal points included."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length, options.refine_extra_params = refine.focal, refine.distortion
-    options.refine_principal_point, options.print_summary = True, False
-    options.ceres.solver_options.num_threads = 1
-    config = pycolmap.BundleAdjustmentConfig()
-    for number, image in reconstruction.images.items():
-        if image.has_pose:
-            config.add_image(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, reconstruction).solve()
-    reconstruction.update_point_3d_errors()
-
-
 def _options(refine: Refine, seed: int) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
@@ -185,25 +201,20 @@ def _options(refine: Refine, seed: int) -> Any:
     return options
 
 
-def _write_database(
+def write_database(
     path: Path,
-    lenses: Sequence[Lens],
+    cameras: Sequence[Any],
     lens_of: Sequence[int],
     features: Sequence[Features],
     verified: Mapping[Pair, Verified],
-    camera_model: str,
 ) -> dict[str, int]:
-    """COLMAP's database of cameras, keypoints and verified pairs. Returns photo numbers by image name."""
+    """COLMAP's database of cameras, keypoints and verified pairs. lens_of: each photo's place in `cameras`. Returns
+    photo numbers by image name."""
     database = pycolmap.Database.open(path)
-    cameras = []
-    for lens in lenses:
-        focal = lens.focal or DEFAULT_FOCAL * max(lens.width, lens.height)
-        camera = pycolmap.Camera.create_from_model_name(0, camera_model, focal, lens.width, lens.height)
-        camera.has_prior_focal_length = lens.focal is not None
-        cameras.append(database.write_camera(camera))
+    written = [database.write_camera(camera) for camera in cameras]
     images = []
     for i, f in enumerate(features):
-        images.append(database.write_image(pycolmap.Image(name=f"{i:05d}", camera_id=cameras[lens_of[i]])))
+        images.append(database.write_image(pycolmap.Image(name=f"{i:05d}", camera_id=written[lens_of[i]])))
         database.write_keypoints(images[-1], f.uv)
     for (i, j), pair in sorted(verified.items()):
         geometry = pycolmap.TwoViewGeometry()
@@ -215,7 +226,8 @@ def _write_database(
     return {f"{i:05d}": i for i in range(len(features))}
 
 
-def _model(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[Any]) -> Model:
+def model_of(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[Any] = ()) -> Model:
+    """What a reconstruction of COLMAP says. others: the smaller ones."""
     poses, errors = {}, {}
     for image in reconstruction.images.values():
         if not image.has_pose:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context, Stage, StageConfig
@@ -13,6 +14,8 @@ from pipeline.errors import StageError, UsageError
 
 if TYPE_CHECKING:
     from stages.poses.normalise import Normalisation
+    from stages.poses.photogrammetry import Settings
+    from stages.poses.solve import Model
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,9 @@ class Config(StageConfig):
     patience: int = Field(
         3, ge=1, le=3, description="tries while photos lack a place: 1 plain, 2 without noise, 3 also as if seen askew"
     )
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto", description="place photos one after the other, or all at once; auto: all at once from 200 photos on"
+    )
     shared_intrinsics: Literal["auto", "yes", "no"] = Field(
         "auto", description="one lens for all photos of equal size and EXIF; auto: unless far more photos fit without"
     )
@@ -49,11 +55,39 @@ class Config(StageConfig):
     )
     use_masks: bool = Field(True, description="look for features on the subject only, where the capture has masks")
     check: bool = Field(True, description="hold given cameras against the photos; leave out views that contradict")
+    given: Literal["keep", "triangulate", "refine"] = Field(
+        "keep",
+        description="given cameras: keep them; triangulate: find points on the subject too; refine: and move the "
+        "cameras to where the photos say, their centres held near the given ones",
+    )
+    given_deviation: float = Field(
+        0.005, gt=0, le=0.2, description="how far given centres may be off, of their distance from the subject (refine)"
+    )
     unit: Literal["auto", "metres", "centimetres", "millimetres", "unknown"] = Field(
         "auto",
         description="unit of the given cameras; auto: FaceScape's from the subject's size, other formats' unknown",
     )
+    scale: Literal["auto", "none", "distance", "markers", "pupils", "gps"] = Field(
+        "auto", description="where metres are from; auto: the first of these that the settings and photos give"
+    )
+    distance: str = Field(
+        "", description='a known distance: "1.jpg to 5.jpg = 0.42" (metres; cameras, or points as PHOTO@X,Y+PHOTO@X,Y)'
+    )
+    marker_mm: float = Field(0.0, ge=0, le=10000, description="edge of the black squares of markers; 0: there are none")
+    marker_kind: Literal["aruco_4x4", "aruco_5x5", "aruco_6x6", "apriltag_16h5", "apriltag_25h9", "apriltag_36h11"] = (
+        Field("aruco_4x4", description="family of the markers")
+    )
+    pupils_mm: float = Field(
+        0.0, ge=0, le=100, description="distance between the subject's pupils, if you know it; 0: it is not used"
+    )
     min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
+
+    @field_validator("distance")
+    @classmethod
+    def _grammar(cls, spec: str) -> str:
+        from stages.poses.scale import check_distance
+
+        return check_distance(spec)
 
 
 MIN_FITTED = 3
@@ -84,8 +118,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
 def _given(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """The capture's own cameras, moved to asset coordinates; without views that their photos contradict."""
     from pipeline.transforms import inverse_rigid, matrix
+    from stages.poses.measure import find_eyes, known_scale
     from stages.poses.normalise import Unit, normalise
-    from stages.poses.place import camera_of, in_asset
+    from stages.poses.place import camera_of, in_asset, save_points
+    from stages.poses.scale import by_world
 
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
@@ -97,19 +133,96 @@ def _given(capture: Located[Capture], config: Config, context: Context) -> Camer
     unit: Unit = auto if config.unit == "auto" else config.unit
     wrong = _contradicted(capture, cameras, config, context) if config.check else []
     names = tuple(cameras[i].name for i in wrong)
-    cameras = [c for i, c in enumerate(cameras) if i not in wrong]
-    found = normalise(cameras, given=True, unit=unit)
+    right = [i for i in range(len(cameras)) if i not in wrong]
+    cameras = [cameras[i] for i in right]
     told = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
             for n in names]  # fmt: skip
+    model = None
+    if config.given != "keep":
+        model, cameras, doubtful = _held_against_photos(capture, right, cameras, config, context)
+        if doubtful:
+            told.append(
+                "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
+            )
+    eyes = find_eyes(capture, cameras, context.check) if config.pupils_mm else None
+    known = known_scale(capture, cameras, config, eyes, told)
+    world, axes = capture.artifact.metres_from_world, None
+    if world is not None and config.unit == "auto":
+        published, axes = by_world(matrix(world))
+        known = published if known is None and config.scale == "auto" else known
+    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
+    if model is not None:
+        save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     return CameraSet(
         source="given",
         metric=found.metric,
+        scale=found.scale,
         capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
         unregistered=names,
+        reprojection_error_px=None if model is None else model.reprojection_error_px,
+        view_errors_px={} if model is None else _view_errors(model, [c.name for c in cameras]),
+        points=None if model is None else context.file("points.npz"),
         warnings=(*told, *found.warnings),
     )
+
+
+def _held_against_photos(
+    capture: Located[Capture], right: list[int], cameras: list[Camera], config: Config, context: Context
+) -> tuple[Model, list[Camera], list[str]]:
+    """Points triangulated from the given cameras `right` of the capture; the cameras, moved if asked for; names of
+    those that should have been and were not.
+
+    Raises:
+        StageError: the photos share no point under these cameras.
+    """
+    from stages.poses.normalise import nearest_point, viewing_rays
+    from stages.poses.photogrammetry import triangulate_given
+    from stages.poses.photos import photos_of
+    from stages.poses.place import camera_of
+
+    photos = photos_of(capture, config.use_masks)
+    centres, axes = viewing_rays(cameras)
+    distance = float(((centres - nearest_point(centres, axes)) ** 2).sum(1).mean() ** 0.5)
+    found = triangulate_given(
+        [photos[i] for i in right], cameras, _settings(capture, config), context.scratch, _progress(context),
+        refine=config.given == "refine", deviation=config.given_deviation * distance,
+    )  # fmt: skip
+    if found is None:
+        raise StageError("no point is seen by two photos", where="poses", value="0 points",
+                         limit="features that neighbouring photos share",
+                         remedy="set poses.given=keep to use the cameras as they are")  # fmt: skip
+    model, doubtful = found
+    names = [cameras[n].name for n in doubtful]
+    if config.given == "refine":
+        views, poses = [capture.artifact.views[i] for i in right], model.poses
+        cameras = [camera_of(v, poses[n].K, poses[n].world_from_cam, c.distortion)
+                   for n, (v, c) in enumerate(zip(views, cameras, strict=True))]  # fmt: skip
+    return model, cameras, names
+
+
+def _progress(context: Context) -> Callable[[int, int, str], None]:
+    def progress(done: int, total: int, message: str) -> None:
+        context.check()
+        context.progress(done, total, message)
+
+    return progress
+
+
+def _settings(capture: Located[Capture], config: Config) -> Settings:
+    from stages.poses.adjust import Refine
+    from stages.poses.photogrammetry import Settings
+
+    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
+    return Settings(
+        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
+        config.camera_model, refine, config.patience, config.mapper, capture.artifact.kind == "video",
+    )  # fmt: skip
+
+
+def _view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
+    return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}
 
 
 def _contradicted(
@@ -120,16 +233,14 @@ def _contradicted(
     Raises:
         StageError: most of them do.
     """
-    from stages.poses.check import check_cameras, features_of
+    from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
     from stages.poses.photos import photos_of
 
-    def progress(done: int, total: int, message: str) -> None:
-        context.check()
-        context.progress(done, total, message)
-
+    progress = _progress(context)
     photos = photos_of(capture, config.use_masks)
     features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
-    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"))
+    far = IMPERFECT if config.given == "refine" else FAR
+    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
     if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
         raise StageError(
             "the cameras do not belong to the photos",
@@ -145,23 +256,14 @@ def _contradicted(
 
 def _solved(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """Cameras from the photos alone."""
+    from stages.poses.measure import find_eyes, known_scale
     from stages.poses.normalise import normalise
-    from stages.poses.photogrammetry import Settings, solve
+    from stages.poses.photogrammetry import solve
     from stages.poses.photos import photos_of
     from stages.poses.place import camera_of, in_asset, save_points
-    from stages.poses.solve import Refine
-
-    def progress(done: int, total: int, message: str) -> None:
-        context.check()
-        context.progress(done, total, message)
 
     views = capture.artifact.views
-    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
-    settings = Settings(
-        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
-        config.camera_model, refine, config.patience,
-    )  # fmt: skip
-    model = solve(photos_of(capture, config.use_masks), settings, context.scratch, progress)
+    model = solve(photos_of(capture, config.use_masks), _settings(capture, config), context.scratch, _progress(context))
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
     strangers = {i for group in (model.others if model is not None else ()) for i in group} - set(placed)
@@ -169,9 +271,12 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     if model is None or len(placed) < config.min_registered * (len(views) - len(strangers)) or fitted < MIN_FITTED:
         raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
-    found = normalise(cameras, model.points, given=False)
+    warnings: list[str] = []
+    eyes = find_eyes(capture, cameras, context.check)
+    known = known_scale(capture, cameras, config, eyes, warnings)
+    found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
     save_points(context.workdir / "points.npz", model, found.capture_from_asset)
-    warnings = [*found.warnings]
+    warnings += found.warnings
     if missing:
         warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {', '.join(missing)}; "
                         "they show something else, are mirrored or blurred, or stand too far from the others: "
@@ -182,12 +287,13 @@ def _solved(capture: Located[Capture], config: Config, context: Context) -> Came
     return CameraSet(
         source="colmap",
         metric=found.metric,
+        scale=found.scale,
         capture_from_asset=_rows(found),
         roi_radius=found.roi_radius,
         cameras=in_asset(cameras, found.capture_from_asset),
         unregistered=missing,
         reprojection_error_px=model.reprojection_error_px,
-        view_errors_px={views[i].name: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e},
+        view_errors_px=_view_errors(model, [v.name for v in views]),
         points=context.file("points.npz"),
         warnings=tuple(warnings),
     )
@@ -216,4 +322,4 @@ def _not_placed(total: int, placed: int, fitted: int, missing: tuple[str, ...], 
     )
 
 
-STAGE = Stage(name="poses", version=2, inputs=Inputs, config=Config, output=CameraSet, run=run)
+STAGE = Stage(name="poses", version=3, inputs=Inputs, config=Config, output=CameraSet, run=run)

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup, escape
 
-from pipeline.artifacts import Camera, CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, Located
 from pipeline.images import read_alpha, read_encoded
 from pipeline.transforms import F64, matrix
+from stages.report.gather import Started
 from stages.report.metrics import encoded
 from stages.report.page import Picture
 from stages.report.pictures import data_uri, to_bytes
@@ -27,17 +28,6 @@ FRUSTUM = 0.12  # of the cameras' median distance: length of a drawn camera
 VIEWPOINTS = (("from the front right, above", 35.0, 20.0), ("from above", 0.0, 89.9))
 OUTLINE = (255, 64, 0)
 KINDS = {"fitted": "#2a9d6f", "held out": "#3f7fd1", "mask dropped": "#d9822b"}
-
-
-class Started(Protocol):
-    """The artifacts that this part of the page is about."""
-
-    @property
-    def capture(self) -> Located[Capture]: ...
-    @property
-    def poses(self) -> Located[CameraSet]: ...
-    @property
-    def masks(self) -> Located[MaskSet]: ...
 
 
 @dataclass(frozen=True, slots=True)

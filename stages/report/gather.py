@@ -17,8 +17,8 @@ from pipeline.artifacts import (
 )
 
 
-class Results(Protocol):
-    """The artifacts that the report is about."""
+class Started(Protocol):
+    """What the reconstruction started from."""
 
     @property
     def capture(self) -> Located[Capture]: ...
@@ -26,6 +26,11 @@ class Results(Protocol):
     def poses(self) -> Located[CameraSet]: ...
     @property
     def masks(self) -> Located[MaskSet]: ...
+
+
+class Results(Started, Protocol):
+    """The artifacts that the report is about."""
+
     @property
     def inverse_rendering(self) -> Located[FittedFace]: ...
     @property
@@ -58,9 +63,15 @@ def figures(r: Results) -> dict[str, Any]:
         "cameras": {
             "source": cameras.source,
             "metric": cameras.metric,
+            "scale": cameras.scale,
             "registered": len(cameras.cameras),
             "unregistered": len(cameras.unregistered),
             "reprojection_error_px": cameras.reprojection_error_px,
+        },
+        "masks": {
+            "views": len(r.masks.artifact.masks),
+            "dropped": len(r.masks.artifact.dropped),
+            "faces": sum(m.labels is not None for m in r.masks.artifact.masks),
         },
         "surface": {
             "vertices": surface.vertices,

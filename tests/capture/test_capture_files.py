@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.capture.exif import Exif, read_exif
+from stages.capture.exif import Exif, metres_from, read_exif
 from stages.capture.gather import turn_upright
 from stages.capture.intact import fault_of
 
@@ -78,8 +78,8 @@ def test_a_tiff_whose_strips_lie_outside_is_found() -> None:
 
 
 # ------------------------------------------------------------------ EXIF
-def tiff_block(order: str, ifd0: list[tuple], sub: list[tuple]) -> bytes:
-    """A TIFF block with two directories; values: (tag, type, count, payload bytes)."""
+def tiff_block(order: str, ifd0: list[tuple], sub: list[tuple], gps: list[tuple] = []) -> bytes:  # noqa: B006
+    """A TIFF block with its directories; values: (tag, type, count, payload bytes)."""
 
     def directory(entries: list[tuple], at: int) -> bytes:
         head, extra = struct.pack(order + "H", len(entries)), b""
@@ -93,11 +93,16 @@ def tiff_block(order: str, ifd0: list[tuple], sub: list[tuple]) -> bytes:
                 extra += payload
         return head + b"\0" * 4 + extra
 
-    first = directory([*ifd0, (0x8769, 4, 1, b"\0\0\0\0")], 8)
-    pointer = struct.pack(order + "I", 8 + len(first))
-    first = directory([*ifd0, (0x8769, 4, 1, pointer)], 8)
+    def first(sub_at: int, gps_at: int) -> bytes:
+        links = [(0x8769, 4, 1, struct.pack(order + "I", sub_at))]
+        links += [(0x8825, 4, 1, struct.pack(order + "I", gps_at))] if gps else []
+        return directory([*ifd0, *links], 8)
+
+    sub_at = 8 + len(first(0, 0))
+    gps_at = sub_at + len(directory(sub, sub_at))
     mark = b"II*\0" if order == "<" else b"MM\0*"
-    return mark + struct.pack(order + "I", 8) + first + directory(sub, 8 + len(first))
+    block = mark + struct.pack(order + "I", 8) + first(sub_at, gps_at) + directory(sub, sub_at)
+    return block + (directory(gps, gps_at) if gps else b"")
 
 
 def exif_jpeg(block: bytes, image: np.ndarray = TEXTURE) -> bytes:
@@ -143,6 +148,62 @@ def test_exif_of_png_and_tiff() -> None:
     chunk = struct.pack(">I", len(block)) + b"eXIf" + block + b"\0" * 4
     assert read_exif(png[:33] + chunk + png[33:]).orientation == 3
     assert read_exif(block).body == "Maker M 7 85mm"
+
+
+def place_block(order: str, lat: tuple[int, int, int] = (33, 51, 2460), south: bool = True, iso: int = 400) -> bytes:
+    """Exposure, automatic white balance and a place; the third of lat is in hundredths of a second of arc."""
+
+    def rationals(*values: tuple[int, int]) -> bytes:
+        return b"".join(struct.pack(order + "II", *v) for v in values)
+
+    short = struct.Struct(order + "H").pack
+    gps = [(1, 2, 2, b"S\0" if south else b"N\0"), (2, 5, 3, rationals((lat[0], 1), (lat[1], 1), (lat[2], 100))),
+           (3, 2, 2, b"E\0"), (4, 5, 3, rationals((151, 1), (12, 1), (4000, 100))), (5, 1, 1, b"\0"),
+           (6, 5, 1, rationals((585, 10)))]  # fmt: skip
+    sub = [(0x829A, 5, 1, rationals((1, 50))), (0x829D, 5, 1, rationals((28, 10))), (0x8827, 3, 1, short(iso)),
+           (0xA403, 3, 1, short(0))]  # fmt: skip
+    return tiff_block(order, [], sub, gps)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_exposure_white_balance_and_place(order: str) -> None:
+    exif = read_exif(exif_jpeg(place_block(order)))
+    assert exif.exposure == pytest.approx(1 / 50 * 400 / 2.8**2) and exif.white_balance == "auto"
+    assert exif.place == pytest.approx((-(33 + 51 / 60 + 24.6 / 3600), 151 + 12 / 60 + 40 / 3600, 58.5))
+    assert read_exif(exif_jpeg(place_block(order, (95, 0, 0)))).place is None  # no such place
+    assert read_exif(exif_jpeg(camera_block(order))).place is None
+    assert read_exif(exif_jpeg(place_block(order, iso=0))).exposure is None
+
+
+def test_metres_from_a_place_agree_with_the_ellipsoid() -> None:
+    """Oracle: both places in the earth's own axes, turned to east, north and up at the first."""
+
+    def earth(lat: float, lon: float, up: float) -> np.ndarray:
+        a, e2 = 6_378_137.0, 0.00669437999014
+        lat, lon = np.radians([lat, lon])
+        n = a / np.sqrt(1 - e2 * np.sin(lat) ** 2)
+        return np.array([(n + up) * np.cos(lat) * np.cos(lon), (n + up) * np.cos(lat) * np.sin(lon),
+                         (n * (1 - e2) + up) * np.sin(lat)])  # fmt: skip
+
+    for lat, lon in ((-33.85, 151.2), (70.0, 179.9999), (0.0, 0.0)):
+        p, q = (lat, lon, 10.0), (lat + 3e-4, (lon + 4e-4 + 180) % 360 - 180, 13.0)
+        phi, theta = np.radians([lat, lon])
+        up = np.array([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)])
+        east = np.array([-np.sin(theta), np.cos(theta), 0])
+        axes = np.stack([east, np.cross(up, east), up])
+        np.testing.assert_allclose(metres_from(q, p), axes @ (earth(*q) - earth(*p)), atol=2e-3)
+
+
+def test_places_are_told_from_the_first(tmp_path: Path, gather) -> None:
+    for i in range(4):
+        block = place_block("<", (33, 51, 2460 - 100 * i)) if i else camera_block("<", 1)
+        image = np.roll(TEXTURE[:160, :200], 20 * i, 1)
+        (tmp_path / f"{i}.jpg").write_bytes(exif_jpeg(block, image))
+    found = gather(tmp_path)
+    views = found.artifact.views
+    assert views[0].place_m is None and views[1].place_m == (0, 0, 0)
+    assert views[3].place_m == pytest.approx((0, 2 * 30.81, 0), abs=0.1)  # a second of arc at 34 degrees south
+    assert "151" not in str([v.place_m for v in views])
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pipeline.errors import StageError
 from pipeline.transforms import F64, apply, matrix, project, rescale_camera, rows, similarity
 from stages.poses.normalise import NOMINAL_ROI, Normalisation, least_turn, nearest_point, normalise, robust_direction
 from stages.poses.place import in_asset
+from stages.poses.scale import Eyes
 from tests.support.textured_ball import camera_on_orbit
 
 SIZE = (400, 300)
@@ -135,6 +136,24 @@ def test_a_table_tells_up_where_photos_were_held_sideways() -> None:
 def test_cameras_all_around_have_a_front_too() -> None:
     poses = [camera_on_orbit(a, 5, 1.0, TARGET) for a in np.arange(0, 360, 15)]
     check_rigid(normalise(cameras(poses), given=False))
+
+
+def test_a_face_says_what_is_in_front() -> None:
+    """A level ring of cameras has no side of its own: eyes have, unless they are elsewhere or one above the other."""
+    ring = cameras([camera_on_orbit(a, 5.0, 1.0, np.zeros(3)) for a in range(0, 360, 24)])
+    turn = np.radians(70.0)
+    looks = np.array([np.sin(turn), 0.0, np.cos(turn)])
+    left = np.cross([0.0, 1.0, 0.0], looks)
+    eyes = Eyes(0.08 * looks - 0.03 * left, 0.08 * looks + 0.03 * left, 5, 0.01)
+    found = normalise(ring, given=False, eyes=eyes).capture_from_asset
+    np.testing.assert_allclose(found[:3, 2] / np.linalg.norm(found[:3, 2]), looks, atol=1e-6)
+    np.testing.assert_allclose(found[:3, 1] / np.linalg.norm(found[:3, 1]), [0, 1, 0], atol=1e-6)
+    without = normalise(ring, given=False).capture_from_asset
+    behind = Eyes(eyes.right + 3 * looks, eyes.left + 3 * looks, 5, 0.01)
+    lying = Eyes(0.08 * looks - [0, 0.03, 0], 0.08 * looks + [0, 0.03, 0], 5, 0.01)
+    for other in (behind, lying):
+        found = normalise(ring, given=False, eyes=other).capture_from_asset
+        np.testing.assert_array_equal(found, without)
 
 
 def test_points_far_off_do_not_move_the_centre() -> None:

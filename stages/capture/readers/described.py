@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -34,6 +35,14 @@ def description(path: Path) -> bytes:
             remedy="export the cameras alone, without points and pictures",
         )
     return path.read_bytes()
+
+
+def read_json(path: Path, what: str, remedy: str) -> Any:
+    """What a description in JSON holds. what: the message if it is no JSON. Raises StageError."""
+    try:
+        return json.loads(description(path))
+    except (ValueError, RecursionError) as e:
+        raise fault(what, path.name, str(e)[:200], "a JSON object", remedy) from e
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ is added to the principal point on the way in.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,10 +22,10 @@ from stages.capture.readers.described import (
     Declared,
     Described,
     checked_K,
-    description,
     fault,
     given_camera,
     natural_key,
+    read_json,
 )
 
 PARAMS = "params.json"
@@ -83,16 +82,8 @@ def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
 
 def read_params(path: Path) -> dict[str, Any]:
     """The file as a dictionary. Raises StageError if it is not a JSON object that names views."""
-    try:
-        found = json.loads(description(path))
-    except (ValueError, RecursionError) as e:
-        raise StageError(
-            "params.json can't be read",
-            where=path.name,
-            value=str(e)[:200],
-            limit="a JSON object",
-            remedy="copy the file again, or remove it to have the cameras solved from the photos",
-        ) from e
+    found = read_json(path, "params.json can't be read",
+                        "copy the file again, or remove it to have the cameras solved from the photos")  # fmt: skip
     if not isinstance(found, dict) or not view_indices(found):
         value = f"{len(found)} keys, none like 0_K" if isinstance(found, dict) else type(found).__name__
         raise StageError(

@@ -8,7 +8,6 @@ z backwards), `mask_path`.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -21,12 +20,12 @@ from stages.capture.readers.described import (
     Declared,
     Described,
     checked_pose,
-    description,
     fault,
     find_photo,
     five_terms,
     given_camera,
     indices_of,
+    read_json,
 )
 from stages.capture.readers.sizes import picture_size
 
@@ -61,10 +60,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(description(path))
-    except (ValueError, RecursionError) as e:
-        raise fault("the cameras' file can't be read", path.name, str(e)[:200], "a JSON object", REMEDY) from e
+    found = read_json(path, "the cameras' file can't be read", REMEDY)
     frames = found.get("frames") if isinstance(found, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise fault("the cameras' file names no frames", path.name, "no list 'frames'",

@@ -1,0 +1,1 @@
+"""Faces in photos, found offline by two small networks (models/NOTICE)."""

@@ -1,0 +1,115 @@
+"""Where a face is in a photo, and 468 points on it: a detector, then landmarks in the upright square around its find.
+
+Positions are in pixels of the photo, the first pixel's centre at (0.5, 0.5); left and right are the person's own.
+
+The detector (models/NOTICE) takes 128 x 128 RGB in [-1, 1] and answers for 896 places, two on each cell of a grid of
+16 x 16 and six on each of 8 x 8: a logit, and a box and six points as offsets from the cell's middle in pixels of its
+input. The landmark network takes 192 x 192 RGB in [0, 1] and gives points in pixels of its input, and a logit of
+whether there is a face at all.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+U8 = npt.NDArray[np.uint8]
+F64 = npt.NDArray[np.float64]
+
+MODELS = Path(__file__).parent / "models"
+DETECTOR_SIDE, LANDMARK_SIDE = 128, 192
+SURE, PRESENT = 0.6, 0.8  # probabilities from which a find, and landmarks, count
+ROOM = 0.75  # half-edge of the landmarks' square in edges of the found box
+RIGHT_EYE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246)  # along the lids
+LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
+_local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
+
+
+@dataclass(frozen=True, slots=True)
+class Face:
+    """points: (468, 2) pixels. sure: probability that they are those of a face."""
+
+    points: F64
+    sure: float
+
+    @property
+    def pupils(self) -> tuple[F64, F64]:
+        """(2,) each: the middles between the corners of the right and of the left eye."""
+        right, left = ((self.points[eye[0]] + self.points[eye[8]]) / 2 for eye in (RIGHT_EYE, LEFT_EYE))
+        return np.asarray(right), np.asarray(left)
+
+
+def find_face(image: U8, x: float, y: float, half: float, roll: float = 0.0) -> Face | None:
+    """The face in the square of half-edge `half` around (x, y) of a photo (H, W, 3) 8-bit sRGB, or None.
+
+    roll: radians, by which the person's up is turned from the photo's, clockwise positive.
+    """
+    photo_from_net = _square(x, y, half, roll, DETECTOR_SIDE)
+    logits, found = _run("face_detection_short_range", _sampled(image, photo_from_net, DETECTOR_SIDE) * 2 - 1,
+                         ("classificators", "regressors"))  # fmt: skip
+    best = int(np.argmax(logits.ravel()))
+    if _probability(float(logits.ravel()[best])) < SURE:
+        return None
+    offsets = found.reshape(-1, 16)[best]
+    middle = offsets[:2] + _cells()[best]
+    eyes = offsets[4:8].reshape(2, 2)  # right, left
+    lean = float(np.arctan2(*(eyes[1] - eyes[0])[::-1]))
+    centre = photo_from_net[:, :2] @ middle + photo_from_net[:, 2] + 0.5
+    scale = 2 * half / DETECTOR_SIDE
+    return _landmarks(image, centre, ROOM * float(offsets[2:4].max()) * scale, roll + lean)
+
+
+def _landmarks(image: U8, centre: F64, half: float, roll: float) -> Face | None:
+    photo_from_net = _square(centre[0], centre[1], half, roll, LANDMARK_SIDE)
+    points, logit = _run("face_landmark", _sampled(image, photo_from_net, LANDMARK_SIDE), ("conv2d_21", "conv2d_31"))
+    sure = _probability(float(logit.ravel()[0]))
+    if sure < PRESENT:
+        return None
+    xy = points.reshape(-1, 3)[:, :2].astype(np.float64) - 0.5
+    return Face(np.asarray(xy @ photo_from_net[:, :2].T + photo_from_net[:, 2] + 0.5, np.float64), sure)
+
+
+def _square(x: float, y: float, half: float, roll: float, side: int) -> F64:
+    """(2, 3) photo from net, both with the first pixel's centre at (0, 0)."""
+    c, s = np.cos(roll) * 2 * half / side, np.sin(roll) * 2 * half / side
+    turn = np.array([[c, -s], [s, c]])
+    shift = np.array([x - 0.5, y - 0.5]) - turn @ np.array([side / 2 - 0.5] * 2)
+    return np.concatenate([turn, shift[:, None]], 1)
+
+
+def _sampled(image: U8, photo_from_net: F64, side: int) -> npt.NDArray[np.float32]:
+    """(side, side, 3) in [0, 1]; what lies beyond the photo is black."""
+    scale = float(np.hypot(*photo_from_net[:, 0]))
+    source = cv2.GaussianBlur(image, (0, 0), 0.4 * scale) if scale > 1.3 else image  # against aliasing
+    out = cv2.warpAffine(source, photo_from_net, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return np.asarray(out, np.float32) / np.float32(255)
+
+
+def _cells() -> F64:
+    """(896, 2) middles of the detector's cells, pixels of its input."""
+    out = []
+    for count, each in ((16, 2), (8, 6)):
+        grid = (np.arange(count) + 0.5) * DETECTOR_SIDE / count
+        y, x = np.meshgrid(grid, grid, indexing="ij")
+        out.append(np.repeat(np.stack([x, y], -1).reshape(-1, 2), each, 0))
+    return np.concatenate(out)
+
+
+def _probability(logit: float) -> float:
+    return float(1 / (1 + np.exp(-np.clip(logit, -50, 50))))
+
+
+def _run(name: str, picture: npt.NDArray[np.float32], outputs: tuple[str, str]) -> tuple[Any, Any]:
+    """Two outputs of a network for a picture (S, S, 3)."""
+    if not hasattr(_local, name):
+        setattr(_local, name, cv2.dnn.readNetFromTFLite(str(MODELS / f"{name}.tflite")))
+    net: Any = getattr(_local, name)
+    net.setInput(np.ascontiguousarray(picture.transpose(2, 0, 1)[None]))
+    first, second = (np.array(net.forward(o), np.float32) for o in outputs)  # the second is no output by its file
+    return first, second

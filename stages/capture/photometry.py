@@ -1,0 +1,51 @@
+"""What photos and their metadata say of light: clipped pixels, exposure, white balance. Files are never changed.
+
+Symbols: e_n exposure of photo n, seconds x ISO / f-number^2, against the capture's middle one; b_n its mean linear
+luminance. Under one light a grey's linear value is proportional to e_n.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.colour import linear_from_srgb
+
+CLIPPED = 0.99  # of an integer file's largest value: JPEG leaves clipped areas a level or two below it
+PLATEAU = 64  # pixels of a float file that share its largest value exactly: that is where the sensor ended
+EVEN = 1.02  # exposures that differ by less are equal: cameras round what they write
+MIDDLE = 0.5
+
+Bool = npt.NDArray[np.bool_]
+
+
+def clipped(image: npt.NDArray[np.generic]) -> Bool:
+    """(H, W) pixels of which a channel is at the end of its range, of a decoded file (H, W, C); alpha has no say."""
+    plane = image[..., : 3 if image.shape[2] >= 3 else 1]
+    brightest = np.asarray(plane.max(axis=2))
+    if np.issubdtype(image.dtype, np.integer):
+        return np.asarray(brightest >= CLIPPED * np.iinfo(image.dtype.name).max)
+    top = brightest == brightest.max()
+    return np.asarray(top if top.sum() >= PLATEAU and brightest.max() > 0 else np.zeros_like(top))
+
+
+def mean_light(grey: npt.NDArray[np.uint8]) -> float:
+    """Mean linear luminance of a small grey picture, encoded as sRGB."""
+    table = linear_from_srgb(np.arange(256) / 255)
+    return float(table[grey].mean())
+
+
+def exposures(written: Sequence[float | None], light: Sequence[float]) -> list[float] | None:
+    """e_n of each photo where the metadata of all say it and the photos bear it out, else None.
+
+    They bear it out if b_n / e_n vary less than b_n: a raw converter that evened the photos out, or a flash that lit
+    them all alike, leaves e_n without meaning.
+    """
+    known = [e for e in written if e is not None]
+    if len(known) < len(written) or not known or max(known) <= EVEN * min(known):
+        return None
+    found = np.array(known) / float(np.quantile(known, MIDDLE, method="nearest"))
+    b = np.log(np.maximum(light, 1e-6))
+    return [float(e) for e in found] if np.std(b - np.log(found)) < np.std(b) else None

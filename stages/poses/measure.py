@@ -1,0 +1,93 @@
+"""Which of the ways to a scale a capture takes: a distance that is known, markers in view, a face, GPS positions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from pipeline.artifacts import Camera, Capture, CaptureView, Located
+from pipeline.errors import StageError
+from pipeline.faces.find import find_face
+from pipeline.images import read_encoded
+from stages.poses.features import U8, grey8
+from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, eyes_of, find_markers
+
+NEEDS = {
+    "markers": "markers of poses.marker_kind and poses.marker_mm in view",
+    "pupils": "poses.pupils_mm, and a face in three photos or more",
+    "gps": "GPS positions in EXIF, spread wider than they are wrong",
+}
+
+
+class Wanted(Protocol):
+    """The stage's settings of the scale."""
+
+    @property
+    def scale(self) -> str: ...
+    @property
+    def distance(self) -> str: ...
+    @property
+    def marker_mm(self) -> float: ...
+    @property
+    def marker_kind(self) -> str: ...
+    @property
+    def pupils_mm(self) -> float: ...
+
+
+def known_scale(
+    capture: Located[Capture], cameras: list[Camera], config: Wanted, eyes: Eyes | None, warnings: list[str]
+) -> Scale | None:  # fmt: skip
+    """Metres per unit of the cameras' world from what the user or the photos say of it, or None.
+
+    Raises:
+        UsageError: a way was asked for whose setting is missing. StageError: one that was asked for does not tell.
+    """
+    wanted = config.scale
+    if wanted == "distance" or (wanted == "auto" and config.distance):
+        return by_distance(config.distance, cameras)
+    why = ""
+    if wanted == "markers" or (wanted == "auto" and config.marker_mm):
+        photos = {v.index: v for v in capture.artifact.views}
+        seen = [(c, find_markers(_grey(capture, photos[c.index]), config.marker_kind)) for c in cameras]
+        found = by_markers(seen, config.marker_mm / 1e3) if config.marker_mm else None
+        if found is not None:
+            return found
+        count = len({n for _, corners in seen for n in corners})
+        why = f"{count} markers of the kind {config.marker_kind} are seen, none of them whole and square by two photos"
+    if wanted == "pupils" or (wanted == "auto" and not why and config.pupils_mm):
+        if config.pupils_mm and eyes is not None:
+            return by_pupils(eyes, config.pupils_mm / 1e3)
+        why = "no face is seen alike in three photos" if config.pupils_mm else "poses.pupils_mm is not set"
+    places = {v.index: v.place_m for v in capture.artifact.views if v.place_m is not None}
+    if wanted == "gps" or (wanted == "auto" and not why and places):
+        found, why = by_positions(cameras, places)
+        if found is not None:
+            return found
+    if wanted in NEEDS:
+        raise StageError("the scale can't be told", where=f"poses.scale={wanted}", value=why,
+                         limit=NEEDS[wanted],
+                         remedy="check these settings, or give poses.distance")  # fmt: skip
+    if why:
+        warnings.append(f"the scale is not taken from the photos: {why}")
+    return None
+
+
+def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]) -> Eyes | None:
+    """The subject's eyes in the cameras' world, or None if no face is seen alike in three photos. check: raises to
+    stop."""
+    photos = {v.index: v for v in capture.artifact.views}
+    out = []
+    for c in cameras:
+        check()
+        image = read_encoded(capture.path(photos[c.index].image))
+        grey = grey8(image, max(c.width, c.height))
+        face = find_face(np.repeat(grey[..., None], 3, 2), c.width / 2, c.height / 2, max(c.width, c.height) / 2)
+        if face is not None:
+            out.append((c, face.pupils))
+    return eyes_of(out)
+
+
+def _grey(capture: Located[Capture], view: CaptureView) -> U8:
+    return grey8(read_encoded(capture.path(view.image)), max(view.width, view.height))
