@@ -49,14 +49,14 @@ class EvenField(AnalyticField):
         return Material(albedo, 0.3 * one, c, 0.1 * one)
 
 
-def ball(centre: tuple[float, float, float] = (0.0, 0.0, 0.0), radius: float = 0.08) -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(3, radius).apply_translation(centre)
+def ball(centre: tuple[float, float, float] = (0.0, 0.0, 0.0), radius: float = 0.08, finer: int = 3) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(finer, radius).apply_translation(centre)
 
 
 def noisy() -> trimesh.Trimesh:
     """A ball whose vertices are off by a twentieth of an edge."""
-    made = ball()
-    made.vertices += 0.0006 * np.random.default_rng(6).standard_normal(made.vertices.shape)
+    made = ball(finer=2)
+    made.vertices += 0.0012 * np.random.default_rng(6).standard_normal(made.vertices.shape)
     return made
 
 
