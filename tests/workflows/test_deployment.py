@@ -80,7 +80,7 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "capture": str(photos), "out": str(out), "preset": "studio", "holdout": "every:4:3", "name": "anna",
                 "seed": 7, "device": "cpu", "until": "capture", "from_stage": "capture", "fit_slots": "gpus",
                 "sets": ["capture.min_views=3"], "config": {"capture": {"drop_blurred": False}},
-                "store": str(tmp_path / "store"), "stage_limit": 600.0,
+                "store": str(tmp_path / "store"), "stage_limit": 600.0, "budget": None,  # with a preset there is none
             }  # fmt: skip
             submit(environment, "capture-to-asset/local", good, "--watch", cwd=tmp_path)
             many = {
