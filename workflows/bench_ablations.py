@@ -171,6 +171,7 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
         "shadows": False,
         "parsimony": 0.0,
         "even_until": 0.0,
+        "light_from": "even",
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}
     return tuple(f"{k}={v}" for k, v in {**values, "surface.resolution": 160}.items())

@@ -97,7 +97,7 @@ def decide(trainer: Trainer) -> tuple[Choices, Lamp | None]:
         s.relief != "off",
         {},
     )
-    wanted = s.judges and s.light_from == "lobe" and s.specular != "off" and s.appearance == "hash"
+    wanted = s.lamps and s.specular != "off"
     why = "setting" if not open_questions(s) else f"fewer than {LEAST_VIEWS} views: nothing to judge by"
     out = replace(given, facts=_facts(given, s, why))
     if not trainer.waiting and not wanted:
@@ -125,7 +125,7 @@ def _told(c: Choices, lamp: Lamp | None) -> Choices:
     """The choices with where the light came from."""
     light: dict[str, str | float | bool] = {"from": "even skin"}
     if lamp is not None:
-        told = {"explained": round(lamp.explained, 4), "band_0_over_band_1": round(lamp.ratio, 3)}
+        told = {"explained": round(lamp.explained, 4), "bands_scaled_by": round(lamp.scale, 3)}
         light = {"from": "what changes with the view", **told}
     return replace(c, lit=lamp is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
 

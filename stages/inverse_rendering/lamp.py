@@ -8,8 +8,8 @@ for every point and drops out with its mean over the views. L_lm is then one lin
 whose light is known its radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth, and its level
 is within 3 % (docs/model.md), where a fit from even light ends at 0.6 to 0.8.
 
-What changes least with the view, band 0 against band 1, is told least well. So the bands from 1 on are scaled to the
-ratio for which the albedo pi D_p / E(n_p) is most even; their shape and band 0 stay.
+What changes least with the view, band 0 against all others, is told least well. So the bands from 1 on are scaled by
+the one factor for which the albedo pi D_p / E(n_p) is most even; their shape and band 0 stay.
 
 Differs: not in the paper, which learns light, albedo and lobe together from a white start.
 """
@@ -33,7 +33,7 @@ RIDGE = 1e-3  # of the mean eigenvalue
 LEAST_VIEWS = 3  # of a point
 LEAST_POINTS = 200
 LEAST_EXPLAINED = 0.15  # of what changes with the view: less is noise, not a lobe under a light
-RATIOS = np.geomspace(0.3, 12, 70)  # |band 0| / |band 1|
+SCALES = np.geomspace(0.4, 2.5, 61)  # of the bands from 1 on
 DARKEST = 0.02  # of the mean irradiance: no light leaves a side of the head darker
 LIT_SHARE = 0.9  # of the points that must be above that, and have a positive D
 
@@ -41,11 +41,11 @@ LIT_SHARE = 0.9  # of the points that must be above that, and have a positive D
 @dataclass(frozen=True, slots=True)
 class Lamp:
     """coefficients ((L + 1)^2,) of a white light in the photos' units; explained: share of the variance within points
-    that it accounts for; ratio: |band 0| / |band 1|."""
+    that it accounts for; scale: what even skin made of the bands from 1 on."""
 
     coefficients: F64
     explained: float
-    ratio: float
+    scale: float
 
 
 def reflectance(cosine: F64) -> F64:
@@ -85,12 +85,10 @@ def light_from_lobe(seen: Sightings, order: int, gain: F64, attenuation: str) ->
     explained = 1 - float(((y - inside @ b) ** 2).sum() / max((y * y).sum(), 1e-300))
     if explained < LEAST_EXPLAINED or b[0] <= 0:
         return None
-    ratio = _evenest(seen, b, mean(colour), mean(f[:, 1:] @ b[1:]), mean(f[:, 0]), often)
-    if ratio is None:
+    scale = _evenest(seen, b, mean(colour), mean(f[:, 1:] @ b[1:]), mean(f[:, 0]), often)
+    if scale is None:
         return None
-    out = b.copy()
-    out[1:] *= b[0] / (ratio * max(float(np.linalg.norm(b[1:4])), 1e-300))
-    return Lamp(out, explained, ratio)
+    return Lamp(np.concatenate([b[:1], scale * b[1:]]), explained, scale)
 
 
 def _bands(direction: F64, order: int, attenuation: str) -> F64:
@@ -102,22 +100,20 @@ def _bands(direction: F64, order: int, attenuation: str) -> F64:
 
 
 def _evenest(seen: Sightings, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]) -> float | None:
-    """|band 0| / |band 1| with the least spread of ln albedo. total, glow, even (P,): means over the views of the
-    colour, of the lobe's bands from 1 on, and of its band 0 per unit of L_00."""
+    """The scale with the least spread of ln albedo. total, glow, even (P,): means over the views of the colour, of the
+    lobe's bands from 1 on, and of its band 0 per unit of L_00."""
     light = np.zeros((len(b), 3))
     light[1:] = b[1:, None]
     sides = sh.irradiance(torch.from_numpy(light), seen.n.detach().cpu().double()).numpy()[:, 0]
-    first = float(np.linalg.norm(b[1:4]))
+    mean = float(np.pi * b[0] / np.sqrt(4 * np.pi))
     best, found = np.inf, None
-    for ratio in RATIOS:
-        level = b[0] / (ratio * first) if first > 0 else 1.0  # bands from 1 on are scaled to the ratio, band 0 stays
-        mean = float(np.pi * b[0] / np.sqrt(4 * np.pi))
-        e, d = mean + level * sides, total - level * glow - even * b[0]
+    for scale in SCALES:
+        e, d = mean + scale * sides, total - scale * glow - even * b[0]
         good = often & (e > DARKEST * mean) & (d > 0)
         if good.sum() < LIT_SHARE * often.sum():
             continue
         log = np.log(d[good] / e[good])
         spread = float(np.abs(log - np.median(log)).mean())
         if spread < best:
-            best, found = spread, float(ratio)
+            best, found = spread, float(scale)
     return found

@@ -82,6 +82,11 @@ class FitSettings:
     max_dropped: int = 20
 
     @property
+    def lamps(self) -> bool:
+        """Whether the light is to be told by the lobe, and this kind of model can take it over."""
+        return self.judges and (self.light_from, self.appearance, self.basis_inputs) == ("lobe", "hash", "cosine")
+
+    @property
     def by_clock(self) -> bool:
         """Whether the fit ends when its time is up, not after so many steps."""
         return self.seconds > 0
