@@ -27,7 +27,7 @@ FOLDER = "textures"
 MM = 1000.0
 LEAST_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value of the coverage of a chart's texel that no photo saw
-IN_MEMORY = 1 << 28  # numbers of a picture; a larger one is put together in a file
+IN_MEMORY = 1 << 27  # numbers of a picture; a larger one is put together in a file
 
 Function = Callable[..., npt.NDArray[Any]]
 
