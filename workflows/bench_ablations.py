@@ -172,6 +172,8 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
         "parsimony": 0.0,
         "even_until": 0.0,
         "light_from": "even",
+        "stereo": False,
+        "levels": 3,
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}
     return tuple(f"{k}={v}" for k, v in {**values, "surface.resolution": 160}.items())
