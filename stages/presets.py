@@ -20,8 +20,8 @@ from pipeline.errors import UsageError
 
 Settings = Mapping[str, Mapping[str, Any]]
 
-# Speed against accuracy. draft, the default: minutes, measured in docs/benchmarks.md. studio: tens of minutes on a
-# CPU. film: hours, or a GPU. Neither of the last two has been measured yet.
+# Speed against accuracy. draft, the default: minutes; studio: tens of minutes on a CPU; both measured in
+# docs/benchmarks.md. film: hours, or a GPU; not measured yet.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},

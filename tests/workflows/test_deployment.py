@@ -130,6 +130,7 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
 ) -> None:
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
+    child_environment = {**child_environment, "PREFECT_HOME": str(tmp_path / "prefect")}  # no runs of other tests
     command = [sys.executable, "-m", "workflows.cli", "serve", "--port", str(port), "--home", str(tmp_path / "home")]
     with (tmp_path / "log").open("wb") as log:
         child = subprocess.Popen(command, env=child_environment, cwd=tmp_path, stdout=log, stderr=log,
