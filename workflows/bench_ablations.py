@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import Artifact, Capture, CaptureView, Located
-from pipeline.errors import UsageError
+from workflows.bench_rows import budget_of, kept, rows_with, shared_options
 from workflows.console import Console
 
 F32 = npt.NDArray[np.float32]
@@ -103,32 +103,18 @@ def options(sub: argparse.ArgumentParser) -> None:
     """The command line's options."""
     sub.add_argument("capture", metavar="CAPTURE", help="a capture; truth/mesh_gt.ply in it gives Chamfer distances")
     sub.add_argument("--out", required=True, metavar="DIR", help="folder for the tables")
-    sub.add_argument("--store", metavar="DIR", help="folder of finished stages (OUT/.store)")
-    sub.add_argument("--holdout", default="every:5:2", metavar="RULE", help="as in neuface run (%(default)s)")
-    sub.add_argument("--steps", type=int, default=400, help="of every fit (%(default)s)")
-    sub.add_argument("--side", type=int, default=256, help="pixels of the photos' longest side (%(default)s)")
-    sub.add_argument("--batch", type=int, default=2048, help="rays a step (%(default)s)")
+    shared_options(sub, 400, "every fit")
     sub.add_argument("--rows", default="", metavar="TEXT", help="only rows with this text in their name")
-    sub.add_argument("--device", default="cpu", help="auto, cpu or cuda (%(default)s)")
 
 
 def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench ablations"""
-    chosen = [r for r in unique(TABLES) if given.rows in r.name]
-    if not chosen:
-        raise UsageError(
-            "no row has this text in its name",
-            where="--rows",
-            value=given.rows,
-            limit="a part of one of: " + "; ".join(r.name for r in unique(TABLES)),
-            remedy="leave --rows out for all",
-        )
+    chosen = rows_with(given.rows, unique(TABLES), "--rows", "row")
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     path = out / "ablations.json"
-    budget = {k: getattr(given, k) for k in ("steps", "side", "batch", "holdout")}
-    budget["capture"] = Path(given.capture).name
-    results = _known(path, budget)
+    budget = budget_of(given, ("steps", "side", "batch", "holdout"))
+    results, _ = kept(path, budget, "rows", Result)
     for number, row in enumerate(chosen, 1):
         console.note(f"row {number} of {len(chosen)}: {row.name}")
         results[row.name] = measure(row, given, console)
@@ -143,15 +129,6 @@ def run(given: argparse.Namespace, console: Console) -> int:
 def unique(tables: Iterable[Table]) -> list[Row]:
     """Every row once, in order."""
     return list({r.name: r for t in tables for r in t.rows}.values())
-
-
-def _known(path: Path, budget: dict[str, Any]) -> dict[str, Result]:
-    """Rows of an earlier bench at the same budget."""
-    try:
-        kept = json.loads(path.read_text())
-        return {k: Result(**v) for k, v in kept["rows"].items()} if kept["budget"] == budget else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import UsageError
 from workflows import machine
+from workflows.bench_rows import budget_of, kept, rows_with, shared_options
 from workflows.console import Console
 from workflows.tradeoff_plot import plot
 
@@ -73,36 +73,21 @@ def options(sub: argparse.ArgumentParser) -> None:
     """The command line's options."""
     sub.add_argument("capture", metavar="CAPTURE", help="a capture; truth/ in it gives chamfer and albedo errors")
     sub.add_argument("--out", required=True, metavar="DIR", help="folder for tradeoff.json, .md and .svg")
-    sub.add_argument("--store", metavar="DIR", help="folder of finished stages (OUT/.store)")
-    sub.add_argument("--holdout", default="every:5:2", metavar="RULE", help="as in neuface run (%(default)s)")
-    sub.add_argument("--steps", type=int, default=300, help="of the middle point (%(default)s)")
-    sub.add_argument("--side", type=int, default=256, help="pixels of its photos' longest side (%(default)s)")
-    sub.add_argument("--batch", type=int, default=2048, help="its rays a step (%(default)s)")
+    shared_options(sub, 300, "the middle point")
     sub.add_argument("--cells", type=int, default=192, help="its grid cells (%(default)s)")
     sub.add_argument("--points", default="", metavar="TEXT", help="only points with this text in their name")
     sub.add_argument("--stop-after", type=float, metavar="S", help="begin no further point after S seconds")
-    sub.add_argument("--device", default="cpu", help="auto, cpu or cuda (%(default)s)")
 
 
 def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench tradeoff"""
-    chosen = [k for k in KNOBS if given.points in k.name]
-    if not chosen:
-        raise UsageError(
-            "no point has this text in its name",
-            where="--points",
-            value=given.points,
-            limit="a part of one of: " + "; ".join(k.name for k in KNOBS),
-            remedy="leave --points out for all",
-        )
+    chosen = rows_with(given.points, KNOBS, "--points", "point")
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     path, begun = out / "tradeoff.json", time.monotonic()
-    budget = {k: getattr(given, k) for k in ("steps", "side", "batch", "cells", "holdout")}
-    budget["capture"] = Path(given.capture).name
-    kept = known(path, budget)
-    found: dict[str, Measured] = {k: Measured(**v) for k, v in kept.get("points", {}).items()}
-    about = kept.get("machine") or machine.machine()
+    budget = budget_of(given, ("steps", "side", "batch", "cells", "holdout"))
+    found, earlier = kept(path, budget, "points", Measured)
+    about = earlier.get("machine") or machine.machine()
     for number, knob in enumerate(chosen, 1):
         late = given.stop_after is not None and time.monotonic() - begun > given.stop_after
         if knob.name in found or late:
@@ -119,15 +104,6 @@ def run(given: argparse.Namespace, console: Console) -> int:
     console.close()
     print(text)
     return 0
-
-
-def known(path: Path, budget: dict[str, Any]) -> dict[str, Any]:
-    """What an earlier bench at the same budget left."""
-    try:
-        kept: dict[str, Any] = json.loads(path.read_text())
-        return kept if kept["budget"] == budget else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
