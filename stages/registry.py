@@ -20,6 +20,7 @@ from stages.usd.stage import STAGE as USD
 from stages.uv.stage import STAGE as UV
 
 SOURCE = "source"  # what the user's folder holds: the input of the first stage, made by no stage
+FIT = INVERSE_RENDERING.name  # what a GPU, a slot and a budget are for
 
 REGISTRY: tuple[Stage[Any, Any, Any], ...] = (
     CAPTURE,

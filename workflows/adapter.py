@@ -27,6 +27,7 @@ from prefect.settings import get_current_settings
 
 from pipeline.contract import Done, Stage, StageConfig, execute, key
 from pipeline.store import MANIFEST
+from stages.registry import FIT
 from workflows.plan import Plan
 from workflows.runner import RunStage
 from workflows.session import current
@@ -34,7 +35,6 @@ from workflows.slots import slot
 from workflows.watchdog import time_limit
 
 log = logging.getLogger(__name__)
-FIT = "inverse_rendering"  # the stage that a GPU is for
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
 
 

@@ -18,8 +18,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.store import Store, write_synced
+from stages.inverse_rendering import settings as fits
+from stages.inverse_rendering.settings import FitSettings
+from stages.presets import PRESETS
+from stages.registry import FIT
 
-FIT = "inverse_rendering"
 PLANS = ".budgets"  # in the store
 DRAFT_RATE = 45_000.0  # rays/s of the ball at the draft's settings on the machine on which `after` was measured
 START_UP = 4.0  # seconds of loading before the session's clock starts, on that machine
@@ -43,29 +46,29 @@ class Rung:
     after: float
 
 
-def _rung(
-    name: str, fit: tuple[int, int, int, int], mesh: tuple[int, int, int], detail: dict[str, Any], *cost: float
-) -> Rung:
-    """fit: photos' side, grid cells, levels, batch; detail: more of it; mesh: surface resolution, faces, texture."""
-    side, cells, levels, batch = fit
-    resolution, faces, texture = mesh
-    settings = {
-        FIT: {"image_side": side, "grid_cells": cells, "levels": levels, "batch": batch, **detail},
-        "surface": {"resolution": resolution},
-        "uv": {"target_faces": faces},
-        "bake": {"size": texture},
-    }
-    return Rung(name, settings, *cost)
+SIZES = ("image_side", "grid_cells", "levels", "batch", "samples", "hash_fine", "hash_log2_size")  # of a fit
 
 
-FINE = {"hash_fine": 0.0005, "hash_log2_size": 18}
-FINEST = {"hash_fine": 0.0003, "hash_log2_size": 20, "samples": 16}
+def _of(preset: str, **changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The sizes of a preset by stage, some of them changed."""
+    fit = FitSettings(**fits.PRESETS[preset])
+    sizes = {**PRESETS[preset], FIT: {name: getattr(fit, name) for name in SIZES}}
+    return {stage: {**own, **changes.get(stage, {})} for stage, own in sizes.items()}
+
+
+COARSE = {
+    FIT: {"image_side": 256, "grid_cells": 192},
+    "surface": {"resolution": 192},
+    "uv": {"target_faces": 20_000},
+    "bake": {"size": 512},
+}
+FINE = {FIT: {"image_side": 768, "grid_cells": 384}, "uv": {"target_faces": 50_000}}
 RUNGS = (
-    _rung("coarse", (256, 192, 2, 4096), (192, 20_000, 512), {}, 0, 1.1, 25, 55),
-    _rung("draft", (512, 288, 2, 4096), (288, 50_000, 1024), {}, 4e6, 1.0, 35, 85),
-    _rung("fine", (768, 384, 2, 8192), (320, 50_000, 2048), FINE, 1.5e7, 1.0, 45, 130),
-    _rung("studio", (1024, 448, 2, 8192), (320, 60_000, 2048), FINE, 3.5e7, 0.9, 60, 150),
-    _rung("film", (2048, 768, 4, 16384), (512, 100_000, 4096), FINEST, 2.5e8, 0.6, 200, 600),
+    Rung("coarse", _of("draft", **COARSE), 0, 1.1, 25, 55),
+    Rung("draft", _of("draft"), 4e6, 1.0, 35, 85),
+    Rung("fine", _of("studio", **FINE), 1.5e7, 1.0, 45, 130),
+    Rung("studio", _of("studio"), 3.5e7, 0.9, 60, 150),
+    Rung("film", _of("film"), 2.5e8, 0.6, 200, 600),
 )
 
 
@@ -106,7 +109,6 @@ def choose(left: float, pace: float) -> BudgetPlan:
 
 def calibrate(device: str) -> float:
     """Rays/s of this machine at the draft's settings, on the ball."""
-    from stages.inverse_rendering.settings import FitSettings
     from workflows.ball import WHOLE, ball_trainer
 
     settings = FitSettings(**WHOLE)

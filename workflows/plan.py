@@ -14,7 +14,7 @@ from pipeline.errors import StageError, UsageError
 from pipeline.store import MANIFEST, Store
 from stages import registry
 from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_sets
-from workflows.budget import FIT
+from stages.registry import FIT
 
 DEVICES = ("auto", "cpu", "cuda")
 

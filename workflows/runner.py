@@ -11,7 +11,8 @@ from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
 from stages import registry
-from workflows.budget import FIT, START_UP, planned
+from stages.registry import FIT
+from workflows.budget import START_UP, planned
 from workflows.plan import Plan, check_settings
 from workflows.session import current
 from workflows.watchdog import time_limit

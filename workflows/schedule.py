@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import StageError
+from stages.registry import FIT
 from workflows.console import Console
 
-FIT = "inverse_rendering"
 HOUR = 3600.0
 
 

@@ -10,8 +10,9 @@ import pytest
 from pipeline.errors import UsageError
 from pipeline.store import Store
 from stages.presets import configs_for
+from stages.registry import FIT
 from workflows import budget
-from workflows.budget import DRAFT_RATE, FIT, LEAST_FIT, RUNGS, BudgetPlan, choose
+from workflows.budget import DRAFT_RATE, LEAST_FIT, RUNGS, BudgetPlan, choose
 from workflows.cli import parser
 from workflows.commands import request_from
 from workflows.plan import RunRequest, check_settings, make_plan, preview
