@@ -22,16 +22,6 @@ from pipeline.artifacts import CameraSet
 F64 = npt.NDArray[np.float64]
 
 
-def umeyama(source: F64, target: F64) -> F64:
-    """4x4 similarity with the least squared distance from source (N, 3) to target (N, 3)."""
-    a, b = source - source.mean(0), target - target.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a / len(a))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u @ np.diag(sign) @ vt
-    scale = float((s * sign).sum() / a.var(0).sum())
-    return transforms.similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
-
-
 def solved_cameras(run: Path) -> CameraSet:
     """The cameras of a finished run, from its store."""
     key = json.loads((run / "run.json").read_text())["stages"]["poses"]["key"]
@@ -51,7 +41,7 @@ def main() -> None:
         solved.append(transforms.matrix(camera.world_from_cam))
         known.append(transforms.inverse_rigid(transforms.rigid(m[:3, :3], m[:3, 3])))
     s, k = np.array(solved), np.array(known)
-    known_from_asset = umeyama(s[:, :3, 3], k[:, :3, 3])
+    known_from_asset = transforms.umeyama(s[:, :3, 3], k[:, :3, 3])
     moved = np.array([transforms.rescale_camera(known_from_asset, m) for m in s])
     apart = np.linalg.norm(moved[:, :3, 3] - k[:, :3, 3], axis=1) * 1e3
     turn = np.einsum("nij,nij->n", moved[:, :3, :3], k[:, :3, :3])

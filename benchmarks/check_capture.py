@@ -18,12 +18,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.align_solved_cameras import F64, umeyama
 from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
 from pipeline.contract import execute
 from pipeline.images import read_alpha
 from pipeline.store import Store
-from pipeline.transforms import matrix
+from pipeline.transforms import F64, matrix, umeyama
 from stages.capture.scan import scan_capture
 from stages.capture.stage import STAGE as CAPTURE
 from stages.capture.stage import Inputs as CaptureInputs

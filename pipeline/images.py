@@ -189,3 +189,8 @@ def shrink(image: F32, factor: int) -> F32:
         raise ValueError(f"{image.shape[1]} x {image.shape[0]} is not a multiple of {factor}")
     small = cv2.resize(np.asarray(image, np.float32), (w, h), interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32).reshape(h, w, *image.shape[2:])
+
+
+def shrink_whole(image: F32, factor: int) -> F32:
+    """The same without the last columns and rows that fill no block."""
+    return shrink(image[: image.shape[0] // factor * factor, : image.shape[1] // factor * factor], factor)

@@ -58,6 +58,17 @@ def similarity(scale: float, rotation: F64, translation: F64) -> F64:
     return rigid(scale * rotation, translation)
 
 
+def umeyama(source: F64, target: F64) -> F64:
+    """4x4 similarity with the least squared distance from source (N, 3) to target (N, 3) [Umeyama 1991]; of scale 0
+    where the source is one point."""
+    a, b = source - source.mean(0), target - target.mean(0)
+    u, values, vt = np.linalg.svd(b.T @ a)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    scale = float((values * signs).sum() / max(float((a * a).sum()), 1e-300))
+    return similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
 def rescale_camera(to_from_world: F64, world_from_cam: F64) -> F64:
     """A camera's rigid pose after its world went through a similarity (scale moves the centre, not the axes)."""
     scale = float(np.cbrt(np.linalg.det(to_from_world[:3, :3])))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.images import read_alpha, read_linear, shrink
+from pipeline.images import read_alpha, read_linear, shrink_whole
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.transforms import inverse_rigid, matrix, rays
 from stages.bake import detail_kernels as kernels
@@ -52,7 +52,7 @@ def read_photos(
         photo = read_linear(view.photo)
         alpha = np.ones(photo.shape[:2], np.float32) if view.mask is None else read_alpha(view.mask)
         factor = _factor(view, mesh, texel)
-        photo = shrink(_whole(photo, factor), factor)
+        photo = shrink_whole(photo, factor)
         depth = _depth(view, alpha, occluder)
         peak = max(float(photo.max()), 1e-6)
         rows.append(_row(view, responses[i], factor, photo.shape, depth.shape, peak, places))
@@ -65,11 +65,6 @@ def read_photos(
     reach = np.linalg.norm(cameras[:, 27:30] - centre, axis=1)
     cameras[:, 40] *= _sharpness(pixels, cameras) / np.median(cameras[:, 40] / reach)
     return Photos(cameras, np.concatenate(pixels), np.concatenate(depths))
-
-
-def _whole(image: F32, factor: int) -> F32:
-    h, w = (s // factor * factor for s in image.shape[:2])
-    return image[:h, :w]
 
 
 def _factor(view: View, mesh: Mesh, texel: float) -> int:

@@ -27,7 +27,7 @@ import torch
 from pipeline.fields.face import FaceModel
 from pipeline.maths import sh
 from pipeline.maths.vmf import ATTENUATIONS
-from stages.inverse_rendering.sightings import LEAST_COSINE, Sightings
+from stages.inverse_rendering.sightings import LEAST_COSINE, Sightings, lobe_basis, point_means
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -74,9 +74,7 @@ class Trial:
 
     def within(self, y: F64) -> F64:
         """y less its mean over the training views of the same point."""
-        points, taken = self.point[self.train], y[self.train].T
-        total = np.stack([np.bincount(points, column, len(self.counts)) for column in taken], -1)
-        return np.asarray(y - (total / self.counts[:, None])[self.point], np.float64)
+        return np.asarray(y - point_means(self.point[self.train], y[self.train], self.counts)[self.point], np.float64)
 
 
 def trial(seen: Sightings, waiting: tuple[int, ...], model: FaceModel) -> Trial | None:
@@ -105,19 +103,14 @@ def trial(seen: Sightings, waiting: tuple[int, ...], model: FaceModel) -> Trial 
 def lobe_features(model: FaceModel, seen: Sightings, keep: BOOL) -> F64:
     """w A_l(s) Y_lm(w_r) with the fit's own lobe, (M, (L + 1)^2): what L_s is linear in."""
     order = model.spec.light_order
-    n, wo = seen.normal[keep], seen.wo[keep]
     with torch.no_grad():
         point = torch.from_numpy(seen.point[keep]).to(seen.x.device)
-        toward = torch.from_numpy(wo).to(seen.x)
+        toward = torch.from_numpy(seen.wo[keep]).to(seen.x)
         _, rho, c, s = model.spatial(seen.x)
         strength = rho[point] * model.basis.integral(seen.x[point], c[point], toward, seen.n[point])
         falls = ATTENUATIONS[model.spec.attenuation](s, order).cpu().numpy()[seen.point[keep]]
         weight = (strength / strength.mean().clamp(min=1e-12)).cpu().numpy()
-    mirror = torch.from_numpy(2 * seen.cosine[keep][:, None] * n - wo)
-    out = sh.sh_basis(mirror, order).numpy()
-    for band in range(order + 1):
-        out[:, band * band : (band + 1) ** 2] *= (weight * falls[:, band])[:, None]
-    return np.asarray(out, np.float64)
+    return lobe_basis(seen.mirror[keep], weight[:, None] * falls)
 
 
 # ------------------------------------------------------------------ solving

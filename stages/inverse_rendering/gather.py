@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline import transforms
 from pipeline.artifacts import Camera, CameraSet, Capture, FileRef, Located, MaskSet
-from pipeline.images import read_alpha, read_linear, shrink
-from stages.inverse_rendering.views import F32, PhotoView, factor_for, whole_blocks
+from pipeline.images import read_alpha, read_linear, shrink_whole
+from stages.inverse_rendering.views import F32, PhotoView, factor_for
 
 
 def read_views(
@@ -52,8 +52,8 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
         return view
     K = view.K.copy()
     K[:2] /= f
-    clipped = None if view.clipped is None else shrink(whole_blocks(view.clipped, f), f)
-    rgb, alpha = shrink(whole_blocks(view.rgb, f), f), shrink(whole_blocks(view.alpha, f), f)
+    clipped = None if view.clipped is None else shrink_whole(view.clipped, f)
+    rgb, alpha = shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)
     return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, K=K)
 
 

@@ -26,7 +26,7 @@ from pipeline.fields.appearance import SKIN_F0, TYPICAL_INV_KAPPA
 from pipeline.maths import sh
 from pipeline.maths.split_sum import alpha_from_inv_kappa, environment_brdf
 from pipeline.maths.vmf import ATTENUATIONS
-from stages.inverse_rendering.sightings import Sightings
+from stages.inverse_rendering.sightings import Sightings, lobe_basis, point_means
 
 F64 = npt.NDArray[np.float64]
 RIDGE = 1e-3  # of the mean eigenvalue
@@ -69,15 +69,13 @@ def light_from_lobe(seen: Sightings, order: int, gain: F64, attenuation: str) ->
     keep = often[seen.point]
     point, cosine = seen.point[keep], seen.cosine[keep]
     colour = (seen.colour[keep] / gain[seen.view[keep]]).mean(1)
-    normal, wo = seen.normal[keep], seen.wo[keep]
-    mirror = 2 * cosine[:, None] * normal - wo
-    weight = reflectance(cosine)
-    f = _bands(mirror, order, attenuation) * weight[:, None]
+    usual = torch.full((1,), TYPICAL_INV_KAPPA, dtype=torch.float64)
+    f = lobe_basis(seen.mirror[keep], ATTENUATIONS[attenuation](usual, order).numpy()) * reflectance(cosine)[:, None]
 
     def mean(values: F64) -> F64:
-        return np.bincount(point, values, len(counts)) / np.maximum(counts, 1)
+        return point_means(point, values, np.maximum(counts, 1))
 
-    inside = f - np.stack([mean(column) for column in f.T], -1)[point]
+    inside = f - mean(f)[point]
     y = colour - mean(colour)[point]
     gram = inside.T @ inside
     gram += RIDGE * max(float(np.trace(gram)) / len(gram), 1e-300) * np.eye(len(gram))
@@ -89,14 +87,6 @@ def light_from_lobe(seen: Sightings, order: int, gain: F64, attenuation: str) ->
     if scale is None:
         return None
     return Lamp(np.concatenate([b[:1], scale * b[1:]]), explained, scale)
-
-
-def _bands(direction: F64, order: int, attenuation: str) -> F64:
-    """A_l Y_lm (M, (L + 1)^2) through the usual lobe."""
-    s = torch.full((1,), TYPICAL_INV_KAPPA, dtype=torch.float64)
-    falls = ATTENUATIONS[attenuation](s, order).numpy()[0]
-    widths = [2 * band + 1 for band in range(order + 1)]
-    return np.asarray(sh.sh_basis(torch.from_numpy(direction), order).numpy() * np.repeat(falls, widths), np.float64)
 
 
 def _evenest(seen: Sightings, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]) -> float | None:

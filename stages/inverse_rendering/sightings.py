@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -17,9 +16,11 @@ from torch import Tensor
 
 from pipeline import transforms
 from pipeline.fields.geometry import GridSdf
+from pipeline.images import shrink_whole
+from pipeline.maths import sh
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
-from stages.inverse_rendering.views import WHOLE, PhotoView, Rays, factor_for, whole_blocks
+from stages.inverse_rendering.views import WHOLE, PhotoView, Rays, factor_for
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -60,21 +61,33 @@ class Sightings:
         """n . wo, (M,)."""
         return np.asarray((self.normal * self.wo).sum(1), np.float64)
 
+    @property
+    def mirror(self) -> F64:
+        """w_r (M, 3)."""
+        return np.asarray(2 * self.cosine[:, None] * self.normal - self.wo, np.float64)
+
+
+def point_means(point: I64, values: F64, counts: F64) -> F64:
+    """(P,) or (P, C) mean of values (M,) or (M, C) over the observations of each point, whose number is counts (P,)."""
+    columns = values.reshape(len(values), -1).T
+    total = np.stack([np.bincount(point, column, len(counts)) for column in columns], -1)
+    return np.asarray((total / counts[:, None]).reshape(-1, *values.shape[1:]), np.float64)
+
+
+def lobe_basis(direction: F64, falls: F64) -> F64:
+    """A_l Y_lm (M, (L + 1)^2) at directions (M, 3); falls: A_l of each lobe, (M, L + 1), or of all, (1, L + 1)."""
+    order = falls.shape[1] - 1
+    spread = np.repeat(falls, 2 * np.arange(order + 1) + 1, axis=1)
+    return np.asarray(sh.sh_basis(torch.from_numpy(direction), order).numpy() * spread, np.float64)
+
 
 def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
     """All photos at about `side` pixels."""
     out = []
     for view in views:
         f = factor_for(view.size, side)
-        out.append(Picture(view, f, _smaller(view.rgb, f), _smaller(view.alpha, f)))
+        out.append(Picture(view, f, shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)))
     return out
-
-
-def _smaller(image: F32, factor: int) -> F32:
-    """Mean of blocks of factor x factor pixels."""
-    whole = whole_blocks(image, factor)
-    size = whole.shape[1] // factor, whole.shape[0] // factor
-    return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def surface_points(geometry: GridSdf, rays: Rays) -> tuple[Tensor, Tensor]:

@@ -23,11 +23,11 @@ from torch import Tensor
 
 from pipeline import transforms
 from pipeline.fields.geometry import GridSdf, largest_solid
-from pipeline.images import shrink
+from pipeline.images import shrink_whole
 from pipeline.maths.correlation import agreement
 from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.fit import Start
-from stages.inverse_rendering.views import PhotoView, factor_for, whole_blocks
+from stages.inverse_rendering.views import PhotoView, factor_for
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -98,7 +98,7 @@ def photos_of(views: list[PhotoView], device: str) -> Photos:
     grey, matrices, sizes = [], [], []
     for view in views:
         f = factor_for(view.size, SIDE)
-        image = np.clip(shrink(whole_blocks(view.rgb, f), f) @ GREY, 0, None) ** np.float32(1 / 2.2)
+        image = np.clip(shrink_whole(view.rgb, f) @ GREY, 0, None) ** np.float32(1 / 2.2)
         K = view.K.copy()
         K[:2] /= f
         grey.append(without_distortion(image, K, view.distortion).ravel())

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pipeline import transforms
 from pipeline.colour import srgb_from_linear
-from pipeline.images import shrink
+from pipeline.images import shrink_whole
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -80,11 +80,6 @@ def factor_for(size: tuple[int, int], side: int, *, exact: bool = False) -> int:
     if exact:
         f = next(k for k in range(f, 0, -1) if size[0] % k == 0 and size[1] % k == 0)
     return f
-
-
-def whole_blocks(image: F32, factor: int) -> F32:
-    """The image without the last columns and rows that fill no block."""
-    return image[: image.shape[0] // factor * factor, : image.shape[1] // factor * factor]
 
 
 def normalised_positions(view: PhotoView, factor: int) -> F32:
@@ -156,8 +151,8 @@ def _pixels_of(
     view: PhotoView, n: int, factor: int
 ) -> tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]:
     """Candidate pixels of one view: (x, y), encoded target, alpha, view number, 1 inside or 0 outside."""
-    alpha = shrink(whole_blocks(view.alpha, factor), factor)
-    encoded = srgb_from_linear(shrink(whole_blocks(view.rgb, factor), factor)).astype(np.float16)
+    alpha = shrink_whole(view.alpha, factor)
+    encoded = srgb_from_linear(shrink_whole(view.rgb, factor)).astype(np.float16)
     xy = normalised_positions(view, factor)
     reach = 2 * max(int(max(alpha.shape) * NEAR_BAND), 2) + 1
     near = cv2.dilate((alpha > 0.01).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
@@ -166,7 +161,7 @@ def _pixels_of(
     far.reshape(-1)[n % FAR_EVERY :: FAR_EVERY] = True
     take = inside | near | far
     if view.clipped is not None:  # what is clipped shows a lower bound; of the background it still shows that it is one
-        take &= ~(inside & (shrink(whole_blocks(view.clipped, factor), factor) > 0))
+        take &= ~(inside & (shrink_whole(view.clipped, factor) > 0))
     return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
 
 

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
-from pipeline.transforms import F64, inverse_rigid, matrix, project, rays
+from pipeline.transforms import F64, apply, inverse_rigid, matrix, project, rays, umeyama
 
 DICTIONARIES = {
     "aruco_4x4": cv2.aruco.DICT_4X4_250,
@@ -225,7 +225,8 @@ def by_positions(
         return None, f"only {len(known)} photos with a place have a GPS position"
     a = np.stack([matrix(c.world_from_cam)[:3, 3] for c in known])
     b = np.array([places[c.index] for c in known])
-    scale, residual = _similarity(a, b)
+    found = umeyama(a, b)
+    scale, residual = float(np.cbrt(np.linalg.det(found[:3, :3]))), apply(found, a) - b
     spread = float(np.sqrt(((b - b.mean(0)) ** 2).sum(1).mean()))
     wrong = float(np.sqrt((residual**2).sum(1).mean() * len(b) / (len(b) - 7 / 3)))
     if scale <= 0 or spread < TOLD_APART * wrong:
@@ -233,12 +234,3 @@ def by_positions(
     return Scale(
         scale, f"from the GPS positions of {len(known)} photos, wrong by {wrong:.2g} m over {spread:.2g} m"
     ), ""
-
-
-def _similarity(a: F64, b: F64) -> tuple[float, F64]:
-    """s and the residuals (N, 3) of s R a + t = b, least squares."""
-    a, b = a - a.mean(0), b - b.mean(0)
-    u, values, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1, 1, np.sign(np.linalg.det(u @ vt))])
-    s = float((values * signs).sum() / max(float((a * a).sum()), 1e-300))
-    return s, np.asarray(s * a @ (u @ np.diag(signs) @ vt).T - b, np.float64)
