@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from stages.inverse_rendering.fit import Start, Trainer
+    from stages.inverse_rendering.fit import Trainer
     from stages.inverse_rendering.settings import FitSettings
+    from stages.inverse_rendering.start import Start
     from stages.inverse_rendering.views import PhotoView
 
 RADIUS, HALF, DISTANCE = 0.1, 0.14, 0.5
@@ -44,7 +45,7 @@ def ball_view(index: int, count: int, side: int) -> PhotoView:
 
 def ball_start(cells: int) -> Start:
     """The SDF of the ball on a grid with so many cells a side."""
-    from stages.inverse_rendering.fit import Start
+    from stages.inverse_rendering.start import Start
 
     axis = np.linspace(-HALF, HALF, cells + 1, dtype=np.float32)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)

@@ -9,8 +9,9 @@ import torch
 from pipeline.fields.face import FaceModel
 from pipeline.fields.spec import FaceSpec
 from stages.inverse_rendering.choices import teach
-from stages.inverse_rendering.fit import Start, Trainer
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, PixelTable
 
 ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'

@@ -10,7 +10,7 @@ beyond the order, colour matrices of cameras that agree, a surface that the prio
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -25,10 +25,8 @@ from stages.inverse_rendering.evidence import NEGLIGIBLE, Trial, more
 from stages.inverse_rendering.lamp import Lamp, light_from_lobe, reflectance
 from stages.inverse_rendering.settings import AUTO, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
-from stages.inverse_rendering.views import PixelTable
-
-if TYPE_CHECKING:
-    from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.start import Start
+from stages.inverse_rendering.views import PhotoView, PixelTable
 
 EVIDENCE_AT = 0.3  # share of the steps: the surface is found to a millimetre, most of the work is still to come
 RAYS = 1500
@@ -42,6 +40,19 @@ TELLING = 0.75  # of the lobe's own size: with a larger rest, bases are not told
 SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
 
 Facts = dict[str, dict[str, str | float | bool]]
+
+
+class Fit(Protocol):
+    """What is read of a fit under way. waiting: positions of the views that it has not seen."""
+
+    views: list[PhotoView]
+    settings: FitSettings
+    device: str
+    model: FaceModel
+    prior: Start | None
+    level: int
+    table: PixelTable | None
+    waiting: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +97,9 @@ def waiting_views(count: int, settings: FitSettings) -> tuple[int, ...]:
 
 
 # ------------------------------------------------------------------ deciding
-def decide(trainer: Trainer) -> tuple[Choices, Lamp | None]:
+def decide(fit: Fit) -> tuple[Choices, Lamp | None]:
     """Judge what is open with the waiting views; and the light, if what changes with the view tells it."""
-    s, model = trainer.settings, trainer.model
+    s, model = fit.settings, fit.model
     given = Choices(
         s.specular != "off",
         s.first_order,
@@ -100,20 +111,20 @@ def decide(trainer: Trainer) -> tuple[Choices, Lamp | None]:
     wanted = s.lamps and s.specular != "off"
     why = "setting" if not open_questions(s) else f"fewer than {LEAST_VIEWS} views: nothing to judge by"
     out = replace(given, facts=_facts(given, s, why))
-    if not trainer.waiting and not wanted:
+    if not fit.waiting and not wanted:
         return out, None
-    shots = pictures(trainer.views)
-    rays = _table(trainer).draw(RAYS, 0.0, SEED + s.seed).rays
+    shots = pictures(fit.views)
+    rays = _table(fit).draw(RAYS, 0.0, SEED + s.seed).rays
     seen = sight(model.geometry, shots, *surface_points(model.geometry, rays))
-    found = evidence.trial(seen, trainer.waiting, model) if trainer.waiting else None
-    gain = np.ones((len(trainer.views), 3))
+    found = evidence.trial(seen, fit.waiting, model) if fit.waiting else None
+    gain = np.ones((len(fit.views), 3))
     if found is not None:
         out = _judge_colours(given, s, found, model)
         if out.calibrated:
             gain = evidence.solve_response(found, out.light_order, gain=True).gain
-        if s.relief == AUTO and trainer.prior is not None:
-            out = _judge_relief(out, trainer, found, shots)
-    elif trainer.waiting:
+        if s.relief == AUTO and fit.prior is not None:
+            out = _judge_relief(out, fit, found, shots)
+    elif fit.waiting:
         out = replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
     lamp = None
     if wanted and out.specular:
@@ -149,9 +160,9 @@ def teach(basis: IntegratedBasis) -> None:
     basis.learn(lambda cosine: torch.from_numpy(reflectance(cosine.cpu().numpy())).to(cosine) / START_RHO)
 
 
-def _table(trainer: Trainer) -> PixelTable:
-    assert trainer.table is not None
-    return trainer.table
+def _table(fit: Fit) -> PixelTable:
+    assert fit.table is not None
+    return fit.table
 
 
 def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -> Choices:
@@ -196,12 +207,12 @@ def _best_order(t: Trial, full: int) -> int:
     return int(np.argmin(errors))
 
 
-def _judge_relief(out: Choices, trainer: Trainer, t: Trial, shots: list[Any]) -> Choices:
+def _judge_relief(out: Choices, fit: Fit, t: Trial, shots: list[Any]) -> Choices:
     """Whether the fitted surface explains the waiting views better than the prior."""
-    prior = prior_surface(trainer)
-    seen = sight(prior, shots, *surface_points(prior, _table(trainer).draw(RAYS, 0.0, SEED + 1).rays))
-    before = evidence.trial(seen, trainer.waiting, trainer.model)
-    own, theirs = (silhouette_error(trainer, g) for g in (trainer.model.geometry, prior))
+    prior = prior_surface(fit)
+    seen = sight(prior, shots, *surface_points(prior, _table(fit).draw(RAYS, 0.0, SEED + 1).rays))
+    before = evidence.trial(seen, fit.waiting, fit.model)
+    own, theirs = (silhouette_error(fit, g) for g in (fit.model.geometry, prior))
     relief = theirs > own + SILHOUETTE
     fact: dict[str, str | float | bool] = {
         "modelled": relief,
@@ -222,9 +233,9 @@ def _consistency(t: Trial, calibrated: bool) -> float:
     return evidence.held_out(t, None, response)
 
 
-def silhouette_error(trainer: Trainer, geometry: GridSdf) -> float:
+def silhouette_error(fit: Fit, geometry: GridSdf) -> float:
     """Share of the waiting views' rays that hit where the mask shows nothing, or pass where it shows the subject."""
-    batch = _table(trainer).only(trainer.waiting).draw(RAYS, 0.5, SEED + 2)
+    batch = _table(fit).only(fit.waiting).draw(RAYS, 0.5, SEED + 2)
     hit = _hits(geometry, batch.rays.o, batch.rays.d)
     return float((hit != (batch.alpha > 0.5)).double().mean())
 
@@ -237,15 +248,15 @@ def _hits(geometry: GridSdf, o: Tensor, d: Tensor) -> Tensor:
     return hit & (far > near)
 
 
-def prior_surface(trainer: Trainer) -> GridSdf:
+def prior_surface(fit: Fit) -> GridSdf:
     """The prior's surface, on the present grid."""
-    assert trainer.prior is not None
-    start = trainer.prior
+    assert fit.prior is not None
+    start = fit.prior
     prior = GridSdf(torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
-    for _ in range(trainer.level):
+    for _ in range(fit.level):
         prior.refine()
-    prior.to(trainer.device)
-    prior.to_device(trainer.device)
+    prior.to(fit.device)
+    prior.to_device(fit.device)
     return prior
 
 

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 import torch
 
 from pipeline.errors import Cancelled, StageError
@@ -33,6 +31,7 @@ from stages.inverse_rendering.choices import (
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
@@ -46,15 +45,6 @@ SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved an
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
 COUNTED = ("step", "loss", "error", "shadows_solved", "allowance", "spent")  # plain numbers of a checkpoint
 SMOOTHING = 0.98  # of the running loss and error that are shown
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where the geometry begins: SDF samples (X, Y, Z) at lo + i cell, asset units."""
-
-    values: npt.NDArray[np.float32]
-    lo: npt.NDArray[np.float32]
-    cell: float
 
 
 @dataclass(frozen=True, slots=True)

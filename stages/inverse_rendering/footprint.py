@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from pipeline import transforms
 from pipeline.fields.face import FaceModel
-from stages.inverse_rendering.fit import Start
 from stages.inverse_rendering.settings import AUTO, FitSettings
 from stages.inverse_rendering.sightings import LEAST_COSINE
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
 
 F64 = npt.NDArray[np.float64]

@@ -23,10 +23,11 @@ from pipeline.fields.priors import HullPrior
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
 from stages.inverse_rendering.begin import spec_for
-from stages.inverse_rendering.fit import Start, Trainer
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.objective import Terms, calibrated_colours
 from stages.inverse_rendering.paper_render import geometry_of, render_samples
 from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable
 
 HALVED_EVERY, HALVED_UNTIL = 0.125, 0.75  # shares of the run: every 375 of 3,000 epochs, until 75 %

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.hull import hull_bounds, hull_sdf, visual_hull
-from stages.inverse_rendering.fit import Start
 
 F32 = npt.NDArray[np.float32]
 SPHERE = 0.6  # share of the region of interest's radius
 MARGIN_CELLS = 4  # room for the band and the spline's border around the hull
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where the geometry begins: SDF samples (X, Y, Z) at lo + i cell, asset units."""
+
+    values: F32
+    lo: F32
+    cell: float
 
 
 def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int) -> Start:

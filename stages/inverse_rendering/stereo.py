@@ -26,7 +26,7 @@ from pipeline.fields.geometry import GridSdf, largest_solid
 from pipeline.images import shrink_whole
 from pipeline.maths.correlation import agreement
 from pipeline.maths.tracing import box_interval
-from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
 
 F32 = npt.NDArray[np.float32]

@@ -18,11 +18,12 @@ from pipeline.transforms import F64
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.choices import Choices, decide, restored, waiting_views
-from stages.inverse_rendering.fit import Start, Trainer
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import footprint, supported
 from stages.inverse_rendering.settings import PRESETS, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
 from stages.inverse_rendering.stage import Config
+from stages.inverse_rendering.start import Start
 from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
 SMALL = FitSettings(

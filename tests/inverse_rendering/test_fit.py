@@ -15,10 +15,11 @@ import torch
 from pipeline import transforms
 from pipeline.errors import Cancelled, StageError
 from stages.inverse_rendering.begin import new_trainer
-from stages.inverse_rendering.fit import Hooks, Start, Trainer, run_fit
+from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
 from stages.inverse_rendering.objective import objective
 from stages.inverse_rendering.predict import predict_view
 from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, PixelTable, factor_for, image_rays
 
 RADIUS, SIDE = 0.1, 64

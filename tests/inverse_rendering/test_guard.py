@@ -12,9 +12,10 @@ import torch
 from pipeline.errors import StageError
 from stages.inverse_rendering import objective
 from stages.inverse_rendering.begin import new_trainer
-from stages.inverse_rendering.fit import Hooks, Start, Trainer, run_fit
+from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
 from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView
 from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
 

@@ -10,7 +10,7 @@ import torch
 
 from pipeline import transforms
 from stages.inverse_rendering import stereo
-from stages.inverse_rendering.fit import Start
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView
 
 RADIUS, SIDE = 0.1, 192

@@ -13,8 +13,8 @@ import torch
 from pipeline import transforms
 from pipeline.maths import sh
 from pipeline.transforms import F64
-from stages.inverse_rendering.fit import Start
 from stages.inverse_rendering.lamp import reflectance
+from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView
 
 RADIUS, SIDE, FOCAL, DISTANCE = 0.1, 96, 170.0, 0.5
