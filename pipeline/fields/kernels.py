@@ -144,3 +144,25 @@ def adam_on_band(
     flat[2][active] = mi = b1 * flat[2][active] + (1 - b1) * g
     flat[3][active] = vi = b2 * flat[3][active] + (1 - b2) * g * g
     flat[0][active] -= lr * (mi / c1) / (torch.sqrt(vi / c2) + eps)
+
+
+def look_up(grey: Tensor, first: Tensor, width: Tensor, height: Tensor, view: Tensor, q: Tensor) -> Tensor:
+    """Bilinear samples (N, V, K) of photos, held at their border.
+
+    grey: all photos' rows one after the other; first, width, height (M,) where each begins and its size in pixels.
+    view (N, V): which photo; q (N, V, 3, K): homogeneous image positions, pixel centres at +0.5. Photos have at least
+    2 x 2 pixels; a position at infinity (third coordinate 0) must not be asked for.
+    """
+    if compiled(grey) and compiled(q):
+        out = torch.empty(*q.shape[:2], q.shape[3])
+        nb.look_up(_np(grey), _np(first), _np(width), _np(height), _np(view), _np(q), out.numpy())
+        return out
+    wide = width[view][..., None]
+    zero = torch.zeros((), device=q.device)
+    x = (q[..., 0, :] / q[..., 2, :] - 0.5).clamp(min=zero, max=wide - 1.001)
+    y = (q[..., 1, :] / q[..., 2, :] - 0.5).clamp(min=zero, max=height[view][..., None] - 1.001)
+    column, row = x.long(), y.long()
+    at = first[view][..., None] + row * wide + column
+    upper = torch.lerp(grey[at], grey[at + 1], x - column)
+    lower = torch.lerp(grey[at + wide], grey[at + wide + 1], x - column)
+    return torch.lerp(upper, lower, y - row)

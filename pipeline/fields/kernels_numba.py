@@ -1,4 +1,4 @@
-"""CPU kernels for the three gathers that rule the fit's cost: spline SDF, ray march, hash encoding.
+"""CPU kernels for the gathers that rule the fit's cost: spline SDF, ray march, hash encoding, patches of photos.
 
 Each has its reference in plain torch (pipeline.maths.sdf, pipeline.maths.tracing, pipeline.fields.encodings), and the
 tests hold them to it. A fit repeats bit by bit, for which two things are needed. Sums are done in an order that does
@@ -276,3 +276,24 @@ def hash_backward(table, offset, size, hashed, mask, lo, inv, x, grad_out, grad_
             grad_x[level, n, 0] = gx * inv[level] if inside_x else ZERO
             grad_x[level, n, 1] = gy * inv[level] if inside_y else ZERO
             grad_x[level, n, 2] = gz * inv[level] if inside_z else ZERO
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def look_up(grey, first, width, height, view, q, out):
+    """Bilinear samples (N, V, K) of the photos `view` (N, V) at homogeneous image positions q (N, V, 3, K)."""
+    n_views, n = q.shape[1], q.shape[3]
+    border = np.float32(1.001)
+    for i in prange(q.shape[0]):
+        for j in range(n_views):
+            k = view[i, j]
+            w, h, start = width[k], height[k], first[k]
+            for s in range(n):
+                depth = q[i, j, 2, s]
+                x = min(max(q[i, j, 0, s] / depth - HALF, ZERO), np.float32(w) - border)
+                y = min(max(q[i, j, 1, s] / depth - HALF, ZERO), np.float32(h) - border)
+                column, row = int(x), int(y)
+                fx, fy = x - np.float32(column), y - np.float32(row)
+                at = start + row * w + column
+                upper = grey[at] + fx * (grey[at + 1] - grey[at])
+                lower = grey[at + w] + fx * (grey[at + w + 1] - grey[at + w])
+                out[i, j, s] = upper + fy * (lower - upper)

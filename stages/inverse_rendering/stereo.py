@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pipeline import transforms
 from pipeline.fields.geometry import GridSdf, largest_solid
+from pipeline.fields.kernels import look_up
 from pipeline.images import shrink_whole
 from pipeline.maths.correlation import agreement
 from pipeline.maths.tracing import box_interval
@@ -206,7 +207,7 @@ def sweep_scores(
     for offset in offsets:
         check()
         q = grid + (centre + float(offset) * along_n)[..., None]
-        patches = _look_up(photos, order, q[..., 0, :] / q[..., 2, :], q[..., 1, :] / q[..., 2, :])
+        patches = look_up(photos.grey, photos.first, photos.width, photos.height, order, q)
         out.append(agreement(patches, seen))
     return torch.stack(out, 1).cpu().numpy()
 
@@ -219,25 +220,12 @@ def _tangents(n: Tensor) -> tuple[Tensor, Tensor]:
     return u, torch.linalg.cross(n, u)
 
 
-def _look_up(photos: Photos, view: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Bilinear samples (N, V, K) of the photos `view` (N, V) at image positions u, v (N, V, K), held at the border."""
-    width = photos.width[view][..., None]
-    x = (u - 0.5).clamp(min=torch.zeros((), device=u.device), max=width - 1.001)
-    y = (v - 0.5).clamp(min=torch.zeros((), device=u.device), max=photos.height[view][..., None] - 1.001)
-    column, row = x.long(), y.long()
-    at = photos.first[view][..., None] + row * width + column
-    fx, fy = x - column, y - row
-    upper = torch.lerp(photos.grey[at], photos.grey[at + 1], fx)
-    lower = torch.lerp(photos.grey[at + width], photos.grey[at + width + 1], fx)
-    return torch.lerp(upper, lower, fy)
-
-
 def vote(points: F64, normals: F64, scores: F32, offsets: F64, voters: int) -> tuple[F64, F64]:
     """Offset (N,) on which a point and its neighbours that face the same way agree, and the confidence in it, >= 0.
 
     A peak is refined by a parabola. One at either end of the sweep says only that the truth lies beyond: confidence 0.
     """
-    distance, near = cKDTree(points).query(points, voters)
+    distance, near = cKDTree(points).query(points, voters, workers=-1)
     facing = np.clip((normals[near] * normals[:, None]).sum(2), 0, None) ** 2
     weight = facing * np.exp(-((distance / np.maximum(distance[:, -1:], 1e-12)) ** 2))
     score = np.einsum("nk,nkj->nj", weight, scores[near]) / weight.sum(1, keepdims=True)
@@ -256,7 +244,7 @@ def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float)
     out, then are scaled to distances; far from the surface they are distances anew."""
     cell = start.cell
     node = np.argwhere(np.abs(start.values) < reach + 3 * cell)
-    distance, near = cKDTree(points).query(start.lo + cell * node, min(24, len(points)))
+    distance, near = cKDTree(points).query(start.lo + cell * node, min(24, len(points)), workers=-1)
     width = np.maximum(1.2 * cell, distance[:, :1] + 0.5 * cell)
     kernel = np.exp(-0.5 * (distance / width) ** 2)
     weight = kernel * confidence[near] ** 2

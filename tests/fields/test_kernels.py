@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 
 from pipeline.fields import kernels
 from pipeline.fields.encodings import HashEncoding
@@ -151,3 +153,30 @@ def test_band_optimiser_leaves_untouched_coefficients_alone() -> None:
     v, m, w = torch.zeros(SHAPE), torch.ones(SHAPE), torch.ones(SHAPE)
     kernels.adam_on_band(v, torch.zeros(SHAPE), m, w, torch.arange(v.numel()), 3, 0.01, (0.9, 0.99))
     assert (v == 0).all() and (m == 1).all()
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_patches_against_scipy(fast: bool) -> None:
+    """Two photos of other sizes, positions inside, at the border and beyond it, scaled as projections are."""
+    kernels.use_numba(fast)
+    rng = np.random.default_rng(2)
+    photos = [rng.random(size, np.float32) for size in ((13, 9), (7, 21))]
+    sizes = torch.tensor([p.shape for p in photos])
+    view = torch.from_numpy(rng.integers(0, 2, (40, 3)))
+    uv = rng.uniform(-4, 25, (40, 3, 2, 5)).astype(np.float32)
+    depth = rng.uniform(0.2, 3, (40, 3, 1, 5)).astype(np.float32)
+    q = torch.from_numpy(np.concatenate([uv * depth, depth], 2))
+    grey = torch.from_numpy(np.concatenate([p.ravel() for p in photos]))
+    first = torch.tensor([0, photos[0].size])
+    found = kernels.look_up(grey, first, sizes[:, 1], sizes[:, 0], view, q).numpy()
+    for k, photo in enumerate(photos):
+        chosen = view.numpy() == k
+        x, y = (uv[chosen][:, i].astype(np.float64) - 0.5 for i in (0, 1))
+        wanted = map_coordinates(photo.astype(np.float64), [y, x], order=1, mode="nearest")
+        assert np.abs(found[chosen] - wanted).max() < 2e-3  # held 0.001 of a pixel before the border
+
+
+def test_patches_of_nothing() -> None:
+    none = kernels.look_up(torch.zeros(1), *[torch.ones(1, dtype=torch.long)] * 3,
+                           torch.zeros(0, 3, dtype=torch.long), torch.zeros(0, 3, 3, 5))  # fmt: skip
+    assert none.shape == (0, 3, 5)

@@ -110,6 +110,32 @@ def test_views_behind_do_not_see() -> None:
     assert pixel == pytest.approx(0.4 / (1.9 * SIDE), rel=0.15)
 
 
+def test_a_hidden_view_gives_way_to_the_next() -> None:
+    """Against segments and spheres, point by point: a second ball stands before the first one."""
+    start, centre, radius = too_large(0.0), np.array([0.0, 0.0, 0.13]), 0.012
+    x = start.lo + start.cell * np.stack(np.meshgrid(*[np.arange(n) for n in start.values.shape], indexing="ij"), -1)
+    values = np.minimum(start.values, np.linalg.norm(x - centre, axis=-1) - radius).astype(np.float32)
+    rng = np.random.default_rng(0)
+    n = rng.normal(size=(300, 3)) * [0.5, 0.5, 0.2] + [0, 0, 1]
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    photos = stereo.photos_of([photo(i) for i in range(24)], "cpu")
+    order, seen, _ = stereo.best_views(RADIUS * n, n, Start(values, start.lo, start.cell), photos)
+    eyes = photos.centre.numpy().astype(np.float64)
+    way = eyes - RADIUS * n[:, None]
+    along = np.clip((((centre - RADIUS * n)[:, None] * way).sum(-1) / (way**2).sum(-1)), 0, 1)
+    miss = np.linalg.norm(RADIUS * n[:, None] + along[..., None] * way - centre, axis=-1)
+    cosine = (way * n[:, None]).sum(-1) / np.linalg.norm(way, axis=-1)
+    wanted = (cosine > stereo.LEAST_COSINE) & (miss > radius)
+    clear = (np.abs(miss - radius) > start.cell).all(1) & (np.abs(cosine - stereo.LEAST_COSINE) > 1e-3).all(1)
+    assert clear.sum() > 100 and ((~wanted) & (cosine > stereo.LEAST_COSINE))[clear].any()
+    for i in np.flatnonzero(clear):
+        best = np.argsort(-np.where(wanted[i], cosine[i], -1), kind="stable")[: min(stereo.VIEWS, wanted[i].sum())]
+        assert (
+            sorted(order[i][seen[i]].tolist()) == sorted(best.tolist())
+            or np.ptp(np.sort(cosine[i][order[i][seen[i]]]) - np.sort(cosine[i][best])) < 1e-5
+        )
+
+
 def test_normals_of_a_ball() -> None:
     p, n = stereo.surface_points(*[getattr(too_large(0.0), k) for k in ("values", "lo", "cell")])
     assert np.abs(np.linalg.norm(p, axis=1) - RADIUS).max() < 1e-3
