@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import Cancelled, StageError
-from workflows import environment, folders
+from workflows import environment, folders, server_tables
 from workflows.alone import alone
 from workflows.console import Console
 from workflows.interrupt import deaf_children, interruptible
@@ -39,17 +39,19 @@ def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, A
     with folders.writable(plan.out, plan.store.root):
         # Prefect stops its server when Python exits and writes to its home until then: look again after that.
         atexit.register(folders.sweep, made, plan.store.root)
-        environment.settle(plan.store.root, plan.out)
+        home = environment.settle(plan.store.root, plan.out)
+        if home is not None:
+            server_tables.begin(home)
         watch = Session(console, plan=plan)
         with (
             session(watch),
             interruptible(watch.stop, _end_server, console.note),
             alone(plan.store.root, plan.out, watch.stop.is_set, console.note),
         ):
-            return _through_prefect(request)
+            return _through_prefect(request, home)
 
 
-def _through_prefect(request: RunRequest) -> dict[str, Any]:
+def _through_prefect(request: RunRequest, home: Path | None) -> dict[str, Any]:
     from prefect.client.orchestration import get_client
     from prefect.settings import get_current_settings
 
@@ -61,6 +63,8 @@ def _through_prefect(request: RunRequest) -> dict[str, Any]:
     with deaf_children():  # Prefect's server outlives a Ctrl-C, so that the run can end in order
         client = get_client(sync_client=True)
     with client:
+        if home is not None:
+            server_tables.keep(home)
         record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
     return record
 

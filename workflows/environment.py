@@ -26,13 +26,16 @@ def defaults() -> None:
         os.environ.setdefault(name, value)
 
 
-def settle(store: Path, out: Path) -> None:
+def settle(store: Path, out: Path) -> Path | None:
     """Prepare the environment for `neuface run`: a throw-away server unless PREFECT_API_URL names one.
 
-    The server's home lies in the store, one for each `out`: two runs on one SQLite file lock each other out.
+    The server's home lies in the store, one for each `out`: two runs on one SQLite file lock each other out. Hands back
+    the home of a server of our own.
     """
     defaults()
-    if "PREFECT_API_URL" not in os.environ:
-        own = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
-        home = Path(os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve())))
-        home.mkdir(parents=True, exist_ok=True)  # Prefect makes the last folder only
+    if "PREFECT_API_URL" in os.environ:
+        return None
+    own = hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:8]
+    home = Path(os.environ.setdefault("PREFECT_HOME", str((store / ".prefect" / own).resolve())))
+    home.mkdir(parents=True, exist_ok=True)  # Prefect makes the last folder only
+    return home
