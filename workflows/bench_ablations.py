@@ -23,6 +23,7 @@ from workflows.bench_rows import budget_of, kept, rows_with, shared_options
 from workflows.console import Console
 
 F32 = npt.NDArray[np.float32]
+Looks = tuple[float, float, float, float]
 OURS = "SH + neural bases, k = 3"
 
 
@@ -183,18 +184,24 @@ def measure(row: Row, given: argparse.Namespace, console: Console) -> Result:
     return Result(psnr, aligned, ssim, flip, chamfer(found, Path(given.capture)), seconds)
 
 
-def scores_of(view: CaptureView, found: dict[str, Located[Any]]) -> tuple[float, float, float, float]:
-    """PSNR, aligned PSNR, SSIM and FLIP of one held-out view."""
-    from pipeline.images import read_alpha, read_exr, read_linear, shrink
-    from stages.report import metrics
+def scores_of(view: CaptureView, found: dict[str, Located[Any]]) -> Looks:
+    """Of one held-out view, as the fit predicted it."""
+    from pipeline.images import read_exr
 
     fitted = found["inverse_rendering"]
     held = next(h for h in fitted.artifact.held_out if h.index == view.index)
-    rendered = read_exr(fitted.path(held.exr))[0]
+    return compared(read_exr(fitted.path(held.exr))[0], held.scale, view, found)
+
+
+def compared(rendered: F32, scale: int, view: CaptureView, found: dict[str, Located[Any]]) -> Looks:
+    """PSNR, aligned PSNR, SSIM and FLIP of a render, `scale` times smaller than the view's photo."""
+    from pipeline.images import read_alpha, read_linear, shrink
+    from stages.report import metrics
+
     mask_of = {m.index: m for m in found["masks"].artifact.masks}[view.index]
     photo, mask = read_linear(found["capture"].path(view.image)), read_alpha(found["masks"].path(mask_of.mask))
-    h, w = (n // held.scale * held.scale for n in photo.shape[:2])
-    photo, mask = shrink(photo[:h, :w], held.scale), shrink(mask[:h, :w], held.scale)
+    h, w = (n // scale * scale for n in photo.shape[:2])
+    photo, mask = shrink(photo[:h, :w], scale), shrink(mask[:h, :w], scale)
     s = metrics.score(rendered, photo, mask)
     return s.psnr, aligned_psnr(rendered[..., :3], photo, mask), s.ssim, float("nan") if s.flip is None else s.flip
 

@@ -11,29 +11,18 @@ import argparse
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from workflows import machine
 from workflows.bench_rows import budget_of, kept, rows_with, shared_options
 from workflows.console import Console
+from workflows.tradeoff_measure import Knob, Measured, measure
 from workflows.tradeoff_plot import plot
 
-ALBEDO_VIEWS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Knob:
-    """A point: its name and the settings of inverse_rendering that differ from the middle."""
-
-    name: str
-    settings: dict[str, Any] = field(default_factory=dict)
-
-
 MIDDLE = Knob("middle")
+PRESETS = tuple(Knob(f"preset {name}", preset=name) for name in ("draft", "studio", "film"))
 KNOBS = (
     MIDDLE,
     *(Knob(f"steps x {f:g}", {"steps": f}) for f in (0.5, 2.0, 4.0)),
@@ -52,21 +41,6 @@ KNOBS = (
     Knob("decided by evidence", {"rank": "auto", "light_order": "auto", "specular": "auto", "calibration": "auto"}),
     Knob("another seed", {"seed": 1}),
 )
-SCALED = ("steps", "batch")
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """Seconds of the fit's stage, peak memory (MB); dB, -, - over held-out views; mm and dB against the truth if it is
-    there (else NaN)."""
-
-    seconds: float
-    memory_mb: float
-    psnr: float
-    ssim: float
-    flip: float
-    chamfer: float
-    albedo: float
 
 
 def options(sub: argparse.ArgumentParser) -> None:
@@ -76,12 +50,13 @@ def options(sub: argparse.ArgumentParser) -> None:
     shared_options(sub, 300, "the middle point")
     sub.add_argument("--cells", type=int, default=192, help="its grid cells (%(default)s)")
     sub.add_argument("--points", default="", metavar="TEXT", help="only points with this text in their name")
+    sub.add_argument("--presets", default="", metavar="NAMES", help="also whole presets: draft,studio,film")
     sub.add_argument("--stop-after", type=float, metavar="S", help="begin no further point after S seconds")
 
 
 def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench tradeoff"""
-    chosen = rows_with(given.points, KNOBS, "--points", "point")
+    chosen = rows_with(given.points, KNOBS, "--points", "point") + presets_named(given.presets)
     out = Path(given.out)
     out.mkdir(parents=True, exist_ok=True)
     path, begun = out / "tradeoff.json", time.monotonic()
@@ -94,7 +69,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
             continue
         console.note(f"point {number} of {len(chosen)}: {knob.name}")
         found[knob.name] = machine.apart(measure, knob, given)
-        found = {k.name: found[k.name] for k in KNOBS if k.name in found}
+        found = {k.name: found[k.name] for k in (*KNOBS, *PRESETS) if k.name in found}
         points = {k: asdict(v) for k, v in found.items()}
         path.write_text(json.dumps({"machine": about, "budget": budget, "points": points}, indent=1) + "\n")
     text = "\n".join(report(about, budget, found))
@@ -106,104 +81,9 @@ def run(given: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
-    """What `--set` would say: the budget, the whole model, and the knob."""
-    values: dict[str, Any] = {
-        "steps": given.steps,
-        "image_side": given.side,
-        "batch": given.batch,
-        "grid_cells": given.cells,
-        "rank": 3,
-        "light_order": 10,
-        "specular": "on",
-        "relief": "on",
-        "resolution": "given",
-        "calibration": "off",
-    }
-    for k, v in knob.settings.items():
-        values[k] = round(v * values[k]) if k in SCALED else v
-    return (*(f"inverse_rendering.{k}={v}" for k, v in values.items()), "surface.resolution=160")
-
-
-def measure(knob: Knob, given: argparse.Namespace) -> Measured:
-    """Run a point up to the surface, or take it from the store, and score it."""
-    import pipeline.threads  # noqa: F401  (before torch, as in the command line)
-    from workflows.bench_ablations import chamfer, scores_of
-    from workflows.plan import RunRequest, make_plan
-    from workflows.runner import run_here, run_plan
-
-    plan = make_plan(
-        RunRequest(
-            capture=given.capture,
-            out=given.out,
-            store=given.store,
-            holdout=given.holdout,
-            device=given.device,
-            until="surface",
-            sets=settings_of(knob, given),
-        )
-    )
-    done = {d.stage: d for d in run_plan(plan, run_here(plan))}
-    found: dict[str, Any] = {name: d.located for name, d in done.items()}
-    fit = done["inverse_rendering"].run
-    views = [scores_of(v, found) for v in found["capture"].artifact.views if v.holdout]
-    mean = np.nanmean(np.array(views, np.float64), axis=0) if views else np.full(4, np.nan)
-    folder = Path(given.capture)
-    return Measured(
-        float(fit["seconds"]),
-        float(fit["peak_memory_mb"]),
-        float(mean[0]),
-        float(mean[2]),
-        float(mean[3]),
-        chamfer(found, folder),
-        albedo_error(found, folder),
-    )
-
-
-def albedo_error(found: dict[str, Any], folder: Path) -> float:
-    """PSNR (dB, sRGB) of the fitted albedo against truth/albedo in some held-out views, after one gain for all
-    channels, over pixels where both are; NaN without a truth."""
-    import torch
-
-    from pipeline.colour import srgb_from_linear
-    from pipeline.fields.face import load_model
-    from pipeline.images import read_exr
-    from stages.inverse_rendering.gather import camera_only
-    from stages.inverse_rendering.sightings import surface_points
-    from stages.inverse_rendering.views import Rays, image_rays
-
-    fitted = found["inverse_rendering"]
-    model = load_model(fitted.path(fitted.artifact.field))
-    cameras = {c.index: c for c in found["poses"].artifact.cameras}
-    mine, true = [], []
-    for held in fitted.artifact.held_out[:: max(len(fitted.artifact.held_out) // ALBEDO_VIEWS, 1)]:
-        path = folder / "truth" / "albedo" / f"{held.index}.exr"
-        if not path.is_file():
-            continue
-        picture = read_exr(path)[0][..., :3]
-        camera = cameras[held.index]
-        rays = image_rays(camera_only(camera), camera.width // picture.shape[1], "cpu")
-        flat = torch.from_numpy(np.ascontiguousarray(picture.reshape(-1, 3)))
-        for i in torch.nonzero(flat.sum(1) > 0.02).squeeze(-1).split(65_536):
-            x, hit = _met(model, Rays(rays.o[i], rays.d[i]), surface_points)
-            with torch.no_grad():
-                mine.append(model.spatial(x)[0])
-            true.append(flat[i][hit])
-    if not mine:
-        return float("nan")
-    a, b = torch.cat(mine), torch.cat(true)
-    a = a * ((a * b).sum() / (a * a).sum())
-    error = float(((srgb_from_linear(a.clamp(0, 1)) - srgb_from_linear(b.clamp(0, 1))) ** 2).mean())
-    return -10 * math.log10(max(error, 1e-10))
-
-
-def _met(model: Any, rays: Any, points: Any) -> tuple[Any, Any]:
-    """Where rays meet the surface, and which of them do."""
-    from pipeline.maths.tracing import box_interval
-
-    near, far = box_interval(rays.o, rays.d, *model.geometry.box())
-    _, hit, _ = model.geometry.trace(rays.o, rays.d, near, far)
-    return points(model.geometry, rays)[0], hit & (far > near)
+def presets_named(text: str) -> list[Knob]:
+    """Points of the presets in a list with commas. Raises UsageError at a name that is none."""
+    return [rows_with(f"preset {name.strip()}", PRESETS, "--presets", "preset")[0] for name in text.split(",") if text]
 
 
 def front(found: dict[str, Measured]) -> list[str]:
@@ -223,7 +103,7 @@ def report(about: dict[str, Any], budget: dict[str, Any], found: dict[str, Measu
     lines = [
         f"`neuface bench tradeoff`, capture {budget['capture']}, held out {budget['holdout']}. Middle: "
         f"{budget['steps']} steps of {budget['batch']} rays, photos of {budget['side']} px, {budget['cells']} cells, "
-        "the whole model.",
+        f"the whole model; presets as they are. All points are scored at {budget['side']} px.",
         f"Machine: {machine.told(about)}.",
         "",
         "| point | s | MB | PSNR (dB) | SSIM | FLIP | chamfer (mm) | albedo (dB) |",

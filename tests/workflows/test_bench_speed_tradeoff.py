@@ -12,10 +12,11 @@ import pytest
 
 from pipeline.errors import UsageError
 from stages.inverse_rendering.stage import Config
-from workflows import bench_speed, bench_tradeoff, machine
-from workflows.bench_tradeoff import KNOBS, Measured, front
+from workflows import bench_speed, bench_tradeoff, machine, tradeoff_measure
+from workflows.bench_tradeoff import KNOBS, front
 from workflows.cli import parser
 from workflows.console import Console
+from workflows.tradeoff_measure import Measured
 from workflows.tradeoff_plot import plot
 
 
@@ -99,7 +100,7 @@ def test_training_of_the_ball_is_timed() -> None:
 def test_every_point_is_a_setting_of_the_stage(tmp_path: Path) -> None:
     given = trade(tmp_path)
     for knob in KNOBS:
-        sets = dict(s.split("=", 1) for s in bench_tradeoff.settings_of(knob, given))
+        sets = dict(s.split("=", 1) for s in tradeoff_measure.settings_of(knob, given))
         own = {k.split(".", 1)[1]: v for k, v in sets.items() if k.startswith("inverse_rendering.")}
         config = Config(**own)
         for key, value in knob.settings.items():
@@ -138,6 +139,15 @@ def test_a_bench_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "Two seeds differ by" in text and "**" in text
     bench_tradeoff.run(trade(tmp_path, "--points", "k = 5", "--steps", "7"), Console())
     assert list(json.loads((out / "tradeoff.json").read_text())["points"]) == ["k = 5"]
+
+
+def test_presets_are_points_as_they_are(tmp_path: Path) -> None:
+    draft, studio = bench_tradeoff.presets_named("draft, studio")
+    assert (draft.preset, studio.preset) == ("draft", "studio")
+    assert tradeoff_measure.settings_of(studio, trade(tmp_path)) == ()
+    assert bench_tradeoff.presets_named("") == []
+    with pytest.raises(UsageError, match="no preset"):
+        bench_tradeoff.presets_named("hasty")
 
 
 def test_an_unknown_point_is_told(tmp_path: Path) -> None:
