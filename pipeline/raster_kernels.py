@@ -1,4 +1,4 @@
-"""Compiled inner loop of the rasteriser."""
+"""Compiled inner loops of the rasteriser."""
 
 # mypy: disable-error-code=no-untyped-def
 from __future__ import annotations
@@ -78,3 +78,31 @@ def _stripe(corners, candidates, size, first, last, reach, distance, face, weigh
                 if d <= reach and d < distance[r, column]:
                     distance[r, column], face[r, column] = d, f
                     weights[r, column, 0], weights[r, column, 1], weights[r, column, 2] = found[0], found[1], found[2]
+
+
+@njit(error_model="numpy", cache=True)
+def count_layers(corners, doubled, size, margin, out):
+    """Add 1 to out (size, size) at every texel centre that lies in a triangle and `margin` from its edges.
+
+    corners (F, 3, 2) texels; doubled (F,) twice the signed areas. Counts stop at 255.
+    """
+    for f in range(len(corners)):
+        c = corners[f]
+        sign = -1.0 if doubled[f] < 0 else 1.0
+        left = max(0, int(np.floor(min(c[0, 0], c[1, 0], c[2, 0]) - 0.5)))
+        right = min(size, int(np.ceil(max(c[0, 0], c[1, 0], c[2, 0]) - 0.5)) + 1)
+        top = max(0, int(np.floor(min(c[0, 1], c[1, 1], c[2, 1]) - 0.5)))
+        bottom = min(size, int(np.ceil(max(c[0, 1], c[1, 1], c[2, 1]) - 0.5)) + 1)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                x, y = column + 0.5, row + 0.5
+                inside = True
+                for i in range(3):
+                    ax, ay = c[i, 0], c[i, 1]
+                    sx, sy = c[(i + 1) % 3, 0] - ax, c[(i + 1) % 3, 1] - ay
+                    length = max(np.hypot(sx, sy), 1e-30)
+                    if sign * (sx * (y - ay) - sy * (x - ax)) / length <= margin:
+                        inside = False
+                        break
+                if inside and out[row, column] < 255:
+                    out[row, column] += 1
