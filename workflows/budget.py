@@ -62,12 +62,12 @@ COARSE = {
     "uv": {"target_faces": 20_000},
     "bake": {"size": 512},
 }
-FINE = {FIT: {"image_side": 768, "grid_cells": 384}, "uv": {"target_faces": 50_000}}
+FINE = {FIT: {"image_side": 768}, "uv": {"target_faces": 50_000}}
 RUNGS = (
     Rung("coarse", _of("draft", **COARSE), 0, 1.1, 25, 55),
     Rung("draft", _of("draft"), 4e6, 1.0, 35, 85),
-    Rung("fine", _of("studio", **FINE), 1.5e7, 1.0, 45, 130),
-    Rung("studio", _of("studio"), 3.5e7, 0.9, 60, 150),
+    Rung("fine", _of("studio", **FINE), 2e7, 1.0, 45, 130),
+    Rung("studio", _of("studio"), 3e7, 1.0, 60, 155),
     Rung("film", _of("film"), 2.5e8, 0.6, 200, 600),
 )
 
