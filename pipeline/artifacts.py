@@ -118,7 +118,8 @@ class CaptureView(Artifact):
 
     place_m: east, north and up in metres of the capture's first photo with a GPS position. clipped: picture of the
     pixels (255) whose value is at the end of the file's range, and so only a lower bound. exposure: what a grey's
-    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell.
+    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell. With a
+    colour chart, 1 in photo / exposure is what a perfect white sends from its place.
     """
 
     index: int
@@ -137,13 +138,42 @@ class CaptureView(Artifact):
     holdout: bool = False
 
 
+class ChartFound(Artifact):
+    """The colour chart as one camera saw it, in the photo where it fits best.
+
+    camera_group: as CaptureView has it. corners: (4, 2) pixels around the chart, from the first patch's (dark skin).
+    matrix: 3 x 3, reflectance of the chart from the photo's linear colours as it came, over its exposure. way: how much
+    of it was free. error: root mean square over patches left out, relative. white: linear colour that a perfect white
+    at the chart's place has in the photo.
+    """
+
+    camera_group: str
+    photo: str
+    index: int
+    corners: Matrix
+    matrix: Matrix
+    way: Literal["gains", "matrix"]
+    error: float
+    patches: int
+    white: tuple[float, float, float]
+
+
+class ColourChart(Artifact):
+    """The colour chart of a capture, to whose white all photos were brought. photos: names of those that show it."""
+
+    photos: tuple[str, ...]
+    fits: tuple[ChartFound, ...]
+
+
 class Capture(Artifact):
     """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
-    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource."""
+    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource. chart: None where
+    none is seen, or none was looked for."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
     colours_drift: bool = False
+    chart: ColourChart | None = None
     metres_from_world: Matrix | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()

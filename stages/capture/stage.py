@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, field_validator
 
-from pipeline.artifacts import Capture, CaptureSource, CaptureView, FileRef, GivenCamera, Located
+from pipeline.artifacts import Capture, CaptureSource, CaptureView, ColourChart, FileRef, GivenCamera, Located
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError
 from stages.capture.holdout import check_rule, held_out
@@ -33,6 +33,12 @@ class Config(StageConfig):
     min_views: int = Field(3, ge=3, description="fewest views that must remain for the fit")
     frames: int = Field(60, ge=8, le=500, description="frames to take from a film, spread over the camera's way")
     drop_blurred: bool = Field(True, description="leave out photos with far less detail than the others")
+
+    chart: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="a colour chart of 24 patches in some photos: off: not looked for; on: must be found; its white "
+        "becomes the photos' white and unit",
+    )
 
     @field_validator("holdout")
     @classmethod
@@ -83,7 +89,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     found = _candidates(source)
     given = source.artifact.cameras != ()
     candidates = _without_doubles(found, given)
-    photos = [_photo(source, c, done, len(candidates), context) for done, c in enumerate(candidates)]
+    photos = [_photo(source, c, (done, len(candidates)), config, context) for done, c in enumerate(candidates)]
     candidates, photos = _useful(candidates, photos, found, config)
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], found.absent)
     if config.holdout != "none" and not held:
@@ -92,9 +98,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     views = [_view(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
     views = _with_exposures(_with_places(views, photos), photos, found.warnings)
+    views, chart = _with_chart(views, photos, found.warnings, config, context)
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     warnings = found.warnings + _foreign_colours(candidates, photos) + _partly_masked(views)
-    return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift,
+    return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world,
                    left_out=tuple(found.left_out), warnings=tuple(warnings))  # fmt: skip
 
@@ -158,13 +165,15 @@ def _without_doubles(found: _Found, given: bool) -> list[_Candidate]:
     return kept
 
 
-def _photo(source: Located[CaptureSource], candidate: _Candidate, done: int, total: int, context: Context) -> Gathered:
+def _photo(
+    source: Located[CaptureSource], candidate: _Candidate, done: tuple[int, int], config: Config, context: Context
+) -> Gathered:
     from stages.capture.gather import gather_photo
 
     context.check()
-    context.progress(done, total, f"checking {candidate.name}")
+    context.progress(*done, f"checking {candidate.name}")
     target = context.workdir / "photos" / _stored_name(candidate)
-    return gather_photo(source.path(candidate.ref), candidate.ref, target, candidate.size)
+    return gather_photo(source.path(candidate.ref), candidate.ref, target, candidate.size, chart=config.chart != "off")
 
 
 def _stored_name(candidate: _Candidate) -> str:
@@ -250,6 +259,24 @@ def _with_exposures(views: list[CaptureView], photos: list[Gathered], warnings: 
     return [v.model_copy(update={"exposure": round(e, 6)}) for v, e in zip(views, found, strict=True)]
 
 
+def _with_chart(
+    views: list[CaptureView], photos: list[Gathered], warnings: list[str], config: Config, context: Context
+) -> tuple[list[CaptureView], ColourChart | None]:
+    """The views in the colours of the chart that some of them show, and what it said; as they are without one."""
+    from stages.capture.charted import bring_to, read_charts
+
+    said = read_charts(views, [p.chart for p in photos], config.chart == "on")
+    warnings += said.told
+    if said.chart is None:
+        return views, None
+
+    def tick(done: int, name: str) -> None:
+        context.check()
+        context.progress(done, len(views), f"bringing {name} to the chart's white")
+
+    return bring_to(said.chart, views, context.workdir, tick), said.chart
+
+
 def _plate(
     source: Located[CaptureSource], candidate: _Candidate, photo: Gathered, warnings: list[str], context: Context
 ) -> FileRef | None:
@@ -301,4 +328,4 @@ def _partly_masked(views: list[CaptureView]) -> list[str]:
     return [f"only {masked} of {len(views)} views have a mask"] if 0 < masked < len(views) else []
 
 
-STAGE = Stage(name="capture", version=3, inputs=Inputs, config=Config, output=Capture, run=run)
+STAGE = Stage(name="capture", version=4, inputs=Inputs, config=Config, output=Capture, run=run)
