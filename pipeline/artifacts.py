@@ -221,7 +221,8 @@ class CameraSet(Artifact):
 class ViewMask(Artifact):
     """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
 
-    labels: where a face was found, PNG of 0 background, 1 subject, 2 face, 3 eyes.
+    labels: where face or hair was found, PNG of codes, whose names MaskSet.label_names has. labelled: the names of
+    those in this photo, the background not among them.
     """
 
     index: int
@@ -230,12 +231,15 @@ class ViewMask(Artifact):
     coverage: float
     hull_iou: float | None = None
     labels: FileRef | None = None
+    labelled: tuple[str, ...] = ()
 
 
 class MaskSet(Artifact):
-    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted."""
+    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted. label_names: of
+    the codes 0, 1, ... in the views' labels."""
 
     masks: tuple[ViewMask, ...]
+    label_names: tuple[str, ...] = ()
     dropped: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
 

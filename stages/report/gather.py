@@ -72,7 +72,8 @@ def figures(r: Results) -> dict[str, Any]:
         "masks": {
             "views": len(r.masks.artifact.masks),
             "dropped": len(r.masks.artifact.dropped),
-            "faces": sum(m.labels is not None for m in r.masks.artifact.masks),
+            "faces": sum("face" in m.labelled for m in r.masks.artifact.masks),
+            "hair": sum("hair" in m.labelled for m in r.masks.artifact.masks),
         },
         "surface": {
             "vertices": surface.vertices,
