@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     UsdAsset,
     UvMesh,
 )
+from stages.report.chart import chart_figures
 
 
 class Started(Protocol):
@@ -68,7 +69,7 @@ def figures(r: Results) -> dict[str, Any]:
             "unregistered": len(cameras.unregistered),
             "reprojection_error_px": cameras.reprojection_error_px,
         },
-        "colour_chart": _chart(r.capture.artifact),
+        "colour_chart": chart_figures(r),
         "masks": {
             "views": len(r.masks.artifact.masks),
             "dropped": len(r.masks.artifact.dropped),
@@ -115,19 +116,6 @@ def figures(r: Results) -> dict[str, Any]:
             **usd.figures,
         },
         "warnings": warnings(r),
-    }
-
-
-def _chart(capture: Capture) -> dict[str, Any]:
-    """What a colour chart said, by camera; `found` alone where there was none."""
-    if capture.chart is None:
-        return {"found": 0}
-    fits = {f.camera_group or "camera": f for f in capture.chart.fits}
-    return {
-        "found": len(capture.chart.photos),
-        "fixes": "white balance, and the photos' unit; not the albedo's scale",
-        **{f"{name}: error of its patches": f.error for name, f in fits.items()},
-        **{f"{name}: white before": ", ".join(f"{w:.3f}" for w in f.white) for name, f in fits.items()},
     }
 
 

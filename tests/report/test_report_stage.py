@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
-from pipeline.artifacts import ChartFound, ColourChart, Located
+from pipeline.artifacts import Located
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from stages.report.page import with_timing
@@ -170,18 +170,6 @@ def test_what_stages_left_out_becomes_a_warning(results: SyntheticResults, tmp_p
     assert "x.jpg" in text
     assert "scale is unknown" in text
     assert "y.jpg: blurred <b>" in "".join(Page(page).words)  # escaped, not markup
-
-
-def test_a_colour_chart_has_its_table(results: SyntheticResults, made: tuple[dict, str], tmp_path: Path) -> None:
-    assert made[0]["colour_chart"] == {"found": 0} and "Colour chart" not in made[1]
-    fit = ChartFound(camera_group="A 1", photo="3.jpg", index=3, corners=((0, 0), (6, 0), (6, 4), (0, 4)),
-                     matrix=((1, 0, 0), (0, 2, 0), (0, 0, 4)), way="gains", error=0.02, patches=23,
-                     white=(1.0, 0.5, 0.25))  # fmt: skip
-    capture = results.capture.artifact.model_copy(update={"chart": ColourChart(photos=("3.jpg", "4.jpg"), fits=(fit,))})
-    changed = replace(results, capture=Located(capture, results.capture.folder))
-    metrics, page = run(changed, tmp_path / "work")
-    assert metrics["colour_chart"]["found"] == 2 and metrics["colour_chart"]["A 1: error of its patches"] == 0.02
-    assert "Colour chart" in page and "1.000, 0.500, 0.250" in page and "not the albedo" in page
 
 
 def test_a_cancelled_report_stops(results: SyntheticResults, tmp_path: Path) -> None:
