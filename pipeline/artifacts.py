@@ -118,8 +118,7 @@ class CaptureView(Artifact):
 
     place_m: east, north and up in metres of the capture's first photo with a GPS position. clipped: picture of the
     pixels (255) whose value is at the end of the file's range, and so only a lower bound. exposure: what a grey's
-    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell. With a
-    colour chart, 1 in photo / exposure is what a perfect white sends from its place.
+    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell.
     """
 
     index: int
@@ -159,9 +158,11 @@ class ChartFound(Artifact):
 
 
 class ColourChart(Artifact):
-    """The colour chart of a capture, to whose white all photos were brought. photos: names of those that show it."""
+    """The colour chart of a capture, to whose white all photos were brought. photos: names of those that show it.
+    level: linear value, over the photo's exposure, of a perfect white at the chart's place in the capture's files."""
 
     photos: tuple[str, ...]
+    level: float
     fits: tuple[ChartFound, ...]
 
 

@@ -1,8 +1,8 @@
 """A capture in whose photos a colour chart was found: all photos brought to the chart's white, and how.
 
-Symbols: c linear colour of a photo, e its exposure, M its camera's map to reflectances (stages.capture.gauge). What the
-fit is to see is M c / e. Stored is k M c, with the largest k at which every colour of every photo is within a file's
-range, and k e as the photo's exposure, by which the fit divides.
+Symbols: c linear colour of a photo, e its exposure, M its camera's map to reflectances (stages.capture.gauge). Stored
+is k M c, with the largest k up to 1 at which every colour of every photo is within a file's range; k is the chart's
+`level`: a perfect white at its place has k e in a stored photo. e stays what EXIF says of it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def read_charts(views: Sequence[CaptureView], found: Sequence[Patches | None], w
     if not best:
         return Charted(None, told)
     fits = tuple(_fit(*b) for _, b in sorted(best.items()))
-    return Charted(ColourChart(photos=tuple(seen), fits=fits), told)
+    k = 1 / max(1.0, *(float(matrix(f.matrix).clip(0).sum(1).max()) for f in fits))
+    return Charted(ColourChart(photos=tuple(seen), level=round(k, 6), fits=fits), told)
 
 
 def _unexposed(patches: Patches, exposure: float) -> Patches:
@@ -76,39 +77,34 @@ def bring_to(
     chart: ColourChart, views: Sequence[CaptureView], folder: Path, tick: Callable[[int, str], None]
 ) -> list[CaptureView]:
     """The views with photos (and clean plates) in the chart's colours, whose files take the place of the copies in
-    `folder`, and with the exposures that go with them. Cameras that saw no chart get the mean of the others' maps.
-    tick: done, name."""
-    of = {f.camera_group: matrix(f.matrix) for f in chart.fits}
+    `folder`. Cameras that saw no chart get the mean of the others' maps. tick: done, name."""
+    of = {f.camera_group: chart.level * matrix(f.matrix) for f in chart.fits}
     mean = np.asarray(np.mean(list(of.values()), axis=0), np.float64)
-    k = 1 / max(1.0, *(float(m.clip(0).sum(1).max()) for m in of.values()))
     out = []
     for n, view in enumerate(views):
         tick(n, view.name)
         m = of.get(view.camera_group, mean)
-        path, scale = recoloured(folder / view.image.path, m, k)
-        changed = {"image": FileRef.of(folder, path), "exposure": round(view.exposure * scale, 6)}
+        changed = {"image": FileRef.of(folder, recoloured(folder / view.image.path, m))}
         if view.plate is not None:
-            changed["plate"] = FileRef.of(folder, recoloured(folder / view.plate.path, m, k)[0])
+            changed["plate"] = FileRef.of(folder, recoloured(folder / view.plate.path, m))
         out.append(view.model_copy(update=changed))
     return out
 
 
-def recoloured(path: Path, m: F64, k: float) -> tuple[Path, float]:
-    """Write k M c in the place of a photo: 16-bit PNG; or M c of a float file, EXR. The new file, and k or 1. Colours
-    that no Rec.709 light has are clamped at 0."""
+def recoloured(path: Path, m: F64) -> Path:
+    """Write m c in the place of a photo, as 16-bit PNG, or EXR of a float file; the new file. Colours that no Rec.709
+    light has are clamped at 0."""
     image = read_encoded(path)
-    whole = np.issubdtype(image.dtype, np.integer)
-    k = k if whole else 1.0
-    colours = np.asarray((read_linear(path) @ (k * m).T.astype(np.float32)).clip(0), np.float32)
+    colours = np.asarray((read_linear(path) @ m.T.astype(np.float32)).clip(0), np.float32)
     path.unlink()
-    if not whole:
+    if not np.issubdtype(image.dtype, np.integer):
         target = path.with_suffix(".exr")
         write_exr(target, colours)
-        return target, k
+        return target
     encoded = np.asarray(srgb_from_linear(colours), np.float32)
     if image.shape[2] == 4:
         alpha = image[..., 3:].astype(np.float32) / np.float32(np.iinfo(image.dtype.name).max)
         encoded = np.concatenate([encoded, alpha], 2)
     target = path.with_suffix(".png")
     write_png(target, encoded, bits=16)
-    return target, k
+    return target

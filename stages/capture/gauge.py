@@ -8,8 +8,8 @@ a diagonal of three gains. Light that is uneven over the chart brightens its pat
 is linear in M, a and b, and is solved with weights 1 / (Y_i + 0.1), Y_i the patch's luminance: relative errors count,
 absolute ones in the dark. Every figure of quality is from patches that were left out of their own solution.
 
-What this fixes is white balance, and the unit: 1 is what a perfect white sends from the chart's place. It can't fix the
-scale of the albedo, because how much light falls on the head and how much on the chart are two numbers.
+What this fixes is white balance, and the unit: M c = 1 is what a perfect white sends from the chart's place. It can't
+fix the scale of the albedo, because how much light falls on the head and how much on the chart are two numbers.
 
 Differs: the paper's captures have one camera response each, and its colours no white but that of its losses.
 """

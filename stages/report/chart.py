@@ -1,9 +1,8 @@
 """What the colour chart says of the fit: its own errors, and whether the fitted light would light it as it was lit.
 
 Symbols: n normal of the chart; E(n) irradiance of the fitted light, without shadows; a perfect white sends E(n) / pi.
-The photos' unit is what a perfect white sent from the chart, so that E(n) / pi is 1 if the chart stood in the light that
-fell on the head, unshadowed, and the fitted light has the right scale. If it is f, the chart bears out f times the
-albedo.
+In the photos it sent the chart's level. Both are alike if the chart stood in the light that fell on the head, unshadowed,
+and the fitted light has the right scale. If they are f : 1, the chart bears out f times the albedo.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def chart_figures(r: Charted) -> dict[str, Any]:
         out[f"{name}: white before"] = ", ".join(f"{w:.3f}" for w in fit.white)
         if fit.index in cameras:
             lit = white_under(coefficients, normal_of(fit.corners, cameras[fit.index]))
-            out[f"{name}: fitted light on it, of what fell on it"] = round(float(lit @ np.array(LUMA)), 4)
+            out[f"{name}: fitted light on it, of what fell on it"] = round(float(lit @ np.array(LUMA)) / chart.level, 4)
     return out
 
 

@@ -70,7 +70,7 @@ def test_the_page_has_a_table_of_it(tmp_path: Path) -> None:
                      way="gains", error=0.02, patches=23, white=(1.0, 0.5, 0.25))  # fmt: skip
     lost = fit.model_copy(update={"camera_group": "B", "index": 999})
     capture = results.capture.artifact.model_copy(
-        update={"chart": ColourChart(photos=("3.jpg", "4.jpg"), fits=(fit, lost))}
+        update={"chart": ColourChart(photos=("3.jpg", "4.jpg"), level=0.5, fits=(fit, lost))}
     )
     light = [[np.sqrt(4 * np.pi) * 0.8] * 3] + [[0.0] * 3] * 3
     folder = results.inverse_rendering.folder
@@ -81,6 +81,6 @@ def test_the_page_has_a_table_of_it(tmp_path: Path) -> None:
     metrics, page = run(changed, tmp_path / "one")
     found = metrics["colour_chart"]
     assert found["found"] == 2 and found["A 1: error of its patches"] == 0.02
-    assert found["A 1: fitted light on it, of what fell on it"] == pytest.approx(0.8)
+    assert found["A 1: fitted light on it, of what fell on it"] == pytest.approx(1.6)
     assert not any(k.startswith("B: fitted") for k in found)  # its photo has no place
     assert "Colour chart" in page and "1.000, 0.500, 0.250" in page and "not the albedo" in page
