@@ -1,8 +1,8 @@
 """What the colour chart says of the fit: its own errors, and whether the fitted light would light it as it was lit.
 
 Symbols: n normal of the chart; E(n) irradiance of the fitted light, without shadows; a perfect white sends E(n) / pi.
-In the photos it sent the chart's level. Both are alike if the chart stood in the light that fell on the head, unshadowed,
-and the fitted light has the right scale. If they are f : 1, the chart bears out f times the albedo.
+In the photos it sent the chart's level. Both are alike if the chart stood in the light that fell on the head, out of
+shadows, and the fitted light has the right scale. If they are f : 1, the chart bears out f times the albedo.
 """
 
 from __future__ import annotations
