@@ -21,6 +21,8 @@ F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 WORKING = 1000  # pixels, longest edge, at which it is looked for
+THUMBNAIL, DIM, HUE, HUE_PIXELS = 250, 0.03, 0.04, 6  # pixels; sum of a pixel's channels; cell of chromaticity; pixels
+HUES = 24  # cells from which a chart is looked for: drawn ones have 35 to 110, a head before black 11 to 20
 STEP = 48  # pixels between the detector's threshold windows: its own 16 finds hardly more and takes three times as long
 COLUMNS, ROWS = 6, 4
 PATCHES = COLUMNS * ROWS
@@ -68,7 +70,7 @@ def find_chart(image: npt.NDArray[np.generic]) -> Patches | None:
 
     The search is OpenCV's (`cv2.mcc`), by contours and not by its network, which the wheel does not hold.
     """
-    if image.shape[2] < 3:
+    if image.shape[2] < 3 or hues(_shown(image, min(1.0, THUMBNAIL / max(image.shape[:2])))) < HUES:
         return None
     scale = min(1.0, WORKING / max(image.shape[:2]))
     detector: Any = cv2.mcc.CCheckerDetector.create()
@@ -87,6 +89,17 @@ def find_chart(image: npt.NDArray[np.generic]) -> Patches | None:
         return None
     corners = _settled(small, _mapped(np.asarray(start, np.float64), CORNERS))
     return _measured(image, (corners + 0.5) / scale)
+
+
+def hues(small: npt.NDArray[Any]) -> int:
+    """How many chromaticities there are in a small picture, 8-bit sRGB. Any one light moves them all, and leaves a
+    chart with more of them than most heads and walls have: whatever has fewer need not be searched."""
+    linear = np.asarray(linear_from_srgb(np.arange(256) / 255), np.float32)[small].reshape(-1, 3)
+    total = linear.sum(1)
+    shown = total > DIM
+    cell = np.floor(linear[shown, :2] / total[shown, None] / HUE).astype(np.int64)
+    counts = np.bincount(cell[:, 0] * round(2 / HUE) + cell[:, 1])
+    return int((counts >= HUE_PIXELS).sum())
 
 
 def _settled(small: npt.NDArray[Any], corners: F64) -> F64:

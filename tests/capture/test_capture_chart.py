@@ -12,7 +12,7 @@ from skimage.color import lab2xyz
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_linear, write_exr
-from stages.capture.chart import PATCHES, REFLECTANCES, Patches, find_chart, places
+from stages.capture.chart import HUES, PATCHES, REFLECTANCES, Patches, find_chart, hues, places
 from stages.capture.gauge import Gauge, gauge_of
 
 LAB = np.array([
@@ -100,6 +100,17 @@ def test_files_of_any_depth_and_uneven_light() -> None:
         assert isinstance(gauge, Gauge) and close_to(gauge.matrix, np.linalg.inv(scale * CAMERA))
     assert find_chart(eight[..., :1]) is None  # a grey photo has no colours to tell
     assert find_chart(encoded(NOISE)) is None
+
+
+@pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (0.9, 0.45, 0.15), (0.15, 0.3, 0.7), (0.1, 0.1, 0.1)])
+def test_plain_photos_are_not_searched_and_charts_in_any_light_are(light: tuple[float, float, float]) -> None:
+    thumb = cv2.resize(encoded(SCENE * light), None, fx=250 / 560, fy=250 / 560, interpolation=cv2.INTER_AREA)
+    assert hues(thumb) > 1.2 * HUES
+    skin = encoded(np.linspace(0.02, 0.9, 560)[:, None] * np.array([0.6, 0.4, 0.3]) * light + 1e-4)[None]
+    assert hues(np.repeat(skin, 200, 0)) < HUES and hues(np.zeros((50, 50, 3), np.uint8)) == 0
+    even = np.zeros((20, 20, 3), np.uint8)  # oracle: four colours by hand, each with a hundred pixels
+    even[:10, :10], even[:10, 10:], even[10:, :10], even[10:, 10:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (99, 99, 99)
+    assert hues(even) == 4
 
 
 def exact(camera: np.ndarray) -> Patches:
