@@ -86,7 +86,7 @@ def without_doubles(found: Found, given: bool) -> list[Candidate]:
             kept.append(c)
             found.warnings.append(f"{c.name} is the same file as {other}, with another camera; take one of them out")
         else:
-            found.leave_out(c, f"it is the same file as {other}")
+            found.leave_out(c, f"it is the same file as {other}; put the photo there that was meant, or remove it")
     return kept
 
 
