@@ -113,7 +113,7 @@ def main() -> None:
         print(compare_cameras(found, known))
     if args.masks:
         masks: Located[MaskSet] = execute(MASKS, MasksInputs(capture, poses), configs["masks"], store).located
-        faces = sum(m.labels is not None for m in masks.artifact.masks)
+        faces = sum("face" in m.labelled for m in masks.artifact.masks)
         print(f"{compare_masks(masks, args.masks)}; not fitted: {masks.artifact.dropped}; faces: {faces}")
 
 

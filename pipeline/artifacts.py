@@ -137,13 +137,44 @@ class CaptureView(Artifact):
     holdout: bool = False
 
 
+class ChartFound(Artifact):
+    """The colour chart as one camera saw it, in the photo where it fits best.
+
+    camera_group: as CaptureView has it. corners: (4, 2) pixels around the chart, from the first patch's (dark skin).
+    matrix: 3 x 3, reflectance of the chart from the photo's linear colours as it came, over its exposure. way: how much
+    of it was free. error: root mean square over patches left out, relative. white: linear colour that a perfect white
+    at the chart's place has in the photo.
+    """
+
+    camera_group: str
+    photo: str
+    index: int
+    corners: Matrix
+    matrix: Matrix
+    way: Literal["gains", "matrix"]
+    error: float
+    patches: int
+    white: tuple[float, float, float]
+
+
+class ColourChart(Artifact):
+    """The colour chart of a capture, to whose white all photos were brought. photos: names of those that show it.
+    level: linear value, over the photo's exposure, of a perfect white at the chart's place in the capture's files."""
+
+    photos: tuple[str, ...]
+    level: float
+    fits: tuple[ChartFound, ...]
+
+
 class Capture(Artifact):
     """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
-    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource."""
+    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource. chart: None where
+    none is seen, or none was looked for."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
     colours_drift: bool = False
+    chart: ColourChart | None = None
     metres_from_world: Matrix | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -191,7 +222,8 @@ class CameraSet(Artifact):
 class ViewMask(Artifact):
     """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
 
-    labels: where a face was found, PNG of 0 background, 1 subject, 2 face, 3 eyes.
+    labels: where face or hair was found, PNG of codes, whose names MaskSet.label_names has. labelled: the names of
+    those in this photo, the background not among them.
     """
 
     index: int
@@ -200,12 +232,15 @@ class ViewMask(Artifact):
     coverage: float
     hull_iou: float | None = None
     labels: FileRef | None = None
+    labelled: tuple[str, ...] = ()
 
 
 class MaskSet(Artifact):
-    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted."""
+    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted. label_names: of
+    the codes 0, 1, ... in the views' labels."""
 
     masks: tuple[ViewMask, ...]
+    label_names: tuple[str, ...] = ()
     dropped: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from pipeline.artifacts import FileRef, sha256_of
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, refuse_bombs
+from stages.capture.chart import Patches, find_chart
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
 from stages.capture.photometry import clipped, mean_light
@@ -31,7 +32,8 @@ _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True
 class Gathered:
     """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
     stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one.
-    clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance."""
+    clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance.
+    chart: a colour chart in it, where one was looked for and seen."""
 
     image: Path
     width: int
@@ -42,6 +44,7 @@ class Gathered:
     profile: str | None = None
     clipped: Path | None = None
     light: float = 0.0
+    chart: Patches | None = None
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
@@ -51,9 +54,12 @@ def turn_upright(image: Image, orientation: int) -> Image:
     return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)
 
 
-def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None) -> Gathered:
+def gather_photo(
+    path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False
+) -> Gathered:
     """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be turned).
 
+    chart: look for a colour chart.
     declared: (width, height) that the camera's description gives, or None. A given camera belongs to the
     stored pixels if their size is the declared one; then nothing is turned, whatever EXIF says.
     Raises StageError if the file is not whole, too small or large, not finite, or not of the declared size.
@@ -84,13 +90,14 @@ def gather_photo(path: Path, ref: FileRef, target: Path, declared: tuple[int, in
     target.parent.mkdir(parents=True, exist_ok=True)
     if turn:
         target = target.with_suffix(".png")
-        _write_png(target, turn_upright(image, exif.orientation))
+        image = turn_upright(image, exif.orientation)
+        _write_png(target, image)
     else:
         target.write_bytes(data)
     grey = small_grey(image)
     sharpness = None if is_blank(grey) else detail(grey)
-    ends = _write_clipped(turn_upright(image, exif.orientation) if turn else image, target)
-    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data), ends, mean_light(grey))
+    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data), _write_clipped(image, target),
+                    mean_light(grey), find_chart(image) if chart else None)  # fmt: skip
 
 
 def _write_clipped(image: Image, photo: Path) -> Path | None:

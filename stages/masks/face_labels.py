@@ -1,8 +1,9 @@
-"""Where the face and its eyes are in a photo: skin, and what the skin model does not know.
+"""Where the face, its eyes and the hair are in a photo: skin, and what the skin model does not know.
 
-Labels: 0 background, 1 subject, 2 face, 3 eyes. The face is the hull of its landmarks, the eyes are what lies between
-the lids (pipeline.faces). Closed eyes are labelled as open ones are: the landmarks hardly differ. Hair and beard have
-no label of their own, for no network at hand that may be passed on knows them.
+Labels are codes, LABELS their names. The face is the hull of its landmarks, the eyes are what lies between the lids
+(pipeline.faces). Closed eyes are labelled as open ones are: the landmarks hardly differ. Hair is what a network of the
+user's calls so, for none that may be passed on is at hand; without one it is subject, or face. Colour does not tell it:
+the stubble of shaved heads is as far from their skin as fair hair is from other skin.
 """
 
 from __future__ import annotations
@@ -14,24 +15,45 @@ import numpy.typing as npt
 from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face, find_face
 from pipeline.transforms import F64
 from stages.masks.region import F32, U8, Disc, eroded
+from stages.masks.user_model import UserModel
 
-SUBJECT, FACE, EYES = 1, 2, 3
+LABELS = ("background", "subject", "face", "eyes", "hair")
+SUBJECT, FACE, EYES, HAIR = 1, 2, 3, 4
 REACH = 1.2  # radii of the region of interest in which a face is looked for
+CROP, SURE = 1.3, 0.5  # half-edge of what the network for hair sees, in such radii; probability that counts
 INSIDE = 0.85  # share of its points that must lie on the subject: a picture on the wall is no face of theirs
 
 
-def face_labels(image: U8, alpha: F32, disc: Disc) -> U8 | None:
-    """(H, W) labels of a photo (H, W, 3) 8-bit sRGB with its mask (H, W), or None without a face on the subject."""
-    face = find_face(image, disc.x, disc.y, REACH * disc.radius, disc.roll)
-    if face is None or on_subject(face, alpha) < INSIDE:
-        return None
+def face_labels(image: U8, alpha: F32, disc: Disc, hair: UserModel | None = None) -> U8 | None:
+    """(H, W) labels of a photo (H, W, 3) 8-bit sRGB with its mask (H, W), or None without face and hair.
+
+    hair: the user's network, if there is one; it has the last word, but for the eyes."""
     out = (alpha >= 0.5).astype(np.uint8) * SUBJECT
-    # the hull and not the oval around the face, which runs through the nose where it is seen from the side
-    hull = cv2.convexHull(face.points.astype(np.float32)).reshape(-1, 2)
-    _fill(out, hull.astype(np.float64), FACE)
-    for eye in (RIGHT_EYE, LEFT_EYE):
-        _fill(out, face.points[list(eye)], EYES)
-    return out
+    face = find_face(image, disc.x, disc.y, REACH * disc.radius, disc.roll)
+    if face is not None and on_subject(face, alpha) >= INSIDE:
+        # the hull and not the oval around the face, which runs through the nose where it is seen from the side
+        hull = cv2.convexHull(face.points.astype(np.float32)).reshape(-1, 2)
+        _fill(out, hull.astype(np.float64), FACE)
+        for eye in (RIGHT_EYE, LEFT_EYE):
+            _fill(out, face.points[list(eye)], EYES)
+    if hair is not None:
+        out[(out > 0) & (out != EYES) & (_probability(image, disc, hair) >= SURE)] = HAIR
+    return out if out.max() > SUBJECT else None
+
+
+def _probability(image: U8, disc: Disc, model: UserModel) -> F32:
+    """(H, W) of hair: the network sees the upright square around the region of interest, its edges repeated."""
+    h, w = image.shape[:2]
+    scale = 2 * CROP * disc.radius / model.side
+    c, s = np.cos(disc.roll) * scale, np.sin(disc.roll) * scale
+    turn = np.array([[c, -s], [s, c]])  # photo position = centre + turn (network's position - middle)
+    shift = np.array([disc.x - 0.5, disc.y - 0.5]) - turn @ np.array([model.side / 2 - 0.5] * 2)
+    photo_from_net = np.concatenate([turn, shift[:, None]], 1)
+    blurred = cv2.GaussianBlur(image, (0, 0), 0.4 * scale) if scale > 1.3 else image  # against aliasing
+    square = cv2.warpAffine(blurred, photo_from_net, (model.side, model.side),
+                            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+    found = model.probability(np.asarray(square, np.uint8))
+    return np.asarray(cv2.warpAffine(found, photo_from_net, (w, h), flags=cv2.INTER_LINEAR), np.float32)
 
 
 def on_subject(face: Face, alpha: F32) -> float:

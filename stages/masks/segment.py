@@ -19,7 +19,7 @@ from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
-from stages.masks.face_labels import face_labels
+from stages.masks.face_labels import LABELS, face_labels
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, distinct, find_solid
@@ -32,6 +32,7 @@ CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
 COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull may find wrong
+Labelled = tuple[Path, tuple[str, ...]]
 T = TypeVar("T")
 R = TypeVar("R")
 
@@ -50,6 +51,7 @@ class Settings:
     seed: int
     model: UserModel | None = None
     faces: bool = True
+    hair: UserModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +98,11 @@ def segment(
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
     dropped = _dropped(masked, settings, warnings)
-    faces = _each(lambda m: _labels(m, context), masked, context, "looking for a face") if settings.faces else []
-    seen = {m.view.index: f for m, f in zip(masked, faces, strict=False) if f is not None}
-    made = tuple(_manifest(m, seen.get(m.view.index), context) for m in masked)
-    return MaskSet(masks=made, dropped=tuple(dropped), warnings=tuple(warnings))
+    labels: list[Labelled | None] = [None] * len(masked)
+    if settings.faces:
+        labels = _each(lambda m: _labels(m, settings.hair, context), masked, context, "looking for a face")
+    made = tuple(_manifest(m, found, context) for m, found in zip(masked, labels, strict=True))
+    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings))
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
@@ -270,17 +273,18 @@ def _enough(left: int, views: int, warnings: list[str]) -> None:
                          "choose another masks.method")  # fmt: skip
 
 
-def _labels(m: Masked, context: Context) -> Path | None:
-    """The file of the labels of a photo that shows the subject's face, else None."""
-    labels = face_labels(m.view.read(), read_alpha(_path(m.view.index, context)), m.view.disc)
+def _labels(m: Masked, hair: UserModel | None, context: Context) -> Labelled | None:
+    """The file of the labels of a photo that shows the subject's face or hair, and which they are; else None."""
+    labels = face_labels(m.view.read(), read_alpha(_path(m.view.index, context)), m.view.disc, hair)
     if labels is None:
         return None
     path = context.workdir / "labels" / f"{m.view.index}.png"
     write_png(path, labels / 255)
-    return path
+    return path, tuple(LABELS[i] for i in np.unique(labels) if i)
 
 
-def _manifest(m: Masked, labels: Path | None, context: Context) -> ViewMask:
+def _manifest(m: Masked, labels: Labelled | None, context: Context) -> ViewMask:
     return ViewMask(index=m.view.index, mask=context.file(_path(m.view.index, context)), source=m.source,
                     coverage=round(m.coverage, 6), hull_iou=None if m.iou is None else round(m.iou, 4),
-                    labels=None if labels is None else context.file(labels))  # fmt: skip
+                    labels=None if labels is None else context.file(labels[0]),
+                    labelled=() if labels is None else labels[1])  # fmt: skip

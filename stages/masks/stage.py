@@ -43,25 +43,43 @@ class Config(StageConfig):
     max_deviation: float = Field(
         0.05, gt=0, le=1, description="IoU below the median from which a mask may be an outlier"
     )
-    faces: bool = Field(True, description="label face and eyes in the photos that show them")
+    faces: bool = Field(True, description="label face and eyes in the photos that show them, and hair (hair_model)")
+    hair_model: str = Field("", description="a network of your own that knows hair, an ONNX file: hair gets a label")
+    hair_model_sha256: str = Field("", description="of that file; filled in, so that another content is another result")
+    hair_model_side: int = Field(512, ge=32, le=2048, description="edge of that network's square input")
+    hair_model_imagenet: bool = Field(False, description="normalise its input as ImageNet's networks expect")
+    hair_model_class: int = Field(
+        -1, ge=-1, le=999, description="which of its classes is hair, from 0; -1: it knows nothing else"
+    )
     mend: bool = Field(True, description="cut a computed mask out anew where the other views contradict it")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
 
     @model_validator(mode="before")
     @classmethod
     def _content(cls, given: Any) -> Any:
-        if not isinstance(given, dict) or not given.get("model"):
+        if not isinstance(given, dict):
             return given
-        path = Path(str(given["model"])).expanduser()
-        if not path.is_file():
-            raise UsageError(
-                "the network's file is not there",
-                where="masks.model",
-                value=given["model"],
-                limit="an ONNX file",
-                remedy="check the path",
-            )
-        return given | {"model": str(path.absolute()), "model_sha256": sha256_of(path)}
+        return given | _named(given, "model") | _named(given, "hair_model")
+
+
+def _named(given: dict[str, Any], setting: str) -> dict[str, str]:
+    """A network's file with its absolute path and content; nothing where none is given.
+
+    Raises:
+        UsageError: it is not there.
+    """
+    if not given.get(setting):
+        return {}
+    path = Path(str(given[setting])).expanduser()
+    if not path.is_file():
+        raise UsageError(
+            "the network's file is not there",
+            where=f"masks.{setting}",
+            value=given[setting],
+            limit="an ONNX file",
+            remedy="check the path",
+        )
+    return {setting: str(path.absolute()), f"{setting}_sha256": sha256_of(path)}
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
@@ -85,8 +103,17 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
         seed=config.seed,
         faces=config.faces,
         model=UserModel(Path(config.model), config.model_side, config.model_imagenet) if config.model else None,
+        hair=UserModel(
+            Path(config.hair_model),
+            config.hair_model_side,
+            config.hair_model_imagenet,
+            config.hair_model_class if config.hair_model_class >= 0 else None,
+            "masks.hair_model",
+        )
+        if config.hair_model
+        else None,
     )
     return segment(inputs.capture, inputs.poses, settings, context)
 
 
-STAGE = Stage(name="masks", version=3, inputs=Inputs, config=Config, output=MaskSet, run=run)
+STAGE = Stage(name="masks", version=4, inputs=Inputs, config=Config, output=MaskSet, run=run)

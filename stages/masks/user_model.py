@@ -1,7 +1,8 @@
-"""A segmentation network of the user's: an ONNX file that OpenCV can run.
+"""Networks of the user's, ONNX files that OpenCV can run: one for the subject, one that knows hair.
 
 Input (1, 3, N, N) float32, RGB in [0, 1] (or normalised as ImageNet's networks expect); first output with N x N values,
-the probability of 'subject', or its logit if any value lies outside [0, 1]; of two channels the second is the subject.
+the probability of what is looked for, or its logit if any value lies outside [0, 1]; of two channels the second counts.
+One that tells several classes apart has (1, C, N, N): probabilities, or values whose softmax they are.
 """
 
 from __future__ import annotations
@@ -24,14 +25,17 @@ _local = threading.local()  # a network holds the buffers of its last run, so ea
 
 @dataclass(frozen=True, slots=True)
 class UserModel:
-    """path: the ONNX file. side: N. imagenet: whether the input is normalised with ImageNet's mean and deviation."""
+    """path: the ONNX file. side: N. imagenet: whether the input is normalised with ImageNet's mean and deviation.
+    of_class: which of C classes is looked for, None of a network that knows one. setting: what the user calls it."""
 
     path: Path
     side: int
     imagenet: bool
+    of_class: int | None = None
+    setting: str = "masks.model"
 
     def probability(self, square: U8) -> F32:
-        """(N, N) probability of 'subject' in a (N, N, 3) 8-bit RGB picture.
+        """(N, N) probability of what is looked for in a (N, N, 3) 8-bit RGB picture.
 
         Raises UsageError if the file is no network, or one of another kind.
         """
@@ -45,21 +49,28 @@ class UserModel:
             out = np.array(net.forward(), np.float32)
         except cv2.error as e:
             raise self._fault(str(e).strip().splitlines()[-1][:200]) from e
-        if out.size not in (self.side**2, 2 * self.side**2):
+        count, rest = divmod(out.size, self.side**2)
+        if rest or not (count in (1, 2) if self.of_class is None else self.of_class < count):
             raise self._fault(f"an output of shape {out.shape}")
-        plane = out.reshape(-1, self.side, self.side)[-1]
-        outside = plane.min() < -1e-4 or plane.max() > 1 + 1e-4
-        return np.asarray(1 / (1 + np.exp(-plane.clip(-60, 60))) if outside else plane, np.float32)
+        planes = out.reshape(count, self.side, self.side)
+        outside = planes.min() < -1e-4 or planes.max() > 1 + 1e-4
+        if self.of_class is None:
+            return np.asarray(1 / (1 + np.exp(-planes[-1].clip(-60, 60))) if outside else planes[-1], np.float32)
+        if outside:
+            planes = np.exp(planes - planes.max(0))
+        return np.asarray(planes[self.of_class] / np.maximum(planes.sum(0), 1e-9), np.float32)
 
     def _net(self) -> Any:
-        if getattr(_local, "path", None) != self.path:
-            _local.net, _local.path = cv2.dnn.readNetFromONNX(str(self.path)), self.path
-        return _local.net
+        nets: dict[Path, Any] = _local.__dict__.setdefault("nets", {})
+        if self.path not in nets:
+            nets[self.path] = cv2.dnn.readNetFromONNX(str(self.path))
+        return nets[self.path]
 
     def _fault(self, value: str) -> UsageError:
-        return UsageError("the network can't be used", where=f"masks.model={self.path}", value=value,
-                          limit=f"ONNX, input 1 x 3 x {self.side} x {self.side}, output 1 x 1 x {self.side} x "
-                          f"{self.side}", remedy="set masks.model_side to the network's input, or export it again "
+        planes = "1" if self.of_class is None else f"at least {self.of_class + 1}"
+        return UsageError("the network can't be used", where=f"{self.setting}={self.path}", value=value,
+                          limit=f"ONNX, input 1 x 3 x {self.side} x {self.side}, output 1 x {planes} x {self.side} x "
+                          f"{self.side}", remedy=f"set {self.setting}_side to the network's input, or export it again "
                           "with a fixed size")  # fmt: skip
 
 

@@ -47,3 +47,8 @@ def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
         error_px=model.error_px.astype(np.float32),
         track=model.track.astype(np.int32),
     )
+
+
+def view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
+    """Mean reprojection error of each view that has one, by its name. names: of the model's photos."""
+    return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}

@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     UsdAsset,
     UvMesh,
 )
+from stages.report.chart import chart_figures
 
 
 class Started(Protocol):
@@ -68,10 +69,12 @@ def figures(r: Results) -> dict[str, Any]:
             "unregistered": len(cameras.unregistered),
             "reprojection_error_px": cameras.reprojection_error_px,
         },
+        "colour_chart": chart_figures(r),
         "masks": {
             "views": len(r.masks.artifact.masks),
             "dropped": len(r.masks.artifact.dropped),
-            "faces": sum(m.labels is not None for m in r.masks.artifact.masks),
+            "faces": sum("face" in m.labelled for m in r.masks.artifact.masks),
+            "hair": sum("hair" in m.labelled for m in r.masks.artifact.masks),
         },
         "surface": {
             "vertices": surface.vertices,

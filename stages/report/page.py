@@ -83,6 +83,8 @@ def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
         ("asset", "Asset"),
     ):
         out.append((title, [(_words(k), _value(v)) for k, v in metrics[key].items()]))
+    if metrics["colour_chart"]["found"]:
+        out.append(("Colour chart", [(_words(k), _value(v)) for k, v in metrics["colour_chart"].items()]))
     rows = [
         (n, f"{_value(m['mean'])}  ({_value(m['minimum'])} to {_value(m['maximum'])}), {m['channels']} channel(s)")
         for n, m in metrics["maps"].items()

@@ -151,8 +151,9 @@ def test_the_same_photo_twice_is_told_and_used_once(tmp_path: Path, gather) -> N
     folder = plain(tmp_path / "c")
     (folder / "z.jpg").write_bytes((folder / "a.jpg").read_bytes())
     capture = gather(folder).artifact
-    assert len(capture.views) == 3 and capture.left_out == ("z.jpg: it is the same file as a.jpg",)
-    assert "z.jpg" in capture.warnings[0]
+    assert len(capture.views) == 3 and len(capture.left_out) == 1
+    assert capture.left_out[0].startswith("z.jpg: it is the same file as a.jpg")
+    assert "z.jpg" in capture.warnings[0] and "or remove it" in capture.warnings[0]
 
 
 def test_the_same_photo_under_two_cameras_is_told(facescape, gather) -> None:
@@ -168,6 +169,7 @@ def test_a_black_frame_is_left_out_and_named(facescape, gather) -> None:
     found = gather(folder)
     assert [v.index for v in found.artifact.views] == [0, 1, 2, 4, 5]
     assert "3.jpg is left out: it is blank" in found.artifact.warnings[0]
+    assert "take the photo again" in found.artifact.warnings[0]
     assert not (found.folder / "photos" / "3_3.jpg").exists()
 
 
@@ -182,6 +184,7 @@ def test_a_blurred_third_is_left_out_and_named(tmp_path: Path, gather) -> None:
     capture = gather(folder).artifact
     assert [v.index for v in capture.views] == [0, 2, 3, 5, 6, 8]
     assert [w.split(" ")[0] for w in capture.warnings] == ["1.png", "4.png", "7.png"]
+    assert all("take the photo again" in w and "capture.drop_blurred=false" in w for w in capture.warnings)
     assert len(gather(folder, drop_blurred=False).artifact.views) == 9
 
 

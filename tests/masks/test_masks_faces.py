@@ -1,14 +1,18 @@
-"""Labels of face and eyes, on a real photo and on drawn ones."""
+"""Labels of face, eyes and hair, on a real photo and on drawn ones."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from skimage import data
 
 from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face
-from stages.masks.face_labels import EYES, FACE, SUBJECT, face_labels, on_subject
+from stages.masks.face_labels import EYES, FACE, HAIR, LABELS, SUBJECT, face_labels, on_subject
 from stages.masks.region import Disc
+from stages.masks.user_model import UserModel
+from tests.masks.test_masks_user_model import write_network, write_red_detector
 
 ASTRONAUT = data.astronaut()
 SUBJECT_ALPHA = np.zeros((512, 512), np.float32)
@@ -53,6 +57,41 @@ def test_labels_fill_the_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
     labels = face_labels(np.zeros((100, 100, 3), np.uint8), alpha, Disc(50, 50, 50, 0.0))
     assert labels is not None and (labels[:, :59] > 0).all() and not labels[:, 60:].any()
     assert (labels[:, 59] == SUBJECT).all()  # the mask's edge is no face yet
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.7, np.pi])
+def test_hair_is_what_the_users_network_says(tmp_path: Path, roll: float) -> None:
+    """Red is hair to this network, and it sees the person upright, however the photo was held."""
+    y, x = np.mgrid[0:240, 0:300]
+    red = np.hypot(x + 0.5 - 180 - 40 * np.sin(roll), y + 0.5 - 130 + 40 * np.cos(roll)) < 25
+    image = np.where(red[..., None], [220, 40, 40], [40, 220, 100]).astype(np.uint8)
+    alpha = np.ones((240, 300), np.float32)
+    alpha[:, :150] = 0
+    seen = []
+
+    class Watched(UserModel):
+        def probability(self, square: np.ndarray) -> np.ndarray:
+            seen.append(square)
+            return super().probability(square)
+
+    model = Watched(write_red_detector(tmp_path / "net.onnx", 64), 64, False, setting="masks.hair_model")
+    labels = face_labels(image, alpha, Disc(180, 130, 70, roll), model)
+    truth = red & (alpha > 0)
+    assert labels is not None and set(np.unique(labels)) == {0, SUBJECT, HAIR}  # no face is seen
+    assert ((labels == HAIR) & truth).sum() / ((labels == HAIR) | truth).sum() > 0.93
+    rows = np.nonzero(seen[0][..., 0].astype(int) - seen[0][..., 1] > 90)[0]
+    assert rows.mean() < 24  # above the middle
+    assert face_labels(np.full_like(image, 90), alpha, Disc(180, 130, 70, roll), model) is None
+
+
+def test_hair_covers_the_face_and_not_the_eyes(tmp_path: Path) -> None:
+    everything = UserModel(write_network(tmp_path / "net.onnx", 64, [(50.0, 50.0, 50.0)]), 64, False)
+    plain = face_labels(ASTRONAUT, SUBJECT_ALPHA, Disc(225, 110, 100, 0.0))
+    labels = face_labels(ASTRONAUT, SUBJECT_ALPHA, Disc(225, 110, 100, 0.0), everything)
+    assert labels is not None and plain is not None
+    assert ((labels == EYES) == (plain == EYES)).all() and not (labels == FACE).any()
+    assert labels[75, 225] == HAIR and labels[400, 200] == SUBJECT  # beyond what the network sees
+    assert not labels[SUBJECT_ALPHA == 0].any() and LABELS[HAIR] == "hair"
 
 
 def test_points_beyond_the_frame_are_not_on_the_subject() -> None:

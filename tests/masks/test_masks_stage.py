@@ -18,6 +18,7 @@ from pipeline.store import Store
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, tolerated, trimap
 from stages.masks.stage import STAGE, Config, Inputs
+from tests.masks.test_masks_user_model import write_red_detector
 
 F32 = npt.NDArray[np.float32]
 SIZE, RADIUS, ROI = 128, 0.1, 0.13
@@ -111,7 +112,14 @@ def test_keyed_capture(scene: Scene, tmp_path: Path) -> None:
 
 
 def test_same_content_same_manifest(scene: Scene, tmp_path: Path) -> None:
-    assert run(scene, tmp_path / "a")[0] == run(scene, tmp_path / "b")[0]
+    """And labels by name: to a network that calls hair what is red the whole ball is hair."""
+    net = {"hair_model": str(write_red_detector(tmp_path / "net.onnx", 32)), "hair_model_side": 32}
+    first, second = run(scene, tmp_path / "a", **net)[0], run(scene, tmp_path / "b", **net)[0]
+    assert first == second and first.label_names == ("background", "subject", "face", "eyes", "hair")
+    assert all("hair" in m.labelled and "eyes" not in m.labelled and m.labels is not None for m in first.masks)
+    file = next((tmp_path / "a").rglob("labels/5.png"))
+    codes = np.round(255 * read_alpha(file))
+    assert set(np.unique(codes)) <= {0, 1, 4} and (codes == 4).mean() > 0.9 * first.masks[5].coverage
 
 
 def test_given_masks_are_kept_exactly(scene: Scene, tmp_path: Path) -> None:

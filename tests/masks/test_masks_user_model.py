@@ -33,15 +33,26 @@ def _field(number: int, value: bytes | int | str) -> bytes:
 
 def write_red_detector(path: Path, side: int, gain: float = 20.0) -> Path:
     """output = gain * (red - green), a 1 x 1 convolution: a logit."""
-    weights = struct.pack("<3f", gain, -gain, 0.0)
-    tensor = b"".join(_field(1, d) for d in (1, 3, 1, 1)) + _field(2, 1) + _field(8, "w") + _field(9, weights)
+    return write_network(path, side, [(gain, -gain, 0.0)])
+
+
+def write_network(path: Path, side: int, rows: list[tuple[float, float, float]]) -> Path:
+    """A 1 x 1 convolution from colours to an output channel for each row."""
+    weights = b"".join(struct.pack("<3f", *r) for r in rows)
+    tensor = b"".join(_field(1, d) for d in (len(rows), 3, 1, 1)) + _field(2, 1) + _field(8, "w") + _field(9, weights)
     node = _field(1, "x") + _field(1, "w") + _field(2, "y") + _field(4, "Conv")
 
     def value(name: str, channels: int) -> bytes:
         shape = b"".join(_field(1, _field(1, d)) for d in (1, channels, side, side))
         return _field(1, name) + _field(2, _field(1, _field(1, 1) + _field(2, shape)))
 
-    graph = _field(1, node) + _field(2, "g") + _field(5, tensor) + _field(11, value("x", 3)) + _field(12, value("y", 1))
+    graph = (
+        _field(1, node)
+        + _field(2, "g")
+        + _field(5, tensor)
+        + _field(11, value("x", 3))
+        + _field(12, value("y", len(rows)))
+    )
     path.write_bytes(_field(1, 8) + _field(7, graph) + _field(8, _field(1, "") + _field(2, 13)))
     return path
 
@@ -72,4 +83,28 @@ def test_other_content_is_another_setting(tmp_path: Path) -> None:
     first = Config(model=str(path))
     write_red_detector(path, 64, 5.0)
     assert first.model_sha256 != Config(model=str(path)).model_sha256 and len(first.model_sha256) == 64
-    assert Config().model_sha256 == ""
+    assert Config().model_sha256 == "" == first.hair_model_sha256
+    hair = Config(hair_model=str(path))
+    assert len(hair.hair_model_sha256) == 64 and hair.model_sha256 == ""
+    with pytest.raises(UsageError, match="not there") as caught:
+        Config(hair_model=str(tmp_path / "nowhere.onnx"))
+    assert caught.value.where == "masks.hair_model"
+
+
+def test_one_class_of_several(tmp_path: Path) -> None:
+    """Oracle: the softmax of what a 1 x 1 convolution gives, by hand; probabilities stay what they are."""
+    rows = [(0.0, 0.0, 0.0), (9.0, -9.0, 0.0), (0.0, 4.0, 1.0)]
+    path = write_network(tmp_path / "net.onnx", 32, rows)
+    square = np.full((32, 32, 3), (200, 60, 60), np.uint8)
+    values = np.exp(np.array(rows) @ (np.array([200, 60, 60]) / 255))
+    for k in range(3):
+        found = UserModel(path, 32, False, k).probability(square)
+        np.testing.assert_allclose(found, values[k] / values.sum(), rtol=1e-4)
+    even = write_network(tmp_path / "even.onnx", 32, [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5)])
+    share = 200 / 320
+    np.testing.assert_allclose(UserModel(even, 32, False, 0).probability(square), share, rtol=1e-4)
+    with pytest.raises(UsageError, match="can't be used") as caught:
+        UserModel(path, 32, False, 3, "masks.hair_model").probability(square)
+    assert "masks.hair_model" in caught.value.where and "at least 4" in caught.value.limit
+    with pytest.raises(UsageError, match="can't be used"):
+        UserModel(path, 32, False).probability(square)  # three classes, and none chosen

@@ -1,0 +1,117 @@
+"""Which photos of the user's folder may take part, with what belongs to each, and what is told of the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import TYPE_CHECKING
+
+from pipeline.artifacts import CaptureSource, FileRef, GivenCamera, Located
+from stages.capture.readers import describe
+from stages.capture.readers.described import indices_of
+from stages.capture.suspects import blurred
+
+if TYPE_CHECKING:
+    from stages.capture.gather import Gathered
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A photo that may take part."""
+
+    index: int
+    name: str
+    ref: FileRef
+    camera: GivenCamera | None = None
+    size: tuple[int, int] | None = None
+    serial: str = ""
+    mask: FileRef | None = None
+    plate: FileRef | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Photos that may take part; notes on those that don't, with their names; warnings."""
+
+    candidates: list[Candidate]
+    left_out: list[str]
+    absent: list[str]
+    warnings: list[str]
+
+    def leave_out(self, candidate: Candidate, why: str) -> None:
+        """One that takes no part after all: a photo that is of no use is told as a warning too."""
+        self.left_out.append(f"{candidate.name}: {why}")
+        self.absent.append(candidate.name)
+        self.warnings.append(f"{candidate.name} is left out: {why}")
+
+
+def candidates_of(source: Located[CaptureSource]) -> Found:
+    """All that the folder, or its description of cameras, names, in order of their numbers."""
+    photos = source.artifact.photos
+    by_stem, plates = ({PurePath(f.path).stem: f for f in files}
+                       for files in (source.artifact.masks, source.artifact.plates))  # fmt: skip
+    if not source.artifact.cameras:
+        names = [PurePath(p.path).name for p in photos]
+        found = [Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
+                 for i, n, p in zip(indices_of(names), names, photos, strict=True)]  # fmt: skip
+        return Found(sorted(found, key=lambda c: c.index), [], [], [])
+    said = describe(source.artifact.kind, source.folder, [source.path(c) for c in source.artifact.cameras])
+    refs, masks = ({f.path: f for f in files} for files in (photos, source.artifact.masks))
+    out = []
+    for v in said.views:
+        if v.photo is None:
+            continue
+        ref = refs[v.photo.relative_to(source.folder).as_posix()]
+        own = masks.get(v.mask.relative_to(source.folder).as_posix()) if v.mask is not None else None
+        out.append(Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, own or _of(by_stem, v.name),
+                              _of(plates, v.name)))  # fmt: skip
+    return Found(sorted(out, key=lambda c: c.index), list(said.left_out), list(said.absent), list(said.warnings))
+
+
+def _of(by_stem: dict[str, FileRef], name: str) -> FileRef | None:
+    """The file beside a photo: `a.png` or `a.jpg.png` for a.jpg."""
+    return by_stem.get(PurePath(name).stem) or by_stem.get(name)
+
+
+def without_doubles(found: Found, given: bool) -> list[Candidate]:
+    """Photos whose bytes another one has too are left out; of ones with cameras it is only told, for one camera is
+    wrong and the file does not say which."""
+    first: dict[str, str] = {}
+    kept = []
+    for c in found.candidates:
+        other = first.setdefault(c.ref.sha256, c.name)
+        if other == c.name:
+            kept.append(c)
+        elif given:
+            kept.append(c)
+            found.warnings.append(f"{c.name} is the same file as {other}, with another camera; take one of them out")
+        else:
+            found.leave_out(c, f"it is the same file as {other}; put the photo there that was meant, or remove it")
+    return kept
+
+
+def useful(
+    candidates: list[Candidate], photos: list[Gathered], found: Found, drop_blurred: bool
+) -> tuple[list[Candidate], list[Gathered]]:
+    """Without blank and blurred photos, whose copies are removed."""
+    seen = [p.detail for p in photos if p.detail is not None]
+    soft = iter(blurred(seen) if drop_blurred and seen else [False] * len(seen))
+    kept = []
+    for candidate, photo in zip(candidates, photos, strict=True):
+        if photo.detail is None:
+            found.leave_out(candidate, "it is blank (one level all over); take the photo again")
+        elif next(soft):
+            found.leave_out(candidate, "it is blurred far beyond the others; take the photo again, or set "
+                            "capture.drop_blurred=false")  # fmt: skip
+        else:
+            kept.append((candidate, photo))
+            continue
+        _remove(photo)
+    return [c for c, _ in kept], [p for _, p in kept]
+
+
+def _remove(photo: Gathered) -> None:
+    """A photo that takes no part after all leaves nothing behind."""
+    photo.image.unlink()
+    if photo.clipped is not None:
+        photo.clipped.unlink()

@@ -1,0 +1,132 @@
+"""Cameras that came with the capture: held against the photos, mended if asked for, moved to asset coordinates."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.artifacts import Camera, CameraSet, Capture, Located
+from pipeline.contract import Context
+from pipeline.errors import StageError
+from pipeline.transforms import inverse_rigid, matrix, rows
+from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
+from stages.poses.measure import find_eyes, known_scale
+from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
+from stages.poses.photos import photos_of
+from stages.poses.place import camera_of, in_asset, save_points, view_errors
+from stages.poses.scale import by_world
+from stages.poses.settings import Config
+from stages.poses.ticks import progress_of
+
+if TYPE_CHECKING:
+    from stages.poses.solve import Model
+
+
+def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
+    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict.
+
+    Raises:
+        StageError: most photos contradict them, or share no point under them.
+    """
+    cameras = [
+        camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
+        for v, c in ((v, v.camera) for v in capture.artifact.views)
+        if c is not None
+    ]
+    # only FaceScape says what its numbers are: metres or millimetres; the others' worlds have any size
+    auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
+    unit: Unit = auto if config.unit == "auto" else config.unit
+    wrong = _contradicted(capture, cameras, config, context) if config.check else []
+    names = tuple(cameras[i].name for i in wrong)
+    right = [i for i in range(len(cameras)) if i not in wrong]
+    cameras = [cameras[i] for i in right]
+    told = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
+            for n in names]  # fmt: skip
+    model = None
+    if config.given != "keep":
+        model, cameras, doubtful = _held_against_photos(capture, right, cameras, config, context)
+        if doubtful:
+            told.append(
+                "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
+            )
+    eyes = find_eyes(capture, cameras, context.check) if config.pupils_mm else None
+    known = known_scale(capture, cameras, config, eyes, told)
+    world, axes = capture.artifact.metres_from_world, None
+    if world is not None and config.unit == "auto":
+        published, axes = by_world(matrix(world))
+        known = published if known is None and config.scale == "auto" else known
+    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
+    if model is not None:
+        save_points(context.workdir / "points.npz", model, found.capture_from_asset)
+    return CameraSet(
+        source="given",
+        metric=found.metric,
+        scale=found.scale,
+        capture_from_asset=rows(found.capture_from_asset),
+        roi_radius=found.roi_radius,
+        cameras=in_asset(cameras, found.capture_from_asset),
+        unregistered=names,
+        reprojection_error_px=None if model is None else model.reprojection_error_px,
+        view_errors_px={} if model is None else view_errors(model, [c.name for c in cameras]),
+        points=None if model is None else context.file("points.npz"),
+        warnings=(*told, *found.warnings),
+    )
+
+
+def _held_against_photos(
+    capture: Located[Capture], right: list[int], cameras: list[Camera], config: Config, context: Context
+) -> tuple[Model, list[Camera], list[str]]:
+    """Points triangulated from the given cameras `right` of the capture; the cameras, moved if asked for; names of
+    those that should have been and were not.
+
+    Raises:
+        StageError: the photos share no point under these cameras.
+    """
+    from stages.poses.photogrammetry import (
+        triangulate_given,
+    )  # takes COLMAP, which cameras that stay as they are do not
+    from stages.poses.solved import settings_of
+
+    photos = photos_of(capture, config.use_masks)
+    centres, axes = viewing_rays(cameras)
+    distance = float(((centres - nearest_point(centres, axes)) ** 2).sum(1).mean() ** 0.5)
+    found = triangulate_given(
+        [photos[i] for i in right], cameras, settings_of(capture, config), context.scratch, progress_of(context),
+        refine=config.given == "refine", deviation=config.given_deviation * distance,
+    )  # fmt: skip
+    if found is None:
+        raise StageError("no point is seen by two photos", where="poses", value="0 points",
+                         limit="features that neighbouring photos share",
+                         remedy="set poses.given=keep to use the cameras as they are")  # fmt: skip
+    model, doubtful = found
+    names = [cameras[n].name for n in doubtful]
+    if config.given == "refine":
+        views, poses = [capture.artifact.views[i] for i in right], model.poses
+        cameras = [camera_of(v, poses[n].K, poses[n].world_from_cam, c.distortion)
+                   for n, (v, c) in enumerate(zip(views, cameras, strict=True))]  # fmt: skip
+    return model, cameras, names
+
+
+def _contradicted(
+    capture: Located[Capture], cameras: list[Camera], config: Config, context: Context
+) -> list[int]:  # fmt: skip
+    """Places of the views whose photos contradict their cameras.
+
+    Raises:
+        StageError: most of them do.
+    """
+    progress = progress_of(context)
+    photos = photos_of(capture, config.use_masks)
+    features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
+    far = IMPERFECT if config.given == "refine" else FAR
+    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
+    if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
+        raise StageError(
+            "the cameras do not belong to the photos",
+            where="poses",
+            value=f"{len(verdict.wrong)} of {verdict.known} views contradict their neighbours, such as "
+            + ", ".join(cameras[i].name for i in verdict.wrong[:5]),
+            limit="most views' features on each other's epipolar lines",
+            remedy="check that photos and cameras are in the same order and of the same size, or set "
+            "poses.method=colmap to have the cameras solved; poses.check=false uses them as they are",
+        )
+    return verdict.wrong
