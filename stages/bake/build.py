@@ -15,11 +15,13 @@ from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.maths import microfacet
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
+from pipeline.visibility import Occluder, View, seen_weight
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
-from stages.bake.confidence import Occluder, View, confidence, seen_weight
+from stages.bake.confidence import sighted
 from stages.bake.gutter import nearest_rows
 from stages.bake.lut import basis_lut
+from stages.bake.regions import Votes
 from stages.bake.smooth import continued
 from stages.bake.spool import Spool, blank
 from stages.bake.texels import Known, Samples, place, points, sample
@@ -41,7 +43,8 @@ Step = Callable[[int, int, str], None]
 class Baked:
     """Samples of the covered texels; `texel` (N,) their flat indices. `nearest` (H, W): row in `texel` for each texel.
 
-    confidence (S, S) at its own size; lut (1, 64, k); coverage: share of covered texels; figures: for the report.
+    confidence (S, S) and votes for the regions at their own size; lut (1, 64, k); coverage: share of covered texels;
+    figures: for the report.
     """
 
     size: int
@@ -53,6 +56,7 @@ class Baked:
     coverage: float
     figures: dict[str, float]
     warnings: tuple[str, ...]
+    votes: Votes | None = None
 
     def covered(self) -> Mask:
         """(H, W) texels that a chart touches."""
@@ -96,13 +100,14 @@ def build(
             limit=f"at least {FEW_TEXELS}",
             remedy="run the uv stage again, or choose a larger bake.size",
         )
-    seen = confidence(mesh, charts, views, size, lambda done, total: step(done, total, "visibility"))
+    seen = sighted(mesh, charts, views, size, lambda done, total: step(done, total, "visibility"))
     lut, residual = basis_lut(field)
     nearest = _nearest(texel, size, scratch)
     share = len(texel) / size**2
     log.info("bake: %.1f %% covered, basis residual %.3f", 100 * share, residual)
     figures = _figures(samples, found is not None)
-    return Baked(size, texel, nearest, samples, seen, lut, share, figures, _warnings(samples, residual, len(views)))
+    warnings = _warnings(samples, residual, len(views))
+    return Baked(size, texel, nearest, samples, seen.confidence, lut, share, figures, warnings, seen.votes)
 
 
 def _known(
