@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from pipeline.picture_size import declared_size_of
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
 ROWS_TEXELS = 1 << 20  # converted at once
-MAX_BYTES = 4_000_000_000  # 250 megapixels of RGBA in 32-bit floats, uncompressed
-MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
+WRITERS = 8  # threads that compress an EXR, at most; its bytes do not depend on them
+MAX_BYTES = 1 << 32  # that many pixels of RGBA in 32-bit floats, uncompressed
+MAX_PIXELS = 1 << 28  # the largest map, larger than any camera's frame: beyond it a file is a mistake or a bomb
 
 
 def read_encoded(path: Path) -> npt.NDArray[Any]:
@@ -167,7 +169,11 @@ def write_exr(
     if units:
         header["units"] = units
     path.parent.mkdir(parents=True, exist_ok=True)
-    OpenEXR.File(header, planes).write(str(path))
+    OpenEXR.set_global_thread_count(min(os.cpu_count() or 1, WRITERS))
+    try:
+        OpenEXR.File(header, planes).write(str(path))
+    finally:
+        OpenEXR.set_global_thread_count(0)  # a process that forks must not find a pool whose threads are gone
 
 
 def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:

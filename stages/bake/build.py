@@ -19,7 +19,7 @@ from pipeline.visibility import Occluder, View, seen_weight
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.confidence import sighted
-from stages.bake.gutter import nearest_rows
+from stages.bake.gutter import HALO, nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.regions import Votes
 from stages.bake.smooth import continued
@@ -29,6 +29,7 @@ from stages.bake.texels import Known, Samples, place, points, sample
 log = logging.getLogger("neuface.bake")
 
 BAND = 262_144  # texels baked at once
+NEAREST_BAND = 1 << 24  # texels whose nearest chart is looked for at once: around each band some are looked at again
 SPARSE = 512  # texels along a side of the points that the detail's low band is made from
 FEW_TEXELS = 100
 MANY_LOST = 0.02  # share of texels off the zero set, beyond the cap of a bust
@@ -159,9 +160,9 @@ def _bands(
     return arrays.pop("texel"), Samples(**arrays)
 
 
-def bands(size: int) -> Iterator[tuple[int, int]]:
-    """First and last row (exclusive) of the bands that a picture is worked off in."""
-    rows = max(1, BAND // size)
+def bands(size: int, texels: int | None = None) -> Iterator[tuple[int, int]]:
+    """First and last row (exclusive) of the bands that a picture is worked off in, of BAND texels or as asked."""
+    rows = max(1, (texels or BAND) // size)
     for first in range(0, size, rows):
         yield first, min(first + rows, size)
 
@@ -175,10 +176,11 @@ def _covered(texel: Indices, size: int) -> Mask:
 def _nearest(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.int32]:
     """(H, W) row in `texel` of the covered texel nearest to each, band by band."""
     covered = _covered(texel, size)
+    row = blank(scratch, (size * size,), np.int32)
+    row[texel] = np.arange(len(texel), dtype=np.int32)
     out = blank(scratch, (size, size), np.int32)
-    for first, last in bands(size):
-        flat = nearest_rows(covered, first, last)
-        out[first:last] = np.searchsorted(texel, flat)
+    for first, last in bands(size, max(NEAREST_BAND, HALO * size)):
+        out[first:last] = row[nearest_rows(covered, first, last)]
     return out
 
 

@@ -320,7 +320,8 @@ def test_coverage_holds_every_touched_texel(mesh_and_charts: tuple[Mesh, Charts]
 def test_maps_do_not_depend_on_bands(
     field: AnalyticField, mesh_and_charts: tuple, baked: Baked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.bake.build.BAND", 3000)
+    for name, small in (("BAND", 3000), ("NEAREST_BAND", 1), ("HALO", 8)):
+        monkeypatch.setattr(f"stages.bake.build.{name}", small)
     again = build(field, *mesh_and_charts, VIEWS, SIZE, quiet)
     assert np.array_equal(again.texel, baked.texel) and np.allclose(again.samples.albedo, baked.samples.albedo)
     assert np.array_equal(again.nearest, baked.nearest)

@@ -119,7 +119,7 @@ def test_a_mesh_with_a_border_keeps_it(dense: Mesh) -> None:
     vertices, faces, source = meshes.compact(points, faces)
     normals = np.concatenate([dense.normals, dense.normals[ends[:, 0]]])[source]
     opened = Mesh(vertices.astype(np.float32), normals, faces)
-    made = build(opened, 3000, 600, unwrap.Options(512, 4), quiet)
+    made = build(opened, 1200, 300, unwrap.Options(512, 4), quiet)
     for mesh in (made.mesh, made.proxy):
         found = meshes.topology(mesh.faces, len(mesh.vertices))
         assert found.sound and found.components == 1 and found.euler == 1
