@@ -114,14 +114,14 @@ def write_png_from_linear(path: Path, image: F32) -> None:
 def _whole(
     image: npt.NDArray[Any], bits: int, shown: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 ) -> npt.NDArray[Any]:
-    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held in float64."""
+    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held twice."""
     data = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     order = [2, 1, 0, 3][: data.shape[2]] if data.ndim == 3 else None
     out = np.empty(data.shape, kind)
     rows = max(1, ROWS_TEXELS // max(data.shape[1], 1))
     for first in range(0, len(data), rows):
-        values = np.nan_to_num(np.asarray(shown(data[first : first + rows]), np.float64)).clip(0, 1)
+        values = np.minimum(np.fmax(np.asarray(shown(data[first : first + rows]), np.float32), 0), 1)  # NaN is 0
         whole = np.round(values * peak).astype(kind)
         out[first : first + rows] = whole if order is None else whole[..., order]
     return out
