@@ -42,7 +42,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     """Mesh the zero set. Raises StageError when the field has none."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
-    from pipeline.visibility import Occluder, seen_by, seen_weight
+    from pipeline.visibility import Occluder, seen_by, sight
     from stages.surface.build import build
 
     fitted = inputs.inverse_rendering
@@ -53,10 +53,15 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         context.progress(done, total, "marching cubes")
 
     def sees(mesh: meshes.Mesh) -> meshes.Mask:
-        context.progress(0, 1, "looking for what photos see")
         views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
         points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
-        return np.asarray(seen_weight(points, normals, views, Occluder(mesh)) > 0)
+        occluder, seen = Occluder(mesh), np.zeros(len(points), np.bool_)
+        for i, view in enumerate(views):
+            context.check()
+            context.progress(i, len(views), "visibility")
+            rest = np.flatnonzero(~seen)
+            seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
+        return seen
 
     built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None)
     meshes.save(context.workdir / MESH, built.mesh)
