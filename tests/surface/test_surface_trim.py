@@ -85,6 +85,17 @@ def test_specks_notches_and_islands_are_tidied() -> None:
     assert built.trimmed == pytest.approx(0.25, abs=0.02)
 
 
+@pytest.mark.parametrize("size, stays", [(4.5, False), (12.0, True)])
+def test_small_holes_are_closed_and_small_islands_dropped(size: float, stays: bool) -> None:
+    """Caps of 4.5 degrees have 0.15 % of a sphere's area, of 12 degrees 1.1 %."""
+    mesh = building.build(AnalyticField(sphere(RADIUS)), 48, quiet).mesh
+    at = latitude(mesh.vertices.astype(np.float64))
+    plain = at > -30
+    hole, island = at > 90 - size, at < size - 90
+    got = trim._tidied(mesh, np.where((plain & ~hole) | island, 0.9, 0.2)) >= 0.5
+    assert np.array_equal(got, (plain & ~hole) | island if stays else plain)
+
+
 def test_two_seen_parts_stay() -> None:
     built = seen_where(lambda p: np.abs(latitude(p)) > 30)
     assert built.topology.components == 2 and built.topology.sound and border_of(built.mesh.faces)[1] == 2
