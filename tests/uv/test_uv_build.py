@@ -111,6 +111,7 @@ def test_smooth_mesh_with_more_faces_wanted_is_kept(dense: Mesh) -> None:
     assert decimate.decimated(dense, len(dense.faces) + 1) is dense
 
 
+@pytest.mark.slow
 def test_a_mesh_with_a_border_keeps_it(dense: Mesh) -> None:
     """A head cut open below, as `surface.unseen=trimmed` leaves it: decimated and unwrapped, still one sheet."""
     ends, share, faces = cut(dense.faces, 0.5 + dense.vertices[:, 1].astype(np.float64) + 0.05)
