@@ -275,7 +275,8 @@ class FittedFace(Artifact):
 
 # ------------------------------------------------------------------ mesh
 class Surface(Artifact):
-    """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32."""
+    """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32.
+    trimmed: share of its area that no photo saw and that was cut off."""
 
     mesh: FileRef
     vertices: int
@@ -284,6 +285,7 @@ class Surface(Artifact):
     components: int
     removed_components: int
     cell: float
+    trimmed: float = 0.0
     warnings: tuple[str, ...] = ()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from pipeline.picture_size import declared_size_of
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
 ROWS_TEXELS = 1 << 20  # converted at once
-MAX_BYTES = 4_000_000_000  # 250 megapixels of RGBA in 32-bit floats, uncompressed
-MAX_PIXELS = 250_000_000  # larger than any camera's frame: beyond it a file is a mistake or an image bomb
+WRITERS = 8  # threads that compress an EXR, at most; its bytes do not depend on them
+MAX_BYTES = 1 << 32  # that many pixels of RGBA in 32-bit floats, uncompressed
+MAX_PIXELS = 1 << 28  # the largest map, larger than any camera's frame: beyond it a file is a mistake or a bomb
 
 
 def read_encoded(path: Path) -> npt.NDArray[Any]:
@@ -112,14 +114,14 @@ def write_png_from_linear(path: Path, image: F32) -> None:
 def _whole(
     image: npt.NDArray[Any], bits: int, shown: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 ) -> npt.NDArray[Any]:
-    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held in float64."""
+    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held twice."""
     data = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     order = [2, 1, 0, 3][: data.shape[2]] if data.ndim == 3 else None
     out = np.empty(data.shape, kind)
     rows = max(1, ROWS_TEXELS // max(data.shape[1], 1))
     for first in range(0, len(data), rows):
-        values = np.nan_to_num(np.asarray(shown(data[first : first + rows]), np.float64)).clip(0, 1)
+        values = np.minimum(np.fmax(np.asarray(shown(data[first : first + rows]), np.float32), 0), 1)  # NaN is 0
         whole = np.round(values * peak).astype(kind)
         out[first : first + rows] = whole if order is None else whole[..., order]
     return out
@@ -167,7 +169,11 @@ def write_exr(
     if units:
         header["units"] = units
     path.parent.mkdir(parents=True, exist_ok=True)
-    OpenEXR.File(header, planes).write(str(path))
+    OpenEXR.set_global_thread_count(min(os.cpu_count() or 1, WRITERS))
+    try:
+        OpenEXR.File(header, planes).write(str(path))
+    finally:
+        OpenEXR.set_global_thread_count(0)  # a process that forks must not find a pool whose threads are gone
 
 
 def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:

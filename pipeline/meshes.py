@@ -52,6 +52,11 @@ class Topology:
         """Closed, and every vertex has one fan of faces."""
         return self.watertight and self.pinched_vertices == 0
 
+    @property
+    def sound(self) -> bool:
+        """A manifold that may have a border."""
+        return self.components > 0 and self.crowded_edges == 0 and self.pinched_vertices == 0
+
 
 def save(path: Path, mesh: Mesh, charts: Charts | None = None) -> None:
     """Write the npz of the Surface and UvMesh artifacts."""

@@ -14,6 +14,7 @@ where MikkTSpace leaves them as interpolated.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,14 +55,24 @@ def frames(mesh: Mesh, charts: Charts) -> Frames:
 
 def at(frame: Frames, mesh: Mesh, face: Indices, weights: npt.NDArray[np.floating]) -> tuple[F64, F64, F64]:
     """T, B, N (M, 3 each) at points of faces (M,) given by barycentric weights (M, 3)."""
-    w = np.asarray(weights, np.float64)[..., None]
-    normal = _unit((mesh.normals[mesh.faces[face]] * w).sum(1))
-    raw = (frame.tangent[face] * w).sum(1)
-    tangent = raw - normal * (normal * raw).sum(1, keepdims=True)
-    lost = (tangent * tangent).sum(1) < 1e-12
+    w = np.asarray(weights, np.float64)
+    normal = _unit(mixed(mesh.normals[mesh.faces[face]], w))
+    raw = mixed(frame.tangent[face], w)
+    tangent = raw - normal * dot(normal, raw)[:, None]
+    lost = dot(tangent, tangent) < 1e-12
     tangent[lost] = _any_across(normal[lost])
     tangent = _unit(tangent)
     return tangent, np.cross(normal, tangent) * frame.sign[face, None], normal
+
+
+def mixed(corners: npt.NDArray[Any], weights: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(M, C) values of corners (M, 3, C) by barycentric weights (M, 3). Faster than a product and its sum."""
+    return np.asarray(np.einsum("mic,mi->mc", corners, weights))
+
+
+def dot(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(...,) scalar products of rows (..., C)."""
+    return np.asarray(np.einsum("...c,...c->...", a, b))
 
 
 def _angle(x: F64, normal: F64, i: int) -> F64:
@@ -81,5 +92,5 @@ def _any_across(n: F64) -> F64:
 
 
 def _unit(v: F64) -> F64:
-    out: F64 = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30)
+    out: F64 = v / np.maximum(np.sqrt(dot(v, v))[..., None], 1e-30)
     return out

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pipeline.meshes import F32, Mesh
-from stages.bake.confidence import LIFT, Occluder
+from pipeline.visibility import LIFT, Occluder
 
 RAYS = 96
 

@@ -15,11 +15,13 @@ from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.maths import microfacet
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
+from pipeline.visibility import Occluder, View, seen_weight
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
-from stages.bake.confidence import Occluder, View, confidence, seen_weight
-from stages.bake.gutter import nearest_rows
+from stages.bake.confidence import sighted
+from stages.bake.gutter import HALO, nearest_rows
 from stages.bake.lut import basis_lut
+from stages.bake.regions import Votes
 from stages.bake.smooth import continued
 from stages.bake.spool import Spool, blank
 from stages.bake.texels import Known, Samples, place, points, sample
@@ -27,6 +29,7 @@ from stages.bake.texels import Known, Samples, place, points, sample
 log = logging.getLogger("neuface.bake")
 
 BAND = 262_144  # texels baked at once
+NEAREST_BAND = 1 << 24  # texels whose nearest chart is looked for at once: around each band some are looked at again
 SPARSE = 512  # texels along a side of the points that the detail's low band is made from
 FEW_TEXELS = 100
 MANY_LOST = 0.02  # share of texels off the zero set, beyond the cap of a bust
@@ -41,7 +44,8 @@ Step = Callable[[int, int, str], None]
 class Baked:
     """Samples of the covered texels; `texel` (N,) their flat indices. `nearest` (H, W): row in `texel` for each texel.
 
-    confidence (S, S) at its own size; lut (1, 64, k); coverage: share of covered texels; figures: for the report.
+    confidence (S, S) and votes for the regions at their own size; lut (1, 64, k); coverage: share of covered texels;
+    figures: for the report.
     """
 
     size: int
@@ -53,6 +57,7 @@ class Baked:
     coverage: float
     figures: dict[str, float]
     warnings: tuple[str, ...]
+    votes: Votes | None = None
 
     def covered(self) -> Mask:
         """(H, W) texels that a chart touches."""
@@ -96,13 +101,14 @@ def build(
             limit=f"at least {FEW_TEXELS}",
             remedy="run the uv stage again, or choose a larger bake.size",
         )
-    seen = confidence(mesh, charts, views, size, lambda done, total: step(done, total, "visibility"))
+    seen = sighted(mesh, charts, views, size, lambda done, total: step(done, total, "visibility"))
     lut, residual = basis_lut(field)
     nearest = _nearest(texel, size, scratch)
     share = len(texel) / size**2
     log.info("bake: %.1f %% covered, basis residual %.3f", 100 * share, residual)
     figures = _figures(samples, found is not None)
-    return Baked(size, texel, nearest, samples, seen, lut, share, figures, _warnings(samples, residual, len(views)))
+    warnings = _warnings(samples, residual, len(views))
+    return Baked(size, texel, nearest, samples, seen.confidence, lut, share, figures, warnings, seen.votes)
 
 
 def _known(
@@ -154,9 +160,9 @@ def _bands(
     return arrays.pop("texel"), Samples(**arrays)
 
 
-def bands(size: int) -> Iterator[tuple[int, int]]:
-    """First and last row (exclusive) of the bands that a picture is worked off in."""
-    rows = max(1, BAND // size)
+def bands(size: int, texels: int | None = None) -> Iterator[tuple[int, int]]:
+    """First and last row (exclusive) of the bands that a picture is worked off in, of BAND texels or as asked."""
+    rows = max(1, (texels or BAND) // size)
     for first in range(0, size, rows):
         yield first, min(first + rows, size)
 
@@ -170,10 +176,11 @@ def _covered(texel: Indices, size: int) -> Mask:
 def _nearest(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.int32]:
     """(H, W) row in `texel` of the covered texel nearest to each, band by band."""
     covered = _covered(texel, size)
+    row = blank(scratch, (size * size,), np.int32)
+    row[texel] = np.arange(len(texel), dtype=np.int32)
     out = blank(scratch, (size, size), np.int32)
-    for first, last in bands(size):
-        flat = nearest_rows(covered, first, last)
-        out[first:last] = np.searchsorted(texel, flat)
+    for first, last in bands(size, max(NEAREST_BAND, HALO * size)):
+        out[first:last] = row[nearest_rows(covered, first, last)]
     return out
 
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 from pipeline.images import read_alpha, read_linear, shrink_whole
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.transforms import inverse_rigid, matrix, rays
+from pipeline.visibility import Occluder, View
 from stages.bake import detail_kernels as kernels
-from stages.bake.confidence import Occluder, View
 
 DEPTH_SIDE = 768  # pixels of a depth picture's longer side, at most: rays cost
 JUMP = 12.0  # pixels of depth over a pixel's neighbours, from which a place is the edge of something

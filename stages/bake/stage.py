@@ -37,8 +37,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     """Bake every map. Raises StageError when the mesh has no charts or the field is not finite on it."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
+    from pipeline.visibility import seen_by
     from stages.bake.build import Photos, build
-    from stages.bake.confidence import seen_by
     from stages.bake.deviation import zero_set_rms
     from stages.bake.write import write_maps
 
@@ -84,4 +84,4 @@ def attenuation(face: FittedFace) -> str:
     return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
 
 
-STAGE = Stage(name="bake", version=3, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=4, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -27,6 +27,7 @@ NEWTON_STEPS = 3
 LEAST_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
 REACH_CELLS = 1.5  # of the field's cells: the decimated mesh is never further from the zero set than that
 LEAST_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
+ARRIVED_CELLS = 1e-3  # |d| below this many cells needs no further step: 2 micrometres
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
 LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
 ALBEDO_RANGE = (0.005, 0.95)  # soot and fresh snow: nothing on a head is darker or brighter
@@ -90,7 +91,7 @@ class Placed:
 def place(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Placed:
     """Where the texels lie."""
     weights = hits.weights.astype(np.float64)
-    start = (mesh.vertices.astype(np.float64)[mesh.faces[hits.face]] * weights[..., None]).sum(1)
+    start = tangents.mixed(mesh.vertices.astype(np.float64)[mesh.faces[hits.face]], weights)
     t, b, n = tangents.at(frame, mesh, hits.face, weights)
     moved, gradient, landed = land(field, start, n)
     world = _unit(np.where(landed[:, None], gradient, n))
@@ -111,7 +112,7 @@ def sample(
     x, straight = at.x.astype(np.float32), at.world.astype(np.float32)
     material = field.material(x)
     ratio = np.asarray(field.irradiance_ratio(x), np.float32)
-    strength = material.rho * (material.coefficients * field.basis(straight, straight)).sum(1)
+    strength = material.rho * tangents.dot(material.coefficients, field.basis(straight, straight))
     f0 = microfacet.f0_from_lobe(strength, material.inv_kappa)
     albedo, support = np.asarray(material.albedo, np.float32), np.zeros(len(x), np.float32)
     _check("albedo", albedo)
@@ -121,9 +122,10 @@ def sample(
     around, unseen = np.ones(len(x), np.float32), np.zeros(len(x), np.float32)
     if known is not None:
         corner = mesh.faces[hits.face]
-        around, unseen = ((a[corner] * hits.weights).sum(1) for a in (known.ambient, known.unseen))
-        nearby = (known.albedo[corner] * hits.weights[..., None]).sum(1)
-        albedo = albedo + unseen[:, None] * (nearby - albedo)
+        around = tangents.dot(known.ambient[corner], hits.weights)
+        unseen = tangents.dot(known.unseen[corner], hits.weights)
+        nearby = tangents.mixed(known.albedo[corner], hits.weights)
+        albedo = np.asarray(albedo + unseen[:, None] * (nearby - albedo), np.float32)
     physical = albedo.clip(*ALBEDO_RANGE)
     found = Samples(
         albedo=physical,
@@ -150,36 +152,40 @@ def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
 
         t <- t - d / max(g . N, LEAST_SLOPE)
 
-    clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not arrive keep t = 0.
+    clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not arrive keep t = 0; those
+    that are within ARRIVED_CELLS cells of the zero set stay where they are.
     """
     reach = REACH_CELLS * field.cell
     t = np.zeros(len(start))
     value, gradient = _evaluate(field, start)
     for _ in range(NEWTON_STEPS):
-        slope = np.maximum((gradient * normal).sum(1), LEAST_SLOPE)
-        t = (t - value / slope).clip(-reach, reach)
-        value, gradient = _evaluate(field, start + t[:, None] * normal)
+        on = np.flatnonzero(np.abs(value) > ARRIVED_CELLS * field.cell)
+        if not len(on):
+            break
+        slope = np.maximum(tangents.dot(gradient[on], normal[on]), LEAST_SLOPE)
+        t[on] = (t[on] - value[on] / slope).clip(-reach, reach)
+        value[on], gradient[on] = _evaluate(field, start[on] + t[on, None] * normal[on])
     # a wall across the normal is not the surface that this texel stands for (the rim of the neck's cut)
-    facing = (_unit(gradient) * normal).sum(1) > LEAST_FACING
+    facing = tangents.dot(_unit(gradient), normal) > LEAST_FACING
     landed = (np.abs(value) < LANDED_CELLS * field.cell) & facing
     return np.where(landed, t, 0.0), gradient, landed
 
 
 def in_frame(world: F64, t: F64, b: F64, n: F64) -> F32:
     """(N, 3) directions in the frame T, B, N, kept on the outer side of the surface."""
-    local = np.stack([(world * axis).sum(1) for axis in (t, b, n)], 1)
+    local = np.stack([tangents.dot(world, axis) for axis in (t, b, n)], 1)
     local[:, 2] = np.maximum(local[:, 2], LEAST_Z)
     return _unit(local).astype(np.float32)
 
 
 def _evaluate(field: Field, points: F64) -> tuple[F64, F64]:
     value, gradient = field.sdf_and_gradient(points.astype(np.float32))
-    return np.asarray(value, np.float64), np.asarray(gradient, np.float64)
+    return np.array(value, np.float64), np.array(gradient, np.float64)
 
 
 def _unit(v: npt.NDArray[np.floating]) -> F64:
     w = np.asarray(v, np.float64)
-    out: F64 = w / np.maximum(np.linalg.norm(w, axis=1, keepdims=True), 1e-30)
+    out: F64 = w / np.maximum(np.sqrt(tangents.dot(w, w))[:, None], 1e-30)
     return out
 
 

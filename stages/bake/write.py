@@ -20,6 +20,7 @@ from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.maths import microfacet
 from pipeline.meshes import F32
 from stages.bake.build import Baked, bands
+from stages.bake.regions import Votes
 from stages.bake.spool import blank
 from stages.bake.texels import Samples
 
@@ -35,12 +36,14 @@ Function = Callable[..., npt.NDArray[Any]]
 @dataclass(frozen=True, slots=True)
 class MapKind:
     """How a map is made from some of the samples' arrays (N, ...) and stored. png: bits, 0 for none; encoded: png
-    holds v/2 + 1/2. colour: its three channels are colours; units: of its values, for the EXR's header."""
+    holds v/2 + 1/2. codes: values are whole numbers, in the png too. colour: its three channels are colours; units: of
+    its values, for the EXR's header."""
 
     sources: tuple[str, ...]
     function: Function = lambda values: values
     png: int = 0
     encoded: bool = False
+    codes: bool = False
     numbered: bool = False
     space: Literal["srgb_png", "raw"] = "raw"
     colour: bool = False
@@ -84,6 +87,8 @@ def write_maps(baked: Baked, context: Context) -> dict[str, TextureMap]:
     flags = np.zeros((baked.size * baked.size, 1), np.float32)
     flags[baked.texel, 0] = np.where(baked.samples.unseen > 0.5, UNSEEN, 1)
     maps["coverage"] = _store("coverage", flags.reshape(*covered.shape, 1), _range(flags), plain, context)
+    if baked.votes is not None:
+        maps["region"] = _region(baked, baked.votes, context)
     lut = MapKind((), numbered=True)
     maps["basis_lut"] = _store("basis_lut", baked.lut, _range(baked.lut), lut, context)
     return maps
@@ -113,6 +118,18 @@ def _from_samples(name: str, kind: MapKind, baked: Baked, context: Context) -> T
     return _store(name, image, (low, total / (rows * shape[2]), high), kind, context)
 
 
+def _region(baked: Baked, votes: Votes, context: Context) -> TextureMap:
+    rows = len(baked.texel)
+    code = np.zeros(rows, np.uint8)
+    for start in range(0, rows, 1 << 20):
+        part = slice(start, start + (1 << 20))
+        code[part] = votes.winners(baked.texel[part], baked.size)
+    image = _picture((baked.size, baked.size, 1), context.scratch)
+    for start, stop in bands(baked.size):
+        image[start:stop, :, 0] = code[baked.nearest[start:stop]]
+    return _store("region", image, _range(code), MapKind((), png=8, codes=True), context)
+
+
 def _picture(shape: tuple[int, int, int], folder: Path) -> F32:
     """Channel after channel in memory, so that each is one piece for the EXR's writer, seen as (H, W, C)."""
     planes = (shape[2], *shape[:2])
@@ -120,7 +137,7 @@ def _picture(shape: tuple[int, int, int], folder: Path) -> F32:
     return np.moveaxis(made, 0, -1)
 
 
-def _range(values: F32) -> tuple[float, float, float]:
+def _range(values: npt.NDArray[Any]) -> tuple[float, float, float]:
     return float(values.min()), float(values.mean(dtype=np.float64)), float(values.max())
 
 
@@ -135,6 +152,8 @@ def _store(name: str, image: F32, figures: tuple[float, float, float], kind: Map
         if kind.space == "srgb_png":
             write_png_from_linear(path, image)
         else:
+            if kind.codes:
+                image /= 255
             write_png(path, image, kind.png, signed=kind.encoded)
         files["png"] = context.file(f"{FOLDER}/{name}.png")
     minimum, mean, maximum = figures

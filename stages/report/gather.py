@@ -82,6 +82,7 @@ def figures(r: Results) -> dict[str, Any]:
             "watertight": surface.watertight,
             "components": surface.components,
             "removed_components": surface.removed_components,
+            "trimmed_share": surface.trimmed,
         },
         "uv": {
             "vertices": uv.vertices,

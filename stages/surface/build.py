@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,18 +10,22 @@ import numpy as np
 from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
-from pipeline.meshes import F64, Faces, Mesh, Topology
+from pipeline.meshes import F64, Faces, Mask, Mesh, Topology
 from stages.surface import clean, extract
 from stages.surface.extract import Step
 from stages.surface.repair import repaired
+from stages.surface.trim import trimmed
 
 LARGE_SECOND = 0.05  # area of a dropped piece over the kept one's, from which it is worth a warning
 MOSTLY_CAP = 0.5  # of the area: more cap than that is a box and not a head
 
+Sees = Callable[[Mesh], Mask]
+
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """The finished mesh and what was found on the way. cell: lattice edge; cap: share of the area on the box."""
+    """The finished mesh and what was found on the way. cell: lattice edge; cap: share of the area on the box; trimmed:
+    share of the area that no photo saw and that was cut off."""
 
     mesh: Mesh
     topology: Topology
@@ -29,10 +34,12 @@ class Built:
     cap: float
     residual: float
     warnings: tuple[str, ...]
+    trimmed: float = 0.0
 
 
-def build(field: Field, resolution: int, step: Step) -> Built:
-    """Mesh the field's zero set with `resolution` cells along the box's longest side.
+def build(field: Field, resolution: int, step: Step, sees: Sees | None = None) -> Built:
+    """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
+    photos see; the rest is cut off.
 
     Raises:
         StageError: no zero crossing, a solid that fills its box, or a mesh that can't be closed.
@@ -58,7 +65,11 @@ def build(field: Field, resolution: int, step: Step) -> Built:
     free = landed.vertices[~landed.capped]
     residual = float(np.abs(field.sdf(free.astype(np.float32))).max(initial=0))
     warnings = _warnings(removed, second, repairs)
-    return Built(mesh, found, removed, grid.h, cap, residual, warnings)
+    if sees is None:
+        return Built(mesh, found, removed, grid.h, cap, residual, warnings)
+    cut = trimmed(field, grid, mesh, sees(mesh))
+    found = meshes.topology(cut.mesh.faces, len(cut.mesh.vertices))
+    return Built(cut.mesh, found, removed, grid.h, cap, residual, warnings, cut.share)
 
 
 def _closed(vertices: F64, faces: Faces) -> tuple[F64, Faces, Topology, Topology | None]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, Surface
+from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface
 from pipeline.contract import Context, Stage, StageConfig
 
 MESH = "surface.npz"
@@ -14,14 +16,16 @@ MESH = "surface.npz"
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The fitted field, and the cameras for the unit of length."""
+    """The fitted field, and what the photos that it was fitted to could see."""
 
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
+    masks: Located[MaskSet]
+    capture: Located[Capture]
 
 
 class Config(StageConfig):
-    """How finely the zero set is sampled."""
+    """How finely the zero set is sampled, and what becomes of surface that no photo saw."""
 
     resolution: int = Field(
         256,
@@ -29,12 +33,16 @@ class Config(StageConfig):
         le=1024,
         description="lattice cells along the longest side of the field's box; time and faces grow with its square",
     )
+    unseen: Literal["closed", "trimmed"] = Field(
+        "closed", description="surface that no fitted photo saw: kept, so that the mesh is closed, or cut off"
+    )
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     """Mesh the zero set. Raises StageError when the field has none."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
+    from pipeline.visibility import Occluder, seen_by, sight
     from stages.surface.build import build
 
     fitted = inputs.inverse_rendering
@@ -44,7 +52,18 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         context.check()
         context.progress(done, total, "marching cubes")
 
-    built = build(field, config.resolution, step)
+    def sees(mesh: meshes.Mesh) -> meshes.Mask:
+        views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
+        points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
+        occluder, seen = Occluder(mesh), np.zeros(len(points), np.bool_)
+        for i, view in enumerate(views):
+            context.check()
+            context.progress(i, len(views), "visibility")
+            rest = np.flatnonzero(~seen)
+            seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
+        return seen
+
+    built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None)
     meshes.save(context.workdir / MESH, built.mesh)
     context.log.info(
         "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g",
@@ -61,8 +80,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         components=built.topology.components,
         removed_components=built.removed,
         cell=built.cell,
+        trimmed=round(built.trimmed, 6),
         warnings=built.warnings,
     )
 
 
-STAGE = Stage(name="surface", version=1, inputs=Inputs, config=Config, output=Surface, run=run)
+STAGE = Stage(name="surface", version=2, inputs=Inputs, config=Config, output=Surface, run=run)

@@ -20,7 +20,7 @@ from stages.usd.gltf import write_glb
 from stages.usd.light import environment, environment_figures, light_json, read_light
 from stages.usd.lookdev import lookdev_layer
 from stages.usd.maps import write_maps
-from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from, without_overlap
+from stages.usd.mesh import UvSurface, half_gap, read_mesh, uv_fault, with_uvs_from, without_overlap
 from stages.usd.obj import write_obj
 from stages.usd.package import bounded_png, write_package
 from stages.usd.shading import Look
@@ -150,8 +150,9 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
 
 
 def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
-    """The dense mesh with the textured mesh's coordinates. At charts' edges its corners are drawn onto the edge."""
-    high = with_uvs_from(read_mesh(surface.path(surface.artifact.mesh), with_uvs=False), mesh, NEAR_HIGH)
+    """The dense mesh with the textured mesh's coordinates. On seams its corners reach into the gutter."""
+    dense = read_mesh(surface.path(surface.artifact.mesh), with_uvs=False)
+    high = with_uvs_from(dense, mesh, NEAR_HIGH, half_gap(mesh))
     fault = uv_fault(high, mesh)
     return (None, [f"the dense mesh was left out: {fault}"]) if fault else (high, [])
 

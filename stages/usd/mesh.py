@@ -15,6 +15,7 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
 SHRINK, SHRINK_ROUNDS = 0.85, 6
+AREAS = (0.25, 4.0)  # of a triangle's own: with less or more in the texture it is laid flat anew
 CANDIDATES = 12  # nearest triangles among which the exact nearest point is looked for
 
 
@@ -88,22 +89,27 @@ def charts_of(uv_faces: I32, count: int) -> I32:
     return np.asarray(labels[uv_faces[:, 0]], np.int32)
 
 
-def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATES) -> UvSurface:
+def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATES, beyond: float = 0.0) -> UvSurface:
     """The proxy with texture coordinates of the full mesh, so that one material serves both.
 
     Each proxy triangle takes the chart that lies nearest to its centroid, and each of its corners the texture
     coordinate of that chart's nearest point. At a chart's edge corners are therefore drawn onto the edge: never into
     a neighbour's texels. Nearest is measured in space and in the texture together (against where the centroid's
     triangle, continued as a plane, would put the corner), because a chart may wind around and meet itself at a seam.
+
+    `beyond` (uv): how far corners may lie past their chart's edge instead, where its triangle continued as a plane
+    puts them. A fine mesh needs that: of its triangles on a seam nothing would be left. Those that stand on end
+    against what they take their coordinates from (a rim that the full mesh cuts off) are laid flat around their middle.
     """
     from scipy.spatial import cKDTree
 
     chart = charts_of(full.uv_faces, len(full.uvs))
     corners, t = full.vertices[full.faces].astype(np.float64), full.uvs[full.uv_faces].astype(np.float64)
     ends = proxy.vertices[proxy.faces].astype(np.float64)
-    hit, weights = _nearest(ends.mean(1), corners, cKDTree(corners.mean(1)).query(ends.mean(1), candidates)[1])
+    near = cKDTree(corners.mean(1)).query(ends.mean(1), candidates)[1]
+    hit, weights_at_centre = _nearest(ends.mean(1), corners, near)
     scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres a unit of texture
-    expected = _continued(ends, corners[hit], t[hit], weights)
+    expected = _continued(ends, corners[hit], t[hit], weights_at_centre)
     places = np.concatenate([corners.mean(1), scale * t.mean(1)], 1)
     wanted = np.concatenate([ends, scale * expected], -1)
     uvs = np.zeros((len(ends), 3, 2))
@@ -112,9 +118,73 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
         query = wanted[rows].reshape(-1, 5)
         near = cKDTree(places[inside]).query(query, min(candidates, len(inside)))[1].reshape(len(query), -1)
         face, weights = _nearest(query[:, :3], corners[inside], near)
-        uvs[rows] = (t[inside[face]] * weights[..., None]).sum(1).reshape(-1, 3, 2)
+        found = (t[inside[face]] * weights[..., None]).sum(1)
+        if beyond > 0:
+            plane = _continued(query[:, None, :3], corners[inside[face]], t[inside[face]], weights)[:, 0]
+            step = plane - found
+            length = np.linalg.norm(step, axis=1, keepdims=True)
+            found = found + step * np.minimum(1, beyond / np.maximum(length, 1e-30))
+        uvs[rows] = found.reshape(-1, 3, 2)
+    if beyond > 0:
+        _lay_flat(uvs, ends, corners[hit], t[hit], weights_at_centre, beyond)
     values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
+
+
+def _lay_flat(uvs: F64, ends: F64, corners: F64, t: F64, weights: F64, most: float) -> None:
+    """Triangles (N, 3, 3) that lost most of their area in uvs (N, 3, 2), turned over or were torn apart are turned in
+    space until they lie in their triangle of the full mesh (`corners`, `t` (N, 3, .), `weights` (N, 3) under their
+    middle), and take its coordinates. Corners stay within `most` (uv) of the middle. Changes uvs."""
+    own, base = (np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) for x in (ends, corners))
+    a, b = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    c, d = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    sign = c[:, 0] * d[:, 1] - c[:, 1] * d[:, 0]
+    wanted = sign * np.linalg.norm(own, axis=1) / np.maximum(np.linalg.norm(base, axis=1), 1e-30)
+    area = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) * np.sign(sign)
+    lost = (area < AREAS[0] * np.abs(wanted)) | (area > AREAS[1] * np.abs(wanted))
+    if not lost.any():
+        return
+    turned = _turned(ends[lost] - ends[lost].mean(1, keepdims=True), own[lost], base[lost])
+    on = (corners[lost] * weights[lost][..., None]).sum(1)
+    middle = (t[lost] * weights[lost][..., None]).sum(1)
+    step = _continued(on[:, None] + turned, corners[lost], t[lost], weights[lost]) - middle[:, None]
+    reach = np.linalg.norm(step, axis=2).max(1)
+    uvs[lost] = middle[:, None] + step * np.minimum(1, most / np.maximum(reach, 1e-30))[:, None, None]
+
+
+def _turned(points: F64, start: F64, goal: F64) -> F64:
+    """(N, K, 3) points turned by the smallest turn that takes direction start (N, 3) to goal (N, 3)."""
+    a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (start, goal))
+    half = a + b  # two mirrorings, at the plane across a and at that across the way between a and b
+    opposite = np.linalg.norm(half, axis=1) < 1e-6
+    half[opposite] = np.cross(a[opposite], np.eye(3)[np.abs(a[opposite]).argmin(1)])
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    for mirror in (a, half):
+        points = points - 2 * np.einsum("nkc,nc->nk", points, mirror)[..., None] * mirror[:, None]
+    return points
+
+
+def half_gap(mesh: UvSurface, size: int = 1024) -> float:
+    """Half of the least distance (uv) between two charts, found on a raster of `size` and a texel too small rather
+    than too large; infinite for one chart. The gutter's texels up to there are filled from the nearer chart."""
+    from pipeline import raster
+    from pipeline.meshes import Charts
+    from pipeline.nearest import nearest_known
+
+    hits = raster.rasterise(raster.texel_corners(Charts(mesh.uvs, mesh.uv_faces), size), size, 0, size, 0.5)
+    chart = np.full(size * size, -1)
+    chart[hits.texel] = charts_of(mesh.uv_faces, len(mesh.uvs))[hits.face]
+    nearest = nearest_known((chart >= 0).reshape(size, size))
+    row, column = np.divmod(nearest, size)
+    y, x = np.mgrid[:size, :size]
+    away = np.hypot(row - y, column - x)
+    of = chart[nearest]
+    least = np.inf
+    for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        border = of[a] != of[b]
+        if border.any():
+            least = min(least, float((away[a] + away[b])[border].min()) / 2)
+    return max(least - 1, 0.0) / size
 
 
 def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
@@ -144,7 +214,7 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
 
 
 def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
-    """(N, 3, 2): where each triangle's affine map from space to texture puts three points (N, 3, 3)."""
+    """(N, K, 2): where each triangle's affine map from space to texture puts its points (N, K, 3)."""
     edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
     on = (corners * weights[..., None]).sum(1)
     start = (t * weights[..., None]).sum(1)
@@ -173,15 +243,15 @@ def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> 
 
 
 def uv_fault(proxy: UvSurface, full: UvSurface, limit: float = 0.005) -> str:
-    """Why a proxy's texture coordinates would mislead a client, or "".
+    """Why texture coordinates taken from the full mesh would mislead a client, or "".
 
     Triangles without area, or more mirrored ones than the full mesh has (an atlas may mirror whole charts).
     """
     empty, mirrored = _shares(proxy)
     if empty > limit:
-        return f"{empty:.1%} of the proxy's surface has no area in the texture"
+        return f"{empty:.1%} of its surface has no area in the texture"
     wrong = abs(mirrored - _shares(full)[1])
-    return f"{wrong:.1%} of the proxy's surface is mirrored in the texture" if wrong > 10 * limit else ""
+    return f"{wrong:.1%} of its surface is mirrored in the texture" if wrong > 10 * limit else ""
 
 
 def _shares(mesh: UvSurface) -> tuple[float, float]:

@@ -37,15 +37,15 @@ def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, st
     """Decimate, unwrap and measure.
 
     Raises:
-        StageError: an open mesh, or one that can't be decimated or unwrapped.
+        StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
     """
     found = meshes.topology(dense.faces, len(dense.vertices))
-    if not found.manifold:
+    if not found.sound:
         raise StageError(
-            "the mesh is not a closed manifold",
+            "the mesh is not a manifold",
             where="surface",
             value=found,
-            limit="every edge with two faces",
+            limit="every edge with two faces, or with one on a border; one fan of faces around every vertex",
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")

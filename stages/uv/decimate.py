@@ -15,7 +15,7 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Indices, Mesh
 
-AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a closed manifold of the wanted size
+AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a manifold of the wanted size
 LOOP = 8  # edges of the largest hole that is closed
 ROUNDS = 4  # of taking bubbles away
 UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
@@ -28,22 +28,25 @@ NEARLY = 1.05  # of the target: near enough to stop trying
 
 
 def decimated(dense: Mesh, target: int) -> Mesh:
-    """A closed manifold with about `target` triangles and smooth normals. A mesh that is small enough is kept.
+    """A manifold with about `target` triangles and smooth normals, closed if the dense mesh is. A mesh that is small
+    enough is kept.
 
     Normals are those of the nearest dense vertex: they come from the field's gradient and know more than the faces.
 
     Raises:
-        StageError: no setting gives a closed manifold.
+        StageError: no setting gives a manifold.
     """
     if len(dense.faces) <= target:
         return dense
+    closed = meshes.topology(dense.faces, len(dense.vertices)).watertight
     scale, origin = _scale(dense)
     points = (dense.vertices.astype(np.float64) - origin) * scale
     best: tuple[F64, Faces] | None = None
     for aggressiveness in AGGRESSIVENESS:
         vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
         vertices, faces = without_bubbles(vertices, faces)
-        if not meshes.topology(faces, len(vertices)).manifold:
+        found = meshes.topology(faces, len(vertices))
+        if not (found.manifold if closed else found.sound):
             continue
         if best is None or len(faces) < len(best[1]):
             best = vertices, faces
@@ -56,7 +59,7 @@ def decimated(dense: Mesh, target: int) -> Mesh:
         "the mesh can't be decimated",
         where="uv.target_faces",
         value=f"{len(dense.faces)} to {target} faces breaks the surface",
-        limit="a closed manifold",
+        limit="a manifold, closed if the dense mesh is",
         remedy="choose more target_faces, or another surface.resolution",
     )
 

@@ -52,11 +52,13 @@ def seam_weights(vertices: F64, faces: Faces) -> F64:
 
 
 def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
-    """Pairs of faces across each edge of a closed manifold, in a fixed order."""
+    """Pairs of faces across each inner edge of a manifold, in a fixed order."""
     e = meshes.edges(faces)
     low, high = e.min(1), e.max(1)
-    order = np.argsort(low * (len(vertices) + 1) + high, kind="stable")
-    first, second = order[::2], order[1::2]
+    code = low * (len(vertices) + 1) + high
+    order = np.argsort(code, kind="stable")
+    pair = np.flatnonzero(np.diff(code[order]) == 0)
+    first, second = order[pair], order[pair + 1]
     edge = np.stack([low[first], high[first]], 1)
     length = np.linalg.norm(vertices[edge[:, 0]] - vertices[edge[:, 1]], axis=1)
     return Dual(first % len(faces), second % len(faces), edge, length, length * weights[edge].mean(1))
@@ -148,7 +150,7 @@ def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: fl
     """
     n = len(area)
     unit = vectors / np.maximum(area, 1e-30)[:, None]
-    near = np.full((n, 3), -1)
+    near = np.repeat(np.arange(n)[:, None], 3, 1)  # beyond a border there is nobody but the face itself
     cost = np.zeros((n, 3))
     faces, others = np.concatenate([pairs.a, pairs.b]), np.concatenate([pairs.b, pairs.a])
     order = np.argsort(faces, kind="stable")

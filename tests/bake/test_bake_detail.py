@@ -16,9 +16,9 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.images import write_exr
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
+from pipeline.visibility import View
 from stages.bake import detail, detail_kernels, detail_views, smooth
 from stages.bake.build import Photos, build
-from stages.bake.confidence import View
 from stages.bake.texels import ALBEDO_RANGE
 from stages.uv import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere

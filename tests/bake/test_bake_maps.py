@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +14,9 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.maths import microfacet
 from pipeline.meshes import Charts, Mesh
+from pipeline.visibility import Occluder, View
 from stages.bake.ambient import ambient
 from stages.bake.build import Baked, build
-from stages.bake.confidence import Occluder, View, confidence, weight_of
 from stages.bake.gutter import nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
@@ -321,7 +320,8 @@ def test_coverage_holds_every_touched_texel(mesh_and_charts: tuple[Mesh, Charts]
 def test_maps_do_not_depend_on_bands(
     field: AnalyticField, mesh_and_charts: tuple, baked: Baked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stages.bake.build.BAND", 3000)
+    for name, small in (("BAND", 3000), ("NEAREST_BAND", 1), ("HALO", 8)):
+        monkeypatch.setattr(f"stages.bake.build.{name}", small)
     again = build(field, *mesh_and_charts, VIEWS, SIZE, quiet)
     assert np.array_equal(again.texel, baked.texel) and np.allclose(again.samples.albedo, baked.samples.albedo)
     assert np.array_equal(again.nearest, baked.nearest)
@@ -339,57 +339,6 @@ def test_cap_is_left_where_it_is() -> None:
     assert np.abs(baked.samples.displacement[on_cap]).max() == 0
     assert np.allclose(baked.samples.normal[on_cap], [0, 0, 1], atol=1e-5)
     assert any("no zero set" in w for w in baked.warnings) and any("no fitted view" in w for w in baked.warnings)
-
-
-# ------------------------------------------------------------------ confidence
-def test_confidence_of_a_sphere_is_its_cosines() -> None:
-    mesh = surface_build(AnalyticField(sphere()), 40, quiet).mesh
-    points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
-    occluder = Occluder(mesh)
-    view = View(camera(0, 0.0), None)
-    away = np.array([0, 0, 0.6]) - points
-    cosine = (away / np.linalg.norm(away, axis=1, keepdims=True) * normals).sum(1)
-    clear = np.abs(cosine) > 0.1  # facets hide their own horizon
-    got = weight_of(view, points, normals, occluder)
-    assert np.allclose(got[clear], cosine.clip(0)[clear], atol=1e-6)
-
-
-def test_confidence_sees_what_is_in_the_way(tmp_path: Path) -> None:
-    ball = surface_build(AnalyticField(sphere(0.05)), 40, quiet).mesh
-    wall_vertices = np.array([[-1, -1, 0.2], [1, -1, 0.2], [1, 1, 0.2], [-1, 1, 0.2]], np.float32)
-    wall = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(ball.vertices)
-    both = Mesh(
-        np.concatenate([ball.vertices, wall_vertices]),
-        np.concatenate([ball.normals, np.tile(np.float32([0, 0, 1]), (4, 1))]),
-        np.concatenate([ball.faces, wall]),
-    )
-    points, normals = ball.vertices.astype(np.float64), ball.normals.astype(np.float64)
-    assert weight_of(View(camera(0, 0.0), None), points, normals, Occluder(both)).max() == 0
-    assert weight_of(View(camera(0, np.pi), None), points, normals, Occluder(both)).max() > 0.9
-    small = replace(View(camera(0, 0.0, focal=1000.0), None))  # only the middle fits into the photo
-    seen = weight_of(small, points, normals, Occluder(ball)) > 0
-    assert seen.any() and np.hypot(*points[seen][:, :2].T).max() < 0.6 * 32 / 1000 * 1.5
-
-
-def test_confidence_respects_masks(tmp_path: Path) -> None:
-    from pipeline.images import write_png
-
-    mask = np.zeros((64, 64))
-    mask[:, 32:] = 1  # the right half of the photo: +x, as the camera looks along -z
-    write_png(tmp_path / "0.png", mask)
-    mesh = surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh
-    points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
-    seen = weight_of(View(camera(0, 0.0), tmp_path / "0.png"), points, normals, Occluder(mesh)) > 0
-    assert seen.any() and points[seen][:, 0].min() > -1e-3
-
-
-def test_confidence_map_grows_with_views(mesh_and_charts: tuple[Mesh, Charts]) -> None:
-    mesh, charts = mesh_and_charts
-    none = confidence(mesh, charts, (), 64, lambda done, total: None)
-    one = confidence(mesh, charts, VIEWS[:1], 64, lambda done, total: None)
-    four = confidence(mesh, charts, VIEWS, 64, lambda done, total: None)
-    assert none.max() == 0 and 0.49 < one.max() <= 0.5 and (four >= one - 1e-6).all() and four.max() < 1
-    assert one.min() == 0 and four.min() >= 0
 
 
 # ------------------------------------------------------------------ table

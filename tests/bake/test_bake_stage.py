@@ -13,7 +13,7 @@ from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, 
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from pipeline.images import read_encoded, read_exr, write_png
-from stages.bake.confidence import seen_by
+from pipeline.visibility import seen_by
 from stages.bake.stage import Config, Inputs, run
 from stages.surface.build import build as surface_build
 from stages.uv.decimate import decimated

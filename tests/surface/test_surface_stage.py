@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import Surface
+from pipeline.artifacts import Capture, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
 from stages.surface import build as building
@@ -23,7 +23,9 @@ from tests.support.field_artifacts import fitted, poses
 
 @pytest.fixture
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
-    return Inputs(fitted(tmp_path, AnalyticField(bumpy_head()), monkeypatch), poses(tmp_path))
+    face = fitted(tmp_path, AnalyticField(bumpy_head()), monkeypatch)
+    photos = Located(Capture(kind="facescape", views=()), tmp_path)
+    return Inputs(face, poses(tmp_path), Located(MaskSet(masks=()), tmp_path), photos)
 
 
 def test_run_writes_the_artifact(inputs: Inputs, tmp_path: Path) -> None:

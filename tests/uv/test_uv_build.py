@@ -10,6 +10,7 @@ from pipeline import meshes, raster
 from pipeline.errors import StageError
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
+from stages.surface.trim import cut
 from stages.uv import decimate, unwrap
 from stages.uv import pack as packing
 from stages.uv.build import Built, build
@@ -110,9 +111,28 @@ def test_smooth_mesh_with_more_faces_wanted_is_kept(dense: Mesh) -> None:
     assert decimate.decimated(dense, len(dense.faces) + 1) is dense
 
 
-def test_open_mesh_is_refused(dense: Mesh) -> None:
-    with pytest.raises(StageError, match="closed manifold"):
-        build(Mesh(dense.vertices, dense.normals, dense.faces[:-1]), 5000, 1000, unwrap.Options(), quiet)
+@pytest.mark.slow
+def test_a_mesh_with_a_border_keeps_it(dense: Mesh) -> None:
+    """A head cut open below, as `surface.unseen=trimmed` leaves it: decimated and unwrapped, still one sheet."""
+    ends, share, faces = cut(dense.faces, 0.5 + dense.vertices[:, 1].astype(np.float64) + 0.05)
+    start, end = dense.vertices[ends].transpose(1, 0, 2)
+    points = np.concatenate([dense.vertices, start + share[:, None] * (end - start)])
+    vertices, faces, source = meshes.compact(points, faces)
+    normals = np.concatenate([dense.normals, dense.normals[ends[:, 0]]])[source]
+    opened = Mesh(vertices.astype(np.float32), normals, faces)
+    made = build(opened, 1200, 300, unwrap.Options(512, 4), quiet)
+    for mesh in (made.mesh, made.proxy):
+        found = meshes.topology(mesh.faces, len(mesh.vertices))
+        assert found.sound and found.components == 1 and found.euler == 1
+        assert mesh.vertices[:, 1].min() > -0.052
+    assert made.quality.overlap == 0 and made.quality.flipped == 0 and made.quality.charts < 30
+    assert made.quality.stretch < 1.35 and made.deviation.rms < 5e-4
+
+
+def test_a_mesh_that_is_no_manifold_is_refused(dense: Mesh) -> None:
+    tips = np.array([[0, 1, 2], [0, 3, 4]], np.int32)
+    with pytest.raises(StageError, match="not a manifold"):
+        build(Mesh(dense.vertices, dense.normals, tips), 1000, 300, unwrap.Options(512, 4), quiet)
 
 
 def test_bubble_is_cut_off() -> None:

@@ -1,0 +1,170 @@
+"""What the photos see of the texture: cosines, confidence and the votes for regions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.contract import Context
+from pipeline.images import read_encoded, read_exr, write_png
+from pipeline.meshes import Charts, Mesh
+from pipeline.visibility import Occluder, View, sight
+from stages.bake.build import Baked, build
+from stages.bake.confidence import sighted
+from stages.bake.regions import Poll, Votes
+from stages.bake.write import write_maps
+from stages.surface.build import build as surface_build
+from stages.uv.decimate import decimated
+from stages.uv.unwrap import Options, unwrap
+from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.field_artifacts import camera
+
+VIEWS = tuple(View(camera(i, np.pi / 2 * i), None) for i in range(4))
+
+
+def quiet(done: int, total: int, message: str = "") -> None:
+    """No progress shown."""
+
+
+@pytest.fixture(scope="module")
+def mesh_and_charts() -> tuple[Mesh, Charts]:
+    mesh = decimated(surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh, 800)
+    return mesh, unwrap(mesh, Options(256, 4))
+
+
+def weight_of(view: View, points: np.ndarray, normals: np.ndarray, occluder: Occluder) -> np.ndarray:
+    return sight(view, points, normals, occluder)[0]
+
+
+def test_confidence_of_a_sphere_is_its_cosines() -> None:
+    mesh = surface_build(AnalyticField(sphere()), 40, quiet).mesh
+    points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
+    occluder = Occluder(mesh)
+    view = View(camera(0, 0.0), None)
+    away = np.array([0, 0, 0.6]) - points
+    cosine = (away / np.linalg.norm(away, axis=1, keepdims=True) * normals).sum(1)
+    clear = np.abs(cosine) > 0.1  # facets hide their own horizon
+    got = weight_of(view, points, normals, occluder)
+    assert np.allclose(got[clear], cosine.clip(0)[clear], atol=1e-6)
+
+
+def test_confidence_sees_what_is_in_the_way(tmp_path: Path) -> None:
+    ball = surface_build(AnalyticField(sphere(0.05)), 40, quiet).mesh
+    wall_vertices = np.array([[-1, -1, 0.2], [1, -1, 0.2], [1, 1, 0.2], [-1, 1, 0.2]], np.float32)
+    wall = np.array([[0, 1, 2], [0, 2, 3]], np.int32) + len(ball.vertices)
+    both = Mesh(
+        np.concatenate([ball.vertices, wall_vertices]),
+        np.concatenate([ball.normals, np.tile(np.float32([0, 0, 1]), (4, 1))]),
+        np.concatenate([ball.faces, wall]),
+    )
+    points, normals = ball.vertices.astype(np.float64), ball.normals.astype(np.float64)
+    assert weight_of(View(camera(0, 0.0), None), points, normals, Occluder(both)).max() == 0
+    assert weight_of(View(camera(0, np.pi), None), points, normals, Occluder(both)).max() > 0.9
+    small = replace(View(camera(0, 0.0, focal=1000.0), None))  # only the middle fits into the photo
+    seen = weight_of(small, points, normals, Occluder(ball)) > 0
+    assert seen.any() and np.hypot(*points[seen][:, :2].T).max() < 0.6 * 32 / 1000 * 1.5
+
+
+def test_confidence_respects_masks(tmp_path: Path) -> None:
+    mask = np.zeros((64, 64))
+    mask[:, 32:] = 1  # the right half of the photo: +x, as the camera looks along -z
+    write_png(tmp_path / "0.png", mask)
+    mesh = surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh
+    points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
+    seen = weight_of(View(camera(0, 0.0), tmp_path / "0.png"), points, normals, Occluder(mesh)) > 0
+    assert seen.any() and points[seen][:, 0].min() > -1e-3
+
+
+def test_confidence_map_grows_with_views(mesh_and_charts: tuple[Mesh, Charts]) -> None:
+    none, one, four = (sighted(*mesh_and_charts, v, 64, quiet).confidence for v in ((), VIEWS[:1], VIEWS))
+    assert none.max() == 0 and 0.49 < one.max() <= 0.5 and (four >= one - 1e-6).all() and four.max() < 1
+    assert one.min() == 0 and four.min() >= 0
+
+
+def test_clipped_pixels_lower_the_confidence(mesh_and_charts: tuple[Mesh, Charts], tmp_path: Path) -> None:
+    """As if the photo did not see them; elsewhere nothing changes. They are seen all the same."""
+    mesh, _ = mesh_and_charts
+    clipped = np.zeros((64, 64))
+    clipped[:32] = 1  # the upper half of the photo: +y
+    write_png(tmp_path / "0.png", clipped)
+    plain, burnt = VIEWS[0], replace(VIEWS[0], clipped=tmp_path / "0.png")
+    before, after = (sighted(*mesh_and_charts, (v, VIEWS[1]), 64, quiet).confidence for v in (plain, burnt))
+    other = sighted(*mesh_and_charts, VIEWS[1:2], 64, quiet).confidence
+    assert (after <= before).all() and np.isin(after, np.concatenate([before.ravel(), other.ravel()])).all()
+    changed = after != before
+    assert 0.1 < changed.mean() < 0.3 and np.array_equal(after[changed], other[changed])
+    points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
+    occluder = Occluder(mesh)
+    assert np.array_equal(weight_of(plain, points, normals, occluder), weight_of(burnt, points, normals, occluder))
+
+
+# ------------------------------------------------------------------ regions
+def labelled(folder: Path, index: int, left: int, right: int) -> View:
+    """A view whose photo has one label to the left of its middle, and another to the right."""
+    labels = np.full((64, 64), left)
+    labels[:, 32:] = right
+    write_png(folder / f"{index}.png", labels / 255)
+    return replace(VIEWS[index], labels=folder / f"{index}.png")
+
+
+@pytest.fixture(scope="module")
+def baked(mesh_and_charts: tuple[Mesh, Charts], tmp_path_factory: pytest.TempPathFactory) -> Baked:
+    """The front view labels -x 1 and +x 7, the back view all 200; those from the sides have no labels."""
+    folder = tmp_path_factory.mktemp("labels")
+    views = (labelled(folder, 0, 1, 7), VIEWS[1], labelled(folder, 2, 200, 200), VIEWS[3])
+    return build(AnalyticField(sphere(0.08)), *mesh_and_charts, views, 256, quiet)
+
+
+def test_each_texel_takes_the_label_of_the_photos_that_see_it(
+    baked: Baked, mesh_and_charts: tuple[Mesh, Charts], tmp_path: Path
+) -> None:
+    from pipeline import raster
+
+    mesh, charts = mesh_and_charts
+    maps = write_maps(baked, Context(tmp_path, tmp_path))
+    image = read_exr(tmp_path / "textures/region.exr")[0][..., 0]
+    assert np.array_equal(read_encoded(tmp_path / "textures/region.png")[..., 0], image)
+    hits = raster.rasterise(raster.texel_corners(charts, 256), 256, 0, 256)
+    x, _, z = (mesh.vertices[mesh.faces[hits.face]] * hits.weights[..., None]).sum(1).T
+    code = image.reshape(-1)[hits.texel]
+    front, sure, side = z > 0.03, np.abs(x) > 0.004, np.abs(z) < 0.006  # cameras at 0.6 m see z > 0.0107 of the ball
+    assert (code[front & sure] == np.where(x > 0, 7, 1)[front & sure]).all()
+    assert (code[z < -0.03] == 200).all() and (code[side] == 0).all()
+    assert set(np.unique(image)) == {0, 1, 7, 200} == set(np.unique(code))
+    assert maps["region"].minimum == 0 and maps["region"].maximum == 200
+    gutter = ~baked.covered()
+    assert np.array_equal(image[gutter], image.reshape(-1)[baked.texel][baked.nearest[gutter]])
+
+
+def test_without_labels_there_is_no_map_of_regions(mesh_and_charts: tuple[Mesh, Charts], tmp_path: Path) -> None:
+    baked = build(AnalyticField(sphere(0.08)), *mesh_and_charts, VIEWS[:1], 256, quiet)
+    assert baked.votes is None and "region" not in write_maps(baked, Context(tmp_path, tmp_path))
+
+
+def test_votes_count_by_their_cosines(tmp_path: Path) -> None:
+    views = [labelled(tmp_path, i, code, code) for i, code in enumerate((5, 3, 3))]
+    poll = Poll(3)
+    for view, cosine in zip(views, ([0.9, 0.9, 0.0], [0.4, 0.5, 0.0], [0.4, 0.5, 0.0]), strict=True):
+        poll.ask(view, np.array(cosine), np.full((3, 2), 32.0))
+    votes = poll.result(lambda values: values.astype(np.float32)[None])
+    assert votes is not None and votes.codes.tolist() == [3, 5]
+    np.testing.assert_allclose(votes.image[0], [[0.8, 0.9], [1.0, 0.9], [0, 0]], rtol=1e-6)
+
+
+def test_borders_of_regions_are_smooth_at_sizes_beyond_the_votes() -> None:
+    """Votes are linear between places: a slanting border does not come in steps of a vote's size."""
+    side, size = 32, 256
+    y, x = np.mgrid[:side, :side] + 0.5
+    first = (0.5 + (x - 0.5 * y - 8) / 8).clip(0, 1)
+    votes = Votes(np.array([1, 2], np.uint8), np.stack([1 - first, first], -1).astype(np.float32))
+    codes = votes.winners(np.arange(size * size), size).reshape(size, size)
+    row, column = np.mgrid[:size, :size] + 0.5
+    away = (column - 0.5 * row) * side / size - 8
+    inside = (np.abs(row - size / 2) < 120) & (np.abs(column - size / 2) < 120)  # at its rim a picture is continued
+    sure = (np.abs(away) > 0.05) & inside
+    assert np.array_equal(codes[sure], np.where(away > 0, 2, 1)[sure])
+    tied = Votes(np.array([4, 9], np.uint8), np.ones((2, 2, 2), np.float32))
+    assert (tied.winners(np.arange(16), 4) == 4).all()
