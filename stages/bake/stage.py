@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,7 +47,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     field = load_face(fitted.path(fitted.artifact.field), context.device)
     path = uv.path(uv.artifact.mesh)
     views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
-    photos = Photos(responses(field, len(views)), attenuation(fitted.artifact)) if config.detail else None
+    exposure = {v.index: v.exposure for v in inputs.capture.artifact.views}
+    response = responses(field, [exposure[v.camera.index] for v in views])
+    photos = Photos(response, attenuation(fitted.artifact)) if config.detail else None
 
     def step(done: int, total: int, message: str) -> None:
         context.check()
@@ -71,12 +74,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     )
 
 
-def responses(field: object, count: int) -> F64:
-    """(views, 3, 3) the fitted A_n of each photo; the identity for fields that have none. [NeuFace eq. 19]"""
+def responses(field: object, exposures: Sequence[float]) -> F64:
+    """(views, 3, 3) e_n A_n of each photo: its exposure, by which the fit divided it, and the fitted A_n, the identity
+    for fields that have none. [NeuFace eq. 19]"""
+    e = np.asarray(exposures, np.float64)[:, None, None]
     model = getattr(field, "model", None)
     if model is None:
-        return np.tile(np.eye(3), (count, 1, 1))
-    return np.asarray(model.calibration().detach().cpu().numpy(), np.float64)
+        return e * np.eye(3)
+    return np.asarray(e * model.calibration().detach().cpu().numpy(), np.float64)
 
 
 def attenuation(face: FittedFace) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import ValidationError
 
 from pipeline import meshes
 from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, UvMesh, ViewMask
+from pipeline.colour import srgb_from_linear
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from pipeline.images import read_encoded, read_exr, write_png
@@ -135,3 +137,25 @@ def test_run_can_be_stopped(inputs: Inputs, tmp_path: Path) -> None:
 def test_size_limits(size: int) -> None:
     with pytest.raises(ValidationError):
         Config(size=size)
+
+
+def test_an_exposure_is_no_detail(inputs: Inputs, tmp_path: Path) -> None:
+    """Photos half as bright, of half the exposure: the same detail, which plain photos have not."""
+    pattern = np.random.default_rng(0).uniform(0.05, 0.9, (64, 64, 3))
+
+    def albedo(exposure: float, values: np.ndarray) -> np.ndarray:
+        views = []
+        for v in inputs.capture.artifact.views:
+            write_png(tmp_path / f"e{v.index}.png", srgb_from_linear(exposure * values))
+            image = FileRef.of(tmp_path, f"e{v.index}.png")
+            views.append(v.model_copy(update={"image": image, "exposure": exposure}))
+        capture = Located(Capture(kind="facescape", views=tuple(views)), tmp_path)
+        out = tmp_path / f"out{exposure}{values.std():.3f}"
+        out.mkdir()
+        found = run(dataclasses.replace(inputs, capture=capture), Config(size=256), Context(out, out))
+        return np.asarray(read_exr(out / found.maps["albedo"].files["exr"].path)[0])
+
+    one, half, plain = albedo(1.0, pattern), albedo(0.5, pattern), albedo(1.0, np.full_like(pattern, 0.3))
+    told = np.abs(one - plain).mean()
+    assert told > 0.002
+    assert np.abs(one - half).mean() < 0.1 * told
