@@ -8,21 +8,23 @@ from xml.sax.saxutils import escape
 
 Place = Callable[[tuple[float, float]], tuple[float, float]]
 
-WIDTH, HEIGHT = 860, 520
-LEFT, RIGHT, TOP, BOTTOM = 64, 20, 24, 52
+WIDTH, HEIGHT = 1020, 560
+KEY = 210  # width of the list of names
+LEFT, RIGHT, TOP, BOTTOM = 64, 20 + KEY, 24, 52
 STYLE = (
-    "text{font:12px sans-serif;fill:#333}.axis{stroke:#888}.grid{stroke:#ddd}"
+    "text{font:12px sans-serif;fill:#333}.number{font-size:10px}.axis{stroke:#888}.grid{stroke:#ddd}"
     ".point{fill:#7a8aa0}.ahead{fill:#c2410c}.front{fill:none;stroke:#c2410c;stroke-width:1.5}"
 )
 
 
 def plot(points: dict[str, tuple[float, float]], ahead: list[str]) -> str:
-    """SVG of named points (seconds, dB), seconds on a logarithmic axis, with a line through the names in `ahead`."""
+    """SVG of named points (seconds, dB), seconds on a logarithmic axis. Those in `ahead` are joined by a
+    line and named where they are, the others are numbered."""
     shown = {k: p for k, p in points.items() if all(map(math.isfinite, p)) and p[0] > 0}
     if not shown:
         return f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}"/>\n'
     s, q = zip(*shown.values(), strict=True)
-    low, high = math.log(min(s)) - 0.1, math.log(max(s)) + 0.25
+    low, high = math.log(min(s)) - 0.25, math.log(max(s)) + 0.25
     floor, top = min(q) - 0.3, max(q) + 0.3
 
     def at(p: tuple[float, float]) -> tuple[float, float]:
@@ -33,20 +35,25 @@ def plot(points: dict[str, tuple[float, float]], ahead: list[str]) -> str:
     line = " ".join(f"{x},{y}" for x, y in (at(shown[k]) for k in ahead if k in shown))
     body.append(f'<polyline class="front" points="{line}"/>')
     taken: list[tuple[float, float]] = []
-    for name, p in sorted(shown.items(), key=lambda item: -item[1][1]):
-        x, y = at(p)
-        body.append(f'<circle class="{"ahead" if name in ahead else "point"}" cx="{x}" cy="{y}" r="4"/>')
-        label = _free(x, y + 4, taken)
-        body.append(f'<text x="{x + 7}" y="{label}">{escape(name)}</text>')
+    behind = sorted((k for k in shown if k not in ahead), key=lambda k: -shown[k][1])
+    for k in (k for k in ahead if k in shown):
+        x, y = at(shown[k])
+        body.append(f'<circle class="ahead" cx="{x}" cy="{y}" r="4"/>')
+        body.append(f'<text x="{x - 4}" y="{_free(x, y - 10, taken, 60)}" text-anchor="end">{escape(k)}</text>')
+    for number, k in enumerate(behind, 1):
+        x, y = at(shown[k])
+        body.append(f'<circle class="point" cx="{x}" cy="{y}" r="3"/>')
+        body.append(f'<text class="number" x="{x + 4}" y="{_free(x, y + 3, taken, 14)}">{number}</text>')
+        body.append(f'<text x="{WIDTH - KEY + 12}" y="{TOP + 4 + 16 * number}">{number} {escape(k)}</text>')
     head = f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}" viewBox="0 0 {WIDTH} {HEIGHT}">'
     back = f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>'
     return "\n".join([head, f"<style>{STYLE}</style>", back, *body, "</svg>"]) + "\n"
 
 
-def _free(x: float, y: float, taken: list[tuple[float, float]]) -> float:
+def _free(x: float, y: float, taken: list[tuple[float, float]], width: float) -> float:
     """A height for a label near (x, y) that covers no other, and take it."""
-    while any(abs(x - a) < 130 and abs(y - b) < 12 for a, b in taken):
-        y += 12
+    while any(abs(x - a) < width and abs(y - b) < 10 for a, b in taken):
+        y += 10
     taken.append((x, y))
     return y
 
