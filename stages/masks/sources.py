@@ -21,6 +21,7 @@ from stages.masks.user_model import UserModel, mask_by_model
 Method = Literal["auto", "given", "plate", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
+PERSON_VIEWS = 0.9  # share of the views in which it must: it takes a statue for a person from some sides, but not all
 TELLING, WRONG_SIDE = 0.02, 0.3  # share of the photo around the region; mean alpha that is all but empty
 SOFT = 2  # pixels of the working size to which a cut-out contour is right
 
@@ -92,11 +93,13 @@ def plan(
     if method == "object":
         return _by_points(solid())
     shares = [_person_share(i, v.disc, threshold, min(working_size, 320), seed)
-              for i, v in zip(images[::2], some[::2], strict=True)]  # fmt: skip
-    if np.median(shares) >= PERSON_SHARE:
+              for i, v in zip(images, some, strict=True)]  # fmt: skip
+    if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
         return Plan("person")
     found = solid()
-    return Plan("grabcut") if found is None else _by_points(found)
+    if found is not None:
+        return _by_points(found)
+    return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
 
 
 def _by_points(solid: Solid | None) -> Plan:

@@ -14,7 +14,10 @@ from pipeline.images import read_alpha, write_png
 from pipeline.store import Store
 from pipeline.support import Support, find_support, is_level
 from pipeline.transforms import F64, matrix, pixel_centres, rays, rows
+from stages.masks import sources
+from stages.masks.region import Disc
 from stages.masks.solid import distinct, find_solid, silhouette_of_points
+from stages.masks.sources import View
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.support.textured_ball import camera_on_orbit
 
@@ -123,3 +126,26 @@ def test_the_stage_cuts_out_the_ball(tmp_path: Path, grey: bool) -> None:
     bare = poses.model_copy(update={"points": None})
     with pytest.raises(StageError, match="no object is found"):
         execute(STAGE, Inputs(inputs.capture, Located(bare, folder)), Config(method="object"), Store(tmp_path / "s"))
+
+
+@pytest.mark.parametrize(
+    ("sides", "points_at_hand", "wanted"),
+    [
+        ([0.95] * 12, True, "person"),  # a person
+        ([0.95] * 11 + [0.3], True, "person"),  # one odd view
+        ([1.0] * 8 + [0.0] * 4, True, "object"),  # a statue: a person from most sides only
+        ([1.0] * 8 + [0.0] * 4, False, "person"),  # nothing else to go by
+        ([0.0] * 12, False, "grabcut"),
+    ],
+)
+def test_a_statue_is_no_person(
+    sides: list[float], points_at_hand: bool, wanted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said = iter(sides)
+    monkeypatch.setattr(sources, "_person_share", lambda *_: next(said))
+    noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)  # no background of one colour
+    camera = cameras(1)[0]
+    views = [View(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
+    solid = find_solid(points(), cameras(), ROI, 0) if points_at_hand else None
+    assert solid is not None or not points_at_hand
+    assert sources.plan(views, "auto", 0.5, 64, 0, lambda: solid).method == wanted
