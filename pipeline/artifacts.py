@@ -18,6 +18,7 @@ from typing import Annotated, Generic, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
 Matrix = tuple[tuple[float, ...], ...]
+UNCHANGED: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 def _stays_inside(path: str) -> str:
@@ -247,12 +248,16 @@ class MaskSet(Artifact):
 
 # ------------------------------------------------------------------ inverse rendering
 class HeldOutView(Artifact):
-    """A prediction from the fitted field, linear Rec.709 RGBA, premultiplied: EXR, and PNG for people."""
+    """A prediction from the fitted field, linear Rec.709 RGBA, premultiplied: EXR, and PNG for people.
+
+    response: rows of the matrix that took the model's colours to those of the photo's camera; it is in both files.
+    """
 
     index: int
     exr: FileRef
     png: FileRef
     scale: int
+    response: Matrix = UNCHANGED
 
 
 class FittedFace(Artifact):

@@ -11,6 +11,7 @@ Source: IEC 61966-2-1; SMPTE RP 177 (matrix of a set of primaries); Lam 1985 (Br
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -79,3 +80,10 @@ def _xyz_from_rgb(c: Chromaticities) -> npt.NDArray[np.float64]:
     """(3, 3): the columns are the primaries, scaled so that equal parts make white."""
     columns = np.stack([_xyz(*c[i : i + 2]) for i in (0, 2, 4)], 1)
     return np.asarray(columns * np.linalg.solve(columns, _xyz(c[6], c[7])), np.float64)
+
+
+def as_photographed(rgba: npt.NDArray[np.float32], response: Sequence[Sequence[float]]) -> npt.NDArray[np.float32]:
+    """Linear RGBA (..., 4) with a camera's colour response, rows of 3 x 3, applied to its colours."""
+    out = np.array(rgba, np.float32)
+    out[..., :3] = rgba[..., :3] @ np.asarray(response, np.float32).T
+    return out

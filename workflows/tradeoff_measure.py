@@ -99,6 +99,7 @@ def measure(knob: Knob, given: argparse.Namespace) -> Measured:
 def looks(found: dict[str, Any], side: int, samples: int) -> npt.NDArray[np.float64]:
     """Mean PSNR, aligned PSNR, SSIM and FLIP over the held-out views, rendered at `side` pixels whatever the fit's own
     resolution was: a smaller picture is easier to match."""
+    from pipeline.colour import as_photographed
     from pipeline.fields.face import load_model
     from stages.inverse_rendering.gather import camera_only
     from stages.inverse_rendering.predict import predict_view
@@ -108,14 +109,14 @@ def looks(found: dict[str, Any], side: int, samples: int) -> npt.NDArray[np.floa
     fitted = found["inverse_rendering"]
     model = load_model(fitted.path(fitted.artifact.field))
     cameras = {c.index: c for c in found["poses"].artifact.cameras}
+    response = {h.index: h.response for h in fitted.artifact.held_out}
     out = []
     for view in found["capture"].artifact.views:
         if view.holdout and view.index in cameras:
             camera = cameras[view.index]
             factor = factor_for((camera.width, camera.height), side, exact=True)
             rgba = predict_view(model, camera_only(camera), factor, samples, "cpu")
-            rgba[..., :3] *= view.exposure
-            out.append(compared(rgba, factor, view, found))
+            out.append(compared(as_photographed(rgba, response[view.index]), factor, view, found))
     return np.asarray(np.nanmean(np.array(out, np.float64), axis=0) if out else np.full(4, np.nan))
 
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
-from pipeline.artifacts import CameraSet, Capture, HeldOutView
+import numpy as np
+
+from pipeline.artifacts import CameraSet, Capture, HeldOutView, Matrix
+from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel
 from pipeline.images import write_exr, write_png_from_linear
+from pipeline.transforms import rows
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.gather import camera_only
@@ -17,7 +22,7 @@ from stages.inverse_rendering.views import factor_for
 
 def write_light(model: FaceModel, context: Context) -> None:
     """light.json: raw coefficients and the conventions that they need."""
-    rows = model.light().detach().cpu().double().numpy().round(7).tolist()
+    coefficients = model.light().detach().cpu().double().numpy().round(7).tolist()
     (context.workdir / "light.json").write_text(
         json.dumps(
             {
@@ -25,32 +30,56 @@ def write_light(model: FaceModel, context: Context) -> None:
                 "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
                 "frame": "asset coordinates, +Y up, direction towards the light",
                 "colour": "linear Rec.709 radiance",
-                "coefficients": rows,
+                "coefficients": coefficients,
             },
             indent=1,
         )
     )
 
 
+def held_out_responses(model: FaceModel, capture: Capture, fitted: Sequence[int]) -> dict[int, Matrix]:
+    """Rows of e_n A_g for every held-out view: its exposure, and the mean colour response of the fitted photos
+    (indices in the model's order) by the same kind of camera; the mean response, I, where there are none. [NeuFace
+    eq. 19]
+
+    Differs: the paper has one kind of camera, and scores its test views after a 3 x 3 matrix of their own. What a kind
+    of camera does to colours is known from its fitted photos, without a look at the held-out ones.
+    """
+    group = {v.index: v.camera_group for v in capture.views}
+    matrices = model.calibration().detach().cpu().double().numpy() if model.spec.calibrated else None
+    out = {}
+    for view in (v for v in capture.views if v.holdout):
+        alike = [n for n, i in enumerate(fitted) if group[i] == view.camera_group]
+        mean = matrices[alike].mean(0) if matrices is not None and alike else np.eye(3)
+        out[view.index] = rows(view.exposure * mean)
+    return out
+
+
 def predict_held_out(
-    model: FaceModel, capture: Capture, poses: CameraSet, side: int, samples: int, context: Context
+    model: FaceModel,
+    capture: Capture,
+    poses: CameraSet,
+    fitted: Sequence[int],
+    side: int,
+    samples: int,
+    context: Context,
 ) -> tuple[HeldOutView, ...]:
     """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
-    held = {v.index: v for v in capture.views if v.holdout}
-    known = [c for c in poses.cameras if c.index in held]
-    exposure = {v.index: v.exposure for v in capture.views}
+    responses = held_out_responses(model, capture, fitted)
+    known = [c for c in poses.cameras if c.index in responses]
     out = []
     for n, c in enumerate(known):
         context.check()
         context.progress(n, len(known), "held-out views")
         factor = factor_for((c.width, c.height), side, exact=True)
         view = camera_only(c)
-        rgba = predict_view(model, view, factor, samples, context.device)
-        rgba[..., :3] *= exposure[c.index]
+        response = responses[c.index]
+        rgba = as_photographed(predict_view(model, view, factor, samples, context.device), response)
         exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
         write_exr(context.workdir / exr, rgba)
         write_png_from_linear(context.workdir / png, rgba[..., :3])
-        out.append(HeldOutView(index=c.index, exr=context.file(exr), png=context.file(png), scale=factor))
+        files = {"exr": context.file(exr), "png": context.file(png)}
+        out.append(HeldOutView(index=c.index, **files, scale=factor, response=response))
     return tuple(out)
 
 

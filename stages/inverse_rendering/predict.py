@@ -15,7 +15,7 @@ F32 = npt.NDArray[np.float32]
 def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, device: str) -> F32:
     """(H / factor, W / factor, 4) linear RGBA, premultiplied; the lens's distortion is in the rays.
 
-    No calibration is applied: a view outside the fit has the mean response, A = I.
+    No calibration is applied: the colours are those of the mean response, A = I.
     """
     w, h = view.size[0] // factor, view.size[1] // factor
     colour, opacity = render_rays(model, image_rays(view, factor, device), samples)

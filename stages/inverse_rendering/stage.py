@@ -201,7 +201,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     model.save(context.workdir / "field.npz")
     write_light(model, context)
     held_out = predict_held_out(
-        model, inputs.capture.artifact, inputs.poses.artifact, config.image_side, config.samples, context
+        model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
     return FittedFace(
         field=context.file("field.npz"),
@@ -227,4 +227,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     return capture.colours_drift or len({v.camera_group for v in capture.views if v.index in set(usable)}) > 1
 
 
-STAGE = Stage(name="inverse_rendering", version=3, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=4, inputs=Inputs, config=Config, output=FittedFace, run=run)

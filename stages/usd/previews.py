@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Camera, CameraSet, FittedFace, HeldOutView
-from pipeline.colour import srgb_from_linear
+from pipeline.artifacts import UNCHANGED, Camera, CameraSet, FittedFace, HeldOutView
+from pipeline.colour import as_photographed, srgb_from_linear
 from pipeline.contract import Context
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import matrix
@@ -39,7 +39,7 @@ def view_of(camera: Camera) -> View:
 def render_held_out(
     root: Path, cameras: CameraSet, face: FittedFace, samples: int, context: Context
 ) -> tuple[HeldOutView, ...]:
-    """asset_views/I.exr and .png for each view that the fit predicted, at the same scale.
+    """asset_views/I.exr and .png for each view that the fit predicted: at its scale, in the colours of its camera.
 
     With no held-out view, of a few fitted ones instead, so that there is something to look at.
     """
@@ -49,15 +49,18 @@ def render_held_out(
     if not wanted:
         return ()
     renderer = Renderer(load_exported(root))
-    out = []
+    responses, out = {v.index: v.response for v in face.held_out}, []
     for number, (index, scale) in enumerate(wanted):
         context.check()
         context.progress(number, len(wanted), f"asset view {index}")
         rgba = renderer.render(view_of(by_index[index]), factor=scale, samples=samples)
+        if index in responses:
+            rgba = as_photographed(rgba, responses[index])
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
         write_exr(exr, rgba)
         write_rgba_png(png, rgba)
-        out.append(HeldOutView(index=index, exr=context.file(exr), png=context.file(png), scale=scale))
+        files = {"exr": context.file(exr), "png": context.file(png)}
+        out.append(HeldOutView(index=index, **files, scale=scale, response=responses.get(index, UNCHANGED)))
     return tuple(out)
 
 
