@@ -24,8 +24,9 @@ F64 = npt.NDArray[np.float64]
 
 def solved_cameras(run: Path) -> CameraSet:
     """The cameras of a finished run, from its store."""
-    key = json.loads((run / "run.json").read_text())["stages"]["poses"]["key"]
-    return CameraSet.model_validate_json((Path(json.loads((run / "run.json").read_text())["store"]) / "poses" / key / "manifest.json").read_text())
+    record = json.loads((run / "run.json").read_text())
+    manifest = Path(record["store"]) / "poses" / record["stages"]["poses"]["key"] / "manifest.json"
+    return CameraSet.model_validate_json(manifest.read_text())
 
 
 def main() -> None:

@@ -44,7 +44,7 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     best: tuple[F64, Faces] | None = None
     for aggressiveness in AGGRESSIVENESS:
         vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
-        vertices, faces = without_bubbles(vertices, faces)
+        vertices, faces = split_apart(*without_bubbles(vertices, faces))
         found = meshes.topology(faces, len(vertices))
         if not (found.manifold if closed else found.sound):
             continue
@@ -85,6 +85,32 @@ def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
         faces = filled(faces[label == np.bincount(label).argmax()])
     v, f, _ = meshes.compact(vertices, faces)
     return np.asarray(v, np.float64), f
+
+
+def split_apart(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
+    """Sheets that touch along a crowded edge or in a point, each with vertices of its own there.
+
+    Collapsing edges pinches thin handles until two sheets share an edge. Corners of faces stay one vertex where they
+    are neighbours across an edge of two faces; elsewhere they become several at the same place.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    e, n = meshes.edges(faces), len(faces)
+    code = np.minimum(e[:, 0], e[:, 1]) * len(vertices) + np.maximum(e[:, 0], e[:, 1])
+    order = np.argsort(code, kind="stable")
+    first = np.flatnonzero(np.diff(code[order], prepend=-1))
+    pair = first[np.diff(first, append=len(code)) == 2]
+    a, b = order[pair], order[pair + 1]  # row r of the edges: from corner r // n of face r % n to its next corner
+    a_next, b_next = ((r + n) % (3 * n) for r in (a, b))
+    one, other = np.concatenate([a, a_next]), np.concatenate([b_next, b])
+    graph = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(3 * n, 3 * n))
+    corner = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    if corner.max() + 1 == len(np.unique(faces)):
+        return vertices, faces
+    source = np.zeros(corner.max() + 1, np.int64)
+    source[corner] = faces.T.ravel()
+    return vertices[source], corner.reshape(3, n).T.astype(np.int32)
 
 
 def filled(faces: Faces) -> Faces:

@@ -67,4 +67,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=2, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=3, inputs=Inputs, config=Config, output=UvMesh, run=run)

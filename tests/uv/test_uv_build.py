@@ -279,3 +279,26 @@ def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.Mon
     charts = unwrap.unwrap(decimate.decimated(dense, 2000), unwrap.Options(512, 4))
     assert painted(charts, 500)[0].max() == 1
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).mean() > 0.99
+
+
+def tetrahedra(shared: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two closed tetrahedra that have `shared` vertices in common."""
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
+    other = np.array([0, 1, 4, 5])[faces] if shared == 2 else np.array([0, 4, 5, 6])[faces]
+    vertices = np.random.default_rng(0).normal(size=(6 if shared == 2 else 7, 3))
+    return vertices, np.concatenate([faces, other]).astype(np.int32)
+
+
+@pytest.mark.parametrize("shared", [1, 2])
+def test_sheets_that_touch_are_split_apart(shared: int) -> None:
+    vertices, faces = tetrahedra(shared)
+    assert not meshes.topology(faces, len(vertices)).manifold
+    v, f = decimate.split_apart(vertices, faces)
+    found = meshes.topology(f, len(v))
+    assert found.manifold and found.components == 2 and len(v) == 8
+    assert np.array_equal(v[f], vertices[faces])  # nothing moves
+
+
+def test_a_manifold_is_not_split(built: Built) -> None:
+    v, f = decimate.split_apart(built.mesh.vertices.astype(np.float64), built.mesh.faces)
+    assert len(v) == len(built.mesh.vertices) and np.array_equal(f, built.mesh.faces)
