@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import Artifact, Capture, CaptureView, Located
-from workflows.bench_rows import budget_of, kept, rows_with, shared_options
+from workflows.bench_rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.console import Console
 
 F32 = npt.NDArray[np.float32]
@@ -159,21 +159,10 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
 
 def measure(row: Row, given: argparse.Namespace, console: Console) -> Result:
     """Run a row, or take it from the store, and score it."""
-    from workflows.plan import RunRequest, make_plan
     from workflows.runner import run_here, run_plan
     from workflows.session import Session, session
 
-    plan = make_plan(
-        RunRequest(
-            capture=given.capture,
-            out=given.out,
-            store=given.store,
-            holdout=given.holdout,
-            device=given.device,
-            until="surface",
-            sets=settings_of(row, given),
-        )
-    )
+    plan = plan_of(given, settings_of(row, given))
     with session(Session(console, plan=plan)):
         done = {d.stage: d for d in run_plan(plan, run_here(plan))}
     found: dict[str, Located[Any]] = {name: d.located for name, d in done.items()}

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from pipeline.errors import UsageError
+from stages.presets import DEFAULT_PRESET
+from workflows.plan import Plan, RunRequest, make_plan
 
 
 class Named(Protocol):
@@ -44,6 +46,22 @@ def rows_with(text: str, rows: Sequence[N], option: str, what: str) -> list[N]:
             remedy=f"leave {option} out for all",
         )
     return chosen
+
+
+def plan_of(given: argparse.Namespace, sets: Sequence[str], preset: str = DEFAULT_PRESET) -> Plan:
+    """A row's run, up to the surface."""
+    return make_plan(
+        RunRequest(
+            capture=given.capture,
+            out=given.out,
+            store=given.store,
+            holdout=given.holdout,
+            device=given.device,
+            until="surface",
+            sets=tuple(sets),
+            preset=preset,
+        )
+    )
 
 
 def budget_of(given: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:

@@ -6,12 +6,15 @@ import argparse
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from stages.presets import DEFAULT_PRESET
+
+if TYPE_CHECKING:
+    from pipeline.fields.face import FaceModel
 
 ALBEDO_VIEWS = 3
 SCALED = ("steps", "batch")
@@ -64,26 +67,17 @@ def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
 def measure(knob: Knob, given: argparse.Namespace) -> Measured:
     """Run a point up to the surface, or take it from the store, and score it."""
     import pipeline.threads  # noqa: F401  (before torch, as in the command line)
+    from pipeline.fields.face import load_model
     from workflows.bench_ablations import chamfer
-    from workflows.plan import RunRequest, make_plan
+    from workflows.bench_rows import plan_of
     from workflows.runner import run_here, run_plan
 
-    plan = make_plan(
-        RunRequest(
-            capture=given.capture,
-            out=given.out,
-            store=given.store,
-            holdout=given.holdout,
-            device=given.device,
-            until="surface",
-            sets=settings_of(knob, given),
-            preset=knob.preset or DEFAULT_PRESET,
-        )
-    )
+    plan = plan_of(given, settings_of(knob, given), knob.preset or DEFAULT_PRESET)
     done = {d.stage: d for d in run_plan(plan, run_here(plan))}
     found: dict[str, Any] = {name: d.located for name, d in done.items()}
     fit = done["inverse_rendering"].run
-    mean = looks(found, given.side, plan.configs["inverse_rendering"].model_dump()["samples"])
+    model = load_model(found["inverse_rendering"].path(found["inverse_rendering"].artifact.field))
+    mean = looks(found, model, given.side, plan.configs["inverse_rendering"].model_dump()["samples"])
     folder = Path(given.capture)
     return Measured(
         float(fit["seconds"]),
@@ -92,22 +86,20 @@ def measure(knob: Knob, given: argparse.Namespace) -> Measured:
         float(mean[2]),
         float(mean[3]),
         chamfer(found, folder),
-        albedo_error(found, folder),
+        albedo_error(found, model, folder),
     )
 
 
-def looks(found: dict[str, Any], side: int, samples: int) -> npt.NDArray[np.float64]:
+def looks(found: dict[str, Any], model: FaceModel, side: int, samples: int) -> npt.NDArray[np.float64]:
     """Mean PSNR, aligned PSNR, SSIM and FLIP over the held-out views, rendered at `side` pixels whatever the fit's own
     resolution was: a smaller picture is easier to match."""
     from pipeline.colour import as_photographed
-    from pipeline.fields.face import load_model
     from stages.inverse_rendering.gather import camera_only
     from stages.inverse_rendering.predict import predict_view
     from stages.inverse_rendering.views import factor_for
     from workflows.bench_ablations import compared
 
     fitted = found["inverse_rendering"]
-    model = load_model(fitted.path(fitted.artifact.field))
     cameras = {c.index: c for c in found["poses"].artifact.cameras}
     response = {h.index: h.response for h in fitted.artifact.held_out}
     out = []
@@ -120,20 +112,18 @@ def looks(found: dict[str, Any], side: int, samples: int) -> npt.NDArray[np.floa
     return np.asarray(np.nanmean(np.array(out, np.float64), axis=0) if out else np.full(4, np.nan))
 
 
-def albedo_error(found: dict[str, Any], folder: Path) -> float:
+def albedo_error(found: dict[str, Any], model: FaceModel, folder: Path) -> float:
     """PSNR (dB, sRGB) of the fitted albedo against truth/albedo in some held-out views, after one gain for all
     channels, over pixels where both are; NaN without a truth."""
     import torch
 
     from pipeline.colour import srgb_from_linear
-    from pipeline.fields.face import load_model
     from pipeline.images import read_exr
     from stages.inverse_rendering.gather import camera_only
     from stages.inverse_rendering.sightings import surface_points
     from stages.inverse_rendering.views import Rays, image_rays
 
     fitted = found["inverse_rendering"]
-    model = load_model(fitted.path(fitted.artifact.field))
     cameras = {c.index: c for c in found["poses"].artifact.cameras}
     mine, true = [], []
     for held in fitted.artifact.held_out[:: max(len(fitted.artifact.held_out) // ALBEDO_VIEWS, 1)]:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.transforms import inverse_rigid, matrix, rows
+from pipeline.transforms import inverse_rigid, matrix
 from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
 from stages.poses.measure import find_eyes, known_scale
 from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
-from stages.poses.place import camera_of, in_asset, save_points, view_errors
+from stages.poses.place import camera_of, camera_set
 from stages.poses.scale import by_world
 from stages.poses.settings import Config
 from stages.poses.ticks import progress_of
@@ -55,21 +55,8 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
         published, axes = by_world(matrix(world))
         known = published if known is None and config.scale == "auto" else known
     found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
-    if model is not None:
-        save_points(context.workdir / "points.npz", model, found.capture_from_asset)
-    return CameraSet(
-        source="given",
-        metric=found.metric,
-        scale=found.scale,
-        capture_from_asset=rows(found.capture_from_asset),
-        roi_radius=found.roi_radius,
-        cameras=in_asset(cameras, found.capture_from_asset),
-        unregistered=names,
-        reprojection_error_px=None if model is None else model.reprojection_error_px,
-        view_errors_px={} if model is None else view_errors(model, [c.name for c in cameras]),
-        points=None if model is None else context.file("points.npz"),
-        warnings=(*told, *found.warnings),
-    )
+    warnings = (*told, *found.warnings)
+    return camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
 
 
 def _held_against_photos(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.artifacts import Camera, CaptureView
+from pipeline.artifacts import Camera, CameraSet, CaptureView
+from pipeline.contract import Context
 from pipeline.transforms import F64, apply, matrix, rescale_camera, rows
 
 if TYPE_CHECKING:
+    from stages.poses.normalise import Normalisation
     from stages.poses.solve import Model
 
 
@@ -52,3 +54,34 @@ def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
 def view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
     """Mean reprojection error of each view that has one, by its name. names: of the model's photos."""
     return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}
+
+
+def camera_set(
+    source: Literal["given", "colmap"],
+    cameras: Sequence[Camera],
+    found: Normalisation,
+    model: Model | None,
+    names: Sequence[str],
+    left_out: Sequence[str],
+    warnings: Sequence[str],
+    context: Context,
+) -> CameraSet:
+    """Cameras of the capture's world in asset coordinates, with the sparse points if there are any, which are written.
+
+    names: of the model's photos. left_out: photos without a place.
+    """
+    if model is not None:
+        save_points(context.workdir / "points.npz", model, found.capture_from_asset)
+    return CameraSet(
+        source=source,
+        metric=found.metric,
+        scale=found.scale,
+        capture_from_asset=rows(found.capture_from_asset),
+        roi_radius=found.roi_radius,
+        cameras=in_asset(cameras, found.capture_from_asset),
+        unregistered=tuple(left_out),
+        reprojection_error_px=None if model is None else model.reprojection_error_px,
+        view_errors_px={} if model is None else view_errors(model, names),
+        points=None if model is None else context.file("points.npz"),
+        warnings=tuple(warnings),
+    )

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pipeline.artifacts import CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.transforms import rows
 from stages.poses.adjust import Refine
 from stages.poses.measure import find_eyes, known_scale
 from stages.poses.normalise import normalise
 from stages.poses.photogrammetry import Settings, solve
 from stages.poses.photos import photos_of
-from stages.poses.place import camera_of, in_asset, save_points, view_errors
+from stages.poses.place import camera_of, camera_set
 from stages.poses.settings import Config
 from stages.poses.ticks import progress_of
 
@@ -39,7 +38,6 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     eyes = find_eyes(capture, cameras, context.check)
     known = known_scale(capture, cameras, config, eyes, warnings)
     found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
-    save_points(context.workdir / "points.npz", model, found.capture_from_asset)
     warnings += found.warnings
     if missing:
         warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {', '.join(missing)}; "
@@ -48,19 +46,7 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     for group in model.others if strangers else ():
         warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
                         + "; if they show another subject, make a capture of their own")  # fmt: skip
-    return CameraSet(
-        source="colmap",
-        metric=found.metric,
-        scale=found.scale,
-        capture_from_asset=rows(found.capture_from_asset),
-        roi_radius=found.roi_radius,
-        cameras=in_asset(cameras, found.capture_from_asset),
-        unregistered=missing,
-        reprojection_error_px=model.reprojection_error_px,
-        view_errors_px=view_errors(model, [v.name for v in views]),
-        points=context.file("points.npz"),
-        warnings=tuple(warnings),
-    )
+    return camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
 
 
 def settings_of(capture: Located[Capture], config: Config) -> Settings:

@@ -53,14 +53,13 @@ def render_held_out(
     for number, (index, scale) in enumerate(wanted):
         context.check()
         context.progress(number, len(wanted), f"asset view {index}")
-        rgba = renderer.render(view_of(by_index[index]), factor=scale, samples=samples)
-        if index in responses:
-            rgba = as_photographed(rgba, responses[index])
+        response = responses.get(index, UNCHANGED)
+        rgba = as_photographed(renderer.render(view_of(by_index[index]), factor=scale, samples=samples), response)
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
         write_exr(exr, rgba)
         write_rgba_png(png, rgba)
         files = {"exr": context.file(exr), "png": context.file(png)}
-        out.append(HeldOutView(index=index, **files, scale=scale, response=responses.get(index, UNCHANGED)))
+        out.append(HeldOutView(index=index, **files, scale=scale, response=response))
     return tuple(out)
 
 
