@@ -299,7 +299,8 @@ class UvMesh(Artifact):
 
     UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs. stretch: L2, stretch_max:
     Linf of [Sander 2001]. seam_front_mm: length of seams where the surface looks to the front. deviation: of the mesh
-    and of the proxy from the dense mesh.
+    and of the proxy from the dense mesh. tiles: UDIM tiles (pipeline.tiles) that the charts lie in; tile_utilisation:
+    share of each under charts, where there are several, and utilisation their mean.
     """
 
     mesh: FileRef
@@ -307,7 +308,9 @@ class UvMesh(Artifact):
     vertices: int
     faces: int
     charts: int
+    tiles: int = 1
     utilisation: float
+    tile_utilisation: tuple[float, ...] = ()
     stretch: float
     overlap: float
     stretch_max: float = 0.0
@@ -320,7 +323,8 @@ class UvMesh(Artifact):
 
 # ------------------------------------------------------------------ maps
 class TextureMap(Artifact):
-    """One map. `files` by format ("exr", "png"). space: "srgb_png" (EXR linear) or "raw"."""
+    """One map. `files` by what follows its name: "exr", "png"; "1001.exr", "1002.exr", ... where it has tiles
+    (pipeline.tiles). space: "srgb_png" (EXR linear) or "raw"."""
 
     name: str
     channels: int
@@ -332,18 +336,23 @@ class TextureMap(Artifact):
 
 
 class TextureSet(Artifact):
-    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1). zero_set_rms_mm: root mean square distance of the
-    mesh from the SDF's zero set, over the texels that have one near them; lod_rms_mm: that of
-    each level of detail, over its area. figures: shares of the covered texels that no
-    photo saw (`unseen`), whose albedo was clamped (`albedo_clamped`), that have photo detail (`detail_support`)."""
+    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1); with several UDIM tiles each map has `tiles`
+    files of that size (but for tables, which no texture coordinate looks up). zero_set_rms_mm: root mean square
+    distance of the mesh from the SDF's zero set, over the texels that have one near them; lod_rms_mm: that of each
+    level of detail, over its area. coverage: share of all texels under charts. figures: shares of the covered
+    texels that no photo saw (`unseen`), whose albedo was clamped (`albedo_clamped`), that have photo detail
+    (`detail_support`); mean edge of a texel and median edge of the photos' finest pixel on the surface (`texel_mm`,
+    `photo_pixel_mm`). regions: share of the surface's area by the name of its region; empty without labelled photos."""
 
     size: int
+    tiles: int = 1
     padding: int
     maps: dict[str, TextureMap]
     coverage: float
     zero_set_rms_mm: float = 0.0
     lod_rms_mm: dict[str, float] = {}
     figures: dict[str, float] = {}
+    regions: dict[str, float] = {}
     warnings: tuple[str, ...] = ()
 
 

@@ -94,7 +94,15 @@ def configs_for(
                     where=f"{origin} {stage}.{key}",
                 )
             merged[stage].update(values)
+    _tile_size(merged)
     return {name: _checked(stages[name], values) for name, values in merged.items()}
+
+
+def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
+    """Several UDIM tiles are laid out for the size that is baked, unless uv.texture_size was said."""
+    uv, bake = merged.get("uv", {}), merged.get("bake", {})
+    if str(uv.get("tiles", 1)) != "1" and "texture_size" not in uv and "size" in bake:
+        uv["texture_size"] = bake["size"]
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:

@@ -1,4 +1,4 @@
-"""The whole way from a field and a mesh with charts to arrays of maps."""
+"""The whole way from a field and a mesh with charts to arrays of maps, tile by tile."""
 
 from __future__ import annotations
 
@@ -10,42 +10,40 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline import meshes, raster, tangents
+from pipeline import meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
-from pipeline.maths import microfacet
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
 from pipeline.visibility import Occluder, View, seen_weight
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
+from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
 from stages.bake.gutter import HALO, nearest_rows
 from stages.bake.lut import basis_lut
-from stages.bake.regions import Votes
+from stages.bake.regions import Votes, areas
 from stages.bake.smooth import continued
 from stages.bake.spool import Spool, blank
+from stages.bake.tally import Tally, tally
 from stages.bake.texels import Known, Samples, place, points, sample
 
 log = logging.getLogger("neuface.bake")
 
 BAND = 262_144  # texels baked at once
 NEAREST_BAND = 1 << 24  # texels whose nearest chart is looked for at once: around each band some are looked at again
-SPARSE = 512  # texels along a side of the points that the detail's low band is made from
+SPARSE = 512  # texels along a side of the points that the detail's low band is made from; fewer in each of many tiles
 FEW_TEXELS = 100
-MANY_LOST = 0.02  # share of texels off the zero set, beyond the cap of a bust
-MANY_CLAMPED = 0.001
-RESIDUAL = 0.1  # of the basis: from here on the table is only an approximation worth a word
-SHARP_KAPPA = 50.0  # light of order 10 can't tell sharper lobes apart
 
 Step = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Baked:
-    """Samples of the covered texels; `texel` (N,) their flat indices. `nearest` (H, W): row in `texel` for each texel.
+    """One tile. Samples of the covered texels; `texel` (N,) their flat indices. `nearest` (H, W): row in `texel` for
+    each texel.
 
-    confidence (S, S) and votes for the regions at their own size; lut (1, 64, k); coverage: share of covered texels;
-    figures: for the report.
+    confidence (S, S) and votes for the regions at their own size; lut (1, 64, k); regions: area (m^2) of the surface by
+    the code of its region, empty where no photo has labels.
     """
 
     size: int
@@ -54,10 +52,9 @@ class Baked:
     samples: Samples
     confidence: F32
     lut: F32
-    coverage: float
-    figures: dict[str, float]
-    warnings: tuple[str, ...]
-    votes: Votes | None = None
+    tally: Tally
+    votes: Votes | None
+    regions: dict[int, float]
 
     def covered(self) -> Mask:
         """(H, W) texels that a chart touches."""
@@ -73,42 +70,70 @@ class Photos:
     attenuation: str
 
 
-def build(
-    field: Field,
-    mesh: Mesh,
-    charts: Charts,
-    views: Sequence[View],
-    size: int,
-    step: Step,
-    photos: Photos | None = None,
-    scratch: Path | None = None,
-) -> Baked:
-    """Bake every texel that a chart touches. `photos`: add their fine detail to the albedo. `scratch`: a folder for
-    arrays larger than the memory.
+class Baker:
+    """What all tiles have in common, found once: the light that reaches the mesh, what the photos see of it, and the
+    low bands of their detail. `tile` may then be called for each of `tiles`."""
 
-    Raises:
-        StageError: no chart has area, or the field is not finite on the mesh.
-    """
-    occluder = Occluder(mesh)
-    known = _known(field, mesh, views, occluder, lambda done, total: step(done, total, "ambient occlusion"))
-    found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
-    texel, samples = _bands(field, mesh, charts, size, step, known, found, scratch)
-    if len(texel) < FEW_TEXELS:
-        raise StageError(
-            "the charts cover no texels",
-            where="uv",
-            value=f"{len(texel)} of {size * size}",
-            limit=f"at least {FEW_TEXELS}",
-            remedy="run the uv stage again, or choose a larger bake.size",
+    def __init__(
+        self,
+        field: Field,
+        mesh: Mesh,
+        charts: Charts,
+        views: Sequence[View],
+        size: int,
+        step: Step,
+        photos: Photos | None = None,
+        scratch: Path | None = None,
+    ) -> None:
+        """`photos`: add their fine detail to the albedo. `scratch`: a folder for arrays larger than the memory."""
+        self.tiles = int(tiles.of_face(charts).max()) + 1
+        self.detailed = photos is not None and len(views) > 0
+        self.lut, self.residual = basis_lut(field)
+        self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
+        self._step, self._scratch = step, scratch
+        self._occluder = Occluder(mesh)
+        self._known = _known(
+            field, mesh, views, self._occluder, lambda done, total: step(done, total, "ambient occlusion")
         )
-    seen = sighted(mesh, charts, views, size, lambda done, total: step(done, total, "visibility"))
-    lut, residual = basis_lut(field)
-    nearest = _nearest(texel, size, scratch)
-    share = len(texel) / size**2
-    log.info("bake: %.1f %% covered, basis residual %.3f", 100 * share, residual)
-    figures = _figures(samples, found is not None)
-    warnings = _warnings(samples, residual, len(views))
-    return Baked(size, texel, nearest, samples, seen.confidence, lut, share, figures, warnings, seen.votes)
+        detailed = photos is not None and views
+        self._found = _detail(field, mesh, charts, views, size, photos, step) if detailed and photos else None
+
+    def tile(self, number: int) -> Baked:
+        """Bake every texel that a chart of this tile touches.
+
+        Raises:
+            StageError: no chart has area, or the field is not finite on the mesh.
+        """
+        size, step = self._size, self._step
+        mesh, charts = tiles.alone(*self._whole, number)
+
+        def ahead(done: int, total: int, message: str) -> None:
+            step(number * total + done, self.tiles * total, message)
+
+        texel, samples = _bands(self._field, mesh, charts, size, ahead, self._known, self._found, self._scratch)
+        least = FEW_TEXELS if self.tiles == 1 else 1
+        if len(texel) < least:
+            raise StageError(
+                "the charts cover no texels",
+                where="uv",
+                value=f"{len(texel)} of {size * size}",
+                limit=f"at least {least}",
+                remedy="run the uv stage again, or choose a larger bake.size",
+            )
+        side = min(size, _per_tile(SIGHT, self.tiles))
+        seen = sighted(
+            mesh, charts, self._views, side, lambda done, total: ahead(done, total, "visibility"), self._occluder
+        )
+        nearest = _nearest(texel, size, self._scratch)
+        found = tally(samples, size)
+        log.info("bake: tile %d, %.1f %% covered, basis residual %.3f", number, 100 * found.coverage, self.residual)
+        regions = {} if seen.votes is None else areas(mesh, charts, seen.votes)
+        return Baked(size, texel, nearest, samples, seen.confidence, self.lut, found, seen.votes, regions)
+
+
+def _per_tile(side: int, count: int) -> int:
+    """Texels along the side of each of `count` tiles that together are about as many as in one of `side`."""
+    return int(np.ceil(side / np.sqrt(count)))
 
 
 def _known(
@@ -123,19 +148,25 @@ def _known(
 def _detail(
     field: Field, mesh: Mesh, charts: Charts, views: Sequence[View], size: int, photos: Photos, step: Step
 ) -> detail.Detail:
-    sparse = min(size, SPARSE)
-    hits = raster.rasterise(raster.texel_corners(charts, sparse), sparse, 0, sparse)
-    at = place(field, mesh, tangents.frames(mesh, charts), hits)
-    x = at.x.astype(np.float32)
-    some = points(field, mesh, hits, at, field.material(x).albedo, np.asarray(field.irradiance_ratio(x), np.float32))
+    count = int(tiles.of_face(charts).max()) + 1
+    sparse = min(size, _per_tile(SPARSE, count))
+    some = detail.joined([_spread(field, *tiles.alone(mesh, charts, t), sparse) for t in range(count)])
     area = float(meshes.areas(mesh.vertices, mesh.faces).sum())
-    texel = float(np.sqrt(area / max(len(hits.texel), 1))) * sparse / size
+    texel = float(np.sqrt(area / max(len(some.x), 1))) * sparse / size
     read = detail_views.read_photos(
         views, photos.responses, mesh, texel, lambda done, total: step(done, total, "reading photos")
     )
     return detail.prepare(
         field, mesh, some, read, photos.attenuation, lambda done, total: step(done, total, "photo detail")
     )
+
+
+def _spread(field: Field, mesh: Mesh, charts: Charts, sparse: int) -> detail.Points:
+    """Points of a tile's surface, a texel of a small texture apart."""
+    hits = raster.rasterise(raster.texel_corners(charts, sparse), sparse, 0, sparse)
+    at = place(field, mesh, tangents.frames(mesh, charts), hits)
+    x = at.x.astype(np.float32)
+    return points(field, mesh, hits, at, field.material(x).albedo, np.asarray(field.irradiance_ratio(x), np.float32))
 
 
 def _bands(
@@ -182,40 +213,3 @@ def _nearest(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.
     for first, last in bands(size, max(NEAREST_BAND, HALO * size)):
         out[first:last] = row[nearest_rows(covered, first, last)]
     return out
-
-
-def _figures(s: Samples, detailed: bool) -> dict[str, float]:
-    out = {"unseen": float((s.unseen > 0.5).mean()), "albedo_clamped": float((s.clamped > 0).mean())}
-    if detailed:
-        out["detail_support"] = float((s.support > detail.HALF_WEIGHT).mean())
-    return {k: round(v, 6) for k, v in out.items()}
-
-
-def _warnings(s: Samples, residual: float, views: int) -> tuple[str, ...]:
-    out = []
-    lost = float(1 - s.landed.mean())
-    if lost > MANY_LOST:
-        out.append(
-            f"{lost:.1%} of the texels have no zero set of the field near them (the flat cut of the neck, or a "
-            "mesh that does not belong to this field)"
-        )
-    if residual > RESIDUAL:
-        out.append(f"basis_lut.exr is a mean over directions: the learned basis varies by {residual:.0%} around it")
-    sharp = float((s.inv_kappa < 1 / SHARP_KAPPA).mean())
-    if sharp > 0.01:
-        out.append(
-            f"{sharp:.0%} of the texels have kappa above {SHARP_KAPPA:.0f}: light of order 10 can't tell such "
-            "lobes apart"
-        )
-    rough = float(((1 / np.maximum(s.inv_kappa, 1e-6)) < microfacet.KAPPA_RANGE[0]).mean())
-    if rough > 0.01:
-        out.append(f"{rough:.0%} of the texels are rougher than the roughness map can say")
-    clamped = float((s.clamped > 0).mean())
-    if clamped > MANY_CLAMPED:
-        out.append(
-            f"the albedo of {clamped:.1%} of the texels was outside of what skin can be and was clamped "
-            "(clamped.png shows where)"
-        )
-    if views == 0:
-        out.append("no fitted view has a camera: confidence is 0 everywhere")
-    return tuple(out)

@@ -35,15 +35,22 @@ class Sighted:
     votes: Votes | None
 
 
-def sighted(mesh: Mesh, charts: Charts, views: Sequence[View], size: int, step: Callable[[int, int], None]) -> Sighted:
-    """What the views see of the texture."""
+def sighted(
+    mesh: Mesh,
+    charts: Charts,
+    views: Sequence[View],
+    size: int,
+    step: Callable[[int, int], None],
+    occluder: Occluder | None = None,
+) -> Sighted:
+    """What the views see of the texture. occluder: of the whole mesh, where this is one tile of it."""
     small = min(size, SIZE)
     hits = raster.rasterise(raster.texel_corners(charts, small), small, 0, small)
     weights = hits.weights.astype(np.float64)[..., None]
     points = (mesh.vertices.astype(np.float64)[mesh.faces[hits.face]] * weights).sum(1)
     normals = (mesh.normals.astype(np.float64)[mesh.faces[hits.face]] * weights).sum(1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    occluder, poll = Occluder(mesh), Poll(len(points))
+    occluder, poll = occluder or Occluder(mesh), Poll(len(points))
     total = np.zeros(len(points))
     for i, view in enumerate(views):
         step(i, len(views))

@@ -11,14 +11,15 @@ Symbols
     added = h / (1 + (s / DISAGREEMENT)^2) W / (W + HALF_WEIGHT)
 
 Each photo loses its own low band before photos are blended: errors of the light, the lobe, the exposure and the shadows
-stay out of the albedo, and there is no seam where the set of photos changes. Where photos disagree (ears, nostrils, a
+stay out of the albedo, and there is no seam where the set of photos changes. A clipped pixel has no say, as in the fit.
+Where photos disagree (ears, nostrils, a
 wrong surface) or hardly see the place, less is added.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +51,13 @@ class Points:
     shade: F32
 
 
+def joined(parts: Sequence[Points]) -> Points:
+    """All points of several tiles."""
+    if len(parts) == 1:
+        return parts[0]
+    return Points(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Points)})
+
+
 @dataclass(frozen=True, slots=True)
 class Detail:
     """What the fine band is made from. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices."""
@@ -63,8 +71,8 @@ class Detail:
         mean, support = np.zeros((len(p.x), 3), np.float32), np.zeros((len(p.x), 2), np.float32)
         photos = self.photos
         kernels.fine(
-            photos.cameras, photos.pixels, photos.depth, p.x, p.n, p.corner, p.weights, self.gloss, self.low,
-            p.albedo, p.shade, mean, support,
+            photos.cameras, photos.pixels, photos.depth, photos.clipped, p.x, p.n, p.corner, p.weights,
+            self.gloss, self.low, p.albedo, p.shade, mean, support,
         )  # fmt: skip
         weight, spread = support.T
         trust = weight / (weight + HALF_WEIGHT) / (1 + (spread / DISAGREEMENT) ** 2)
@@ -84,8 +92,8 @@ def prepare(
         step(v, len(gloss))
         values, cosines = np.zeros((len(sparse.x), 3), np.float32), np.zeros(len(sparse.x), np.float32)
         kernels.residual(
-            photos.cameras[v], photos.pixels, photos.depth, sparse.x, sparse.n, sparse.corner, sparse.weights,
-            gloss[v], sparse.albedo, sparse.shade, values, cosines,
+            photos.cameras[v], photos.pixels, photos.depth, photos.clipped, sparse.x, sparse.n, sparse.corner,
+            sparse.weights, gloss[v], sparse.albedo, sparse.shade, values, cosines,
         )  # fmt: skip
         sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
         kernels.splat(sparse.corner, sparse.weights, values, cosines**2, sums, total)

@@ -9,6 +9,9 @@ keeps its steps and decoding is one product. A camera is a row of numbers:
     30..38  colours before the calibration from colours after it, row by row
     39      radiance of code 65535                    40      weight of the photo: its sharpness
     41, 42  where its pixels and its depths start
+
+`clipped` has a number for every pixel, not 0 where the photo tells only how bright the place is at least; it is empty
+where no pixel of any photo is.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -29,8 +32,9 @@ BLOCK = 1024  # points worked off in a row
 
 
 @njit(error_model="numpy", cache=True)
-def _look(camera, depth, x, n):
-    """cosine, distance, column, row of point x with normal n in a photo; cosine 0 where the photo does not see it."""
+def _look(camera, depth, clipped, x, n):
+    """cosine, distance, column, row of point x with normal n in a photo; cosine 0 where the photo does not see it, or
+    one of the four pixels that its colour would be mixed from is clipped."""
     dx, dy, dz = camera[27] - x[0], camera[28] - x[1], camera[29] - x[2]
     height = dx * n[0] + dy * n[1] + dz * n[2]
     if height <= 0:
@@ -59,6 +63,11 @@ def _look(camera, depth, x, n):
     slack = 1 + DEPTH_SLACK + np.sqrt(max(1 - cosine * cosine, 0.0)) / (cosine * camera[12] * camera[17])
     if distance > depth[int(camera[42]) + j * int(camera[20]) + i] * slack:
         return 0.0, distance, 0.0, 0.0
+    if len(clipped) > 0:
+        width = int(camera[18])
+        first = int(camera[41]) + int(row - 0.5) * width + int(column - 0.5)
+        if clipped[first] or clipped[first + 1] or clipped[first + width] or clipped[first + width + 1]:
+            return 0.0, distance, 0.0, 0.0
     return cosine, distance, column, row
 
 
@@ -82,7 +91,7 @@ def _colour(camera, pixels, column, row, out):
 
 
 @njit(error_model="numpy", cache=True)
-def residual(camera, pixels, depth, x, n, corner, weights, gloss, albedo, shade, out, cosines):
+def residual(camera, pixels, depth, clipped, x, n, corner, weights, gloss, albedo, shade, out, cosines):
     """One photo's albedo less the field's at N points (N, 3), no larger than OUTLIER, and the cosines (N,), 0 where it
     does not see them.
 
@@ -90,7 +99,7 @@ def residual(camera, pixels, depth, x, n, corner, weights, gloss, albedo, shade,
     """
     found = np.empty(3)
     for i in range(len(x)):
-        cosine, _, column, row = _look(camera, depth, x[i], n[i])
+        cosine, _, column, row = _look(camera, depth, clipped, x[i], n[i])
         cosines[i] = cosine
         if cosine > 0:
             _colour(camera, pixels, column, row, found)
@@ -102,7 +111,7 @@ def residual(camera, pixels, depth, x, n, corner, weights, gloss, albedo, shade,
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
     """The finest band at N points: a robust mean over photos of their albedo less the field's, without their low band.
 
     gloss, low (views, V, 3): specular radiance, and the low band of the photo's residual, at the mesh's vertices.
@@ -112,13 +121,13 @@ def fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, shad
     for block in prange((len(x) + BLOCK - 1) // BLOCK):
         rows = slice(block * BLOCK, min((block + 1) * BLOCK, len(x)))
         _fine(
-            cameras, pixels, depth, x[rows], n[rows], corner[rows], weights[rows], gloss, low,
+            cameras, pixels, depth, clipped, x[rows], n[rows], corner[rows], weights[rows], gloss, low,
             albedo[rows], shade[rows], out[rows], support[rows],
         )  # fmt: skip
 
 
 @njit(error_model="numpy", cache=True)
-def _fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
     """A block of `fine`: a function of its own, because the compiler takes long over bodies of parallel loops."""
     values, chosen, found = np.empty((MOST, 3)), np.empty(MOST), np.empty(3)
     views, places = np.empty(MOST, np.int64), np.empty((MOST, 2))
@@ -126,7 +135,7 @@ def _fine(cameras, pixels, depth, x, n, corner, weights, gloss, low, albedo, sha
         count = 0
         for v in range(len(cameras)):
             camera = cameras[v]
-            cosine, distance, column, row = _look(camera, depth, x[i], n[i])
+            cosine, distance, column, row = _look(camera, depth, clipped, x[i], n[i])
             if cosine == 0:
                 continue
             # what a photo resolves across the line of sight falls with the cosine and the distance

@@ -23,17 +23,19 @@ JUMP = 12.0  # pixels of depth over a pixel's neighbours, from which a place is 
 OPAQUE = 0.99  # of a mask: the edge of the head mixes with what is behind it
 CODE = 65535.0
 
+U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True, slots=True)
 class Photos:
     """cameras (views, ROW) as detail_kernels describes them; pixels (P, 3); depth (D,) metres, 0 where a photo is of no
-    use."""
+    use; clipped (P,), empty where nothing is."""
 
     cameras: F64
     pixels: U16
     depth: F32
+    clipped: U8
 
 
 def read_photos(
@@ -44,7 +46,7 @@ def read_photos(
     responses (views, 3, 3): the fitted colour response A_n of each photo. [NeuFace eq. 19]
     """
     occluder = Occluder(mesh)
-    rows, pixels, depths = [], [], []
+    rows, pixels, depths, clipped = [], [], [], []
     places = [0, 0]
     for i, view in enumerate(views):
         step(i, len(views))
@@ -58,13 +60,22 @@ def read_photos(
         rows.append(_row(view, responses[i], factor, photo.shape, depth.shape, peak, places))
         pixels.append(np.round(np.sqrt(photo.clip(0) / peak) * CODE).astype(np.uint16).reshape(-1, 3))
         depths.append(depth.ravel())
+        clipped.append(_clipped(view, photo.shape, factor))
         places = [places[0] + len(pixels[-1]), places[1] + depth.size]
     cameras = np.array(rows)
     # weight 1: a sharp photo from straight ahead at the median distance and focal length
     centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
     reach = np.linalg.norm(cameras[:, 27:30] - centre, axis=1)
     cameras[:, 40] *= _sharpness(pixels, cameras) / np.median(cameras[:, 40] / reach)
-    return Photos(cameras, np.concatenate(pixels), np.concatenate(depths))
+    ends = np.concatenate(clipped) if any(c.any() for c in clipped) else np.zeros(0, np.uint8)
+    return Photos(cameras, np.concatenate(pixels), np.concatenate(depths), ends)
+
+
+def _clipped(view: View, shape: tuple[int, ...], factor: int) -> U8:
+    """(h w,) 1 where a block of `factor` x `factor` photo pixels holds a clipped one, which the fit leaves out too."""
+    if view.clipped is None:
+        return np.zeros(shape[0] * shape[1], np.uint8)
+    return (shrink_whole(read_alpha(view.clipped), factor) > 0).astype(np.uint8).ravel()
 
 
 def _factor(view: View, mesh: Mesh, texel: float) -> int:

@@ -14,11 +14,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import meshes
 from pipeline.images import read_encoded
-from pipeline.meshes import F32, F64, Indices
+from pipeline.meshes import F32, F64, Charts, Indices, Mesh
 from pipeline.visibility import View, picked
 
 U8 = npt.NDArray[np.uint8]
+GRID = 8192  # texels along the side of the texture in which triangles' middles are looked up
 FEW_VOTES = 1e-3  # one photo that sees the place from the very side
 
 
@@ -40,6 +42,16 @@ class Votes:
         lower = self.image[low, left] * (1 - x) + self.image[low, right] * x
         votes = upper * (1 - y) + lower * y
         return np.where(votes.max(1) > FEW_VOTES, self.codes[votes.argmax(1)], 0).astype(np.uint8)
+
+
+def areas(mesh: Mesh, charts: Charts, votes: Votes) -> dict[int, float]:
+    """Area of the surface by the code of its region, 0 where no photo with labels sees it. Each triangle counts with
+    the label under its middle."""
+    middle = charts.uvs.astype(np.float64)[charts.faces].mean(1)
+    column, row = (np.stack([middle[:, 0], 1 - middle[:, 1]]) * GRID).astype(np.int64).clip(0, GRID - 1)
+    code = votes.winners(row * GRID + column, GRID)
+    total = np.bincount(code, meshes.areas(mesh.vertices, mesh.faces))
+    return {int(c): float(total[c]) for c in np.flatnonzero(np.bincount(code))}
 
 
 class Poll:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,12 +37,13 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     """Bake every map. Raises StageError when the mesh has no charts or the field is not finite on it."""
-    from pipeline import meshes
+    from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
     from pipeline.visibility import seen_by
-    from stages.bake.build import Photos, build
+    from stages.bake.build import Baker, Photos
     from stages.bake.deviation import zero_set_rms
-    from stages.bake.write import write_maps
+    from stages.bake.tally import together
+    from stages.bake.write import joined, write_maps
 
     uv, fitted = inputs.uv, inputs.inverse_rendering
     field = load_face(fitted.path(fitted.artifact.field), context.device)
@@ -56,22 +58,41 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         context.progress(done, total, message)
 
     mesh, charts = meshes.load(path), meshes.load_charts(path)
-    baked = build(field, mesh, charts, views, config.size, step, photos, context.scratch)
-    maps = write_maps(baked, context)
+    baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch)
+    parts, tallies, areas = [], [], Counter[int]()
+    for number in range(baker.tiles):
+        baked = baker.tile(number)
+        parts.append(write_maps(baked, context, number, baker.tiles))
+        tallies.append(baked.tally)
+        areas.update(baked.regions)
+        del baked
+    maps, all_tiles = joined(parts, [t.texels for t in tallies], context), together(tallies)
+    pixel = footprint.pixel(mesh, (v.camera for v in views))
+    sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
+    figures = all_tiles.figures(detail=baker.detailed) | {k: round(1000 * v, 5) for k, v in sizes.items() if v}
     levels = {"render": mesh, "high": meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))}
     if uv.artifact.proxy is not None:
         levels["proxy"] = meshes.load(uv.path(uv.artifact.proxy))
     # every texel between the charts is filled, so the padding reaches across the whole picture
     return TextureSet(
         size=config.size,
+        tiles=baker.tiles,
         padding=config.size,
         maps=maps,
-        coverage=baked.coverage,
-        zero_set_rms_mm=1000 * baked.samples.deviation(),
+        coverage=all_tiles.coverage,
+        zero_set_rms_mm=1000 * all_tiles.deviation,
         lod_rms_mm={name: round(1000 * zero_set_rms(field, level), 5) for name, level in levels.items()},
-        figures=baked.figures,
-        warnings=baked.warnings,
+        figures=figures,
+        regions=region_shares(areas, inputs.masks.artifact.label_names),
+        warnings=all_tiles.warnings(baker.residual, len(views)),
     )
+
+
+def region_shares(areas: Mapping[int, float], names: Sequence[str]) -> dict[str, float]:
+    """Shares of the surface by the name of its region; areas by code. Code 0: no photo has a label of the place."""
+    total = sum(areas.values())
+    named = {code: "unlabelled" if code == 0 else names[code] if code < len(names) else str(code) for code in areas}
+    return {named[code]: round(areas[code] / total, 6) for code in sorted(areas)}
 
 
 def responses(field: object, exposures: Sequence[float]) -> F64:
@@ -89,4 +110,4 @@ def attenuation(face: FittedFace) -> str:
     return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
 
 
-STAGE = Stage(name="bake", version=4, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=5, inputs=Inputs, config=Config, output=TextureSet, run=run)

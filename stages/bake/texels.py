@@ -58,11 +58,6 @@ class Samples:
     unseen: F32
     clamped: F32
 
-    def deviation(self) -> float:
-        """Root mean square distance (m) of the mesh from the zero set, where there is one."""
-        d = self.displacement[self.landed].astype(np.float64)
-        return float(np.sqrt((d * d).mean())) if len(d) else 0.0
-
 
 @dataclass(frozen=True, slots=True)
 class Known:

@@ -1,11 +1,12 @@
 """Maps to files, one after the other, so that only one full picture is held at a time.
 
-Every map is float32 EXR; those that preview shaders and people look at are PNG too.
+Every map is float32 EXR; those that preview shaders and people look at are PNG too. Of several tiles each has its own
+files, and where one has a map all have it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import tiles
 from pipeline.artifacts import FileRef, TextureMap
 from pipeline.colour import REC709
 from pipeline.contract import Context
@@ -28,6 +30,7 @@ FOLDER = "textures"
 MM = 1000.0
 LEAST_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value of the coverage of a chart's texel that no photo saw
+OPTIONAL = ("clamped", "region")  # maps that are kept only where there is something on them
 IN_MEMORY = 1 << 27  # numbers of a picture; a larger one is put together in a file
 
 Function = Callable[..., npt.NDArray[Any]]
@@ -72,26 +75,60 @@ KINDS: dict[str, MapKind] = {
 }
 
 
-def write_maps(baked: Baked, context: Context) -> dict[str, TextureMap]:
-    """Write every map into `textures/` and describe it; figures are over covered texels."""
-    maps = {}
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where a tile's files go, and which of how many it is."""
+
+    context: Context
+    tile: int
+    count: int
+
+
+def write_maps(baked: Baked, context: Context, tile: int = 0, count: int = 1) -> dict[str, TextureMap]:
+    """Write every map of one of `count` tiles into `textures/` and describe it; figures are over covered texels."""
+    maps, place = {}, _Place(context, tile, count)
     for name, kind in KINDS.items():
         context.check()
-        if name == "clamped" and not baked.figures["albedo_clamped"]:
+        if name == "clamped" and count == 1 and not baked.tally.clamped:
             continue
-        maps[name] = _from_samples(name, kind, baked, context)
+        maps[name] = _from_samples(name, kind, baked, place)
     covered = baked.covered()
     plain = MapKind((), png=8)
     seen = resized(baked.confidence, baked.size)[..., None]
-    maps["confidence"] = _store("confidence", seen, _range(seen[covered]), plain, context)
+    maps["confidence"] = _store("confidence", seen, _range(seen[covered]), plain, place)
     flags = np.zeros((baked.size * baked.size, 1), np.float32)
     flags[baked.texel, 0] = np.where(baked.samples.unseen > 0.5, UNSEEN, 1)
-    maps["coverage"] = _store("coverage", flags.reshape(*covered.shape, 1), _range(flags), plain, context)
-    if baked.votes is not None:
-        maps["region"] = _region(baked, baked.votes, context)
-    lut = MapKind((), numbered=True)
-    maps["basis_lut"] = _store("basis_lut", baked.lut, _range(baked.lut), lut, context)
+    maps["coverage"] = _store("coverage", flags.reshape(*covered.shape, 1), _range(flags), plain, place)
+    if baked.votes is not None or count > 1:
+        maps["region"] = _region(baked, baked.votes, place)
+    if tile == 0:
+        lut = MapKind((), numbered=True)
+        maps["basis_lut"] = _store("basis_lut", baked.lut, _range(baked.lut), lut, _Place(context, 0, 1))
     return maps
+
+
+def joined(parts: Sequence[dict[str, TextureMap]], texels: Sequence[int], context: Context) -> dict[str, TextureMap]:
+    """All tiles' maps as one set; figures weighted by the texels of each tile. Optional maps with nothing on them in
+    any tile are removed."""
+    if len(parts) == 1:
+        return parts[0]
+    out = {}
+    for name in parts[0]:
+        found = [p[name] for p in parts if name in p]
+        if name in OPTIONAL and max(m.maximum for m in found) == 0:
+            for ref in (r for m in found for r in m.files.values()):
+                (context.workdir / ref.path).unlink()
+            continue
+        share = [1.0] * len(found) if name == "coverage" else [float(n) for n in texels[: len(found)]]
+        out[name] = found[0].model_copy(
+            update={
+                "files": {k: ref for m in found for k, ref in m.files.items()},
+                "minimum": min(m.minimum for m in found),
+                "mean": sum(n * m.mean for n, m in zip(share, found, strict=True)) / sum(share),
+                "maximum": max(m.maximum for m in found),
+            }
+        )
+    return out
 
 
 def resized(image: F32, size: int) -> F32:
@@ -103,11 +140,11 @@ def resized(image: F32, size: int) -> F32:
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.float32)
 
 
-def _from_samples(name: str, kind: MapKind, baked: Baked, context: Context) -> TextureMap:
+def _from_samples(name: str, kind: MapKind, baked: Baked, place: _Place) -> TextureMap:
     low, high, total = np.inf, -np.inf, 0.0
     first = kind.values(baked.samples, slice(0, 1))
     shape = (baked.size, baked.size, first.shape[-1])
-    image = _picture(shape, context.scratch)
+    image = _picture(shape, place.context.scratch)
     for start, stop in bands(baked.size):
         image[start:stop] = kind.values(baked.samples, baked.nearest[start:stop])
     rows = len(baked.texel)
@@ -115,19 +152,20 @@ def _from_samples(name: str, kind: MapKind, baked: Baked, context: Context) -> T
         part = kind.values(baked.samples, slice(start, start + (1 << 20)))
         low, high = min(low, float(part.min())), max(high, float(part.max()))
         total += float(part.sum(dtype=np.float64))
-    return _store(name, image, (low, total / (rows * shape[2]), high), kind, context)
+    return _store(name, image, (low, total / (rows * shape[2]), high), kind, place)
 
 
-def _region(baked: Baked, votes: Votes, context: Context) -> TextureMap:
+def _region(baked: Baked, votes: Votes | None, place: _Place) -> TextureMap:
     rows = len(baked.texel)
     code = np.zeros(rows, np.uint8)
-    for start in range(0, rows, 1 << 20):
+    for start in range(0, rows, 1 << 20) if votes is not None else ():
+        assert votes is not None
         part = slice(start, start + (1 << 20))
         code[part] = votes.winners(baked.texel[part], baked.size)
-    image = _picture((baked.size, baked.size, 1), context.scratch)
+    image = _picture((baked.size, baked.size, 1), place.context.scratch)
     for start, stop in bands(baked.size):
         image[start:stop, :, 0] = code[baked.nearest[start:stop]]
-    return _store("region", image, _range(code), MapKind((), png=8, codes=True), context)
+    return _store("region", image, _range(code), MapKind((), png=8, codes=True), place)
 
 
 def _picture(shape: tuple[int, int, int], folder: Path) -> F32:
@@ -141,21 +179,22 @@ def _range(values: npt.NDArray[Any]) -> tuple[float, float, float]:
     return float(values.min()), float(values.mean(dtype=np.float64)), float(values.max())
 
 
-def _store(name: str, image: F32, figures: tuple[float, float, float], kind: MapKind, context: Context) -> TextureMap:
-    folder = context.workdir / FOLDER
+def _store(name: str, image: F32, figures: tuple[float, float, float], kind: MapKind, place: _Place) -> TextureMap:
+    folder = place.context.workdir / FOLDER
+    exr, png = (tiles.form(k, place.tile, place.count) for k in ("exr", "png"))
     channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
     primaries = REC709 if kind.colour else None
-    write_exr(folder / f"{name}.exr", image, channels, primaries=primaries, units=kind.units)
-    files: dict[str, FileRef] = {"exr": context.file(f"{FOLDER}/{name}.exr")}
+    write_exr(folder / f"{name}.{exr}", image, channels, primaries=primaries, units=kind.units)
+    files: dict[str, FileRef] = {exr: place.context.file(f"{FOLDER}/{name}.{exr}")}
     if kind.png:
-        path = folder / f"{name}.png"
+        path = folder / f"{name}.{png}"
         if kind.space == "srgb_png":
             write_png_from_linear(path, image)
         else:
             if kind.codes:
                 image /= 255
             write_png(path, image, kind.png, signed=kind.encoded)
-        files["png"] = context.file(f"{FOLDER}/{name}.png")
+        files[png] = place.context.file(f"{FOLDER}/{name}.{png}")
     minimum, mean, maximum = figures
     return TextureMap(
         name=name,

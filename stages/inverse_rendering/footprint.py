@@ -1,9 +1,6 @@
 """How large a pixel is on the surface, and how fine a grid, an encoding and a texture the photos can fill.
 
-    footprint(x) = min over the views that face x of  z f_b / (f (n . wo))
-
-Symbols: z depth, f focal length in pixels, f_b the side of the blocks of pixels that the fit takes as one. Visibility
-is not tested: a hidden view can only make the median look finer, which costs time and no detail.
+The footprint of a pixel is that of pipeline.footprint, of the blocks of pixels that the fit takes as one.
 """
 
 from __future__ import annotations
@@ -13,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from pipeline import transforms
 from pipeline.fields.face import FaceModel
+from pipeline.footprint import edges
 from stages.inverse_rendering.settings import AUTO, FitSettings
-from stages.inverse_rendering.sightings import LEAST_COSINE
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
 
@@ -56,15 +52,9 @@ def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | No
     points, normals, area = _surface_of(start)
     best = np.full(len(points), np.inf)
     for view in views:
-        away = view.world_from_cam[:3, 3] - points
-        cosine = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
-        uv, depth = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, points)
-        inside = (
-            (depth > 0) & (np.nan_to_num(uv, nan=-1) >= 0).all(1) & (np.nan_to_num(uv, nan=np.inf) < view.size).all(1)
-        )
-        pixel = depth * factor_for(view.size, side) / float(np.sqrt(abs(np.linalg.det(view.K[:2, :2]))))
-        seen = inside & (cosine > LEAST_COSINE)
-        best[seen] = np.minimum(best[seen], (pixel / cosine.clip(min=LEAST_COSINE))[seen])
+        block = factor_for(view.size, side)
+        camera = view.K, view.world_from_cam, view.distortion
+        best = np.minimum(best, edges(points, normals, *camera, view.size, block))
     known = best[np.isfinite(best)]
     return Footprint(float(np.median(known)), area) if len(known) else None
 

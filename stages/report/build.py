@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import tiles
 from pipeline.images import read_encoded, read_exr
 from stages.report.captured import captured
 from stages.report.compare import JudgedView
@@ -25,7 +26,7 @@ from stages.report.pictures import (
 )
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
-ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit.png"
+ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,26 +121,32 @@ def _over_grey(image: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8
 
 
 def _maps(r: Results, side: int) -> list[Picture]:
-    out = []
+    """Every map; the tiles of one with several next to each other."""
+    out, count = [], r.bake.artifact.tiles
+    kinds = [tiles.form("exr", t, count) for t in range(count)]
     for name, texture in sorted(r.bake.artifact.maps.items()):
-        if name not in SKIPPED_MAPS and "exr" in texture.files:
-            values = read_exr(r.bake.path(texture.files["exr"]))[0]
-            step = max(1, values.shape[0] // (2 * side))
-            picture = map_picture(values[::step, ::step], texture.space)
+        if name not in SKIPPED_MAPS and set(kinds) <= texture.files.keys():
+            values = np.concatenate([_thinned(read_exr(r.bake.path(texture.files[k]))[0], side) for k in kinds], 1)
+            picture = map_picture(values, texture.space)
             out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}"))
     return out + _lobe_fit(r, side)
 
 
 def _lobe_fit(r: Results, side: int) -> list[Picture]:
     """Where a GGX lobe does not stand for the fitted one, and where kappa is a guess."""
-    files = [f for f in r.usd.artifact.files if f.path.endswith(LOBE_FIT)]
+    files = [f for f in r.usd.artifact.files if LOBE_FIT in f.path]
     if not files:
         return []
-    picture = read_encoded(r.usd.path(files[0]))[..., :3]
-    step = max(1, picture.shape[0] // (2 * side))
+    picture = np.concatenate([_thinned(read_encoded(r.usd.path(f))[..., :3], side) for f in files], 1)
     mean = r.usd.artifact.figures.get("ggx_residual_mean", 0.0)
     caption = f"GGX against the fitted lobe: red, residual (mean {mean:.1%}); green, kappa not resolved"
-    return [Picture(data_uri(picture[::step, ::step], side), caption)]
+    return [Picture(data_uri(picture, side), caption)]
+
+
+def _thinned(image: np.ndarray[Any, Any], side: int) -> np.ndarray[Any, Any]:
+    """Every so many rows and columns, about twice as many as are shown."""
+    step = max(1, image.shape[0] // (2 * side))
+    return np.asarray(image[::step, ::step])
 
 
 def _light(r: Results, side: int) -> Picture | None:

@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     UsdAsset,
     UvMesh,
 )
+from pipeline.tiles import FIRST
 from stages.report.chart import chart_figures
 
 
@@ -88,7 +89,9 @@ def figures(r: Results) -> dict[str, Any]:
             "vertices": uv.vertices,
             "faces": uv.faces,
             "charts": uv.charts,
+            "tiles": uv.tiles,
             "utilisation": uv.utilisation,
+            **{f"utilisation_{FIRST + t}": share for t, share in enumerate(uv.tile_utilisation)},
             "stretch": uv.stretch,
             "overlap": uv.overlap,
             "stretch_max": uv.stretch_max,
@@ -99,6 +102,7 @@ def figures(r: Results) -> dict[str, Any]:
         },
         "maps": {
             "size": bake.size,
+            "tiles": bake.tiles,
             "covered_share": bake.coverage,
             "zero_set_rms_mm": bake.zero_set_rms_mm,
             **{f"zero_set_rms_mm_{name}": value for name, value in sorted(bake.lod_rms_mm.items())},
@@ -108,6 +112,7 @@ def figures(r: Results) -> dict[str, Any]:
                 for n, m in sorted(bake.maps.items())
             },
         },
+        "regions": dict(bake.regions),
         "asset": {
             "name": usd.name,
             "root": usd.root.rpartition("/")[2],

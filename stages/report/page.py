@@ -66,9 +66,9 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         if h.get(key) is not None:
             out.append((f"{h[key]:.3f}", what, meaning))
     out.append((f"{metrics['uv']['faces']:,}", "triangles", f"{metrics['uv']['charts']} charts"))
-    out.append(
-        (f"{metrics['maps']['size']}²", "texels", f"{100 * metrics['maps']['covered_share']:.0f} % of them used")
-    )
+    maps = metrics["maps"]
+    times = f"{maps['tiles']} × " if maps["tiles"] > 1 else ""
+    out.append((f"{times}{maps['size']}²", "texels", f"{100 * maps['covered_share']:.0f} % of them used"))
     return out
 
 
@@ -85,6 +85,11 @@ def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
         out.append((title, [(_words(k), _value(v)) for k, v in metrics[key].items()]))
     if metrics["colour_chart"]["found"]:
         out.append(("Colour chart", [(_words(k), _value(v)) for k, v in metrics["colour_chart"].items()]))
+    if metrics["regions"]:
+        shares = [(_words(k), f"{100 * v:.1f} %") for k, v in metrics["regions"].items()]
+        out.append(("Regions: share of the surface", shares))
+    figures = [(_words(n), _value(v)) for n, v in metrics["maps"].items() if not isinstance(v, Mapping)]
+    out.append(("Texture", figures))
     rows = [
         (n, f"{_value(m['mean'])}  ({_value(m['minimum'])} to {_value(m['maximum'])}), {m['channels']} channel(s)")
         for n, m in metrics["maps"].items()

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
 
+from pipeline import tiles
 from stages.usd.materialx import materialx_networks
-from stages.usd.mesh import UvSurface
+from stages.usd.mesh import UvSurface, on_tile, tile_count
 from stages.usd.shading import MATERIAL, Look, preview_networks
 
 STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
@@ -158,10 +159,21 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
 
 
 def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
-    """The one layer of NAME.usdz. No proxy: viewers on phones show every purpose at once."""
+    """The one layer of NAME.usdz. No proxy: viewers on phones show every purpose at once. Of several tiles each is a
+    mesh with a material of its own, its st in the unit square: those viewers know no <UDIM>."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
-    _fill(stage, who.name, mesh, None, look)
+    count = tile_count(mesh)
+    if count == 1:
+        _fill(stage, who.name, mesh, None, look)
+    else:
+        for folder in ("geo", "mtl"):
+            UsdGeom.Scope.Define(stage, f"/{who.name}/{folder}")
+        for t in range(count):
+            number = tiles.FIRST + t
+            material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
+            preview_networks(stage, material, look.on_tile(t))
+            _mesh(stage, f"/{who.name}/geo/render_{number}", on_tile(mesh, t, count), material)
     return detached(stage)
 
 
@@ -200,7 +212,8 @@ def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Mater
     out.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
     st = UsdGeom.PrimvarsAPI(out).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     # xatlas may put a border vertex a rounding error outside of the square
-    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.uvs[uv_used].clip(0, 1), np.float32)))
+    kept = mesh.uvs[uv_used].clip(0, [tile_count(mesh), 1])
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(kept, np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))
     if material is not None:
         UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)

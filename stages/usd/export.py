@@ -20,7 +20,7 @@ from stages.usd.gltf import write_glb
 from stages.usd.light import environment, environment_figures, light_json, read_light
 from stages.usd.lookdev import lookdev_layer
 from stages.usd.maps import write_maps
-from stages.usd.mesh import UvSurface, half_gap, read_mesh, uv_fault, with_uvs_from, without_overlap
+from stages.usd.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap
 from stages.usd.obj import write_obj
 from stages.usd.package import bounded_png, write_package
 from stages.usd.shading import Look
@@ -106,7 +106,7 @@ def export(
         # viewers on phones read no MaterialX, and some take any preview surface that they find
         plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
         single = component.package_layer(who, mesh, plain)
-        written.append(_package(single, folder, name, plain))
+        written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if settings.glb:
         written.append(folder / f"{name}.glb")
         write_glb(written[-1], name, mesh, look, folder, who.stated())
@@ -164,15 +164,16 @@ def attenuation_of(face: FittedFace) -> str:
 
 
 # ------------------------------------------------------------------ package
-def _package(content: Sdf.Layer, folder: Path, name: str, look: Look) -> Path:
-    """NAME.usdz: one binary layer and the PNG textures that it reads."""
+def _package(content: Sdf.Layer, folder: Path, name: str, look: Look, count: int) -> Path:
+    """NAME.usdz: one binary layer and the PNG textures that it reads, of `count` tiles."""
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / f"{name}.usdc"
         _write_layer(content, layer, "usdc")
         members = [(layer.name, layer.read_bytes())]
-    for file in (look.albedo, look.roughness, look.normal):
-        if file:
-            members.append((file.removeprefix("./"), bounded_png(folder / file)))
+    for one in (look.on_tile(t) for t in range(count)):
+        for file in (one.albedo, one.roughness, one.normal):
+            if file:
+                members.append((file.removeprefix("./"), bounded_png(folder / file)))
     path = folder / f"{name}.usdz"
     write_package(path, members)
     return path

@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import tiles
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from stages.usd.light import read_light
-from stages.usd.mesh import UvSurface
+from stages.usd.mesh import UvSurface, tile_count
 from stages.usd.view import View
 
 F32 = npt.NDArray[np.float32]
@@ -23,7 +24,7 @@ F32 = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class ExportedAsset:
-    """Everything that the model's equations need.
+    """Everything that the model's equations need. Maps of several tiles lie side by side: W = tiles H.
 
     albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) the share of the captured light that arrives, so that
     albedo * occlusion is the fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
@@ -40,6 +41,7 @@ class ExportedAsset:
     light: F32
     attenuation: str
     occlusion: F32 | None = None
+    tiles: int = 1
 
 
 def load_exported(root: Path) -> ExportedAsset:
@@ -50,9 +52,11 @@ def load_exported(root: Path) -> ExportedAsset:
     light_file = folder / "light.json"
     light = read_light(light_file)
     attenuation = str(json.loads(light_file.read_text()).get("attenuation", "exponential"))
-    albedo, inv_kappa = (_map(folder, name, m) for m in ("albedo", "inv_kappa"))
-    coefficients = numbered(_file(folder, name, "specular_coefficients"))
-    basis = numbered(_file(folder, name, "basis_lut")).mean(0)
+    mesh = read_usd_mesh(root)
+    count = tile_count(mesh)
+    albedo, inv_kappa = (_map(folder, name, m, count) for m in ("albedo", "inv_kappa"))
+    coefficients = np.concatenate([numbered(f) for f in _files(folder, name, "specular_coefficients", count)], 1)
+    basis = numbered(_files(folder, name, "basis_lut")[0]).mean(0)
     if coefficients.shape[2] != basis.shape[1]:
         raise StageError(
             "the specular maps do not fit each other",
@@ -62,33 +66,41 @@ def load_exported(root: Path) -> ExportedAsset:
             remedy="run the bake stage again",
         )
     return ExportedAsset(
-        read_usd_mesh(root),
+        mesh,
         albedo[..., :3],
         coefficients,
         inv_kappa[..., :1],
-        _normal(folder, name),
+        _normal(folder, name, count),
         basis,
         light,
         attenuation,
-        _occlusion(folder, name),
+        _occlusion(folder, name, count),
+        count,
     )
 
 
-def _map(folder: Path, name: str, which: str) -> F32:
-    return read_exr(_file(folder, name, which))[0]
+def _map(folder: Path, name: str, which: str, count: int) -> F32:
+    read = [read_exr(f)[0] for f in _files(folder, name, which, count)]
+    return read[0] if count == 1 else np.concatenate(read, 1)
 
 
-def _file(folder: Path, name: str, which: str) -> Path:
-    path = folder / "textures" / f"{name}_{which}.exr"
-    if not path.is_file():
-        raise StageError(
-            "a map of the asset is missing",
-            where=path.name,
-            value="no such file",
-            limit="the maps that the usd stage wrote",
-            remedy="keep the asset's folder together",
-        )
-    return path
+def _files(folder: Path, name: str, which: str, count: int = 1) -> list[Path]:
+    """A map's file for each tile, all of them there."""
+    paths = _paths(folder, name, which, "exr", count)
+    for path in paths:
+        if not path.is_file():
+            raise StageError(
+                "a map of the asset is missing",
+                where=path.name,
+                value="no such file",
+                limit="the maps that the usd stage wrote",
+                remedy="keep the asset's folder together",
+            )
+    return paths
+
+
+def _paths(folder: Path, name: str, which: str, kind: str, count: int) -> list[Path]:
+    return [folder / "textures" / f"{name}_{which}.{tiles.form(kind, t, count)}" for t in range(count)]
 
 
 def numbered(path: Path) -> F32:
@@ -99,21 +111,20 @@ def numbered(path: Path) -> F32:
     return values
 
 
-def _occlusion(folder: Path, name: str) -> F32 | None:
+def _occlusion(folder: Path, name: str, count: int) -> F32 | None:
     """What the export divided out of the albedo, or the same as the fit modelled it (pipeline.fields.shadowing)."""
     for which in ("occlusion", "irradiance_ratio"):
-        path = folder / "textures" / f"{name}_{which}.exr"
-        if path.is_file():
-            return read_exr(path)[0][..., :3]
+        if _paths(folder, name, which, "exr", count)[0].is_file():
+            return _map(folder, name, which, count)[..., :3]
     return None
 
 
-def _normal(folder: Path, name: str) -> F32 | None:
+def _normal(folder: Path, name: str, count: int) -> F32 | None:
     """From the PNG that the shader network reads: stored as (n + 1) / 2."""
-    path = folder / "textures" / f"{name}_normal.png"
-    if not path.is_file():
+    paths = _paths(folder, name, "normal", "png", count)
+    if not paths[0].is_file():
         return None
-    stored = read_encoded(path)[..., :3]
+    stored = np.concatenate([read_encoded(p)[..., :3] for p in paths], 1)
     n = stored.astype(np.float32) / (255 if stored.dtype == np.uint8 else 65535) * 2 - 1
     return np.asarray(n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6), np.float32)
 

@@ -7,6 +7,7 @@ import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom
 
 from stages.usd.findings import Finding
+from stages.usd.tile_checks import coordinate_findings, tiled
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
@@ -106,7 +107,8 @@ def _against_winding(
 
 
 def _primvars(mesh: UsdGeom.Mesh, sizes: dict[str, int]) -> list[Finding]:
-    """Counts and indices of every primvar, and texture coordinates that are there, typed, finite and in the square."""
+    """Counts and indices of every primvar, and texture coordinates that are there, typed, finite and in the square, or
+    each face in one of a row of tiles."""
     out = []
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         where = str(primvar.GetAttr().GetPath())
@@ -127,6 +129,8 @@ def _primvars(mesh: UsdGeom.Mesh, sizes: dict[str, int]) -> list[Finding]:
     if st.GetTypeName() != Sdf.ValueTypeNames.TexCoord2fArray:
         out.append(Finding("error", "st", f"type {st.GetTypeName()}, expected texCoord2f[]", str(mesh.GetPath())))
     values = np.array(st.Get(Usd.TimeCode.Default()), np.float64)
+    if not out and np.isfinite(values).all() and st.GetInterpolation() == "faceVarying" and tiled(mesh):
+        return coordinate_findings(mesh, np.array(st.ComputeFlattened(), np.float64))
     if not (np.isfinite(values).all() and values.min() >= -1e-5 and values.max() <= 1 + 1e-5):
         out.append(
             Finding(

@@ -5,7 +5,8 @@ Core metallic-roughness material with metallic 0, and KHR_materials_specular: re
     F0 = 0.04 * specularColorFactor * specularColorTexture
 
 whose texture is sRGB-encoded F0 over its largest value, so that eight bits serve. Texture coordinates have their origin
-top left there, so v becomes 1 - v. The same content gives the same bytes.
+top left there, so v becomes 1 - v. glTF knows no UDIM tiles: each becomes a primitive and a material of its own, its
+coordinates in the unit square. The same content gives the same bytes.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import tiles
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_encoded, read_exr
-from stages.usd.mesh import UvSurface
+from stages.usd.mesh import UvSurface, on_tile, tile_count
 from stages.usd.package import bounded_png
 from stages.usd.shading import Look
 
@@ -68,22 +70,13 @@ def corners(mesh: UvSurface) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int6
 
 def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, said: dict[str, str]) -> None:
     """`folder`: what the look's paths are relative to. `said`: what the user stated about the capture."""
-    binary = _Binary()
-    vertex, uv, faces = corners(mesh)
-    points, normals = mesh.vertices[vertex].astype(np.float32), mesh.normals[vertex].astype(np.float64)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    st = mesh.uvs[uv].clip(0, 1).astype(np.float32)
-    primitive = {
-        "attributes": {
-            "POSITION": binary.accessor(points, "VEC3", ARRAY_BUFFER, bounds=True),
-            "NORMAL": binary.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER),
-            "TEXCOORD_0": binary.accessor(np.stack([st[:, 0], 1 - st[:, 1]], -1), "VEC2", ARRAY_BUFFER),
-        },
-        "indices": binary.accessor(faces.ravel(), "SCALAR", ELEMENT_BUFFER),
-        "material": 0,
-    }
+    binary, count = _Binary(), tile_count(mesh)
+    looks = [look.on_tile(t) for t in range(count)]
+    primitives = [_primitive(on_tile(mesh, t, count), t, binary) for t in range(count)]
     images: list[dict[str, Any]] = []
-    material = _material(name, look, folder, binary, images)
+    names = [name] if count == 1 else [f"{name}_{tiles.FIRST + t}" for t in range(count)]
+    top = max((_top(folder / x.f0) for x in looks if x.f0), default=0.0)
+    materials = [_material(n, x, folder, binary, images, top) for n, x in zip(names, looks, strict=True)]
     asset: dict[str, Any] = {"version": "2.0", "generator": "NeuFace Asset"}
     if said:
         asset["extras"] = said
@@ -91,12 +84,12 @@ def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, 
             asset["copyright"] = said["license"]
     document = {
         "asset": asset,
-        "extensionsUsed": sorted(material.get("extensions", {})),
+        "extensionsUsed": sorted(materials[0].get("extensions", {})),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"name": name, "primitives": [primitive]}],
-        "materials": [material],
+        "meshes": [{"name": name, "primitives": primitives}],
+        "materials": materials,
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP}],
         "textures": [{"sampler": 0, "source": i} for i in range(len(images))],
         "images": images,
@@ -114,7 +107,32 @@ def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, 
         f.write(struct.pack("<I4s", len(binary.data), b"BIN\0") + bytes(binary.data))
 
 
-def _material(name: str, look: Look, folder: Path, binary: _Binary, images: list[dict[str, Any]]) -> dict[str, Any]:
+def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any]:
+    vertex, uv, faces = corners(mesh)
+    points, normals = mesh.vertices[vertex].astype(np.float32), mesh.normals[vertex].astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    st = mesh.uvs[uv].clip(0, 1).astype(np.float32)
+    return {
+        "attributes": {
+            "POSITION": binary.accessor(points, "VEC3", ARRAY_BUFFER, bounds=True),
+            "NORMAL": binary.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER),
+            "TEXCOORD_0": binary.accessor(np.stack([st[:, 0], 1 - st[:, 1]], -1), "VEC2", ARRAY_BUFFER),
+        },
+        "indices": binary.accessor(faces.ravel(), "SCALAR", ELEMENT_BUFFER),
+        "material": material,
+    }
+
+
+def _top(f0: Path) -> float:
+    """What stands for the largest F0 of a map, outliers left out."""
+    return float(np.clip(np.percentile(read_exr(f0)[0][..., 0], 99.9), LEAST_TOP, LARGEST_TOP))
+
+
+def _material(
+    name: str, look: Look, folder: Path, binary: _Binary, images: list[dict[str, Any]], top: float
+) -> dict[str, Any]:
+    """`top`: the F0 that the texture's largest value stands for."""
+
     def add(kind: str, content: bytes) -> dict[str, int]:
         images.append({"name": f"{name}_{kind}", "mimeType": "image/png", "bufferView": binary.view(content)})
         return {"index": len(images) - 1}
@@ -133,7 +151,6 @@ def _material(name: str, look: Look, folder: Path, binary: _Binary, images: list
         out["normalTexture"] = add("normal", bounded_png(folder / look.normal))
     if look.f0:
         f0 = read_exr(folder / look.f0)[0][..., 0]
-        top = float(np.clip(np.percentile(f0, 99.9), LEAST_TOP, LARGEST_TOP))
         stored = np.repeat(srgb_from_linear((f0 / top).clip(0, 1))[..., None], 3, -1)
         bits = np.round(stored * 255).astype(np.uint8)
         specular = {

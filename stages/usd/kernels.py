@@ -32,15 +32,18 @@ def hit_weights(corners, face, origin, directions, out):
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def bilinear(image, uv, out):
-    """(N, C) of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border."""
-    h, w, channels = image.shape
+def bilinear(image, tiles, uv, out):
+    """(N, C) of (H, W, C), `tiles` squares side by side, at uv (N, 2): texel centres at +0.5, v up, clamped at the
+    border of each tile."""
+    h, w, channels = image.shape[0], image.shape[1] // tiles, image.shape[2]
     for i in prange(len(uv)):
-        x = min(max(uv[i, 0] * w - 0.5, 0.0), w - 1.0)
+        tile = min(max(int(uv[i, 0]), 0), tiles - 1)
+        x = min(max((uv[i, 0] - tile) * w - 0.5, 0.0), w - 1.0)
         y = min(max((1.0 - uv[i, 1]) * h - 0.5, 0.0), h - 1.0)
         x0, y0 = int(x), int(y)
         x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
         fx, fy = np.float32(x - x0), np.float32(y - y0)
+        x0, x1 = x0 + tile * w, x1 + tile * w
         for k in range(channels):
             top = image[y0, x0, k] * (1 - fx) + image[y0, x1, k] * fx
             low = image[y1, x0, k] * (1 - fx) + image[y1, x1, k] * fx

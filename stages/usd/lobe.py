@@ -12,6 +12,7 @@ F exactly is sum_j rho c_j B_j(c) / R(c, alpha(s)): linear in the coefficients, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,13 +36,28 @@ RESOLVED_KAPPA = 50.0  # above it a light of order 10 looks the same through the
 @dataclass(frozen=True, slots=True)
 class LobeFit:
     """residual (H, W): |F - R| over |F|, root mean square over c weighted by c. unresolved (H, W): kappa is a guess.
-
-    `figures`: means over covered texels, for the report.
-    """
+    covered (H, W): texels under charts."""
 
     residual: F32
     unresolved: Mask
-    figures: dict[str, float]
+    covered: Mask
+
+    def shown(self, step: int = 1) -> tuple[F32, Mask]:
+        """(N,) residual and unresolved of every step-th covered texel."""
+        return self.residual[self.covered][::step], self.unresolved[self.covered][::step]
+
+
+def fit_figures(parts: Sequence[tuple[F32, Mask]]) -> dict[str, float]:
+    """Means over the covered texels of all tiles (LobeFit.shown), for the report."""
+    if not parts:
+        return {}
+    shown, unresolved = (np.concatenate(p) for p in zip(*parts, strict=True))
+    figures = {
+        "ggx_residual_mean": float(shown.mean(dtype=np.float64)) if shown.size else 0.0,
+        "ggx_residual_p95": float(np.percentile(shown, 95)) if shown.size else 0.0,
+        "kappa_unresolved_share": float(unresolved.sum() / max(unresolved.size, 1)),
+    }
+    return {k: round(v, 5) for k, v in figures.items()}
 
 
 def basis_table(basis: F32) -> F32:
@@ -84,13 +100,7 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
         scale = (fitted**2 * weights).sum(1)
         residual[y, x] = np.sqrt(error / np.maximum(scale, 1e-12))
     unresolved = covered & (inv_kappa < 1 / RESOLVED_KAPPA)
-    shown = residual[covered]
-    figures = {
-        "ggx_residual_mean": float(shown.mean(dtype=np.float64)) if shown.size else 0.0,
-        "ggx_residual_p95": float(np.percentile(shown, 95)) if shown.size else 0.0,
-        "kappa_unresolved_share": float(unresolved.sum() / max(covered.sum(), 1)),
-    }
-    return LobeFit(residual, unresolved, {k: round(v, 5) for k, v in figures.items()})
+    return LobeFit(residual, unresolved, covered)
 
 
 def _rows_at(

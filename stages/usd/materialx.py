@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from pxr import Sdf, Usd, UsdShade
 
+from pipeline import tiles
 from stages.usd.lobe import INV_KAPPA_SCALE, REFERENCE_F0, REFERENCE_IOR
 from stages.usd.shading import Look, T, connect, shader
 
@@ -45,19 +46,19 @@ class _Nodes:
         return made.CreateOutput("out", out)
 
     def image(self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str) -> UsdShade.Output:
-        """A picture at st, clamped."""
+        """A picture at st."""
         return self.image_at(name, kind, out, file, space, self.st)
 
     def image_at(
         self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str, at: UsdShade.Output
     ) -> UsdShade.Output:
-        """A picture at `at`, clamped."""
+        """A picture at `at`, clamped if it is one and not a row of tiles."""
         made = shader(self.stage, f"{self.path}/{name}", f"ND_image_{kind}")
         picture = made.CreateInput("file", T.Asset)
         picture.Set(Sdf.AssetPath(file))
         picture.GetAttr().SetColorSpace(space)
         connect(made.CreateInput("texcoord", T.Float2), at)
-        for axis in "uv":
+        for axis in "uv" if tiles.TOKEN not in file else "":  # with tiles, clamped would be the whole row
             made.CreateInput(f"{axis}addressmode", T.String).Set("clamp")
         return made.CreateOutput("out", out)
 

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import tiles
 from pipeline.errors import StageError
+from pipeline.meshes import Charts
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -16,6 +18,7 @@ I32 = npt.NDArray[np.int32]
 
 SHRINK, SHRINK_ROUNDS = 0.85, 6
 AREAS = (0.25, 4.0)  # of a triangle's own: with less or more in the texture it is laid flat anew
+INSIDE = 1e-5  # of a tile: how far from its border corners are kept, so that rounding leaves no doubt whose they are
 CANDIDATES = 12  # nearest triangles among which the exact nearest point is looked for
 
 
@@ -78,6 +81,20 @@ def _bad_mesh(path: Path, value: str) -> StageError:
     )
 
 
+def tile_count(mesh: UvSurface) -> int:
+    """How many UDIM tiles (pipeline.tiles) a mesh's triangles lie in."""
+    return int(tiles.of_face(Charts(mesh.uvs, mesh.uv_faces)).max()) + 1
+
+
+def on_tile(mesh: UvSurface, tile: int, count: int) -> UvSurface:
+    """The triangles of one of `count` tiles, their texture coordinates in the unit square."""
+    if count == 1:
+        return mesh
+    mine = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces)) == tile
+    moved = (mesh.uvs - np.array([tile, 0], np.float32)).clip(0, 1)
+    return UvSurface(mesh.vertices, mesh.normals, mesh.faces[mine], moved, mesh.uv_faces[mine])
+
+
 def charts_of(uv_faces: I32, count: int) -> I32:
     """(F,) chart number of each triangle: triangles that share a texture vertex are in one chart."""
     from scipy.sparse import coo_matrix
@@ -127,6 +144,9 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
         uvs[rows] = found.reshape(-1, 3, 2)
     if beyond > 0:
         _lay_flat(uvs, ends, corners[hit], t[hit], weights_at_centre, beyond)
+    home = tiles.of_face(Charts(full.uvs, full.uv_faces))[hit].astype(np.float64)
+    if home.any():  # of several tiles: what reaches past a border of its own would show another's texels
+        uvs[..., 0] = uvs[..., 0].clip(home[:, None] + INSIDE, home[:, None] + 1 - INSIDE)
     values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
 
@@ -167,8 +187,12 @@ def _turned(points: F64, start: F64, goal: F64) -> F64:
 def half_gap(mesh: UvSurface, size: int = 1024) -> float:
     """Half of the least distance (uv) between two charts, found on a raster of `size` and a texel too small rather
     than too large; infinite for one chart. The gutter's texels up to there are filled from the nearer chart."""
+    count = tile_count(mesh)
+    return min(_half_gap(on_tile(mesh, t, count), size) for t in range(count))
+
+
+def _half_gap(mesh: UvSurface, size: int) -> float:
     from pipeline import raster
-    from pipeline.meshes import Charts
     from pipeline.nearest import nearest_known
 
     hits = raster.rasterise(raster.texel_corners(Charts(mesh.uvs, mesh.uv_faces), size), size, 0, size, 0.5)
@@ -194,21 +218,26 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
     proxy would then write texels twice. A stand-in can bear a little stretch instead.
     """
     from pipeline import raster
-    from pipeline.meshes import Charts
 
     t = proxy.uvs[proxy.uv_faces].astype(np.float64)
     inside = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 0.5], [2, 0.5, 2], [0.5, 2, 2]], np.float64)
     inside /= inside.sum(1, keepdims=True)
-    for _ in range(SHRINK_ROUNDS):
-        flat = Charts(t.reshape(-1, 2).astype(np.float32), np.arange(t.size // 2, dtype=np.int32).reshape(-1, 3))
-        twice = raster.layers(raster.texel_corners(flat, size), size).reshape(size, size) > 1
-        if not twice.any():
-            break
-        places = np.einsum("sc,fcx->fsx", inside, t)
-        column = (places[..., 0] * size).astype(int).clip(0, size - 1)
-        row = ((1 - places[..., 1]) * size).astype(int).clip(0, size - 1)
-        folded = twice[row, column].any(1)
-        t[folded] += (1 - SHRINK) * (t[folded].mean(1, keepdims=True) - t[folded])
+    tile = tiles.of_face(Charts(proxy.uvs, proxy.uv_faces))
+    for number in range(int(tile.max()) + 1):
+        own, offset = np.flatnonzero(tile == number), np.array([number, 0])
+        for _ in range(SHRINK_ROUNDS):
+            local = t[own] - offset
+            flat = Charts(
+                local.reshape(-1, 2).astype(np.float32), np.arange(3 * len(own), dtype=np.int32).reshape(-1, 3)
+            )
+            twice = raster.layers(raster.texel_corners(flat, size), size).reshape(size, size) > 1
+            if not twice.any():
+                break
+            places = np.einsum("sc,fcx->fsx", inside, local)
+            column = (places[..., 0] * size).astype(int).clip(0, size - 1)
+            row = ((1 - places[..., 1]) * size).astype(int).clip(0, size - 1)
+            folded = own[twice[row, column].any(1)]
+            t[folded] += (1 - SHRINK) * (t[folded].mean(1, keepdims=True) - t[folded])
     values, inverse = np.unique(t.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pipeline.maths.microfacet import KAPPA_RANGE
 from stages.usd import kernels
 from stages.usd.lamps import Lamps, checked_environment, lamps
-from stages.usd.render import Points, Renderer, bilinear
+from stages.usd.render import Points, Renderer
 from stages.usd.transport import Transport
 
 F32 = npt.NDArray[np.float32]
@@ -43,11 +43,11 @@ class Environment:
         n = points.normal.astype(np.float32)
         facing = (points.normal * points.wo).sum(1, keepdims=True)
         mirror = (2 * facing * points.normal - points.wo).astype(np.float32)
-        s = bilinear(renderer.asset.inv_kappa, points.uv)[:, 0].clip(1 / KAPPA_RANGE[1], 1 / KAPPA_RANGE[0])
+        s = renderer.at(renderer.asset.inv_kappa, points.uv)[:, 0].clip(1 / KAPPA_RANGE[1], 1 / KAPPA_RANGE[0])
         direct, glossy = np.empty((len(n), 3), np.float32), np.empty((len(n), 3), np.float32)
         kernels.under_lamps(n, mirror, s, points.corner, points.weights, self._seen, self._lamp, direct, glossy)
         bounced = np.einsum("nic,ni->nc", self._indirect[points.corner], points.weights)
-        albedo = bilinear(renderer.asset.albedo, points.uv)
+        albedo = renderer.at(renderer.asset.albedo, points.uv)
         return np.asarray(albedo / np.pi * (direct + bounced) + renderer.strength(points)[:, None] * glossy, np.float64)
 
 
@@ -61,4 +61,4 @@ def vertex_values(image: F32, renderer: Renderer) -> F64:
     mesh = renderer.asset.mesh
     uv = np.zeros((len(mesh.vertices), 2), np.float32)
     uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
-    return bilinear(image, uv).astype(np.float64)
+    return renderer.at(image, uv).astype(np.float64)

@@ -81,10 +81,10 @@ class Harmonics:
         """[NeuFace eq. 12] + [NeuFace eq. 16]"""
         asset, light = renderer.asset, torch.from_numpy(np.asarray(self.coefficients, np.float32))
         n = torch.from_numpy(points.normal.astype(np.float32))
-        albedo = np.full((len(n), 3), 0.5, np.float32) if self.plain else bilinear(renderer.fitted_albedo, points.uv)
+        albedo = np.full((len(n), 3), 0.5, np.float32) if self.plain else renderer.at(renderer.fitted_albedo, points.uv)
         colour = brdf.diffuse(torch.from_numpy(albedo), n, light)
         if not self.plain:
-            s = torch.from_numpy(bilinear(asset.inv_kappa, points.uv)[:, 0]).clamp(min=0)
+            s = torch.from_numpy(renderer.at(asset.inv_kappa, points.uv)[:, 0]).clamp(min=0)
             toward = torch.from_numpy(points.wo.astype(np.float32))
             incident = brdf.light_integral(brdf.reflect(toward, n), s, light, asset.attenuation)
             colour = colour + torch.from_numpy(renderer.strength(points))[:, None] * incident
@@ -184,14 +184,18 @@ class Renderer:
         uv, smooth = (np.einsum("nic,ni->nc", a[hits.face], w) for a in (self._uvs, self._normals))
         normal = _unit(smooth)
         if self.asset.normal is not None:
-            normal = self._bent(hits.face, w, normal, bilinear(self.asset.normal, uv))
+            normal = self._bent(hits.face, w, normal, self.at(self.asset.normal, uv))
         return Points(hits.ray, -directions[hits.ray], normal, uv, mesh.faces[hits.face], w)
+
+    def at(self, image: F32, uv: npt.NDArray[np.floating]) -> F32:
+        """(N, C) values of one of the asset's maps at uv (N, 2)."""
+        return bilinear(image, uv, self.asset.tiles)
 
     def strength(self, points: Points) -> F32:
         """(M,) rho c . B(n.wo): the lobe's share of the light in it."""
         cosine = (points.normal * points.wo).sum(1).clip(0, 1)
         table = lookup(self.asset.basis, cosine)
-        return np.asarray((bilinear(self.asset.coefficients, points.uv) * table).sum(1).clip(min=0), np.float32)
+        return np.asarray((self.at(self.asset.coefficients, points.uv) * table).sum(1).clip(min=0), np.float32)
 
     def _bent(self, face: npt.NDArray[np.int64], weights: F32, normal: F64, local: F32) -> F64:
         """The normal map's normal (tangent space) in asset coordinates."""
@@ -225,10 +229,11 @@ def tangents(asset: ExportedAsset) -> F64:
     return np.concatenate([_unit(total)[mesh.uv_faces], sign], -1)
 
 
-def bilinear(image: F32, uv: npt.NDArray[np.floating]) -> F32:
-    """(N, C) values of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border."""
+def bilinear(image: F32, uv: npt.NDArray[np.floating], tiles: int = 1) -> F32:
+    """(N, C) values of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border. `tiles`: the image
+    is that many squares side by side, tile t for t <= u < t + 1, each clamped at its own border."""
     out = np.empty((len(uv), image.shape[2]), np.float32)
-    kernels.bilinear(np.ascontiguousarray(image, np.float32), uv, out)
+    kernels.bilinear(np.ascontiguousarray(image, np.float32), tiles, uv, out)
     return out
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
+
+from pipeline import tiles
 
 T = Sdf.ValueTypeNames
 MATERIAL = "captured"
@@ -13,7 +16,8 @@ MATERIAL = "captured"
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What the material's networks show. Paths are relative to the layer; None leaves a map out.
+    """What the material's networks show. Paths are relative to the layer, of several tiles with <UDIM> in place of the
+    tile's number; None leaves a map out.
 
     coefficients, basis: pictures of three coefficients c_j(x), and three tables B_j / R, each; () where there are none.
     """
@@ -28,6 +32,13 @@ class Look:
     inv_kappa: str | None = None
     coefficients: tuple[str, ...] = ()
     basis: tuple[str, ...] = ()
+
+    def on_tile(self, tile: int) -> Look:
+        """The same with the files of one tile."""
+        number = str(tiles.FIRST + tile)
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        named: dict[str, Any] = {k: p.replace(tiles.TOKEN, number) for k, p in values.items() if isinstance(p, str)}
+        return replace(self, **named, coefficients=tuple(c.replace(tiles.TOKEN, number) for c in self.coefficients))
 
 
 def ior_from_f0(f0: float) -> float:
@@ -90,7 +101,8 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
 def _texture(
     stage: Usd.Stage, st: UsdShade.Output, path: str, file: str, space: str, channel: str = "rgb"
 ) -> UsdShade.Output:
-    """A texture reader. Clamped: charts never wrap, and wrapping would mix opposite borders."""
+    """A texture reader. Clamped: charts never wrap, and wrapping would mix opposite borders. (Readers of tiles pay no
+    heed to it, each tile being looked up by its own part of st.)"""
     out = shader(stage, path, "UsdUVTexture")
     out.CreateInput("file", T.Asset).Set(Sdf.AssetPath(file))
     out.CreateInput("sourceColorSpace", T.Token).Set(space)

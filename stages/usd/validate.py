@@ -19,6 +19,7 @@ from pathlib import Path
 from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from pipeline.errors import StageError
+from stages.usd import tile_checks
 from stages.usd.findings import Finding, errors
 from stages.usd.geometry_checks import mesh_findings
 from stages.usd.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
@@ -185,28 +186,45 @@ def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Every image resolves, decodes and holds no NaN."""
-    out, done = [], set()
+    """Every image resolves, decodes and holds no NaN; of one in tiles, every tile that the meshes need."""
+    out: list[Finding] = []
+    done: set[str] = set()
+    wanted = tile_checks.needed(stage)
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         for attribute in prim.GetAttributes():
             value = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
             if value is None or not value.path.lower().endswith(IMAGES):
                 continue
-            if not value.resolvedPath:
-                out.append(
-                    Finding("error", "missing_texture", f"{value.path} does not resolve", str(attribute.GetPath()))
-                )
+            where = str(attribute.GetPath())
+            if tile_checks.is_tiled(value.path):
+                if value.path not in done:
+                    done.add(value.path)
+                    out += _tiles(value.path, tile_checks.tile_files(value.path, stage, attribute), wanted, where)
+            elif not value.resolvedPath:
+                out.append(Finding("error", "missing_texture", f"{value.path} does not resolve", where))
             elif value.resolvedPath not in done:
                 done.add(value.resolvedPath)
                 fault = _image_fault(value.resolvedPath)
                 if fault:
-                    out.append(
-                        Finding("error", "unreadable_texture", f"{value.path}: {fault}", str(attribute.GetPath()))
-                    )
+                    out.append(Finding("error", "unreadable_texture", f"{value.path}: {fault}", where))
     return out
 
 
-def _image_fault(resolved: str) -> str:
+def _tiles(path: str, files: dict[str, str], wanted: set[str], where: str) -> list[Finding]:
+    """A texture in tiles: each decodes, none is missing, all are of one size."""
+    out, sizes = [], set()
+    for number, file in sorted(files.items()):
+        seen: list[tuple[int, ...]] = []
+        fault = _image_fault(file, seen)
+        sizes |= set(seen)
+        if fault:
+            named = tile_checks.named(path, number)
+            out.append(Finding("error", "unreadable_texture", f"{named}: {fault}", where))
+    return out + tile_checks.tile_findings(path, files, wanted, sizes, where)
+
+
+def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> str:
+    """What is wrong with an image, or "". Its size is added to `sizes`."""
     import numpy as np
 
     from pipeline.images import MAX_BYTES, read_encoded, read_exr
@@ -219,13 +237,15 @@ def _image_fault(resolved: str) -> str:
                     return f"is larger than {MAX_BYTES / 1e9:.0f} GB"
                 copy = Path(scratch) / Path(member[2]).name
                 copy.write_bytes(z.read(member[2]))
-                return _image_fault(str(copy))
+                return _image_fault(str(copy), sizes)
         path = Path(resolved)
         image = read_exr(path)[0] if path.suffix.lower() == ".exr" else read_encoded(path)
     except StageError as e:
         return str(e.value)
     except (OSError, KeyError, RuntimeError, ValueError, zipfile.BadZipFile) as e:  # OpenEXR raises RuntimeError
         return f"can't be decoded: {e}"
+    if sizes is not None:
+        sizes.append(image.shape[1::-1])
     return "" if np.isfinite(image).all() else "holds values that are not finite"
 
 

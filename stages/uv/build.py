@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pipeline import meshes
+from pipeline import footprint, meshes
 from pipeline.errors import StageError
 from pipeline.meshes import Charts, Mesh
 from stages.uv import decimate
@@ -55,11 +55,13 @@ def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, st
     charts = unwrap(mesh, options)
     step(2, 4, "measuring charts")
     quality = measure(mesh, charts)
+    tiles = len(quality.tile_utilisation)
     step(3, 4, "measuring the decimation")
     deviation, rough = decimate.deviation(dense, mesh), decimate.deviation(dense, proxy)
     against = decimate.flipped_share(dense, mesh)
     step(4, 4, "done")
-    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against))
+    short = _too_few(options, tiles, footprint.texel(mesh, charts, options.texture_size))
+    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short)
 
 
 def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
@@ -73,3 +75,15 @@ def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
     if quality.crumbs > MANY_CRUMBS:
         out.append(f"{quality.crumbs} of {quality.charts} charts are crumbs: the surface is rough")
     return tuple(out)
+
+
+def _too_few(options: Options, tiles: int, texel: float) -> tuple[str, ...]:
+    """Where the texture became coarser than was asked, or fewer tiles than asked were of use."""
+    if options.texel is not None and texel > 1.001 * options.texel:
+        return (
+            f"{tiles} tile(s) of {options.texture_size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
+            f"pixels are {1e3 * options.texel:.3g} mm: a larger bake.size carries more",
+        )
+    if options.texel is None and tiles < options.tiles:
+        return (f"the charts fill {tiles} of {options.tiles} tiles",)
+    return ()

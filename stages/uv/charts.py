@@ -15,6 +15,7 @@ from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.flatten import Flat, flattened, rigid, signed, unfolded
 from stages.uv.pack import LOOSEST, boxed, pack
 from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment
+from stages.uv.tiling import Tiling, packed
 
 TRUE_STEPS = 6  # rigid steps on the true surface
 LARGE = 0.2  # of the area: such charts are parted when they fill too little of their rectangle
@@ -23,6 +24,7 @@ TRIES = 5  # packings
 ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
 WORTH = 0.005  # of the square: a packing that gains less is not looked for
 MOST_CHARTS = 40
+ONE = Tiling()
 CHECK = 768  # texels along a chart's longest side: where two layers of it would show
 
 
@@ -38,10 +40,11 @@ class _Surface:
     weight: F64
 
 
-def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
+def unwrapped(mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE) -> Charts | None:
     """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
 
-    smooth: (V, 3) vertices without bumps. padding: between charts, in uv.
+    smooth: (V, 3) vertices without bumps. padding: between charts, in uv. They are made for one square; where that is
+    not enough, only charts that are too large for a tile are cut further.
     """
     weight = seam_weights(smooth, mesh.faces)
     pairs = dual(smooth, mesh.faces, weight)
@@ -49,16 +52,16 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
     surface = _Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight)
     label = segment(smooth, mesh.faces, pairs)
     known: dict[bytes, Flat] = {}
-    best: tuple[float, Charts] | None = None
-    packed = 0
-    while packed < TRIES and int(label.max()) < MOST_CHARTS:
+    best: tuple[float, Charts, Indices] | None = None
+    tries = 0
+    while tries < TRIES and int(label.max()) < MOST_CHARTS:
         flats = _flats(surface, label, known)
         part = _must_part(surface, flats)
         if part is None:
-            packed += 1
+            tries += 1
             charts = _packed(mesh, flats, padding, LOOSEST if best is None else best[0] + WORTH)
             if charts is not None:
-                best = _share(charts), charts
+                best = _share(charts), charts, label
             if best is not None and best[0] >= ENOUGH:
                 break
             part = _worth_parting(surface, flats)
@@ -66,7 +69,40 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float) -> Charts | None:
         label = _parted(surface, label, flats[part])
         if int(label.max()) <= pieces:  # a piece of one face
             break
-    return None if best is None else best[1]
+    if best is None:
+        return None
+    total = float(meshes.areas(mesh.vertices, mesh.faces).sum())
+    if tiling.content_with(best[0], total):
+        return best[1]
+    tiled = _tiled(mesh, surface, best[2], known, padding, tiling)
+    return best[1] if tiled is None else tiled
+
+
+def _tiled(
+    mesh: Mesh, surface: _Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling
+) -> Charts | None:
+    """The pieces in several tiles; those are cut further whose chart would fill a tile before others are large."""
+    total = float(meshes.areas(mesh.vertices, mesh.faces).sum())
+    limit = tiling.largest_chart(total)
+    while True:
+        flats = _flats(surface, label, known)
+        part = next((i for i, f in enumerate(flats) if not f.good or _longest(mesh, f) > limit), None)
+        pieces = int(label.max())
+        if part is None or pieces > MOST_CHARTS * tiling.most:
+            break
+        label = _parted(surface, label, flats[part])
+        if int(label.max()) <= pieces:  # a piece of one face
+            break
+    if not all(f.good for f in flats):
+        return None
+    uvs, faces, chart_of_face = _together(mesh, flats)
+    placed = packed(uvs, faces, chart_of_face, total, padding, tiling)
+    return None if placed is None else Charts(placed, faces)
+
+
+def _longest(mesh: Mesh, flat: Flat) -> float:
+    """Longer side of the smallest rectangle around a chart, at the scale of the true surface."""
+    return float(np.ptp(boxed(_at_scale(mesh, flat)), axis=0).max())
 
 
 def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
@@ -143,17 +179,28 @@ def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
 
 def _packed(mesh: Mesh, flats: list[Flat], padding: float, least: float) -> Charts | None:
     """All charts in one square at one scale against the true surface, if `least` of it comes under charts."""
-    area = meshes.areas(mesh.vertices, mesh.faces)
+    uvs, faces, label = _together(mesh, flats)
+    placed: F32 | None = pack(uvs, faces, label, padding, least)
+    return None if placed is None else Charts(placed, faces)
+
+
+def _together(mesh: Mesh, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
+    """All charts as one array of texture vertices, each at the scale of the true surface; faces, and their charts."""
     faces = np.zeros((len(mesh.faces), 3), np.int32)
     label = np.zeros(len(mesh.faces), np.int64)
     parts, first = [], 0
     for i, flat in enumerate(flats):
-        own = 0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum()
-        parts.append(flat.uv * np.sqrt(area[flat.member].sum() / max(own, 1e-30)))
+        parts.append(_at_scale(mesh, flat))
         faces[flat.member], label[flat.member] = flat.faces + first, i
         first += len(flat.uv)
-    placed: F32 | None = pack(np.concatenate(parts), faces, label, padding, least)
-    return None if placed is None else Charts(placed, faces)
+    return np.concatenate(parts), faces, label
+
+
+def _at_scale(mesh: Mesh, flat: Flat) -> F64:
+    """A chart's texture vertices, scaled so that its area is that of the true surface."""
+    own = 0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum()
+    area = meshes.areas(mesh.vertices, mesh.faces[flat.member]).sum()
+    return np.asarray(flat.uv * np.sqrt(area / max(own, 1e-30)), np.float64)
 
 
 def _share(charts: Charts) -> float:

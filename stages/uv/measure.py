@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import meshes, raster
+from pipeline import meshes, raster, tiles
 from pipeline.meshes import F64, Charts, Mesh
 from stages.uv.segment import FRONT
 from stages.uv.unwrap import chart_of_face, signed_areas
@@ -27,7 +27,7 @@ TINY_CHART = 5e-4  # of the area: smaller charts are crumbs
 class Quality:
     """charts; crumbs: charts with next to no area; utilisation: share of texels under a chart; overlap: share of
     those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty: share of the area whose
-    charts are mirrored or flat; seam_front: length (m) of the seams in front."""
+    charts are mirrored or flat; seam_front: length (m) of the seams in front; tile_utilisation: of each tile."""
 
     charts: int
     crumbs: int
@@ -38,6 +38,7 @@ class Quality:
     flipped: float
     empty: float
     seam_front: float
+    tile_utilisation: tuple[float, ...]
 
 
 def measure(mesh: Mesh, charts: Charts) -> Quality:
@@ -46,20 +47,23 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     area = meshes.areas(mesh.vertices, mesh.faces)
     share = area / area.sum()
     label = chart_of_face(charts.faces, len(charts.uvs))
-    layers = raster.layers(raster.texel_corners(charts, RASTER), RASTER)
-    covered = int((layers > 0).sum())
+    tile = tiles.of_face(charts)
+    parts = (tiles.alone(mesh, charts, t)[1] for t in range(int(tile.max()) + 1))
+    layers = [raster.layers(raster.texel_corners(part, RASTER), RASTER) for part in parts]
+    covered = [int((layer > 0).sum()) for layer in layers]
     flat = np.abs(uv_area) < 1e-12
     mean, most = stretch(mesh, charts, ~flat)
     return Quality(
         charts=int(label.max()) + 1,
         crumbs=int((np.bincount(label, share) < TINY_CHART).sum()),
-        utilisation=covered / RASTER**2,
-        overlap=float((layers > 1).sum() / max(covered, 1)),
+        utilisation=sum(covered) / (len(layers) * RASTER**2),
+        overlap=float(sum((layer > 1).sum() for layer in layers) / max(sum(covered), 1)),
         stretch=mean,
         stretch_max=most,
         flipped=float(share[(uv_area < 0) & ~flat].sum()),
         empty=float(share[flat].sum()),
         seam_front=seam_length(mesh, charts),
+        tile_utilisation=tuple(c / RASTER**2 for c in covered),
     )
 
 

@@ -1,9 +1,9 @@
-"""Placing charts in the square: greedy, largest first, by exact collision tests of their pixels.
+"""Placing charts in the square, or in several: greedy, largest first, by exact collision tests of their pixels.
 
 Symbols
-    G       cells along the square's side during packing
+    G       cells along a square's side during packing
     reach   cells around a chart that count as its own, so that two charts keep their padding
-    scale   side of the square over the unit of the charts: searched, the largest at which all charts fit
+    scale   side of a square over the unit of the charts: searched, the largest at which all charts fit; one for all
 
 All free places of a chart are found at one time, as the zeros of the correlation of its pixels with the occupied ones
 (by FFT); the one where the rim around it touches most is taken (the one nearest to a corner left 9 % more empty on a
@@ -28,6 +28,7 @@ FINER = 4  # fine cells along a cell's side when a chart is drawn
 SEARCH = 5  # halvings of the interval of scales
 DENSEST, LOOSEST = 0.76, 0.36  # share of the square that charts may take, where the search starts and ends
 SMALL = 0.01  # of all charts' area: smaller charts are tried in one orientation only
+LOWER, LOWEST = 0.93, 12  # several squares: how much smaller a scale is tried where charts do not fit, and how often
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +46,47 @@ def pack(uvs: F64, faces: Faces, chart_of_face: Indices, padding: float, least: 
 
     uvs: (U, 2) in any one scale, positive areas. None if they do not fit with `least` of the square under them.
     """
+    upright, charts, total = _ready(uvs, faces, chart_of_face)
+    low, high = np.sqrt(least / total), np.sqrt(max(DENSEST, 1.05 * least) / total)
+    return _largest(upright, charts, _placed(upright, charts, low, padding), low, high, padding)
+
+
+def pack_tiles(
+    uvs: F64, faces: Faces, chart_of_face: Indices, padding: float, tiles: int, scale: float | None = None
+) -> F32 | None:
+    """As `pack`, into `tiles` squares side by side: u in [0, tiles], no chart across a border, all at one scale.
+
+    scale: the least that will do; by default the first at which they fit, from LOOSEST of the squares under charts on
+    down. Each chart goes into the first square that has room, so that only the last ones may stay empty.
+    """
+    upright, charts, total = _ready(uvs, faces, chart_of_face)
+    low = np.sqrt(tiles * LOOSEST / total) if scale is None else scale
+    found = _placed(upright, charts, low, padding, tiles)
+    for _ in range(LOWEST if scale is None else 0):
+        if found is not None:
+            break
+        low *= LOWER
+        found = _placed(upright, charts, low, padding, tiles)
+    high = max(float(np.sqrt(tiles * DENSEST / total)), 1.05 * low)
+    return _largest(upright, charts, found, low, high, padding, tiles)
+
+
+def _ready(uvs: F64, faces: Faces, chart_of_face: Indices) -> tuple[F64, list[Chart], float]:
+    """The charts upright, the largest first, and their area."""
     upright = np.array(uvs, np.float64)
     charts = _charts(upright, faces, chart_of_face)
     for chart in charts:
         upright[chart.vertices] = boxed(upright[chart.vertices])
-    total = sum(c.area for c in charts)
-    low, high = np.sqrt(least / total), np.sqrt(max(DENSEST, 1.05 * least) / total)
-    best = _placed(upright, charts, low, padding)
+    return upright, charts, sum(c.area for c in charts)
+
+
+def _largest(
+    upright: F64, charts: list[Chart], best: F32 | None, low: float, high: float, padding: float, tiles: int = 1
+) -> F32 | None:
+    """The charts at the largest scale up to `high` at which they fit; `best`: how they lie at `low`, if they do."""
     for _ in range(SEARCH if best is not None else 0):
         middle = 0.5 * (low + high)
-        found = _placed(upright, charts, middle, padding)
+        found = _placed(upright, charts, middle, padding, tiles)
         if found is None:
             high = middle
         else:
@@ -115,31 +147,40 @@ def outline(faces: Indices) -> list[Indices]:
     return loops
 
 
-def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float) -> F32 | None:
+def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float, tiles: int = 1) -> F32 | None:
     """Every chart at this scale, or None if one does not fit."""
-    occupied = np.zeros((G, G), np.float32)
+    squares = [np.zeros((G, G), np.float32) for _ in range(tiles)]
     out = np.zeros((len(uvs), 2), np.float64)
     total = sum(c.area for c in charts)
     reach = OVERLOOKED + 0.5 * padding * G
     border = int(np.ceil(reach))
     for chart in charts:
-        room = _Room(occupied)
-        best: tuple[float, int, tuple[int, int]] | None = None
         points = uvs[chart.vertices] * scale * G + border
         upright = _pixels(points, chart.outline, reach, border)
         if upright is None:
             return None
-        for turns in range(4 if chart.area > SMALL * total else 1):
-            place = room.snuggest(np.rot90(upright, turns))
-            if place is not None and (best is None or place[0] > best[0]):
-                best = place[0], turns, place[1]
-        if best is None:
+        turnings = 4 if chart.area > SMALL * total else 1
+        found = ((t, _snuggest(s, upright, turnings)) for t, s in enumerate(squares))
+        tile, place = next((f for f in found if f[1] is not None), (0, None))
+        if place is None:
             return None
-        _, turns, (row, column) = best
+        turns, (row, column) = place
         mask = np.rot90(upright, turns)
-        occupied[row : row + mask.shape[0], column : column + mask.shape[1]] += mask
-        out[chart.vertices] = (_turned(points, upright.shape, turns) + np.array([column, row])) / G
-    return np.asarray(out.clip(0, 1), np.float32)
+        squares[tile][row : row + mask.shape[0], column : column + mask.shape[1]] += mask
+        placed = (_turned(points, upright.shape, turns) + np.array([column, row])) / G
+        out[chart.vertices] = placed.clip(0, 1) + [tile, 0]
+    return np.asarray(out, np.float32)
+
+
+def _snuggest(occupied: F32, upright: Mask, turnings: int) -> tuple[int, tuple[int, int]] | None:
+    """Quarter turns and the place (row, column) where a chart's mask sits tightest in a square; None without room."""
+    room = _Room(occupied)
+    best: tuple[float, int, tuple[int, int]] | None = None
+    for turns in range(turnings):
+        place = room.snuggest(np.rot90(upright, turns))
+        if place is not None and (best is None or place[0] > best[0]):
+            best = place[0], turns, place[1]
+    return None if best is None else best[1:]
 
 
 def _turned(points: F64, shape: tuple[int, ...], turns: int) -> F64:

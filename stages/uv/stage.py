@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.artifacts import Located, Surface, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, UvMesh
 from pipeline.contract import Context, Stage, StageConfig
 
 MESH, PROXY = "uv_mesh.npz", "proxy.npz"
@@ -14,9 +15,11 @@ MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The dense mesh."""
+    """The dense mesh; and for how fine the photos are on it, which of them were fitted and their cameras."""
 
     surface: Located[Surface]
+    inverse_rendering: Located[FittedFace]
+    poses: Located[CameraSet]
 
 
 class Config(StageConfig):
@@ -24,7 +27,15 @@ class Config(StageConfig):
 
     target_faces: int = Field(50_000, ge=200, le=2_000_000, description="triangles of the mesh that is textured")
     proxy_faces: int = Field(5_000, ge=100, le=200_000, description="triangles of the coarse stand-in")
-    texture_size: int = Field(1024, ge=256, le=8192, description="texture that the padding is measured in")
+    tiles: Annotated[int, Field(ge=1, le=10)] | Literal["auto"] = Field(
+        1, description="UDIM tiles to fill; auto: as many as it takes for texels no coarser than the photos' pixels"
+    )
+    texture_size: int = Field(
+        1024,
+        ge=256,
+        le=16384,
+        description="texels of a tile that padding and tiles=auto count on; with tiles it follows bake.size if not set",
+    )
     padding: int = Field(4, ge=1, le=64, description="texels of texture_size between two charts")
     max_cost: float = Field(
         12.0, gt=0, le=64, description="how bent a chart of xatlas may get; for meshes that our own charts do not suit"
@@ -34,7 +45,7 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     """Decimate, cut, flatten, pack, measure. Raises StageError when the mesh can't be unwrapped."""
-    from pipeline import meshes
+    from pipeline import footprint, meshes, tiles
     from stages.uv.build import build
     from stages.uv.unwrap import Options
 
@@ -45,7 +56,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.check()
         context.progress(done, total, message)
 
-    options = Options(config.texture_size, config.padding, config.max_cost, config.iterations)
+    most, texel = config.tiles, None
+    if most == "auto":
+        fitted = set(inputs.inverse_rendering.artifact.fitted_views)
+        texel = footprint.pixel(dense, (c for c in inputs.poses.artifact.cameras if c.index in fitted))
+        most = 1 if texel is None else tiles.MOST
+    options = Options(config.texture_size, config.padding, config.max_cost, config.iterations, most, texel)
     built = build(dense, config.target_faces, config.proxy_faces, options, step)
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
@@ -55,7 +71,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         vertices=len(built.mesh.vertices),
         faces=len(built.mesh.faces),
         charts=built.quality.charts,
+        tiles=len(built.quality.tile_utilisation),
         utilisation=built.quality.utilisation,
+        tile_utilisation=built.quality.tile_utilisation if len(built.quality.tile_utilisation) > 1 else (),
         stretch=built.quality.stretch,
         overlap=built.quality.overlap,
         stretch_max=built.quality.stretch_max,
@@ -67,4 +85,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=3, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=4, inputs=Inputs, config=Config, output=UvMesh, run=run)

@@ -16,6 +16,7 @@ from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
 from stages.uv.pack import pack
+from stages.uv.tiling import Tiling, packed
 
 log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
@@ -26,16 +27,21 @@ MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for ea
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """texture_size and padding in texels; max_cost and iterations as in xatlas."""
+    """texture_size and padding in texels; max_cost and iterations as in xatlas. tiles: that many are filled, or, with
+    `texel`, no more than it takes for texels that are no larger (mean edge on the surface, in the mesh's unit)."""
 
     texture_size: int = 1024
     padding: int = 4
     max_cost: float = 12.0
     iterations: int = 1
+    tiles: int = 1
+    texel: float | None = None
 
 
 def unwrap(mesh: Mesh, options: Options) -> Charts:
-    """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding.
+    """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
+
+    A mesh that only xatlas can take, in many charts, stays in one tile.
 
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
@@ -43,7 +49,9 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     span = float(np.ptp(mesh.vertices, axis=0).max())
     points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
-    own = unwrapped(scaled, points, options.padding / options.texture_size)
+    padding = options.padding / options.texture_size
+    tiling = Tiling(options.tiles, None if options.texel is None else 1 / (options.texel * options.texture_size))
+    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
     if own is not None:
         return own
     log.info("uv: charts of our own do not lie flat; xatlas takes over")
@@ -51,7 +59,11 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     even = evened(turned_over(uvs, faces), faces, meshes.areas(mesh.vertices, mesh.faces))
     label = chart_of_face(faces, len(even))
     if label.max() < MANY_CHARTS:
-        placed = pack(even, faces, label, options.padding / options.texture_size)
+        placed = pack(even, faces, label, padding)
+        total = float(np.abs(signed_areas(even, faces)).sum())
+        share = 0.0 if placed is None else float(np.abs(signed_areas(placed.astype(np.float64), faces)).sum())
+        if not tiling.content_with(share, total):
+            placed = packed(even, faces, label, total, padding, tiling)
         if placed is not None:
             return Charts(placed, faces)
     return _packed(spread(even, faces), faces, options)

@@ -18,7 +18,7 @@ from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
 from pipeline.visibility import View
 from stages.bake import detail, detail_kernels, detail_views, smooth
-from stages.bake.build import Photos, build
+from stages.bake.build import Baker, Photos
 from stages.bake.texels import ALBEDO_RANGE
 from stages.uv import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
@@ -106,7 +106,7 @@ class Scene:
     def baked(self, views: list[View], photos: bool = True) -> tuple[F64, F64, F32, F32]:
         """Points, albedo, support, unseen of the covered texels."""
         given = Photos(self.responses, "exponential") if photos else None
-        found = build(self.field, self.mesh, self.charts, views, SIZE, lambda *_: None, given)
+        found = Baker(self.field, self.mesh, self.charts, views, SIZE, lambda *_: None, given).tile(0)
         hits = raster.rasterise(raster.texel_corners(self.charts, SIZE), SIZE, 0, SIZE)
         x = (self.mesh.vertices[self.mesh.faces[hits.face]] * hits.weights[..., None]).sum(1).astype(np.float64)
         x *= RADIUS / np.linalg.norm(x, axis=1, keepdims=True)
@@ -193,7 +193,7 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
     nothing, zero = np.zeros((len(x), 3), np.float32), np.zeros((len(x), 3), np.int32)
     out, cosines = np.zeros((len(x), 3), np.float32), np.zeros(len(x), np.float32)
     detail_kernels.residual(
-        photos.cameras[0], photos.pixels, photos.depth, x, n, zero, nothing, nothing[:1], nothing,
+        photos.cameras[0], photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
         np.full_like(nothing, 10), out, cosines,
     )  # fmt: skip
     world_from_cam = matrix(c.world_from_cam)

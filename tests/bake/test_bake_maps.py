@@ -16,7 +16,7 @@ from pipeline.maths import microfacet
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import Occluder, View
 from stages.bake.ambient import ambient
-from stages.bake.build import Baked, build
+from stages.bake.build import Baked, Baker
 from stages.bake.gutter import nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
@@ -53,7 +53,7 @@ def mesh_and_charts(field: AnalyticField) -> tuple[Mesh, Charts]:
 
 @pytest.fixture(scope="module")
 def baked(field: AnalyticField, mesh_and_charts: tuple[Mesh, Charts]) -> Baked:
-    return build(field, *mesh_and_charts, VIEWS, SIZE, quiet)
+    return Baker(field, *mesh_and_charts, VIEWS, SIZE, quiet).tile(0)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def test_normal_map_brings_back_bumps() -> None:
     """Bumps that the decimated mesh has lost are in the map; +y is up (growing v)."""
     smooth, bumpy = AnalyticField(ellipsoid()), AnalyticField(bumpy_ellipsoid)
     mesh, charts = charted(smooth, 1500)
-    baked = build(bumpy, mesh, charts, (), SIZE, quiet)
+    baked = Baker(bumpy, mesh, charts, (), SIZE, quiet).tile(0)
     hits = raster.rasterise(raster.texel_corners(charts, SIZE), SIZE, 0, SIZE)
     t, b, n = tangents.at(tangents.frames(mesh, charts), mesh, hits.face, hits.weights)
     local = baked.samples.normal.astype(np.float64)
@@ -292,11 +292,14 @@ def test_albedo_is_clamped_to_what_skin_can_be(field: AnalyticField, mesh_and_ch
             found.albedo[points[:, 0] > 0.05] = 1.0
             return found
 
-    baked = build(Glowing(ellipsoid()), *mesh_and_charts, VIEWS, SIZE, quiet)
+    baked = Baker(Glowing(ellipsoid()), *mesh_and_charts, VIEWS, SIZE, quiet).tile(0)
     albedo, clamped = np.asarray(baked.samples.albedo), np.asarray(baked.samples.clamped)
     assert albedo.max() == np.float32(0.95) and clamped.max() == pytest.approx(0.05, abs=1e-6)
-    assert baked.figures["albedo_clamped"] == pytest.approx((clamped > 0).mean(), abs=1e-6) and (clamped > 0).any()
-    assert any("was clamped" in w for w in baked.warnings)
+    assert (
+        baked.tally.figures(detail=False)["albedo_clamped"] == pytest.approx((clamped > 0).mean(), abs=1e-6)
+        and (clamped > 0).any()
+    )
+    assert any("was clamped" in w for w in baked.tally.warnings(0, 0))
     maps = write_maps(baked, Context(tmp_path, tmp_path))
     marked = read_exr(tmp_path / "textures/clamped.exr")[0][..., 0]
     assert np.array_equal(marked.reshape(-1)[baked.texel] > 0, clamped > 0) and "clamped" in maps
@@ -312,7 +315,7 @@ def test_coverage_holds_every_touched_texel(mesh_and_charts: tuple[Mesh, Charts]
     covered = baked.covered()
     assert covered[row.clip(0, SIZE - 1), column.clip(0, SIZE - 1)].all()
     assert (
-        covered.mean() == baked.coverage
+        covered.mean() == baked.tally.coverage
         and covered.mean() < 1.35 * unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces).sum()
     )
 
@@ -322,7 +325,7 @@ def test_maps_do_not_depend_on_bands(
 ) -> None:
     for name, small in (("BAND", 3000), ("NEAREST_BAND", 1), ("HALO", 8)):
         monkeypatch.setattr(f"stages.bake.build.{name}", small)
-    again = build(field, *mesh_and_charts, VIEWS, SIZE, quiet)
+    again = Baker(field, *mesh_and_charts, VIEWS, SIZE, quiet).tile(0)
     assert np.array_equal(again.texel, baked.texel) and np.allclose(again.samples.albedo, baked.samples.albedo)
     assert np.array_equal(again.nearest, baked.nearest)
 
@@ -331,14 +334,16 @@ def test_maps_do_not_depend_on_bands(
 def test_cap_is_left_where_it_is() -> None:
     field = AnalyticField(bumpy_head(0.0005))
     mesh, charts = charted(field, 3000)
-    baked = build(field, mesh, charts, (), SIZE, quiet)
+    baked = Baker(field, mesh, charts, (), SIZE, quiet).tile(0)
     hits = raster.rasterise(raster.texel_corners(charts, SIZE), SIZE, 0, SIZE)
     y = (mesh.vertices[mesh.faces[hits.face]] * hits.weights[..., None]).sum(1)
     on_cap = (y[:, 1] < -0.1275) & (np.hypot(y[:, 0], y[:, 2]) < 0.04)
     assert on_cap.sum() > 50 and not baked.samples.landed[on_cap].any()
     assert np.abs(baked.samples.displacement[on_cap]).max() == 0
     assert np.allclose(baked.samples.normal[on_cap], [0, 0, 1], atol=1e-5)
-    assert any("no zero set" in w for w in baked.warnings) and any("no fitted view" in w for w in baked.warnings)
+    assert any("no zero set" in w for w in baked.tally.warnings(0, 0)) and any(
+        "no fitted view" in w for w in baked.tally.warnings(0, 0)
+    )
 
 
 # ------------------------------------------------------------------ table
@@ -364,7 +369,7 @@ def test_charts_without_area_are_refused(field: AnalyticField, mesh_and_charts: 
     mesh, charts = mesh_and_charts
     flat = Charts(np.full_like(charts.uvs, -5.0), charts.faces)
     with pytest.raises(StageError, match="no texels"):
-        build(field, mesh, flat, (), SIZE, quiet)
+        Baker(field, mesh, flat, (), SIZE, quiet).tile(0)
 
 
 def test_field_that_is_not_finite_is_refused(mesh_and_charts: tuple[Mesh, Charts]) -> None:
@@ -375,7 +380,7 @@ def test_field_that_is_not_finite_is_refused(mesh_and_charts: tuple[Mesh, Charts
             return found
 
     with pytest.raises(StageError, match="not finite"):
-        build(Broken(ellipsoid()), *mesh_and_charts, (), SIZE, quiet)
+        Baker(Broken(ellipsoid()), *mesh_and_charts, (), SIZE, quiet).tile(0)
 
 
 def test_meshes_round_trip(mesh_and_charts: tuple[Mesh, Charts], tmp_path: Path) -> None:

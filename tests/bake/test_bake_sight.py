@@ -12,7 +12,7 @@ from pipeline.contract import Context
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import Occluder, View, sight
-from stages.bake.build import Baked, build
+from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.regions import Poll, Votes
 from stages.bake.write import write_maps
@@ -115,7 +115,7 @@ def baked(mesh_and_charts: tuple[Mesh, Charts], tmp_path_factory: pytest.TempPat
     """The front view labels -x 1 and +x 7, the back view all 200; those from the sides have no labels."""
     folder = tmp_path_factory.mktemp("labels")
     views = (labelled(folder, 0, 1, 7), VIEWS[1], labelled(folder, 2, 200, 200), VIEWS[3])
-    return build(AnalyticField(sphere(0.08)), *mesh_and_charts, views, 256, quiet)
+    return Baker(AnalyticField(sphere(0.08)), *mesh_and_charts, views, 256, quiet).tile(0)
 
 
 def test_each_texel_takes_the_label_of_the_photos_that_see_it(
@@ -140,7 +140,7 @@ def test_each_texel_takes_the_label_of_the_photos_that_see_it(
 
 
 def test_without_labels_there_is_no_map_of_regions(mesh_and_charts: tuple[Mesh, Charts], tmp_path: Path) -> None:
-    baked = build(AnalyticField(sphere(0.08)), *mesh_and_charts, VIEWS[:1], 256, quiet)
+    baked = Baker(AnalyticField(sphere(0.08)), *mesh_and_charts, VIEWS[:1], 256, quiet).tile(0)
     assert baked.votes is None and "region" not in write_maps(baked, Context(tmp_path, tmp_path))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.maths import microfacet
-from stages.usd.lobe import COSINES, INV_KAPPA_SCALE, REFERENCE_F0, ROWS, basis_table, in_groups, lobe_fit
+from stages.usd.lobe import COSINES, INV_KAPPA_SCALE, REFERENCE_F0, ROWS, basis_table, fit_figures, in_groups, lobe_fit
 
 
 def test_table_times_the_layers_reflectance_is_the_basis() -> None:
@@ -42,7 +42,7 @@ def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
     assert lobe_fit(one, s, f0, basis, covered).residual.max() < 0.01
     wrong = lobe_fit(one, s, f0, basis * 2, covered)
     np.testing.assert_allclose(wrong.residual, 0.5, atol=0.01)  # |2 R - R| / |2 R|
-    assert wrong.figures["ggx_residual_mean"] == pytest.approx(0.5, abs=0.01)
+    assert fit_figures([wrong.shown()])["ggx_residual_mean"] == pytest.approx(0.5, abs=0.01)
     assert len(COSINES) >= 8
 
 
@@ -54,5 +54,5 @@ def test_texels_whose_kappa_the_light_can_not_tell_are_flagged() -> None:
         np.ones((*shape, 1), np.float32), s, np.full(shape, 0.03, np.float32), np.ones((8, 1), np.float32), covered
     )
     np.testing.assert_array_equal(fit.unresolved, [[True, False], [False, False]])
-    assert fit.figures["kappa_unresolved_share"] == pytest.approx(1 / 3, abs=1e-4)
+    assert fit_figures([fit.shown()])["kappa_unresolved_share"] == pytest.approx(1 / 3, abs=1e-4)
     assert not fit.residual[0, 1]
