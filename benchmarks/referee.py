@@ -7,7 +7,7 @@ Reads what any tool would: NAME.obj, the textures, environment.exr and the camer
 neither UsdPreviewSurface nor OpenPBR: its `principled` (a GGX dielectric over a diffuse base) stands for both.
 `standard` has one index of refraction; `openpbr` has F0 as a map: a blend, texel by texel, of two such surfaces with
 F0 0 and 0.16. `neuface_basis` has the tint that the exported table gives as seen from this camera, as the weight of a
-blend of F0 0 and the table's own surface; it is bounded by 1 there.
+blend of F0 0 and the table's own surface; it is bounded by 1 there. Assets of one UDIM tile only.
 Writes OUT.exr.
 """
 

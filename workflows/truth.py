@@ -166,7 +166,9 @@ def _distances(mesh: Any, points: F64) -> F64:
 # ------------------------------------------------------------------ albedo
 def _albedo_psnr(out: Path, capture_folder: Path, mesh: Any, st: F64, views: list[CaptureView]) -> float:
     """Albedo map seen from the held-out cameras against the truth's, after the one gain that fits best."""
-    texture = read_exr(next((out / "asset/textures").glob("*_albedo.exr")))[0][..., :3]
+    maps = out / "asset/textures"
+    files = list(maps.glob("*_albedo.exr")) or sorted(maps.glob("*_albedo.[0-9]*.exr"))
+    texture = np.concatenate([read_exr(f)[0][..., :3] for f in files], 1)
     got, expected = [], []
     for view in views:
         path = capture_folder / f"truth/albedo/{view.index}.exr"
@@ -202,9 +204,9 @@ def _albedo_of_view(
 
 
 def _bilinear(texture: npt.NDArray[np.float32], st: F64) -> F64:
-    """(N, 3) from a texture with row 0 at v = 1 and texel centres at +0.5."""
+    """(N, 3) from a square texture, or a row of square tiles, with row 0 at v = 1 and texel centres at +0.5."""
     from scipy.ndimage import map_coordinates
 
-    rows, columns = (1 - st[:, 1]) * texture.shape[0] - 0.5, st[:, 0] * texture.shape[1] - 0.5
+    rows, columns = (1 - st[:, 1]) * texture.shape[0] - 0.5, st[:, 0] * texture.shape[0] - 0.5
     planes = [map_coordinates(texture[..., c], (rows, columns), order=1, mode="nearest") for c in range(3)]
     return np.stack(planes, -1).astype(np.float64)

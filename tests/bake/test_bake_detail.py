@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ import trimesh
 from pipeline import raster
 from pipeline.artifacts import Camera
 from pipeline.fields.protocol import F32, Material
-from pipeline.images import write_exr
+from pipeline.images import write_exr, write_png
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
 from pipeline.visibility import View
@@ -239,3 +239,33 @@ def test_shade_is_the_radiance_of_a_white_surface() -> None:
     assert np.allclose(detail.shade(light, n, np.ones((3, 3), np.float32)), [1, 2, 3], rtol=1e-4)
     dark = detail.shade(light, n, np.full((3, 3), 1e-6, np.float32))
     assert np.allclose(dark, detail.LEAST_LIGHT * 2, rtol=1e-4)
+
+
+def test_clipped_pixels_have_no_say(scene: Scene, tmp_path: Path) -> None:
+    """One clipped pixel takes its whole block, and with it every colour that is mixed from the block."""
+    c = CAMERAS[0]
+    clipped = np.zeros((PIXELS, PIXELS))
+    clipped[:, 81] = 1  # the second column of the block of columns 80 and 81
+    write_png(tmp_path / "clipped.png", clipped)
+    write_exr(tmp_path / "0.exr", np.full((PIXELS, PIXELS, 3), 0.3, np.float32))
+    n = scene.mesh.vertices.astype(np.float64) / RADIUS
+    x, zero = RADIUS * n, np.zeros((len(n), 3), np.int32)
+    plain, burnt = View(c, None, tmp_path / "0.exr"), View(c, None, tmp_path / "0.exr", tmp_path / "clipped.png")
+    seen, texel = [], 2.5 * 0.2 / FOCAL
+    for view in (plain, burnt):
+        photos = detail_views.read_photos([view], np.eye(3)[None], scene.mesh, texel, lambda *_: None)
+        assert photos.cameras[0, 18] == PIXELS / 2
+        assert (photos.clipped.sum() == PIXELS / 2) if view is burnt else not len(photos.clipped)
+        nothing, cosines = np.zeros((len(x), 3), np.float32), np.zeros(len(x), np.float32)
+        detail_kernels.residual(
+            photos.cameras[0], photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
+            np.ones_like(nothing), np.zeros_like(nothing), cosines,
+        )  # fmt: skip
+        found = detail.Detail(photos, np.zeros((1, len(x), 3), np.float32), np.zeros((1, len(x), 3), np.float32))
+        given = detail.Points(x, n, zero, nothing, nothing, np.ones_like(nothing))
+        support = found.added(replace(given, albedo=np.full_like(nothing, 0.3)))[1]
+        assert np.array_equal(support > 0, cosines > 0)
+        seen.append(cosines > 0)
+    column = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), x)[0][:, 0] / 2
+    near = (column > 39.5) & (column < 41.5)  # within half a block of the clipped one, whose middle is at 40.5
+    assert (near & seen[0]).sum() > 5 and np.array_equal(seen[1], seen[0] & ~near)

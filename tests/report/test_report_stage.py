@@ -205,3 +205,20 @@ def test_pictures_are_never_larger_than_asked(shape: tuple[int, int, int]) -> No
     image = cv2.imdecode(np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8), cv2.IMREAD_UNCHANGED)
     assert max(image.shape[:2]) <= 100
     assert image.shape[2] == shape[2]
+
+
+def test_tiles_stand_next_to_each_other_and_regions_have_their_shares(tmp_path: Path) -> None:
+    made = write_results(tmp_path, tiled=True)
+    regions = {"unlabelled": 0.25, "face": 0.75}
+    bake = made.bake.artifact.model_copy(update={"regions": regions, "figures": {"texel_mm": 0.5}})
+    metrics, page = run(replace(made, bake=replace(made.bake, artifact=bake)), tmp_path / "work")
+    assert metrics["regions"] == regions and metrics["maps"]["tiles"] == metrics["uv"]["tiles"] == 2
+    assert metrics["uv"]["utilisation_1002"] == 0.92 and metrics["maps"]["texel_mm"] == 0.5
+    words = " ".join(" ".join(Page(page).words).split())
+    assert "2 × 128² texels" in words and "face 75.0 %" in words
+    albedo = page[page[: page.index("albedo, mean")].rindex("base64,") + 7 :].partition('"')[0]
+    picture = cv2.imdecode(np.frombuffer(base64.b64decode(albedo), np.uint8), cv2.IMREAD_COLOR)
+    height, width = picture.shape[:2]
+    assert width == 2 * height
+    red = picture[..., 2].astype(float).mean(0)  # grows with u over both tiles
+    assert red[: width // 2].max() < red[width // 2 :].min() + 6 and red[-1] > red[0] + 40

@@ -91,6 +91,19 @@ def ball(columns: int = 64, rings: int = 32, height: float = 1.25) -> dict[str, 
     }
 
 
+def cut_in_two(mesh: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The ball with its chart cut at u = 0.5, each half stretched over a UDIM tile of its own."""
+    u = mesh["uvs"][:, 0].astype(np.float64)
+    right = u[mesh["uv_faces"]].mean(1) > 0.5
+    count = len(u)
+    share = (u - 0.02) / 0.96
+    halves = [np.stack([t + 0.02 + 0.96 * (2 * share - t), mesh["uvs"][:, 1]], -1) for t in (0, 1)]
+    uv_faces = mesh["uv_faces"] + np.where(right, count, 0)[:, None]
+    used, faces = np.unique(uv_faces, return_inverse=True)
+    uvs = np.concatenate(halves)[used].astype(np.float32)
+    return mesh | {"uvs": uvs, "uv_faces": faces.reshape(-1, 3).astype(np.int32)}
+
+
 def smooth_light(order: int = 10) -> np.ndarray:
     """((order + 1)^2, 3) light, warm from +X +Y and cool from behind, positive everywhere."""
     light = np.zeros(((order + 1) ** 2, 3), np.float32)
@@ -100,9 +113,11 @@ def smooth_light(order: int = 10) -> np.ndarray:
     return light
 
 
-def texture_arrays(size: int = 128) -> dict[str, np.ndarray]:
-    """Maps that vary smoothly; their names are those of the bake stage."""
+def texture_arrays(size: int = 128, tile: int | None = None) -> dict[str, np.ndarray]:
+    """Maps that vary smoothly; their names are those of the bake stage. `tile`: of the ball that is cut in two."""
     v, u = np.meshgrid(1 - (np.arange(size) + 0.5) / size, (np.arange(size) + 0.5) / size, indexing="ij")
+    if tile is not None:
+        u = 0.02 + 0.96 * ((u - 0.02) / 0.96 + tile) / 2
     wave = 0.5 + 0.5 * np.sin(12 * np.pi * u) * np.sin(6 * np.pi * v)
     one = np.ones_like(u)
     n = np.stack([0.15 * np.sin(20 * np.pi * u), 0.1 * np.cos(14 * np.pi * v), one], -1)
@@ -153,6 +168,22 @@ def write_textures(folder: Path, arrays: dict[str, np.ndarray]) -> Located[Textu
     return Located(TextureSet(size=size, padding=4, maps=maps, coverage=0.9), folder)
 
 
+def write_tiles(folder: Path, parts: list[dict[str, np.ndarray]]) -> Located[TextureSet]:
+    """The same of several UDIM tiles, all of one size."""
+    made = [write_textures(folder / str(1001 + t), arrays).artifact for t, arrays in enumerate(parts)]
+    maps = {}
+    for name, first in made[0].maps.items():
+        files = {}
+        for t, one in enumerate(made):
+            for kind, ref in one.maps[name].files.items():
+                suffix = kind if name == "basis_lut" else f"{1001 + t}.{kind}"
+                target = folder / f"{name}.{suffix}"
+                (folder / str(1001 + t) / ref.path).rename(target)
+                files[suffix] = FileRef.of(folder, target)
+        maps[name] = first.model_copy(update={"files": files})
+    return Located(made[0].model_copy(update={"maps": maps, "tiles": len(parts)}), folder)
+
+
 def cameras(count: int = 5, width: int = 96, height: int = 120) -> CameraSet:
     """Cameras on a ring 0.7 m away, with unequal focal lengths, an off-centre principal point and distortion."""
     out = []
@@ -189,8 +220,9 @@ def write_inputs(
     proxy: bool = True,
     held_out: tuple[int, ...] = (3, 9),
     scale: int = 1,
+    tiled: bool = False,
 ) -> SyntheticInputs:
-    """All inputs of the usd stage. The fit's predictions of held-out views are grey cards."""
+    """All inputs of the usd stage. The fit's predictions of held-out views are grey cards. tiled: on two UDIM tiles."""
     made = {n: folder / n for n in ("surface", "uv", "bake", "face", "poses", "capture")}
     for f in made.values():
         f.mkdir(parents=True, exist_ok=True)
@@ -205,7 +237,7 @@ def write_inputs(
         removed_components=0,
         cell=0.001,
     )
-    mesh = mesh or ball()
+    mesh = mesh or (cut_in_two(ball()) if tiled else ball())
     np.savez(made["uv"] / "mesh.npz", **mesh)
     refs = {"mesh": FileRef.of(made["uv"], "mesh.npz")}
     if proxy:
@@ -216,8 +248,10 @@ def write_inputs(
         **refs,
         vertices=len(mesh["vertices"]),
         faces=len(mesh["faces"]),
-        charts=1,
+        charts=2 if tiled else 1,
+        tiles=2 if tiled else 1,
         utilisation=0.92,
+        tile_utilisation=(0.92, 0.92) if tiled else (),
         stretch=1.4,
         overlap=0.0,
         deviation_mm=0.1,
@@ -256,7 +290,9 @@ def write_inputs(
     return SyntheticInputs(
         Located(surface, made["surface"]),
         Located(uv, made["uv"]),
-        write_textures(made["bake"], arrays or texture_arrays()),
+        write_tiles(made["bake"], [texture_arrays(tile=t) for t in (0, 1)])
+        if tiled
+        else write_textures(made["bake"], arrays or texture_arrays()),
         Located(face, made["face"]),
         Located(rig, made["poses"]),
         _capture(made["capture"], rig, held_out),

@@ -40,10 +40,15 @@ class SyntheticResults:
 
 
 def write_results(
-    folder: Path, *, held_out: tuple[int, ...] = (3, 9), asset_views: tuple[int, ...] | None = None, scale: int = 1
+    folder: Path,
+    *,
+    held_out: tuple[int, ...] = (3, 9),
+    asset_views: tuple[int, ...] | None = None,
+    scale: int = 1,
+    tiled: bool = False,
 ) -> SyntheticResults:
     """The asset's renders are grey discs; masks are the photos' discs."""
-    made = write_inputs(folder, held_out=held_out, scale=scale)
+    made = write_inputs(folder, held_out=held_out, scale=scale, tiled=tiled)
     return SyntheticResults(
         made.capture,
         made.poses,

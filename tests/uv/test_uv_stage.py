@@ -33,7 +33,8 @@ def inputs(tmp_path: Path) -> Inputs:
         removed_components=0,
         cell=0.006,
     )
-    return Inputs(Located(artifact, tmp_path))
+    # fitted photos and cameras are only asked for with tiles=auto (test_uv_tiles)
+    return Inputs(Located(artifact, tmp_path), None, None)  # type: ignore[arg-type]
 
 
 def test_run_writes_mesh_and_proxy(inputs: Inputs, tmp_path: Path) -> None:

@@ -100,6 +100,12 @@ def test_a_gain_does_not_explain_a_pattern(run: tuple[Path, Path]) -> None:
     assert figures.albedo == pytest.approx(expected, abs=0.2)
 
 
+def test_tiles_are_read_side_by_side() -> None:
+    texture = np.concatenate([np.full((8, 8, 3), v, np.float32) for v in (0.2, 0.6)], 1)
+    found = truth._bilinear(texture, np.array([[0.5, 0.5], [1.5, 0.5], [1.1, 0.9], [1.9, 0.1]]))
+    assert np.allclose(found[:, 0], [0.2, 0.6, 0.6, 0.6])
+
+
 def test_only_what_several_views_see_counts() -> None:
     mesh = trimesh.creation.icosphere(4, RADIUS)
     seen = truth._seen(mesh, views())
