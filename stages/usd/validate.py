@@ -128,7 +128,7 @@ def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
     """Every path relative and inside the asset's folder; every file that is named there."""
-    layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(path))
+    layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(path), _but_tiles)
     out = [Finding("error", "missing_file", "does not resolve", _shown(str(u), path)) for u in unresolved]
     for layer in layers:
         copy, name = Sdf.Layer.CreateAnonymous(), Path(layer.realPath or layer.identifier).name
@@ -141,6 +141,11 @@ def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
             elif os.path.normpath(p).startswith(".."):
                 out.append(Finding("error", "path_outside", f"{p} leaves the asset's folder", name))
     return out
+
+
+def _but_tiles(layer: Sdf.Layer, found: UsdUtils.DependencyInfo) -> UsdUtils.DependencyInfo:
+    """Rows of tiles are looked at by `textures`; the library would complain of each aloud, though it finds them."""
+    return UsdUtils.DependencyInfo() if tile_checks.is_tiled(found.assetPath) else found
 
 
 def _shown(text: str, path: Path) -> str:

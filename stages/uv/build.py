@@ -11,7 +11,7 @@ from pipeline.meshes import Charts, Mesh
 from stages.uv import decimate
 from stages.uv.decimate import Deviation
 from stages.uv.measure import Quality, measure
-from stages.uv.unwrap import Options, unwrap
+from stages.uv.unwrap import COARSER, Options, unwrap
 
 MOST_OVERLAP, MOST_FLIPPED, MOST_EMPTY, MOST_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
 MANY_CRUMBS = 50
@@ -79,7 +79,7 @@ def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
 
 def _too_few(options: Options, tiles: int, texel: float) -> tuple[str, ...]:
     """Where the texture became coarser than was asked, or fewer tiles than asked were of use."""
-    if options.texel is not None and texel > 1.001 * options.texel:
+    if options.texel is not None and texel > 1.001 * COARSER * options.texel:
         return (
             f"{tiles} tile(s) of {options.texture_size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
             f"pixels are {1e3 * options.texel:.3g} mm: a larger bake.size carries more",

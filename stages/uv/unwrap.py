@@ -22,13 +22,15 @@ log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
 SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
 PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
+COARSER = 1.05  # of the texel that is wished for: a few per cent are not worth a further tile
 MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
     """texture_size and padding in texels; max_cost and iterations as in xatlas. tiles: that many are filled, or, with
-    `texel`, no more than it takes for texels that are no larger (mean edge on the surface, in the mesh's unit)."""
+    `texel`, no more than it takes for texels that are no larger (mean edge on the surface, in the mesh's unit) but for
+    COARSER."""
 
     texture_size: int = 1024
     padding: int = 4
@@ -50,7 +52,9 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = options.padding / options.texture_size
-    tiling = Tiling(options.tiles, None if options.texel is None else 1 / (options.texel * options.texture_size))
+    tiling = Tiling(
+        options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.texture_size)
+    )
     own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
     if own is not None:
         return own

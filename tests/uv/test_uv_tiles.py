@@ -107,7 +107,7 @@ def test_a_mesh_is_laid_out_for_its_tiles(ball: Mesh) -> None:
     content = unwrap.unwrap(ball, replace(plain, tiles=10, texel=1.01 * texel))
     assert content.uvs.tobytes() == one.uvs.tobytes() and content.faces.tobytes() == one.faces.tobytes()
     finer = unwrap.unwrap(ball, replace(plain, tiles=10, texel=0.7 * texel))
-    assert footprint.texel(ball, finer, 512) <= 0.7 * texel * (1 + 1e-4)
+    assert footprint.texel(ball, finer, 512) <= unwrap.COARSER * 0.7 * texel * (1 + 1e-4)
     assert 2 <= tiles.of_face(finer).max() + 1 <= 4
 
 
@@ -163,7 +163,11 @@ def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Pat
         assert out.tiles == int(tiles.of_face(charts).max()) + 1
         assert len(out.tile_utilisation) == (out.tiles if out.tiles > 1 else 0)
         pixel = footprint.pixel(ball, [camera(0.35)])
-        assert pixel is not None and footprint.texel(mesh, charts, size) <= pixel * 1.001 and out.warnings == ()
+        assert (
+            pixel is not None
+            and footprint.texel(mesh, charts, size) <= pixel * unwrap.COARSER * 1.001
+            and out.warnings == ()
+        )
         found[size] = out.tiles
     assert found[512] == 1 < found[256] <= 4
 
