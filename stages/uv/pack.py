@@ -14,6 +14,7 @@ the square empty on heads.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from scipy import fft
 
 from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
+Spectrum = npt.NDArray[np.complexfloating]
 G = 256
 OVERLOOKED = 0.25  # of a cell: a corner that is drawn in the next fine cell may be this much outside
 RIM = 3  # cells around a chart whose neighbours count as touching
@@ -149,7 +151,7 @@ def outline(faces: Indices) -> list[Indices]:
 
 def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float, tiles: int = 1) -> F32 | None:
     """Every chart at this scale, or None if one does not fit."""
-    squares = [np.zeros((G, G), np.float32) for _ in range(tiles)]
+    squares = [_Room() for _ in range(tiles)]
     out = np.zeros((len(uvs), 2), np.float64)
     total = sum(c.area for c in charts)
     reach = OVERLOOKED + 0.5 * padding * G
@@ -159,25 +161,23 @@ def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float, tiles: 
         upright = _pixels(points, chart.outline, reach, border)
         if upright is None:
             return None
-        turnings = 4 if chart.area > SMALL * total else 1
-        found = ((t, _snuggest(s, upright, turnings)) for t, s in enumerate(squares))
+        shapes = [_Shape(np.rot90(upright, turns)) for turns in range(4 if chart.area > SMALL * total else 1)]
+        found = ((t, _snuggest(square, shapes)) for t, square in enumerate(squares))
         tile, place = next((f for f in found if f[1] is not None), (0, None))
         if place is None:
             return None
         turns, (row, column) = place
-        mask = np.rot90(upright, turns)
-        squares[tile][row : row + mask.shape[0], column : column + mask.shape[1]] += mask
+        squares[tile].fill(shapes[turns], row, column)
         placed = (_turned(points, upright.shape, turns) + np.array([column, row])) / G
         out[chart.vertices] = placed.clip(0, 1) + [tile, 0]
     return np.asarray(out, np.float32)
 
 
-def _snuggest(occupied: F32, upright: Mask, turnings: int) -> tuple[int, tuple[int, int]] | None:
-    """Quarter turns and the place (row, column) where a chart's mask sits tightest in a square; None without room."""
-    room = _Room(occupied)
+def _snuggest(square: _Room, shapes: list[_Shape]) -> tuple[int, tuple[int, int]] | None:
+    """Quarter turns and the place (row, column) where a chart sits tightest in a square; None without room."""
     best: tuple[float, int, tuple[int, int]] | None = None
-    for turns in range(turnings):
-        place = room.snuggest(np.rot90(upright, turns))
+    for turns, shape in enumerate(shapes):
+        place = square.snuggest(shape)
         if place is not None and (best is None or place[0] > best[0]):
             best = place[0], turns, place[1]
     return None if best is None else best[1:]
@@ -207,33 +207,70 @@ def _pixels(points: F64, loops: list[Indices], reach: float, border: int) -> Mas
     return np.asarray(fine.reshape(height, FINER, width, FINER).max((1, 3)) > 0)
 
 
-class _Room:
-    """The square with the charts that are in it, ready to be asked where a further one fits best."""
+class _Shape:
+    """A chart's mask and the rim around it, as correlations take them: found once for all squares."""
 
-    def __init__(self, occupied: F32) -> None:
-        self._taken = fft.rfft2(occupied, (2 * G, 2 * G))
-        walled = np.ones((G + 2 * RIM, G + 2 * RIM), np.float32)
-        walled[RIM:-RIM, RIM:-RIM] = occupied
-        self._walled = fft.rfft2(walled, (2 * G, 2 * G))
+    def __init__(self, mask: Mask) -> None:
+        self.mask = mask
 
-    def snuggest(self, mask: Mask) -> tuple[float, tuple[int, int]] | None:
-        """The free place (row, column) where most of the rim around the mask touches charts or walls, and the share."""
+    @cached_property
+    def spectrum(self) -> Spectrum:
+        """Of the mask."""
+        return _spectrum(self.mask)
+
+    @cached_property
+    def rim(self) -> tuple[Spectrum, float]:
+        """Of the cells around it, and how many they are."""
         import cv2
 
-        h, w = mask.shape
-        hits = fft.irfft2(self._taken * _spectrum(mask), (2 * G, 2 * G))
+        wide = np.pad(self.mask, RIM).astype(np.uint8)
+        rim = cv2.dilate(wide, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) - wide
+        return _spectrum(rim), float(rim.sum())
+
+
+class _Room:
+    """A square with the charts that are in it, ready to be asked where a further one fits best."""
+
+    def __init__(self) -> None:
+        self._occupied = np.zeros((G, G), np.float32)
+        self._spectra: tuple[Spectrum, Spectrum] | None = None
+
+    def fill(self, shape: _Shape, row: int, column: int) -> None:
+        """A chart takes its place."""
+        height, width = shape.mask.shape
+        self._occupied[row : row + height, column : column + width] += shape.mask
+        self._spectra = None
+
+    def snuggest(self, shape: _Shape) -> tuple[float, tuple[int, int]] | None:
+        """The free place (row, column) where most of the rim around the mask touches charts or walls, and the share."""
+        h, w = shape.mask.shape
+        if self._occupied.sum() + shape.mask.sum() > G * G:
+            return None
+        if self._spectra is None:
+            walled = np.ones((G + 2 * RIM, G + 2 * RIM), np.float32)
+            walled[RIM:-RIM, RIM:-RIM] = self._occupied
+            self._spectra = fft.rfft2(self._occupied, (2 * G, 2 * G)), fft.rfft2(walled, (2 * G, 2 * G))
+        taken, edges = self._spectra
+        hits = _correlation(taken, shape.spectrum)
         free = hits[h - 1 : G, w - 1 : G] < 0.5
         if not free.any():
             return None
-        wide = np.pad(mask, RIM).astype(np.uint8)
-        rim = cv2.dilate(wide, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) - wide
-        touched = fft.irfft2(self._walled * _spectrum(rim), (2 * G, 2 * G))
+        rim, around = shape.rim
+        touched = _correlation(edges, rim)
         score = np.where(free, touched[h + 2 * RIM - 1 :, w + 2 * RIM - 1 :][: free.shape[0], : free.shape[1]], -1.0)
         best = int(np.round(score, 3).argmax())
         row, column = divmod(best, free.shape[1])
-        return float(score.flat[best]) / float(rim.sum()), (row, column)
+        return float(score.flat[best]) / around, (row, column)
 
 
-def _spectrum(mask: npt.NDArray[np.generic]) -> npt.NDArray[np.complexfloating]:
+def _correlation(room: Spectrum, shape: Spectrum) -> F32:
+    """Of two pictures by their spectra. The product is made in place: numpy rounds it otherwise into a new array, and
+    ties between places are settled by that."""
+    product = shape.copy()
+    product *= room
+    return np.asarray(fft.irfft2(product, (2 * G, 2 * G)))
+
+
+def _spectrum(mask: npt.NDArray[np.generic]) -> Spectrum:
     """Of the mask turned by half, so that a product of spectra is a correlation."""
     return np.asarray(fft.rfft2(mask[::-1, ::-1].astype(np.float32), (2 * G, 2 * G)))

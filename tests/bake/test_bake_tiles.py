@@ -21,7 +21,7 @@ from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.stage import Config, Inputs, region_shares, run
 from stages.bake.write import KINDS, joined, write_maps
-from stages.uv import unwrap
+from stages.uv import pack, unwrap
 from tests.bake.test_bake_sight import VIEWS, labelled
 from tests.bake.test_bake_stage import inputs  # noqa: F401  (a fixture)
 from tests.support.analytic_fields import AnalyticField, linear_albedo, sphere
@@ -50,7 +50,9 @@ def ball() -> Mesh:
 
 @pytest.fixture(scope="module")
 def charts(ball: Mesh) -> Charts:
-    found = unwrap.unwrap(ball, unwrap.Options(SIZE, 4, tiles=COUNT))
+    with pytest.MonkeyPatch.context() as patch:  # a coarser packing is quicker
+        patch.setattr(pack, "G", 96)
+        found = unwrap.unwrap(ball, unwrap.Options(SIZE, 4, tiles=COUNT))
     assert int(tiles.of_face(found).max()) + 1 == COUNT
     return found
 
@@ -167,7 +169,9 @@ def test_points_of_several_tiles_are_put_together() -> None:
 def test_the_stage_bakes_every_tile_with_the_photos_detail(
     inputs: Inputs,  # noqa: F811
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(pack, "G", 96)
     mesh = meshes.load(inputs.uv.path(inputs.uv.artifact.mesh))
     charts = unwrap.unwrap(mesh, unwrap.Options(256, 2, tiles=2))
     meshes.save(tmp_path / "uv.npz", mesh, charts)
