@@ -27,6 +27,7 @@ from stages.usd.material_checks import colour_findings, material_findings, mater
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
 MISSING_ID = "MissingShaderIdInRegistry"
+UNRESOLVED = "NormalMapTextureValidator.InvalidFile"
 
 
 def validate(path: Path) -> list[Finding]:
@@ -84,13 +85,14 @@ def _validators() -> list[object]:
 
 
 def library(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """UsdValidation. Shader ids of MaterialX are unknown to builds without its node definitions: info, not error."""
+    """UsdValidation. Shader ids of MaterialX are unknown to builds without its node definitions: info, not error. So is
+    a normal map in tiles, which has no single file: `textures` looks for the tiles."""
     out = []
     for e in UsdValidation.ValidationContext(_validators()).Validate(stage):
         kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
         message, name = " ".join(e.GetMessage().split()), e.GetIdentifier()
-        materialx = MISSING_ID in name and "'ND_" in message
-        level = "info" if materialx or kind == "info" else "warning" if kind.startswith("warn") else "error"
+        known = (MISSING_ID in name and "'ND_" in message) or (UNRESOLVED in name and tile_checks.is_tiled(message))
+        level = "info" if known or kind == "info" else "warning" if kind.startswith("warn") else "error"
         where = ", ".join(str(s.GetPrim().GetPath()) for s in e.GetSites() if s.IsPrim())
         out.append(Finding(level, name, message, where))  # type: ignore[arg-type]
     return out
