@@ -15,6 +15,7 @@ from pipeline.artifacts import Camera, CameraSet, FileRef, FittedFace, Located, 
 from pipeline.contract import Context
 from pipeline.meshes import Charts, Mesh
 from pipeline.transforms import rows
+from stages.uv import charts as charting
 from stages.uv import pack as packing
 from stages.uv import unwrap
 from stages.uv.measure import measure
@@ -28,8 +29,9 @@ RADIUS = 0.1
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarser packing, a tenth of the time; nothing here depends on how tight it is."""
-    monkeypatch.setattr(packing, "G", 128)
+    monkeypatch.setattr(packing, "G", 96)
     monkeypatch.setattr(packing, "SEARCH", 3)
+    monkeypatch.setattr(charting, "TRIES", 1)
 
 
 @pytest.fixture(scope="module")
