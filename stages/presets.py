@@ -99,10 +99,10 @@ def configs_for(
 
 
 def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
-    """Several UDIM tiles are laid out for the size that is baked, unless uv.texture_size was said."""
+    """UDIM tiles are counted for the size that is baked, unless uv.tile_size was said."""
     uv, bake = merged.get("uv", {}), merged.get("bake", {})
-    if str(uv.get("tiles", 1)) != "1" and "texture_size" not in uv and "size" in bake:
-        uv["texture_size"] = bake["size"]
+    if uv.get("tiles") == "auto" and "tile_size" not in uv and "size" in bake:
+        uv["tile_size"] = bake["size"]
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:

@@ -60,7 +60,7 @@ def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, st
     deviation, rough = decimate.deviation(dense, mesh), decimate.deviation(dense, proxy)
     against = decimate.flipped_share(dense, mesh)
     step(4, 4, "done")
-    short = _too_few(options, tiles, footprint.texel(mesh, charts, options.texture_size))
+    short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short)
 
 
@@ -81,7 +81,7 @@ def _too_few(options: Options, tiles: int, texel: float) -> tuple[str, ...]:
     """Where the texture became coarser than was asked, or fewer tiles than asked were of use."""
     if options.texel is not None and texel > 1.001 * COARSER * options.texel:
         return (
-            f"{tiles} tile(s) of {options.texture_size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
+            f"{tiles} tile(s) of {options.size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
             f"pixels are {1e3 * options.texel:.3g} mm: a larger bake.size carries more",
         )
     if options.texel is None and tiles < options.tiles:

@@ -30,12 +30,10 @@ class Config(StageConfig):
     tiles: Annotated[int, Field(ge=1, le=10)] | Literal["auto"] = Field(
         1, description="UDIM tiles to fill; auto: as many as it takes for texels no coarser than the photos' pixels"
     )
-    texture_size: int = Field(
-        1024,
-        ge=256,
-        le=16384,
-        description="texels of a tile that padding and tiles=auto count on; with tiles it follows bake.size if not set",
+    tile_size: int = Field(
+        1024, ge=256, le=16384, description="texels along a tile's side that tiles=auto counts on; bake.size if not set"
     )
+    texture_size: int = Field(1024, ge=256, le=8192, description="texture that the padding is measured in")
     padding: int = Field(4, ge=1, le=64, description="texels of texture_size between two charts")
     max_cost: float = Field(
         12.0, gt=0, le=64, description="how bent a chart of xatlas may get; for meshes that our own charts do not suit"
@@ -61,7 +59,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         fitted = set(inputs.inverse_rendering.artifact.fitted_views)
         texel = footprint.pixel(dense, (c for c in inputs.poses.artifact.cameras if c.index in fitted))
         most = 1 if texel is None else tiles.MOST
-    options = Options(config.texture_size, config.padding, config.max_cost, config.iterations, most, texel)
+    options = Options(
+        config.texture_size, config.padding, config.max_cost, config.iterations, most, texel, config.tile_size
+    )
     built = build(dense, config.target_faces, config.proxy_faces, options, step)
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)

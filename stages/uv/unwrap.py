@@ -30,7 +30,7 @@ MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for ea
 class Options:
     """texture_size and padding in texels; max_cost and iterations as in xatlas. tiles: that many are filled, or, with
     `texel`, no more than it takes for texels that are no larger (mean edge on the surface, in the mesh's unit) but for
-    COARSER."""
+    COARSER, `size` of them along a tile's side."""
 
     texture_size: int = 1024
     padding: int = 4
@@ -38,6 +38,7 @@ class Options:
     iterations: int = 1
     tiles: int = 1
     texel: float | None = None
+    size: int = 1024
 
 
 def unwrap(mesh: Mesh, options: Options) -> Charts:
@@ -52,9 +53,7 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = options.padding / options.texture_size
-    tiling = Tiling(
-        options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.texture_size)
-    )
+    tiling = Tiling(options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.size))
     own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
     if own is not None:
         return own

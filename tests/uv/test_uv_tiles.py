@@ -113,9 +113,9 @@ def test_a_mesh_is_laid_out_for_its_tiles(ball: Mesh) -> None:
     assert len(quality.tile_utilisation) == 3 and quality.overlap == 0
     assert np.mean(quality.tile_utilisation) == pytest.approx(quality.utilisation)
     # texels that one tile has already: the same charts, to the last bit
-    content = unwrap.unwrap(ball, replace(plain, tiles=10, texel=1.01 * texel))
+    content = unwrap.unwrap(ball, replace(plain, tiles=10, texel=1.01 * texel, size=512))
     assert content.uvs.tobytes() == one.uvs.tobytes() and content.faces.tobytes() == one.faces.tobytes()
-    finer = unwrap.unwrap(ball, replace(plain, tiles=10, texel=0.7 * texel))
+    finer = unwrap.unwrap(ball, replace(plain, tiles=10, texel=0.7 * texel, size=512))
     assert footprint.texel(ball, finer, 512) <= unwrap.COARSER * 0.7 * texel * (1 + 1e-4)
     assert 2 <= tiles.of_face(finer).max() + 1 <= 4
 
@@ -163,7 +163,7 @@ def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Pat
         fitted_views=(0,), held_out=(), steps=1, loss=0, psnr=1, beta=1, cell=1, model={},
     )  # fmt: skip
     inputs = Inputs(Located(surface, tmp_path), Located(face, tmp_path), Located(poses, tmp_path))
-    out = run(inputs, Config(target_faces=1200, texture_size=256, tiles="auto"), Context(tmp_path, tmp_path))
+    out = run(inputs, Config(target_faces=1200, tile_size=256, tiles="auto"), Context(tmp_path, tmp_path))
     mesh, charts = meshes.load(tmp_path / out.mesh.path), meshes.load_charts(tmp_path / out.mesh.path)
     assert 1 < out.tiles == int(tiles.of_face(charts).max()) + 1 == len(out.tile_utilisation) <= 4
     pixel = footprint.pixel(ball, [camera(0.35)])
@@ -182,11 +182,10 @@ def test_tiles_follow_the_size_that_is_baked() -> None:
     from stages.presets import configs_for
 
     for sets, wanted in (
-        ({}, 1024),
         ({"bake": {"size": "4096"}}, 1024),
+        ({"uv": {"tiles": "3"}, "bake": {"size": "4096"}}, 1024),
         ({"uv": {"tiles": "auto"}, "bake": {"size": "4096"}}, 4096),
-        ({"uv": {"tiles": "1"}, "bake": {"size": "4096"}}, 1024),
-        ({"uv": {"tiles": "3", "texture_size": "512"}}, 512),
-        ({"uv": {"tiles": 3}}, 2048),
+        ({"uv": {"tiles": "auto", "tile_size": "512"}}, 512),
+        ({"uv": {"tiles": "auto"}}, 2048),
     ):
-        assert configs_for("studio", sets)["uv"].texture_size == wanted  # type: ignore[attr-defined]
+        assert configs_for("studio", sets)["uv"].tile_size == wanted  # type: ignore[attr-defined]
