@@ -87,7 +87,6 @@ class Baker:
     ) -> None:
         """`photos`: add their fine detail to the albedo. `scratch`: a folder for arrays larger than the memory."""
         self.tiles = int(tiles.of_face(charts).max()) + 1
-        self.detailed = photos is not None and len(views) > 0
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
         self._step, self._scratch = step, scratch
@@ -95,8 +94,8 @@ class Baker:
         self._known = _known(
             field, mesh, views, self._occluder, lambda done, total: step(done, total, "ambient occlusion")
         )
-        detailed = photos is not None and views
-        self._found = _detail(field, mesh, charts, views, size, photos, step) if detailed and photos else None
+        self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
+        self.detailed = self._found is not None
 
     def tile(self, number: int) -> Baked:
         """Bake every texel that a chart of this tile touches.
@@ -126,8 +125,14 @@ class Baker:
         )
         nearest = _nearest(texel, size, self._scratch)
         found = tally(samples, size)
-        log.info("bake: tile %d, %.1f %% covered, basis residual %.3f", number, 100 * found.coverage, self.residual)
-        regions = {} if seen.votes is None else areas(mesh, charts, seen.votes)
+        log.info(
+            "bake: tile %d, %.1f %% covered, basis residual %.3f",
+            tiles.FIRST + number,
+            100 * found.coverage,
+            self.residual,
+        )
+        labelled = any(v.labels is not None for v in self._views)
+        regions = areas(mesh, charts, seen.votes) if labelled else {}
         return Baked(size, texel, nearest, samples, seen.confidence, self.lut, found, seen.votes, regions)
 
 

@@ -44,13 +44,16 @@ class Votes:
         return np.where(votes.max(1) > FEW_VOTES, self.codes[votes.argmax(1)], 0).astype(np.uint8)
 
 
-def areas(mesh: Mesh, charts: Charts, votes: Votes) -> dict[int, float]:
+def areas(mesh: Mesh, charts: Charts, votes: Votes | None) -> dict[int, float]:
     """Area of the surface by the code of its region, 0 where no photo with labels sees it. Each triangle counts with
     the label under its middle."""
+    area = meshes.areas(mesh.vertices, mesh.faces)
+    if votes is None:
+        return {0: float(area.sum())}
     middle = charts.uvs.astype(np.float64)[charts.faces].mean(1)
     column, row = (np.stack([middle[:, 0], 1 - middle[:, 1]]) * GRID).astype(np.int64).clip(0, GRID - 1)
     code = votes.winners(row * GRID + column, GRID)
-    total = np.bincount(code, meshes.areas(mesh.vertices, mesh.faces))
+    total = np.bincount(code, area)
     return {int(c): float(total[c]) for c in np.flatnonzero(np.bincount(code))}
 
 

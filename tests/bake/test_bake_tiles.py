@@ -16,7 +16,7 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import Occluder
-from stages.bake import detail, tally
+from stages.bake import detail, regions, tally
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.stage import Config, Inputs, region_shares, run
@@ -133,6 +133,9 @@ def test_regions_and_their_shares_of_the_surface(
     cap = 0.5 * (1 - RADIUS / 0.6)
     assert shares["face"] == pytest.approx(cap / 2, abs=0.02) and shares["3"] == pytest.approx(cap / 2, abs=0.02)
     assert shares["unlabelled"] == pytest.approx(1 - cap, abs=0.02) and region_shares({}, ()) == {}
+    assert regions.areas(ball, Charts(np.zeros((3, 2), np.float32), ball.faces * 0), None) == {
+        0: pytest.approx(meshes.areas(ball.vertices, ball.faces).sum())
+    }
 
 
 def test_a_tile_is_hidden_by_what_lies_in_another(ball: Mesh, charts: Charts) -> None:
