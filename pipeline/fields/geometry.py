@@ -3,6 +3,10 @@
 Symbols: values (X, Y, Z) spline coefficients at lo + i cell, asset units (pipeline.maths.sdf). The band is the set of
 coefficients within BAND cells of the zero set; only they have optimiser state that moves. Beyond it the values are
 distances by an exact transform, made anew at each refinement, so that rays can step over empty space.
+
+Differs from plain Adam, whose steps are as long for a coefficient that rays graze now and then as for one that many
+photos see squarely: there noise alone walks it about, and skin that few views see turns rough. Here the root of the
+band's mean second moment is added to each coefficient's own, so that a step shrinks with what is known (docs/model.md).
 """
 
 from __future__ import annotations
@@ -17,6 +21,9 @@ from pipeline.maths import sdf as spline
 
 BAND = 4.0
 BETAS = (0.9, 0.99)
+DAMPING = 1.0  # of the band's typical gradient, added to the root of each coefficient's second moment
+LEAST_EPS = 1e-12  # far below any useful gradient: distances are in metres
+TYPICAL_EVERY = 20  # steps
 
 
 class GridSdf(nn.Module):
@@ -41,6 +48,7 @@ class GridSdf(nn.Module):
         self.m = torch.zeros_like(values)
         self.v = torch.zeros_like(values)
         self.steps = 0
+        self.typical = 0.0  # gradient of the coefficients that rays touch, as of the last look
         self.find_band()
 
     @property
@@ -80,9 +88,20 @@ class GridSdf(nn.Module):
             self.active = torch.nonzero(near.view(-1)).squeeze(-1)
 
     def step(self, lr: float) -> None:
-        """One Adam step on the band; lr in asset units."""
+        """One damped Adam step on the band; lr in asset units, the length of the longest step."""
         self.steps += 1
-        kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS)
+        if self.steps <= 2 or self.steps % TYPICAL_EVERY == 0:
+            self.typical = self._typical_gradient()
+        eps = max(DAMPING * self.typical, LEAST_EPS)
+        kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS, eps)
+
+    def _typical_gradient(self) -> float:
+        """Mean root of the second moments, as far as rays have touched their coefficients; of the first gradients."""
+        known = self.steps > 1
+        moments = self.v.view(-1)[self.active] if known else self.sink.view(-1)[self.active].square()
+        moments = moments[moments > 0]
+        unbiased = 1 - BETAS[1] ** (self.steps - 1) if known else 1.0
+        return float((moments / unbiased).sqrt().mean()) if len(moments) else 0.0
 
     def gradient_is_finite(self) -> bool:
         """Whether the gradients gathered since the last step are. See kernels.SplineSdf for how a fault is marked."""
@@ -122,22 +141,24 @@ class GridSdf(nn.Module):
         """Take a grid of another size (from a checkpoint); the optimiser's state starts empty."""
         self._set(values)
 
-    def optimiser_state(self) -> dict[str, Tensor | int]:
+    def optimiser_state(self) -> dict[str, Tensor | float]:
         """State of the band's optimiser, as far as it can move."""
         return {
             "active": self.active,
             "m": self.m.view(-1)[self.active],
             "v": self.v.view(-1)[self.active],
             "steps": self.steps,
+            "typical": self.typical,
         }
 
-    def load_optimiser_state(self, state: dict[str, Tensor | int]) -> None:
+    def load_optimiser_state(self, state: dict[str, Tensor | float]) -> None:
         """Inverse of `optimiser_state`, on the same grid."""
         active = torch.as_tensor(state["active"]).to(self.values.device)
         self.active = active
         self.m.view(-1)[active] = torch.as_tensor(state["m"]).to(self.m)
         self.v.view(-1)[active] = torch.as_tensor(state["v"]).to(self.v)
         self.steps = int(state["steps"])
+        self.typical = float(state["typical"])
 
 
 def coarse_distance(free: np.ndarray) -> np.ndarray:

@@ -127,7 +127,8 @@ def adam_on_band(
     Coefficients that no ray touched are left alone, momentum and all: a batch sees a few per cent of the band, and
     moving the rest by old gradients costs most of the time and adds noise.
 
-    eps is far below any useful gradient's size: distances are in metres, so that gradients can be as small as 1e-8.
+    eps is what is added to the root of the second moment; distances are in metres, so that gradients can be as small as
+    1e-8, and a useful eps smaller still, unless it is meant to damp.
     """
     b1, b2 = betas
     c1, c2 = 1 - b1**step, 1 - b2**step

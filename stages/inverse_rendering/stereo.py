@@ -25,7 +25,7 @@ from pipeline import transforms
 from pipeline.fields.geometry import GridSdf, largest_solid
 from pipeline.fields.kernels import look_up
 from pipeline.images import shrink_whole
-from pipeline.maths.correlation import agreement
+from pipeline.maths.correlation import FLOOR, agreement
 from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
@@ -34,11 +34,14 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 SIDE = 512  # pixels of the photos' longest side: a patch then spans some 4 mm of a head
 HALF, SPACING = 2, 2.0  # a patch is (2 HALF + 1)^2 samples, so many pixels apart
+BLUR = 1.0  # pixels: what lies between samples two apart goes, and most of the noise with it
 VIEWS = 6  # that look at a point most squarely are compared
 LEAST_COSINE = 0.25  # between a normal and the way to a camera
 POINTS = 12_000  # of the surface that one sweep takes
-CERTAIN = 5e-4  # squared confidence, mean over what lies around, at which a point moves half way
+CERTAIN = 5e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise has 7e-2
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
+LAPLACIAN = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +54,14 @@ class Sweep:
     voters: int
 
 
-SWEEPS = (Sweep(0.006, 0.04, 1.1, 14), Sweep(0.012, 0.016, 0.75, 12), Sweep(0.006, 0.006, 0.5, 8))
+SWEEPS = (Sweep(0.006, 0.04, 1.1, 42), Sweep(0.012, 0.016, 0.75, 36), Sweep(0.006, 0.006, 0.5, 24))
 
 
 @dataclass(frozen=True, slots=True)
 class Photos:
     """Grey photos without distortion, one after the other in `grey`; `first`, `width` and `height` (V,) say where.
 
-    image_from_world (V, 3, 4); centre (V, 3).
+    image_from_world (V, 3, 4); centre (V, 3). noise: standard deviation of what is left of the sensor's noise.
     """
 
     grey: Tensor
@@ -67,6 +70,7 @@ class Photos:
     height: Tensor
     image_from_world: Tensor
     centre: Tensor
+    noise: float
 
 
 def start_from_photos(
@@ -96,12 +100,14 @@ def start_from_photos(
 
 def photos_of(views: list[PhotoView], device: str) -> Photos:
     """Photos of at most SIDE pixels, encoded so that a step of brightness means as much in shade as in light."""
-    grey, matrices, sizes = [], [], []
+    grey, matrices, sizes, noise = [], [], [], []
     for view in views:
         f = factor_for(view.size, SIDE)
         image = np.clip(shrink_whole(view.rgb, f) @ GREY, 0, None) ** np.float32(1 / 2.2)
         K = view.K.copy()
         K[:2] /= f
+        noise.append(noise_of(image, shrink_whole(view.alpha, f) > INSIDE))
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), BLUR), np.float32)
         grey.append(without_distortion(image, K, view.distortion).ravel())
         sizes.append(image.shape)
         matrices.append(K @ transforms.inverse_rigid(view.world_from_cam)[:3])
@@ -109,7 +115,21 @@ def photos_of(views: list[PhotoView], device: str) -> Photos:
     first = np.concatenate([[0], np.cumsum(height * width)[:-1]])
     centre = np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)
     tensors = (np.concatenate(grey), first, width, height, np.stack(matrices).astype(np.float32), centre)
-    return Photos(*(torch.from_numpy(x).to(device) for x in tensors))
+    level = max(float(np.median(noise)) / (2 * np.sqrt(np.pi) * BLUR), FLOOR / 3)
+    return Photos(*(torch.from_numpy(x).to(device) for x in tensors), level)
+
+
+def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
+    """Standard deviation of a picture's noise (H, W) within `inside`, in its own unit; 0 where too little is inside.
+
+    The median of a Laplacian's Laplacian, which smooth shading does not answer. Source: Immerkaer, Fast noise variance
+    estimation (1996), with the median absolute deviation in the place of the mean.
+    """
+    inner = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
+    if inner.sum() < LEAST_PIXELS:
+        return 0.0
+    answer = cv2.filter2D(image, -1, LAPLACIAN)[inner]
+    return float(1.4826 * np.median(np.abs(answer)) / np.sqrt((LAPLACIAN**2).sum()))
 
 
 def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
@@ -208,7 +228,7 @@ def sweep_scores(
         check()
         q = grid + (centre + float(offset) * along_n)[..., None]
         patches = look_up(photos.grey, photos.first, photos.width, photos.height, order, q)
-        out.append(agreement(patches, seen))
+        out.append(agreement(patches, seen, photos.noise))
     return torch.stack(out, 1).cpu().numpy()
 
 

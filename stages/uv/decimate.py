@@ -45,6 +45,8 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     for aggressiveness in AGGRESSIVENESS:
         vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
         vertices, faces = split_apart(*without_bubbles(vertices, faces))
+        if closed:  # sheets that were apart only now leave holes that can be walked around
+            faces = filled(faces)
         found = meshes.topology(faces, len(vertices))
         if not (found.manifold if closed else found.sound):
             continue

@@ -144,6 +144,28 @@ def test_what_enters_the_band_owes_nothing_to_the_past() -> None:
     assert float(geometry.values.detach()[i, j, k]) == 0.0
 
 
+def test_what_is_hardly_known_hardly_moves() -> None:
+    """Noise of two sizes, a few coefficients with a thousandth of what the others get: a random walk as long as plain
+    Adam's would be is cut by a thousand, while a steady pull on the others is followed as before but for one half."""
+    geometry = ball_model().geometry
+    start = geometry.values.detach().clone()
+    faint, firm = geometry.active[:40], geometry.active[40:]
+    torch.manual_seed(0)
+    for _ in range(60):
+        sink = geometry.sink.view(-1)
+        sink[faint] = 1e-6 * torch.randn(len(faint))
+        sink[firm] = 1e-3
+        geometry.step(1e-4)
+    moved = (geometry.values.detach() - start).view(-1)
+    assert geometry.typical == pytest.approx(1e-3, rel=0.05)
+    assert float(moved[faint].abs().max()) < 1e-5
+    assert torch.allclose(moved[firm], torch.full((len(firm),), -3e-3), rtol=0.1)
+    saved = geometry.optimiser_state()
+    other = ball_model().geometry
+    other.load_optimiser_state(saved)
+    assert other.typical == geometry.typical
+
+
 @pytest.mark.parametrize("shape", [(24, 24, 24), (25, 22, 27)])
 def test_coarse_distance_is_never_too_long(shape: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(0)
