@@ -34,13 +34,13 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 SIDE = 512  # pixels of the photos' longest side: a patch then spans some 4 mm of a head
 HALF, SPACING = 2, 2.0  # a patch is (2 HALF + 1)^2 samples, so many pixels apart
-BLUR = 1.0  # pixels: what lies between samples two apart goes, and most of the noise with it
+BLUR = 0.7  # pixels: what lies between samples two apart goes, and most of the noise with it
 VIEWS = 6  # that look at a point most squarely are compared
 LEAST_COSINE = 0.25  # between a normal and the way to a camera
 POINTS = 12_000  # of the surface that one sweep takes
-CERTAIN = 5e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise has 7e-2
+CERTAIN = 4e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise reaches 6e-2
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
-LAPLACIAN = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
 
 
@@ -114,9 +114,16 @@ def photos_of(views: list[PhotoView], device: str) -> Photos:
     height, width = np.array(sizes).T
     first = np.concatenate([[0], np.cumsum(height * width)[:-1]])
     centre = np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)
-    tensors = (np.concatenate(grey), first, width, height, np.stack(matrices).astype(np.float32), centre)
     level = max(float(np.median(noise)) / (2 * np.sqrt(np.pi) * BLUR), FLOOR / 3)
-    return Photos(*(torch.from_numpy(x).to(device) for x in tensors), level)
+    return Photos(
+        torch.from_numpy(np.concatenate(grey)).to(device),
+        torch.from_numpy(first).to(device),
+        torch.from_numpy(width).to(device),
+        torch.from_numpy(height).to(device),
+        torch.from_numpy(np.stack(matrices).astype(np.float32)).to(device),
+        torch.from_numpy(centre).to(device),
+        level,
+    )
 
 
 def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
