@@ -1,0 +1,82 @@
+"""The same photos by a worse camera: fewer pixels, noise, JPEG. Two captures become comparable that way.
+
+    python benchmarks/degrade_capture.py CAPTURE OUT [--side 640] [--noise 0.0275] [--quality 95]
+
+CAPTURE is a FaceScape folder (`params.json`, I.png or I.jpg), with its `truth/` if it has one. Photos and the truth's
+alpha are averaged down by area in linear light; cameras follow (pixel centres at integers); noise is Gaussian in the
+encoded values, the same for dark and bright, of one seed. A background that is black stays without noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.colour import srgb_from_linear
+from pipeline.images import read_alpha, read_linear, write_png
+
+BLACK = 0.02  # encoded: below it lies the background
+Params = dict[str, Any]
+
+
+def smaller(params: Params, side: int) -> Params:
+    """Cameras for photos whose longest side is `side`; other entries as they are."""
+    out = dict(params)
+    for key in (k for k in params if k.endswith("_K")):
+        index = key.removesuffix("_K")
+        size = [int(params[f"{index}_{edge}"]) for edge in ("width", "height")]
+        factor = side / max(size)
+        K = np.array(params[key], float)
+        K[:2, :2] *= factor
+        K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
+        out[key] = K.tolist()
+        out[f"{index}_width"], out[f"{index}_height"] = (round(n * factor) for n in size)
+        if f"{index}_ori" in params:
+            out[f"{index}_ori"] = f"{index}.jpg"
+    return out
+
+
+def resized(image: npt.NDArray[np.float32], side: int) -> npt.NDArray[np.float32]:
+    """Averaged by area until its longest side is `side`."""
+    h, w = image.shape[:2]
+    factor = side / max(h, w)
+    return np.asarray(cv2.resize(image, (round(w * factor), round(h * factor)), interpolation=cv2.INTER_AREA))
+
+
+def main() -> None:
+    """Write the worse capture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--side", type=int, default=640, help="longest side of the new photos (%(default)s)")
+    parser.add_argument("--noise", type=float, default=0.0275, help="standard deviation, white = 1 (%(default)s)")
+    parser.add_argument("--quality", type=int, default=95, help="of the JPEG (%(default)s)")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    params = json.loads((args.capture / "params.json").read_text())
+    (args.out / "params.json").write_text(json.dumps(smaller(params, args.side)))
+    rng = np.random.default_rng(0)
+    photos = (p for p in args.capture.iterdir() if p.stem.isdigit() and p.suffix.lower() in (".png", ".jpg", ".jpeg"))
+    for photo in sorted(photos, key=lambda p: int(p.stem)):
+        shown = srgb_from_linear(resized(read_linear(photo)[..., :3], args.side))
+        shown = shown + args.noise * rng.normal(size=shown.shape) * (shown > BLACK)
+        pixels = np.round(255 * np.clip(shown, 0, 1)).astype(np.uint8)[..., ::-1]
+        cv2.imwrite(str(args.out / f"{photo.stem}.jpg"), pixels, [cv2.IMWRITE_JPEG_QUALITY, args.quality])
+    truth = args.out / "truth"
+    for alpha in sorted((args.capture / "truth" / "alpha").glob("*.png")):
+        (truth / "alpha").mkdir(parents=True, exist_ok=True)
+        write_png(truth / "alpha" / alpha.name, resized(read_alpha(alpha), args.side))
+    for name in ("mesh_gt.ply", "env.exr"):
+        if (args.capture / "truth" / name).is_file():
+            shutil.copy(args.capture / "truth" / name, truth / name)
+
+
+if __name__ == "__main__":
+    main()
