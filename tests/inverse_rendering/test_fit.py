@@ -24,6 +24,7 @@ from stages.inverse_rendering.views import PhotoView, PixelTable, factor_for, im
 
 RADIUS, SIDE = 0.1, 64
 SMALL = FitSettings(
+    lr_sdf=0.2,  # few steps for 8 mm
     image_side=64,
     steps=200,
     batch=512,
