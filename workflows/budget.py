@@ -68,7 +68,7 @@ RUNGS = (
     Rung("draft", _of("draft"), 4e6, 1.0, 35, 85),
     Rung("fine", _of("studio", **FINE), 2e7, 1.0, 45, 130),
     Rung("studio", _of("studio"), 3e7, 1.0, 60, 155),
-    Rung("film", _of("film"), 2.5e8, 0.6, 200, 600),
+    Rung("film", _of("film"), 1e8, 0.6, 200, 600),
 )
 
 

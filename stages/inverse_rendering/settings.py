@@ -119,7 +119,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "film": {
         "image_side": 2048,
-        "steps": 30000,
+        "steps": 12000,
         "batch": 8192,
         "grid_cells": 448,
         "levels": 3,
