@@ -10,7 +10,6 @@ whether there is a face at all.
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,8 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from pipeline.networks import network
 
 U8 = npt.NDArray[np.uint8]
 F64 = npt.NDArray[np.float64]
@@ -28,7 +29,6 @@ SURE, PRESENT = 0.6, 0.8  # probabilities from which a find, and landmarks, coun
 ROOM = 0.75  # half-edge of the landmarks' square in edges of the found box
 RIGHT_EYE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246)  # along the lids
 LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
-_local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +107,7 @@ def _probability(logit: float) -> float:
 
 def _run(name: str, picture: npt.NDArray[np.float32], outputs: tuple[str, str]) -> tuple[Any, Any]:
     """Two outputs of a network for a picture (S, S, 3)."""
-    if not hasattr(_local, name):
-        setattr(_local, name, cv2.dnn.readNetFromTFLite(str(MODELS / f"{name}.tflite")))
-    net: Any = getattr(_local, name)
+    net = network(MODELS / f"{name}.tflite", cv2.dnn.readNetFromTFLite)
     net.setInput(np.ascontiguousarray(picture.transpose(2, 0, 1)[None]))
     first, second = (np.array(net.forward(o), np.float32) for o in outputs)  # the second is no output by its file
     return first, second

@@ -6,13 +6,12 @@ its own sigmoid. It was trained on upright people, so the crop around the subjec
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from pipeline.networks import network
 from stages.masks.cut_out import cut
 from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, working_size
 from stages.masks.soften import largest_parts
@@ -22,19 +21,12 @@ SIDE = 256  # the network's input
 CROP = 1.6  # half-edge of the crop in radii of the region of interest
 UNSURE = 2.5  # network pixels on both sides of its contour that grabCut decides
 MIN_PART = 0.3  # of the largest piece: smaller ones are mistakes of the network
-_local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
-
-
-def _net() -> Any:
-    if not hasattr(_local, "net"):
-        _local.net = cv2.dnn.readNetFromTFLite(str(MODEL))
-    return _local.net
 
 
 def probability(square: U8) -> F32:
     """(256, 256) probability of 'person' in a (256, 256, 3) 8-bit RGB picture."""
     blob = np.ascontiguousarray(square.transpose(2, 0, 1)[None].astype(np.float32) / 255)
-    net = _net()
+    net = network(MODEL, cv2.dnn.readNetFromTFLite)
     net.setInput(blob)
     return np.array(net.forward(), np.float32).reshape(SIDE, SIDE)
 

@@ -7,20 +7,18 @@ One that tells several classes apart has (1, C, N, N): probabilities, or values 
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from pipeline.errors import UsageError
+from pipeline.networks import network
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import refined
 
 IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-_local = threading.local()  # a network holds the buffers of its last run, so each thread has its own
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,7 @@ class UserModel:
             values = (values - np.array(IMAGENET_MEAN, np.float32)) / np.array(IMAGENET_DEVIATION, np.float32)
         blob = np.ascontiguousarray(values.transpose(2, 0, 1)[None])
         try:
-            net = self._net()
+            net = network(self.path, cv2.dnn.readNetFromONNX)
             net.setInput(blob)
             out = np.array(net.forward(), np.float32)
         except cv2.error as e:
@@ -59,12 +57,6 @@ class UserModel:
         if outside:
             planes = np.exp(planes - planes.max(0))
         return np.asarray(planes[self.of_class] / np.maximum(planes.sum(0), 1e-9), np.float32)
-
-    def _net(self) -> Any:
-        nets: dict[Path, Any] = _local.__dict__.setdefault("nets", {})
-        if self.path not in nets:
-            nets[self.path] = cv2.dnn.readNetFromONNX(str(self.path))
-        return nets[self.path]
 
     def _fault(self, value: str) -> UsageError:
         planes = "1" if self.of_class is None else f"at least {self.of_class + 1}"
