@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import cKDTree
 
 from pipeline import meshes, raster
@@ -302,3 +303,19 @@ def test_sheets_that_touch_are_split_apart(shared: int) -> None:
 def test_a_manifold_is_not_split(built: Built) -> None:
     v, f = decimate.split_apart(built.mesh.vertices.astype(np.float64), built.mesh.faces)
     assert len(v) == len(built.mesh.vertices) and np.array_equal(f, built.mesh.faces)
+
+
+def test_holes_that_met_in_a_vertex_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A closed mesh loses two faces that share a vertex, opposite each other among its six: only once that vertex is
+    parted can one walk around the hole."""
+    whole, fine = (trimesh.creation.icosphere(subdivisions=n) for n in (2, 3))
+    faces = np.asarray(whole.faces, np.int32)
+    shared = int(np.flatnonzero(np.bincount(faces.ravel()) == 6)[0])
+    centre = whole.triangles_center - whole.vertices[shared]
+    around = np.flatnonzero((faces == shared).any(1))
+    opposite = around[(centre[around] @ centre[around[0]]).argmin()]
+    left = np.delete(faces, [around[0], opposite], axis=0)
+    monkeypatch.setattr(decimate, "_simplified", lambda *_: (np.asarray(whole.vertices, np.float64), left))
+    dense = Mesh(fine.vertices.astype(np.float32), fine.vertex_normals.astype(np.float32), fine.faces.astype(np.int32))
+    found = decimate.decimated(dense, len(faces))
+    assert meshes.topology(found.faces, len(found.vertices)).manifold
