@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import transforms
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_alpha, read_linear, write_png
 
@@ -33,10 +34,9 @@ def smaller(params: Params, side: int) -> Params:
         index = key.removesuffix("_K")
         size = [int(params[f"{index}_{edge}"]) for edge in ("width", "height")]
         factor = side / max(size)
-        K = np.array(params[key], float)
-        K[:2, :2] *= factor
-        K[:2, 2] = (K[:2, 2] + 0.5) * factor - 0.5
-        out[key] = K.tolist()
+        K = transforms.corner_K_from_centre_K(np.array(params[key], float))
+        K[:2] *= factor
+        out[key] = transforms.centre_K_from_corner_K(K).tolist()
         out[f"{index}_width"], out[f"{index}_height"] = (round(n * factor) for n in size)
         if f"{index}_ori" in params:
             out[f"{index}_ori"] = f"{index}.jpg"

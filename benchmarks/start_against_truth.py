@@ -36,8 +36,12 @@ def found_in(run: Path) -> tuple[dict[str, Located[Any]], F64]:
     """Artifacts of the run's first stages, and its capture_from_asset."""
     record = json.loads((run / "run.json").read_text())
     store, by_name = Store(Path(record["store"])), {s.name: s for s in REGISTRY}
-    names = ("capture", "poses", "masks")
-    loaded = {n: store.load(n, record["stages"][n]["key"], by_name[n].output) for n in names}
+    loaded = {}
+    for name in ("capture", "poses", "masks"):
+        artifact = store.load(name, record["stages"][name]["key"], by_name[name].output)
+        if artifact is None:
+            raise SystemExit(f"{run}: its {name} are no longer in the store {store.root}; run it again")
+        loaded[name] = artifact
     return loaded, np.array(record["capture_from_asset"], float).reshape(4, 4)
 
 

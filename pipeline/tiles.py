@@ -7,15 +7,12 @@ NAME.1002.exr, ..., and NAME.<UDIM>.exr where all of them are meant; of a single
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 
 from pipeline.meshes import Charts, Indices, Mesh
 
 FIRST, MOST = 1001, 10
 TOKEN = "<UDIM>"
-NUMBER = re.compile(r"10(0[1-9]|10)")
 
 
 def form(kind: str, tile: int, tiles: int) -> str:
@@ -27,6 +24,11 @@ def of_face(charts: Charts) -> Indices:
     """(F,) the tile of each face, from the middle of its corners."""
     middle = charts.uvs.astype(np.float64)[charts.faces][..., 0].mean(1)
     return np.asarray(np.floor(middle).clip(0), np.int64)
+
+
+def count(charts: Charts) -> int:
+    """How many tiles, from the first to the last one with a face."""
+    return int(of_face(charts).max()) + 1
 
 
 def alone(mesh: Mesh, charts: Charts, tile: int) -> tuple[Mesh, Charts]:

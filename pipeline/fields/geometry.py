@@ -22,7 +22,6 @@ from pipeline.maths import sdf as spline
 BAND = 4.0
 BETAS = (0.9, 0.99)
 DAMPING = 1.0  # of the band's typical gradient, added to the root of each coefficient's second moment
-LEAST_EPS = 1e-12  # far below any useful gradient: distances are in metres
 TYPICAL_EVERY = 20  # steps
 
 
@@ -92,7 +91,7 @@ class GridSdf(nn.Module):
         self.steps += 1
         if self.steps <= 2 or self.steps % TYPICAL_EVERY == 0:
             self.typical = self._typical_gradient()
-        eps = max(DAMPING * self.typical, LEAST_EPS)
+        eps = max(DAMPING * self.typical, kernels.LEAST_EPS)
         kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS, eps)
 
     def _typical_gradient(self) -> float:

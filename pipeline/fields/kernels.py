@@ -14,6 +14,8 @@ from torch import Tensor
 from pipeline.maths.sdf import spline_sdf, spline_stencil
 from pipeline.maths.tracing import MAX_STEPS, REFINE_STEPS, sphere_trace
 
+LEAST_EPS = 1e-12  # of the optimiser: distances are in metres, so that gradients can be as small as 1e-8
+
 nb: Any
 try:
     from pipeline.fields import kernels_numba as nb
@@ -120,15 +122,14 @@ def adam_on_band(
     step: int,
     lr: float,
     betas: tuple[float, float],
-    eps: float = 1e-12,
+    eps: float = LEAST_EPS,
 ) -> None:
     """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
 
     Coefficients that no ray touched are left alone, momentum and all: a batch sees a few per cent of the band, and
     moving the rest by old gradients costs most of the time and adds noise.
 
-    eps is what is added to the root of the second moment; distances are in metres, so that gradients can be as small as
-    1e-8, and a useful eps smaller still, unless it is meant to damp.
+    eps is what is added to the root of the second moment, far below any useful gradient unless it is meant to damp.
     """
     b1, b2 = betas
     c1, c2 = 1 - b1**step, 1 - b2**step

@@ -86,7 +86,7 @@ class Baker:
         scratch: Path | None = None,
     ) -> None:
         """`photos`: add their fine detail to the albedo. `scratch`: a folder for arrays larger than the memory."""
-        self.tiles = int(tiles.of_face(charts).max()) + 1
+        self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
         self._step, self._scratch = step, scratch
@@ -153,7 +153,7 @@ def _known(
 def _detail(
     field: Field, mesh: Mesh, charts: Charts, views: Sequence[View], size: int, photos: Photos, step: Step
 ) -> detail.Detail:
-    count = int(tiles.of_face(charts).max()) + 1
+    count = tiles.count(charts)
     sparse = min(size, _per_tile(SPARSE, count))
     some = detail.joined([_spread(field, *tiles.alone(mesh, charts, t), sparse) for t in range(count)])
     area = float(meshes.areas(mesh.vertices, mesh.faces).sum())

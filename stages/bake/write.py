@@ -158,10 +158,10 @@ def _from_samples(name: str, kind: MapKind, baked: Baked, place: _Place) -> Text
 def _region(baked: Baked, votes: Votes | None, place: _Place) -> TextureMap:
     rows = len(baked.texel)
     code = np.zeros(rows, np.uint8)
-    for start in range(0, rows, 1 << 20) if votes is not None else ():
-        assert votes is not None
-        part = slice(start, start + (1 << 20))
-        code[part] = votes.winners(baked.texel[part], baked.size)
+    if votes is not None:
+        for start in range(0, rows, 1 << 20):
+            part = slice(start, start + (1 << 20))
+            code[part] = votes.winners(baked.texel[part], baked.size)
     image = _picture((baked.size, baked.size, 1), place.context.scratch)
     for start, stop in bands(baked.size):
         image[start:stop, :, 0] = code[baked.nearest[start:stop]]

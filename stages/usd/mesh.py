@@ -83,7 +83,7 @@ def _bad_mesh(path: Path, value: str) -> StageError:
 
 def tile_count(mesh: UvSurface) -> int:
     """How many UDIM tiles (pipeline.tiles) a mesh's triangles lie in."""
-    return int(tiles.of_face(Charts(mesh.uvs, mesh.uv_faces)).max()) + 1
+    return tiles.count(Charts(mesh.uvs, mesh.uv_faces))
 
 
 def on_tile(mesh: UvSurface, tile: int, count: int) -> UvSurface:

@@ -47,8 +47,7 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     area = meshes.areas(mesh.vertices, mesh.faces)
     share = area / area.sum()
     label = chart_of_face(charts.faces, len(charts.uvs))
-    tile = tiles.of_face(charts)
-    parts = (tiles.alone(mesh, charts, t)[1] for t in range(int(tile.max()) + 1))
+    parts = (tiles.alone(mesh, charts, t)[1] for t in range(tiles.count(charts)))
     layers = [raster.layers(raster.texel_corners(part, RASTER), RASTER) for part in parts]
     covered = [int((layer > 0).sum()) for layer in layers]
     flat = np.abs(uv_area) < 1e-12
