@@ -281,7 +281,8 @@ class FittedFace(Artifact):
 # ------------------------------------------------------------------ mesh
 class Surface(Artifact):
     """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32.
-    trimmed: share of its area that no photo saw and that was cut off."""
+    trimmed: share of its area that no photo saw and that was cut off. handles_cut: small handles that were opened and
+    closed; handles_left: those that are too wide for a fault."""
 
     mesh: FileRef
     vertices: int
@@ -291,6 +292,8 @@ class Surface(Artifact):
     removed_components: int
     cell: float
     trimmed: float = 0.0
+    handles_cut: int = 0
+    handles_left: int = 0
     warnings: tuple[str, ...] = ()
 
 

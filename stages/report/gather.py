@@ -84,6 +84,8 @@ def figures(r: Results) -> dict[str, Any]:
             "components": surface.components,
             "removed_components": surface.removed_components,
             "trimmed_share": surface.trimmed,
+            "handles_cut": surface.handles_cut,
+            "handles_left": surface.handles_left,
         },
         "uv": {
             "vertices": uv.vertices,

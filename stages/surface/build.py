@@ -1,4 +1,4 @@
-"""The whole way from a field to a mesh: extract, keep one piece, land on the zero set, check."""
+"""The whole way from a field to a mesh: extract, keep one piece, land on the zero set, cut handles, check."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F64, Faces, Mask, Mesh, Topology
 from stages.surface import clean, extract
+from stages.surface.clean import Landed
 from stages.surface.extract import Step
+from stages.surface.handles import Opened, without_handles
 from stages.surface.repair import repaired
 from stages.surface.trim import trimmed
 
 LARGE_SECOND = 0.05  # area of a dropped piece over the kept one's, from which it is worth a warning
 MOSTLY_CAP = 0.5  # of the area: more cap than that is a box and not a head
+
+HANDLE = 0.1  # of the box's longest side: a handle with a shorter loop is a fault of the fit. Of a head, 4 cm
 
 Sees = Callable[[Mesh], Mask]
 
@@ -25,7 +29,7 @@ Sees = Callable[[Mesh], Mask]
 @dataclass(frozen=True, slots=True)
 class Built:
     """The finished mesh and what was found on the way. cell: lattice edge; cap: share of the area on the box; trimmed:
-    share of the area that no photo saw and that was cut off."""
+    share of the area that no photo saw and that was cut off; handles: how many were cut, and how many are left."""
 
     mesh: Mesh
     topology: Topology
@@ -35,11 +39,12 @@ class Built:
     residual: float
     warnings: tuple[str, ...]
     trimmed: float = 0.0
+    handles: tuple[int, int] = (0, 0)
 
 
-def build(field: Field, resolution: int, step: Step, sees: Sees | None = None) -> Built:
+def build(field: Field, resolution: int, step: Step, sees: Sees | None = None, handle: float = HANDLE) -> Built:
     """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
-    photos see; the rest is cut off.
+    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut.
 
     Raises:
         StageError: no zero crossing, a solid that fills its box, or a mesh that can't be closed.
@@ -61,15 +66,28 @@ def build(field: Field, resolution: int, step: Step, sees: Sees | None = None) -
             limit=f"at most {MOSTLY_CAP:.0%}",
             remedy="check the masks (is the background black?) and the region of interest",
         )
-    mesh = Mesh(landed.vertices.astype(np.float32), landed.normals, faces)
     free = landed.vertices[~landed.capped]
     residual = float(np.abs(field.sdf(free.astype(np.float32))).max(initial=0))
-    warnings = _warnings(removed, second, repairs)
+    opened = without_handles(landed.vertices, faces, handle * float((grid.upper - grid.lower).max()))
+    mesh, handles = _mesh(landed, opened), (opened.cut, opened.left)
+    warnings = _warnings(removed, second, repairs, opened.left)
+    if opened.cut:
+        found = meshes.topology(mesh.faces, len(mesh.vertices))
     if sees is None:
-        return Built(mesh, found, removed, grid.h, cap, residual, warnings)
+        return Built(mesh, found, removed, grid.h, cap, residual, warnings, handles=handles)
     cut = trimmed(field, grid, mesh, sees(mesh))
     found = meshes.topology(cut.mesh.faces, len(cut.mesh.vertices))
-    return Built(cut.mesh, found, removed, grid.h, cap, residual, warnings, cut.share)
+    return Built(cut.mesh, found, removed, grid.h, cap, residual, warnings, cut.share, handles)
+
+
+def _mesh(landed: Landed, opened: Opened) -> Mesh:
+    """The mesh with the field's normals, and its own where handles were cut and the zero set is elsewhere."""
+    normals = meshes.vertex_normals(opened.vertices, opened.faces)
+    kept = np.ones(len(normals), np.bool_)
+    kept[opened.moved] = False
+    still = np.flatnonzero(kept)
+    normals[still] = landed.normals[still]
+    return Mesh(opened.vertices.astype(np.float32), normals, opened.faces)
 
 
 def _closed(vertices: F64, faces: Faces) -> tuple[F64, Faces, Topology, Topology | None]:
@@ -91,7 +109,7 @@ def _closed(vertices: F64, faces: Faces) -> tuple[F64, Faces, Topology, Topology
     return fixed_vertices, fixed_faces, now, found
 
 
-def _warnings(removed: int, second: float, repairs: Topology | None) -> tuple[str, ...]:
+def _warnings(removed: int, second: float, repairs: Topology | None, handles: int) -> tuple[str, ...]:
     out = []
     if second > LARGE_SECOND:
         out.append(
@@ -102,4 +120,6 @@ def _warnings(removed: int, second: float, repairs: Topology | None) -> tuple[st
             f"the mesh was repaired: {repairs.boundary_edges} open and {repairs.crowded_edges} crowded edges, "
             f"{repairs.pinched_vertices} pinched vertices"
         )
+    if handles:
+        out.append(f"{handles} handles are wider than surface.handle and were left: charts may be many")
     return tuple(out)

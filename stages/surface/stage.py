@@ -36,6 +36,12 @@ class Config(StageConfig):
     unseen: Literal["closed", "trimmed"] = Field(
         "closed", description="surface that no fitted photo saw: kept, so that the mesh is closed, or cut off"
     )
+    handle: float = Field(
+        0.1,
+        ge=0,
+        le=10,
+        description="handles with a loop up to this share of the box's longest side are cut and closed; 0 keeps all",
+    )
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Surface:
@@ -63,14 +69,15 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
             seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
         return seen
 
-    built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None)
+    built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None, config.handle)
     meshes.save(context.workdir / MESH, built.mesh)
     context.log.info(
-        "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g",
+        "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g, %d handles cut",
         len(built.mesh.faces),
         built.cell,
         100 * built.cap,
         built.residual,
+        built.handles[0],
     )
     return Surface(
         mesh=context.file(MESH),
@@ -81,8 +88,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         removed_components=built.removed,
         cell=built.cell,
         trimmed=round(built.trimmed, 6),
+        handles_cut=built.handles[0],
+        handles_left=built.handles[1],
         warnings=built.warnings,
     )
 
 
-STAGE = Stage(name="surface", version=2, inputs=Inputs, config=Config, output=Surface, run=run)
+STAGE = Stage(name="surface", version=3, inputs=Inputs, config=Config, output=Surface, run=run)

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Sdf, Usd, UsdGeom
 
+from stages.usd.chart_checks import chart_findings
 from stages.usd.findings import Finding
 from stages.usd.tile_checks import coordinate_findings, tiled
 
@@ -129,12 +130,15 @@ def _primvars(mesh: UsdGeom.Mesh, sizes: dict[str, int]) -> list[Finding]:
     if st.GetTypeName() != Sdf.ValueTypeNames.TexCoord2fArray:
         out.append(Finding("error", "st", f"type {st.GetTypeName()}, expected texCoord2f[]", str(mesh.GetPath())))
     values = np.array(st.Get(Usd.TimeCode.Default()), np.float64)
-    if not out and np.isfinite(values).all() and st.GetInterpolation() == "faceVarying" and tiled(mesh):
-        return coordinate_findings(mesh, np.array(st.ComputeFlattened(), np.float64))
-    if not (np.isfinite(values).all() and values.min() >= -1e-5 and values.max() <= 1 + 1e-5):
-        out.append(
-            Finding(
-                "error", "st", f"from {values.min():.4f} to {values.max():.4f}, expected 0 to 1", str(mesh.GetPath())
-            )
-        )
-    return out
+    if not out and np.isfinite(values).all() and st.GetInterpolation() == "faceVarying":
+        corners = np.array(st.ComputeFlattened(), np.float64)
+        placed = coordinate_findings(mesh, corners) if tiled(mesh) else _in_square(mesh, values)
+        return placed or chart_findings(mesh, corners)
+    return [*out, *_in_square(mesh, values)]
+
+
+def _in_square(mesh: UsdGeom.Mesh, values: F64) -> list[Finding]:
+    if np.isfinite(values).all() and values.min() >= -1e-5 and values.max() <= 1 + 1e-5:
+        return []
+    found = f"from {values.min():.4f} to {values.max():.4f}, expected 0 to 1"
+    return [Finding("error", "st", found, str(mesh.GetPath()))]

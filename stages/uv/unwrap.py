@@ -17,12 +17,15 @@ from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
 from stages.uv.pack import pack
 from stages.uv.tiling import Tiling, packed
+from stages.uv.unfold import folded, one_by_one, taken_apart
 
 log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
 SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
 PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
 COARSER = 1.05  # of the texel that is wished for: a few per cent are not worth a further tile
+UNFOLDINGS = 6  # rounds in which what folds is taken apart; in the latter half face by face, which ends it
+FOLD_RASTER = 2048  # texels along a side on which folds are looked for
 MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
 
 
@@ -59,7 +62,7 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
         return own
     log.info("uv: charts of our own do not lie flat; xatlas takes over")
     uvs, faces = _cut(points, mesh.faces, options)
-    even = evened(turned_over(uvs, faces), faces, meshes.areas(mesh.vertices, mesh.faces))
+    even, faces = _flat(uvs, faces, mesh, options)
     label = chart_of_face(faces, len(even))
     if label.max() < MANY_CHARTS:
         placed = pack(even, faces, label, padding)
@@ -70,6 +73,22 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
         if placed is not None:
             return Charts(placed, faces)
     return _packed(spread(even, faces), faces, options)
+
+
+def _flat(uvs: F64, faces: Faces, mesh: Mesh, options: Options) -> tuple[F64, Faces]:
+    """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.unfold)."""
+    areas, corners = meshes.areas(mesh.vertices, mesh.faces), mesh.vertices.astype(np.float64)[mesh.faces]
+    for turn in range(UNFOLDINGS):
+        uvs = evened(turned_over(uvs, faces), faces, areas)
+        out = folded(_packed(spread(uvs, faces), faces, options), FOLD_RASTER)
+        log.info("uv: %d faces lie on others", int(out.sum()))
+        if not out.any():
+            break
+        if turn < UNFOLDINGS // 2:
+            uvs, faces = taken_apart(uvs, faces, out)
+        else:
+            uvs, faces = one_by_one(uvs, faces, out, corners)
+    return evened(turned_over(uvs, faces), faces, areas), faces
 
 
 def smoothed(vertices: F64, faces: Faces, length: float) -> F64:

@@ -7,10 +7,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from pipeline.errors import StageError
+from stages.usd.chart_checks import _fans, overlap
 from stages.usd.validate import checks_run, require_valid, validate
 
 
@@ -68,6 +70,20 @@ def st_index_too_large(stage: Usd.Stage) -> None:
 def st_outside(stage: Usd.Stage) -> None:
     st = UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st")
     st.Set([Gf.Vec2f(v[0] + 1, v[1]) for v in st.Get()])
+
+
+def change_st(stage: Usd.Stage, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    st = UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st")
+    st.Set([Gf.Vec2f(*v) for v in change(np.asarray(st.Get(), np.float64)).tolist()])
+
+
+def folded_over(stage: Usd.Stage) -> None:
+    """The right half of the texture on the left one."""
+    change_st(stage, lambda st: np.stack([np.abs(st[:, 0] - 0.5) + 0.5, st[:, 1]], 1))
+
+
+def on_a_line(stage: Usd.Stage) -> None:
+    change_st(stage, lambda st: np.stack([st[:, 0], np.full(len(st), 0.5)], 1))
 
 
 def short_normals(stage: Usd.Stage) -> None:
@@ -166,6 +182,8 @@ FAULTS = [
     (drop_st_index, "primvar"),
     (st_index_too_large, "primvar"),
     (st_outside, "st"),
+    (folded_over, "st_overlap"),
+    (on_a_line, "st"),
     (lambda s: mesh(s).GetPrim().RemoveProperty("primvars:st"), "st"),
     (short_normals, "normals"),
     (fewer_normals, "normals"),
@@ -188,6 +206,38 @@ def test_each_fault_is_reported(asset: Path, change: Callable[[Usd.Stage], None]
     assert any(check in f.check for f in found if f.level == "error"), [str(f) for f in found]
     with pytest.raises(StageError, match="fault"):
         require_valid(asset / "head.usd")
+
+
+def test_a_mirrored_part_is_worth_a_warning(asset: Path) -> None:
+    """The first tenth of the faces with two corners' coordinates exchanged: no overlap, as each keeps its place."""
+
+    def turn(stage: Usd.Stage) -> None:
+        st = UsdGeom.PrimvarsAPI(mesh(stage)).GetPrimvar("st")
+        index = np.array(st.GetIndices()).reshape(-1, 3)
+        some = index[: len(index) // 10]
+        some[:] = some[:, [1, 0, 2]]
+        st.SetIndices(index.ravel().tolist())
+
+    edit(asset, turn)
+    found = [f for f in validate(asset / "head.usd") if f.level != "info"]
+    assert found and {(f.level, f.check) for f in found} == {("warning", "st")}
+    assert all("mirrored" in f.message for f in found)
+
+
+@pytest.mark.parametrize("shift, share", [(0.0, 1.0), (0.25, 1 / 3), (0.45, 0.05 / 0.95), (0.5, 0.0)])
+def test_overlap_is_the_share_of_covered_texels(shift: float, share: float) -> None:
+    """Two squares of half a tile, one moved along: what both cover over what either does. The same on another tile."""
+    square = np.array([[[0, 0], [1, 0], [1, 1]], [[0, 0], [1, 1], [0, 1]]]) * 0.5
+    both = np.concatenate([square, square + [shift, 0]])
+    assert overlap(both) == pytest.approx(share, abs=4e-3)
+    assert overlap(np.concatenate([both, both + [1, 0]])) == pytest.approx(share, abs=4e-3)
+    assert overlap(np.concatenate([square, square + [1, 0]])) == 0
+
+
+def test_faces_with_more_corners_are_fans() -> None:
+    assert _fans(np.array([3, 5, 4])).tolist() == [
+        [0, 1, 2], [3, 4, 5], [3, 5, 6], [3, 6, 7], [8, 9, 10], [8, 10, 11],
+    ]  # fmt: skip
 
 
 def test_missing_kind(asset: Path) -> None:

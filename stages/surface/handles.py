@@ -1,0 +1,245 @@
+"""Handles of a closed mesh: found as short loops that part nothing, cut open along them, both sides closed by a cap.
+
+Symbols
+    genus   number of handles, (2 pieces - euler) / 2
+    T       tree of shortest paths along edges from a root (Dijkstra)
+    C       spanning tree of the faces across edges that are not in T, of those whose loops are longest
+    loop    what an edge that is in neither tree closes together with T
+
+There are two loops for each handle, one around it and one through it, and no sum of some of them bounds anything
+(Eppstein 2003; Erickson and Whittlesey 2005 for the choice of C). From a root far off they take a long way round, so
+further roots lie where the first one's loops close. A set of disjoint loops that does not part the mesh may be cut
+together, and every cut takes one handle away: it either severs it or puts a skin across its hole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.meshes import F64, Faces, Indices, Mask
+
+ROOTS = 8  # tried in a round, besides the first
+ROUNDS = 64  # each cuts all loops that keep clear of each other
+RINGS = 3  # of vertices around a cut that are smoothed, so that two caps come apart
+SMOOTHING = 20  # steps
+
+
+@dataclass(frozen=True, slots=True)
+class Opened:
+    """A mesh with fewer handles. moved (M,): its vertices that are new or no longer where they were; cut: handles
+    that went; left: those whose loops are longer than was asked for."""
+
+    vertices: F64
+    faces: Faces
+    moved: Indices
+    cut: int
+    left: int
+
+
+@dataclass(frozen=True, slots=True)
+class Web:
+    """Edges of a closed manifold, in order: pairs (E, 2), low vertex first; length (E,); sides (E, 2), faces, low
+    first."""
+
+    pairs: Indices
+    length: F64
+    sides: Indices
+    vertices: int
+    faces: int
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Vertices (N,) in order, each joined to the next and the last to the first; the length all round."""
+
+    vertices: Indices
+    length: float
+    closing: int  # vertex of the edge in neither tree: where two ways around a handle meet
+
+
+def genus(faces: Faces, count: int) -> int:
+    """Handles of a closed manifold of one piece."""
+    return (2 - meshes.topology(faces, count).euler) // 2
+
+
+def without_handles(vertices: F64, faces: Faces, longest: float) -> Opened:
+    """Cut every handle that is found to have a loop no longer than `longest`, the shortest loops first.
+
+    vertices (V, 3), faces (F, 3): a closed manifold of one piece. Its vertices keep their places and numbers but for
+    those near a cut; new ones come after them.
+    """
+    first = left = genus(faces, len(vertices))
+    touched: list[Indices] = []
+    for _ in range(ROUNDS):
+        chosen = _chosen(vertices, faces, longest) if left else []
+        if not chosen:
+            break
+        for loop in chosen:
+            vertices, faces, caps = _cut(vertices, faces, loop.vertices)
+            touched.append(caps)
+        left -= len(chosen)
+    if not touched:
+        return Opened(vertices, faces, np.zeros(0, np.int64), 0, left)
+    around = _rings(np.concatenate(touched), faces, len(vertices))
+    return Opened(_smoothed(vertices, faces, around), faces, around, first - left, left)
+
+
+def web(vertices: F64, faces: Faces) -> Web:
+    """The edges of a closed manifold."""
+    e = np.sort(meshes.edges(faces), axis=1)
+    order = np.argsort(e[:, 0] * len(vertices) + e[:, 1], kind="stable")
+    pairs = e[order[::2]]
+    sides = np.sort((order % len(faces)).reshape(-1, 2), axis=1)
+    length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
+    return Web(pairs, np.asarray(length, np.float64), sides, len(vertices), len(faces))
+
+
+def loops_from(net: Web, root: int) -> list[Loop]:
+    """Two loops for each handle, the shortest first."""
+    distance, before = _paths(net, root)
+    low, high = net.pairs.T
+    in_tree = (before[low] == high) | (before[high] == low)
+    closing = distance[low] + distance[high] + net.length
+    found = [_loop(net, int(e), distance, before) for e in _rest(net, in_tree, closing)]
+    return sorted(found, key=lambda loop: loop.length)
+
+
+def _chosen(vertices: F64, faces: Faces, longest: float) -> list[Loop]:
+    """Loops that are short enough, share no vertex and together part nothing, the shortest first."""
+    net = web(vertices, faces)
+    found = loops_from(net, int(net.pairs[0, 0]))
+    for root in list(dict.fromkeys(loop.closing for loop in found))[:ROOTS]:
+        found += loops_from(net, root)
+    used = np.zeros(len(vertices), np.bool_)
+    out: list[Loop] = []
+    for loop in sorted(found, key=lambda loop: loop.length):
+        if loop.length <= longest and not used[loop.vertices].any() and _whole(net, [*out, loop]):
+            used[loop.vertices] = True
+            out.append(loop)
+    return out
+
+
+def _whole(net: Web, loops: list[Loop]) -> bool:
+    """Whether the mesh would still hang together when cut along all of these."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    code = net.pairs[:, 0] * net.vertices + net.pairs[:, 1]
+    uncut = np.ones(len(code), np.bool_)
+    for loop in loops:
+        e = np.sort(np.stack([loop.vertices, np.roll(loop.vertices, -1)], 1), axis=1)
+        uncut[np.searchsorted(code, e[:, 0] * net.vertices + e[:, 1])] = False
+    a, b = net.sides[uncut].T
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(net.faces, net.faces))
+    return int(connected_components(graph, directed=False, return_labels=False)) == 1
+
+
+def _paths(net: Web, root: int) -> tuple[F64, Indices]:
+    """Distance along edges from the root, and the vertex before each on the way; negative at the root."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import dijkstra
+
+    cost = np.maximum(net.length, np.finfo(np.float32).tiny)  # a stored zero would be no edge
+    graph = coo_array((cost, (net.pairs[:, 0], net.pairs[:, 1])), shape=(net.vertices, net.vertices)).tocsr()
+    distance, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
+    return distance, before.astype(np.int64)
+
+
+def _rest(net: Web, in_tree: Mask, closing: F64) -> Indices:
+    """Edges that are in neither T nor C."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
+    free = np.flatnonzero(~in_tree)
+    rank = np.empty(len(free), np.int64)
+    rank[np.argsort(-closing[free], kind="stable")] = np.arange(1, len(free) + 1)  # all different: one tree only
+    a, b = net.sides[free].T
+    # two faces may share two edges, of which the longer loop's is kept: a sparse array would add the two up
+    best = np.lexsort((rank, b, a))
+    new = np.ones(len(best), np.bool_)
+    new[1:] = (np.diff(a[best]) != 0) | (np.diff(b[best]) != 0)
+    kept = best[new]
+    graph = coo_array((rank[kept].astype(np.float64), (a[kept], b[kept])), shape=(net.faces, net.faces))
+    taken = minimum_spanning_tree(graph.tocsr()).data.astype(np.int64)
+    out = np.ones(len(free), np.bool_)
+    out[np.argsort(rank)[taken - 1]] = False
+    return np.asarray(free[out], np.int64)
+
+
+def _loop(net: Web, edge: int, distance: F64, before: Indices) -> Loop:
+    """The loop that an edge closes in T, from where the two ways part."""
+    a, b = (int(v) for v in net.pairs[edge])
+    way = [a]
+    while before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    place = {v: i for i, v in enumerate(way)}
+    back = [b]
+    while back[-1] not in place:
+        back.append(int(before[back[-1]]))
+    length = distance[a] + distance[b] + net.length[edge] - 2 * distance[back[-1]]
+    return Loop(np.asarray(way[: place[back[-1]] + 1] + back[-2::-1], np.int64), float(length), a)
+
+
+def _cut(vertices: F64, faces: Faces, loop: Indices) -> tuple[F64, Faces, Indices]:
+    """Open the mesh along a loop and close both sides, each by a fan around the loop's middle."""
+    n, count = len(loop), len(vertices)
+    faces = faces.copy()
+    for i, (face, corner) in enumerate(_right_of(faces, loop)):
+        faces[face, corner] = count + i
+    twin, middle = count + np.arange(n), count + n
+    after, twin_after = np.roll(loop, -1), np.roll(twin, -1)
+    left = np.stack([after, loop, np.full(n, middle)], 1)
+    right = np.stack([twin, twin_after, np.full(n, middle + 1)], 1)
+    centre = vertices[loop].mean(0)
+    out = np.concatenate([vertices, vertices[loop], [centre, centre]])
+    closed = np.concatenate([faces, left, right]).astype(np.int32)
+    return out, closed, np.concatenate([loop, twin, [middle, middle + 1]])
+
+
+def _right_of(faces: Faces, loop: Indices) -> list[tuple[Indices, Indices]]:
+    """For each vertex of the loop: faces on its right hand side, and which of their corners the vertex is.
+
+    Corners are told one by one, because a face may lie on the left of one part of a loop and on the right of another.
+    """
+    near = np.flatnonzero(np.isin(faces, loop).any(1))
+    ahead: dict[tuple[int, int], tuple[int, int]] = {}  # directed edge -> its face and the vertex that ends the face
+    for f in near.tolist():
+        a, b, c = (int(v) for v in faces[f])
+        ahead[a, b], ahead[b, c], ahead[c, a] = (f, c), (f, a), (f, b)
+    out = []
+    for before, v, after in zip(np.roll(loop, 1).tolist(), loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
+        right, spoke = [], before
+        while spoke != after:
+            face, spoke = ahead[v, spoke]
+            right.append(face)
+        found = np.asarray(right, np.int64)
+        out.append((found, np.asarray((faces[found] == v).argmax(1), np.int64)))
+    return out
+
+
+def _rings(seeds: Indices, faces: Faces, count: int) -> Indices:
+    """Vertices within RINGS edges of the seeds."""
+    inside = np.zeros(count, np.bool_)
+    inside[seeds] = True
+    for _ in range(RINGS):
+        inside[faces[inside[faces].any(1)]] = True
+    return np.flatnonzero(inside)
+
+
+def _smoothed(vertices: F64, faces: Faces, free: Indices) -> F64:
+    """Free vertices moved to the middle of their neighbours, SMOOTHING times, all at once."""
+    from scipy.sparse import coo_array
+
+    e = meshes.edges(faces)
+    row = np.full(len(vertices), -1)
+    row[free] = np.arange(len(free))
+    e = e[row[e[:, 0]] >= 0]
+    neighbours = coo_array((np.ones(len(e)), (row[e[:, 0]], e[:, 1])), shape=(len(free), len(vertices))).tocsr()
+    degree = neighbours.sum(1)[:, None]
+    out = vertices.copy()
+    for _ in range(SMOOTHING):
+        out[free] = (neighbours @ out) / degree
+    return out
