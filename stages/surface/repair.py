@@ -1,4 +1,4 @@
-"""The one place that uses pymeshlab (GPL-3): closing a mesh that marching cubes left open or pinched.
+"""Closing a mesh that marching cubes left open or pinched, by pymeshlab (GPL-3; used here and in stages.uv.remesh).
 
 It is called only for a mesh that fails the check, which a smooth field does not produce. Without pymeshlab installed
 the stage still works, and such a mesh is refused.

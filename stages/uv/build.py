@@ -11,6 +11,7 @@ from pipeline.meshes import Charts, Mesh
 from stages.uv import decimate
 from stages.uv.decimate import Deviation
 from stages.uv.measure import Quality, measure
+from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, Options, unwrap
 
 MOST_OVERLAP, MOST_FLIPPED, MOST_EMPTY, MOST_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
@@ -33,8 +34,10 @@ class Built:
     warnings: tuple[str, ...]
 
 
-def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, step: Step) -> Built:
-    """Decimate, unwrap and measure.
+def build(
+    dense: Mesh, target_faces: int, proxy_faces: int, options: Options, step: Step, *, even: bool = False
+) -> Built:
+    """Decimate, unwrap and measure. even: triangles of one size and shape in the place of few where it is flat.
 
     Raises:
         StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
@@ -49,7 +52,7 @@ def build(dense: Mesh, target_faces: int, proxy_faces: int, options: Options, st
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")
-    mesh = decimate.decimated(dense, target_faces)
+    mesh = remeshed(dense, target_faces) if even else decimate.decimated(dense, target_faces)
     proxy = decimate.decimated(mesh, proxy_faces)
     step(1, 4, "unwrapping")
     charts = unwrap(mesh, options)

@@ -26,6 +26,10 @@ class Config(StageConfig):
     """Size of the meshes and how they are cut into charts."""
 
     target_faces: int = Field(50_000, ge=200, le=2_000_000, description="triangles of the mesh that is textured")
+    remesh: Literal["adaptive", "even"] = Field(
+        "adaptive",
+        description="adaptive: few triangles where it is flat; even: one size and shape, for sculpting and quads",
+    )
     proxy_faces: int = Field(5_000, ge=100, le=200_000, description="triangles of the coarse stand-in")
     tiles: Annotated[int, Field(ge=1, le=10)] | Literal["auto"] = Field(
         1, description="UDIM tiles to fill; auto: as many as it takes for texels no coarser than the photos' pixels"
@@ -62,7 +66,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     options = Options(
         config.texture_size, config.padding, config.max_cost, config.iterations, most, texel, config.tile_size
     )
-    built = build(dense, config.target_faces, config.proxy_faces, options, step)
+    built = build(dense, config.target_faces, config.proxy_faces, options, step, even=config.remesh == "even")
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
     return UvMesh(
@@ -85,4 +89,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=4, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=5, inputs=Inputs, config=Config, output=UvMesh, run=run)
