@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from pipeline import footprint, meshes
@@ -54,17 +55,24 @@ def build(
     step(0, 4, "decimating")
     mesh = remeshed(dense, target_faces) if even else decimate.decimated(dense, target_faces)
     proxy = decimate.decimated(mesh, proxy_faces)
-    step(1, 4, "unwrapping")
-    charts = unwrap(mesh, options)
-    step(2, 4, "measuring charts")
-    quality = measure(mesh, charts)
+    with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
+        away = beside.submit(_away, dense, mesh, proxy)
+        step(1, 4, "unwrapping")
+        charts = unwrap(mesh, options)
+        step(2, 4, "measuring charts")
+        quality = measure(mesh, charts)
+        step(3, 4, "measuring the decimation")
+        deviation, rough, against = away.result()
     tiles = len(quality.tile_utilisation)
-    step(3, 4, "measuring the decimation")
-    deviation, rough = decimate.deviation(dense, mesh), decimate.deviation(dense, proxy)
-    against = decimate.flipped_share(dense, mesh)
     step(4, 4, "done")
     short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short)
+
+
+def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, float]:
+    """Distances of mesh and proxy, and the share of the mesh that looks against the dense one."""
+    against = decimate.flipped_share(dense, mesh)
+    return decimate.deviation(dense, mesh), decimate.deviation(dense, proxy), against
 
 
 def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
