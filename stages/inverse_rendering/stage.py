@@ -227,4 +227,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
     return capture.colours_drift or len({v.camera_group for v in capture.views if v.index in set(usable)}) > 1
 
 
-STAGE = Stage(name="inverse_rendering", version=5, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=6, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -39,6 +39,7 @@ VIEWS = 6  # that look at a point most squarely are compared
 LEAST_COSINE = 0.25  # between a normal and the way to a camera
 POINTS = 12_000  # of the surface that one sweep takes
 CERTAIN = 4e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise reaches 6e-2
+DEEPER = 2.0  # times as far inwards where the noise is below FLOOR: of noisy skin the best of many depths is chance
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
 LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
@@ -86,14 +87,15 @@ def start_from_photos(
         check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
-        offsets = np.arange(sweep.outward * side, -sweep.inward * side, -sweep.step * pixel)
+        inward = sweep.inward * (DEEPER if photos.noise < FLOOR and sweep is SWEEPS[0] else 1.0)
+        offsets = np.arange(sweep.outward * side, -inward * side, -sweep.step * pixel)
         scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos, check)
         kept = scores.max(1) > -1
         if kept.sum() < sweep.voters:
             break
         points, normals, scores = points[kept], normals[kept], scores[kept]
         offset, confidence = vote(points, normals, scores, offsets, sweep.voters)
-        reach = max(sweep.outward, sweep.inward) * side
+        reach = max(sweep.outward, inward) * side
         values = moved(Start(values, hull.lo, hull.cell), points, offset, confidence, reach)
     return Start(values, hull.lo, hull.cell)
 

@@ -80,6 +80,15 @@ def test_a_fill_is_carved_away(lens: np.ndarray | None) -> None:
     assert np.percentile(misses(found), 99) < 1.5e-3 and misses(found).mean() < 4e-4
 
 
+def test_a_deep_fill_is_carved_away_from_clean_photos(monkeypatch: pytest.MonkeyPatch) -> None:
+    """13 mm on a ball of 200: more than the first sweep's reach, which would leave the middle of it standing."""
+    start, photos = too_large(0.013), [photo(i) for i in range(24)]
+    found = stereo.start_from_photos(start, photos, "cpu")
+    assert np.percentile(misses(found), 99) < 2e-3 and misses(found).max() < 4e-3
+    monkeypatch.setattr(stereo, "DEEPER", 1.0)
+    assert misses(stereo.start_from_photos(start, photos, "cpu")).max() > 6e-3
+
+
 def test_blank_skin_stays_where_it_is() -> None:
     start = too_large(0.004)
     found = stereo.start_from_photos(start, [photo(i, blank=True) for i in range(24)], "cpu")
