@@ -105,7 +105,9 @@ def mirrored_and_wound() -> np.ndarray:
     return uvs
 
 
-@pytest.mark.parametrize("uvs", [turned(*wound()), mirrored_and_wound(), thrown(1)])
+@pytest.mark.parametrize(
+    "uvs", [turned(*wound()), mirrored_and_wound(), pytest.param(thrown(1), marks=pytest.mark.slow)]
+)
 def test_charts_that_fold_are_mended_before_they_are_packed(uvs: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = band()
     before = measure(mesh, Charts(uvs.astype(np.float32), mesh.faces))
