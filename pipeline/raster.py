@@ -35,7 +35,11 @@ class Hits:
 
 def texel_corners(charts: Charts, size: int) -> F64:
     """(F, 3, 2) corners of the charts' triangles in texel coordinates."""
-    uv = charts.uvs.astype(np.float64)[charts.faces]
+    return in_texels(charts.uvs.astype(np.float64)[charts.faces], size)
+
+
+def in_texels(uv: F64, size: int) -> F64:
+    """(..., 2) texture coordinates in texels."""
     return np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], -1)
 
 

@@ -39,7 +39,6 @@ VIEWS = 6  # that look at a point most squarely are compared
 LEAST_COSINE = 0.25  # between a normal and the way to a camera
 POINTS = 12_000  # of the surface that one sweep takes
 CERTAIN = 4e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise reaches 6e-2
-DEEPER = 2.0  # times as far inwards where the noise is below FLOOR: of noisy skin the best of many depths is chance
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
 LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
@@ -47,15 +46,23 @@ INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Reach outwards and inwards as shares of the subject's longest side; a step in pixels; points that vote on one."""
+    """Reach outwards and inwards as shares of the subject's longest side; a step in pixels; points that vote on one.
+
+    inward_clean: inwards where the photos' noise is below FLOOR: of noisy skin the best of many depths is chance.
+    """
 
     outward: float
     inward: float
+    inward_clean: float
     step: float
     voters: int
 
 
-SWEEPS = (Sweep(0.006, 0.04, 1.1, 42), Sweep(0.012, 0.016, 0.75, 36), Sweep(0.006, 0.006, 0.5, 24))
+SWEEPS = (
+    Sweep(0.006, 0.04, 0.08, 1.1, 42),
+    Sweep(0.012, 0.016, 0.016, 0.75, 36),
+    Sweep(0.006, 0.006, 0.006, 0.5, 24),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +94,7 @@ def start_from_photos(
         check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
-        inward = sweep.inward * (DEEPER if photos.noise < FLOOR and sweep is SWEEPS[0] else 1.0)
+        inward = sweep.inward_clean if photos.noise < FLOOR else sweep.inward
         offsets = np.arange(sweep.outward * side, -inward * side, -sweep.step * pixel)
         scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos, check)
         kept = scores.max(1) > -1

@@ -68,11 +68,12 @@ def build(field: Field, resolution: int, step: Step, sees: Sees | None = None, h
         )
     free = landed.vertices[~landed.capped]
     residual = float(np.abs(field.sdf(free.astype(np.float32))).max(initial=0))
-    opened = without_handles(landed.vertices, faces, handle * float((grid.upper - grid.lower).max()))
-    mesh, handles = _mesh(landed, opened), (opened.cut, opened.left)
-    warnings = _warnings(removed, second, repairs, opened.left)
-    if opened.cut:
+    mesh, handles = Mesh(landed.vertices.astype(np.float32), landed.normals, faces), (0, 0)
+    if found.euler < 2:
+        opened = without_handles(landed.vertices, faces, handle * float((grid.upper - grid.lower).max()))
+        mesh, handles = _mended(landed, opened), (opened.cut, opened.left)
         found = meshes.topology(mesh.faces, len(mesh.vertices))
+    warnings = _warnings(removed, second, repairs, handles[1])
     if sees is None:
         return Built(mesh, found, removed, grid.h, cap, residual, warnings, handles=handles)
     cut = trimmed(field, grid, mesh, sees(mesh))
@@ -80,7 +81,7 @@ def build(field: Field, resolution: int, step: Step, sees: Sees | None = None, h
     return Built(cut.mesh, found, removed, grid.h, cap, residual, warnings, cut.share, handles)
 
 
-def _mesh(landed: Landed, opened: Opened) -> Mesh:
+def _mended(landed: Landed, opened: Opened) -> Mesh:
     """The mesh with the field's normals, and its own where handles were cut and the zero set is elsewhere."""
     normals = meshes.vertex_normals(opened.vertices, opened.faces)
     kept = np.ones(len(normals), np.bool_)

@@ -8,7 +8,6 @@ import numpy.typing as npt
 from pxr import UsdGeom
 
 from pipeline import raster
-from pipeline.meshes import Charts
 from stages.usd.findings import Finding
 
 F64 = npt.NDArray[np.float64]
@@ -49,9 +48,7 @@ def overlap(triangles: F64) -> float:
     covered = twice = 0
     for one in np.unique(tile, axis=0):
         own = triangles[(tile == one).all(1)] - one
-        faces = np.arange(3 * len(own), dtype=np.int32).reshape(-1, 3)
-        charts = Charts(own.reshape(-1, 2).astype(np.float32), faces)
-        layers = raster.layers(raster.texel_corners(charts, RASTER), RASTER)
+        layers = raster.layers(raster.in_texels(own, RASTER), RASTER)
         covered, twice = covered + int((layers > 0).sum()), twice + int((layers > 1).sum())
     return twice / max(covered, 1)
 

@@ -227,10 +227,8 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
         own, offset = np.flatnonzero(tile == number), np.array([number, 0])
         for _ in range(SHRINK_ROUNDS):
             local = t[own] - offset
-            flat = Charts(
-                local.reshape(-1, 2).astype(np.float32), np.arange(3 * len(own), dtype=np.int32).reshape(-1, 3)
-            )
-            twice = raster.layers(raster.texel_corners(flat, size), size).reshape(size, size) > 1
+            corners = raster.in_texels(local.astype(np.float32).astype(np.float64), size)  # as they will be written
+            twice = raster.layers(corners, size) > 1
             if not twice.any():
                 break
             places = np.einsum("sc,fcx->fsx", inside, local)

@@ -1,4 +1,4 @@
-"""Triangles of one size and shape: isotropic remeshing (pymeshlab, GPL-3; Botsch and Kobbelt 2004).
+"""Triangles of one size and shape: isotropic remeshing (by pymeshlab; Botsch and Kobbelt 2004).
 
 For sculpting, subdivision and pairing to quads: every edge is about as long as the others and most vertices have six
 neighbours, which decimation does not give. It spends as many triangles on a flat forehead as on an eyelid, and so lies
@@ -8,12 +8,14 @@ further from the dense mesh at the same number; decimation is the default for th
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Mesh
+from pipeline.meshlab import filtered
 from stages.uv.decimate import normals_from
 
 ITERATIONS = 10  # of splits, collapses, flips, smoothing and projection
@@ -46,36 +48,26 @@ def remeshed(dense: Mesh, target: int) -> Mesh:
                 break
         edge *= math.sqrt(len(faces) / target)
     if best is None:
-        raise StageError(
-            "the mesh can't be remeshed evenly",
-            where="uv.remesh",
-            value=found,
-            limit="a manifold, closed if the dense mesh is",
-            remedy="choose more target_faces, or uv.remesh=adaptive",
-        )
+        raise _refused(str(found))
     v = best[0].astype(np.float32)
     return Mesh(v, normals_from(dense, v, best[1]), best[1])
 
 
 def _even(points: F64, faces: Faces, edge: float) -> tuple[F64, Faces]:
-    try:
-        import pymeshlab
-    except ImportError as e:
-        raise StageError(
-            "even triangles need pymeshlab",
-            where="uv.remesh",
-            value="not installed",
-            limit="pymeshlab (GPL-3)",
-            remedy="install pymeshlab, or choose uv.remesh=adaptive",
-        ) from e
-    work = pymeshlab.MeshSet(verbose=False)
-    work.add_mesh(pymeshlab.Mesh(points, np.asarray(faces, np.int32)))
-    work.meshing_isotropic_explicit_remeshing(
-        iterations=ITERATIONS,
-        targetlen=pymeshlab.PureValue(edge),
-        featuredeg=CREASE,
-        checksurfdist=False,
-    )
-    mesh = work.current_mesh()
-    v, f, _ = meshes.compact(np.asarray(mesh.vertex_matrix(), np.float64), np.asarray(mesh.face_matrix(), np.int32))
+    def remesh(library: Any, work: Any) -> None:
+        work.meshing_isotropic_explicit_remeshing(
+            iterations=ITERATIONS, targetlen=library.PureValue(edge), featuredeg=CREASE, checksurfdist=False
+        )
+
+    v, f, _ = meshes.compact(*filtered(points, faces, remesh, _refused))
     return np.asarray(v, np.float64), f
+
+
+def _refused(reason: str) -> StageError:
+    return StageError(
+        "the mesh can't be remeshed evenly",
+        where="uv.remesh",
+        value=reason,
+        limit="a manifold, closed if the dense mesh is, and pymeshlab",
+        remedy="choose more target_faces, or uv.remesh=adaptive",
+    )

@@ -78,17 +78,16 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
 def _flat(uvs: F64, faces: Faces, mesh: Mesh, options: Options) -> tuple[F64, Faces]:
     """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.unfold)."""
     areas, corners = meshes.areas(mesh.vertices, mesh.faces), mesh.vertices.astype(np.float64)[mesh.faces]
+    uvs = evened(turned_over(uvs, faces), faces, areas)
     for turn in range(UNFOLDINGS):
-        uvs = evened(turned_over(uvs, faces), faces, areas)
         out = folded(_packed(spread(uvs, faces), faces, options), FOLD_RASTER)
-        log.info("uv: %d faces lie on others", int(out.sum()))
         if not out.any():
             break
-        if turn < UNFOLDINGS // 2:
-            uvs, faces = taken_apart(uvs, faces, out)
-        else:
-            uvs, faces = one_by_one(uvs, faces, out, corners)
-    return evened(turned_over(uvs, faces), faces, areas), faces
+        log.info("uv: %d faces lie on others", int(out.sum()))
+        in_pieces = turn < UNFOLDINGS // 2
+        uvs, faces = taken_apart(uvs, faces, out) if in_pieces else one_by_one(uvs, faces, out, corners)
+        uvs = evened(turned_over(uvs, faces), faces, areas)
+    return uvs, faces
 
 
 def smoothed(vertices: F64, faces: Faces, length: float) -> F64:

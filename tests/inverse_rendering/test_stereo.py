@@ -85,7 +85,8 @@ def test_a_deep_fill_is_carved_away_from_clean_photos(monkeypatch: pytest.Monkey
     start, photos = too_large(0.013), [photo(i) for i in range(24)]
     found = stereo.start_from_photos(start, photos, "cpu")
     assert np.percentile(misses(found), 99) < 2e-3 and misses(found).max() < 4e-3
-    monkeypatch.setattr(stereo, "DEEPER", 1.0)
+    shallow = tuple(dataclasses.replace(s, inward_clean=s.inward) for s in stereo.SWEEPS)
+    monkeypatch.setattr(stereo, "SWEEPS", shallow)
     assert misses(stereo.start_from_photos(start, photos, "cpu")).max() > 6e-3
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
+import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -67,14 +66,7 @@ def test_repair_closes_holes() -> None:
 
 
 def test_repair_without_its_library_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def missing(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "pymeshlab":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)  # as if it were not installed
     vertices, faces = holed()
     with pytest.raises(StageError, match="not closed"):
         repaired(vertices, faces, meshes.topology(faces, len(vertices)))

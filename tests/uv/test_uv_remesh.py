@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
-from typing import Any
+import sys
 
 import numpy as np
 import pytest
@@ -87,13 +86,6 @@ def test_charts_on_even_triangles(dense: Mesh) -> None:
 
 
 def test_without_pymeshlab_that_is_said(dense: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = builtins.__import__
-
-    def missing(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name == "pymeshlab":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "pymeshlab", None)  # as if it were not installed
     with pytest.raises(StageError, match=r"uv\.remesh"):
         remeshed(dense, 3000)
