@@ -20,6 +20,7 @@ from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.face_labels import LABELS, face_labels
+from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, distinct, find_solid
@@ -31,6 +32,7 @@ SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
+LEARNED = ("model", "person")  # cut out along a network's contour
 COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull may find wrong
 Labelled = tuple[Path, tuple[str, ...]]
 T = TypeVar("T")
@@ -217,10 +219,7 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = (
-        made.source in ("plate", "model", "person", "object", "grabcut")
-        and contradiction(inside, opinion) > CONTRADICTED
-    )
+    doubtful = made.source in COMPUTED and contradiction(inside, opinion) > CONTRADICTED
     if not (bad or doubtful):
         return made
     image = made.view.read()
@@ -229,6 +228,8 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
     small = np.asarray(resized(image, w, h), np.uint8)
     new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), settings.seed)
+    if made.source in LEARNED:
+        new = redrawn(small, new)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:

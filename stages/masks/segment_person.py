@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.networks import network
 from stages.masks.cut_out import cut
+from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, working_size
 from stages.masks.soften import largest_parts
 
@@ -77,7 +78,8 @@ def person_mask(image: U8, disc: Disc, threshold: float, longest: int, seed: int
 
 
 def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, seed: int) -> Bool:
-    """Hard mask (h, w) from a network's probability: the photo's colours and contrast decide near its contour.
+    """Hard mask (h, w) from a network's probability: the photo's colours and contrast decide near its contour, first
+    all of them (cut_out.py), then those beside it (redraw.py).
 
     scale: size in pixels of what the network took for one pixel.
     """
@@ -88,7 +90,7 @@ def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, s
     trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[eroded(inside, radius)] = cv2.GC_FGD
     trimap[~dilated(inside, radius)] = cv2.GC_BGD
-    return of_subject(cut(small, trimap, seed), disc)
+    return of_subject(redrawn(small, of_subject(cut(small, trimap, seed), disc)), disc)
 
 
 def of_subject(inside: Bool, disc: Disc) -> Bool:

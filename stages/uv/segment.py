@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline import meshes
+from pipeline.least_cut import ENDLESS, least_cut
 from pipeline.meshes import F64, Faces, Indices, Mask
 
 FRONT = np.array([0.0, 0.0, 1.0])  # asset coordinates: the subject looks along +Z
@@ -196,9 +197,6 @@ def halved(place: F64, label: Indices, which: int, area: F64, pairs: Dual) -> In
 
     place: (F,) how far along the piece each of its faces lies; the ends are the first and last ENDS of its area.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import breadth_first_order, maximum_flow
-
     own = np.flatnonzero(label == which)
     row = np.full(len(label), -1)
     row[own] = np.arange(len(own))
@@ -206,21 +204,12 @@ def halved(place: F64, label: Indices, which: int, area: F64, pairs: Dual) -> In
     order = own[np.argsort(place[own], kind="stable")]
     share = np.cumsum(area[order]) / area[order].sum()
     first, last = row[order[share <= ENDS]], row[order[share >= 1 - ENDS]]
-    n = len(own)
     scale = FLOW / pairs.cost[inside].max()
     capacity = np.maximum(pairs.cost[inside] * scale, 1).astype(np.int32)
-    a, b = row[pairs.a[inside]], row[pairs.b[inside]]
-    endless = np.full(len(first) + len(last), 2**30, np.int32)
-    rows = np.concatenate([a, b, np.full(len(first), n), last])
-    columns = np.concatenate([b, a, first, np.full(len(last), n + 1)])
-    graph = coo_array((np.concatenate([capacity, capacity, endless]), (rows, columns)), shape=(n + 2, n + 2)).tocsr()
-    flow = maximum_flow(graph, n, n + 1).flow
-    left = (graph - flow).tocsr()
-    left.data[left.data < 0] = 0
-    left.eliminate_zeros()
-    reached = breadth_first_order(left, n, return_predecessors=False)
-    beyond = np.ones(n + 2, np.bool_)
-    beyond[reached] = False
+    pull = np.zeros(len(own), np.int32)
+    pull[last] = -ENDLESS
+    pull[first] = ENDLESS
+    near = least_cut(row[pairs.a[inside]], row[pairs.b[inside]], capacity, pull)
     out = label.copy()
-    out[own[beyond[:n]]] = int(label.max()) + 1
+    out[own[~near]] = int(label.max()) + 1
     return out

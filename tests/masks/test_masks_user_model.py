@@ -10,6 +10,7 @@ import pytest
 
 from pipeline.errors import UsageError
 from stages.masks.region import Disc
+from stages.masks.sources import to_full_size
 from stages.masks.stage import Config
 from stages.masks.user_model import UserModel, mask_by_model
 
@@ -64,7 +65,7 @@ def test_a_network_of_the_users_finds_its_subject(tmp_path: Path) -> None:
     image = np.where(truth[..., None], [200, 60, 60], [90, 110, 100]).astype(np.uint8)
     square = np.full((64, 64, 3), (200, 60, 60), np.uint8)
     np.testing.assert_allclose(model.probability(square), 1 / (1 + np.exp(-20 * 140 / 255)), rtol=1e-4)
-    found = mask_by_model(image, Disc(100, 70, 60, 0), model, 0.5, 640, 0)
+    found = to_full_size(image, mask_by_model(image, Disc(100, 70, 60, 0), model, 0.5, 640, 0)) >= 0.5
     assert (found & truth).sum() / (found | truth).sum() > 0.97
 
 
