@@ -119,6 +119,18 @@ def edges(faces: Faces) -> Indices:
     return np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
 
 
+def paired_edges(faces: Faces, count: int) -> tuple[Indices, Indices, int]:
+    """Rows (P,), (P,) of `edges`: the two sides of each edge that two faces share, ordered by the edge's lower and then
+    higher vertex. And the most faces at one edge. Row r is of face r % F. `count`: vertices."""
+    e = edges(faces)
+    code = np.minimum(e[:, 0], e[:, 1]) * count + np.maximum(e[:, 0], e[:, 1])
+    order = np.argsort(code, kind="stable")
+    first = np.flatnonzero(np.diff(code[order], prepend=-1))
+    uses = np.diff(first, append=len(code))
+    pair = first[uses == 2]
+    return order[pair], order[pair + 1], int(uses.max(initial=0))
+
+
 def edge_lengths(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
     """(3 F,) lengths of `edges`."""
     v = np.asarray(vertices, np.float64)

@@ -89,10 +89,9 @@ def without_handles(vertices: F64, faces: Faces, longest: float) -> Opened:
 
 def web(vertices: F64, faces: Faces) -> Web:
     """The edges of a closed manifold."""
-    e = np.sort(meshes.edges(faces), axis=1)
-    order = np.argsort(e[:, 0] * len(vertices) + e[:, 1], kind="stable")
-    pairs = e[order[::2]]
-    sides = np.sort((order % len(faces)).reshape(-1, 2), axis=1)
+    first, second, _ = meshes.paired_edges(faces, len(vertices))
+    pairs = np.sort(meshes.edges(faces)[first], axis=1)
+    sides = np.sort(np.stack([first, second], 1) % len(faces), axis=1)
     length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     return Web(pairs, np.asarray(length, np.float64), sides, len(vertices), len(faces))
 

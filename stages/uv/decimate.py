@@ -99,7 +99,7 @@ def split_apart(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
     from scipy.sparse.csgraph import connected_components
 
     n = len(faces)
-    a, b, _ = _paired(faces, len(vertices))  # row r: from corner r // n of face r % n to its next corner
+    a, b, _ = meshes.paired_edges(faces, len(vertices))  # row r: from corner r // n of face r % n to its next corner
     a_next, b_next = ((r + n) % (3 * n) for r in (a, b))
     one, other = np.concatenate([a, a_next]), np.concatenate([b_next, b])
     graph = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(3 * n, 3 * n))
@@ -135,22 +135,11 @@ def _parts(faces: Faces, count: int) -> Indices | None:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    a, b, most = _paired(faces, count)
+    a, b, most = meshes.paired_edges(faces, count)
     if most <= 2:
         return None
     graph = coo_array((np.ones(len(a), np.int8), (a % len(faces), b % len(faces))), shape=(len(faces), len(faces)))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
-
-
-def _paired(faces: Faces, count: int) -> tuple[Indices, Indices, int]:
-    """Rows (P,), (P,) of `meshes.edges`: the two sides of each edge of two faces. And the most faces at one edge."""
-    e = meshes.edges(faces)
-    code = np.minimum(e[:, 0], e[:, 1]) * count + np.maximum(e[:, 0], e[:, 1])
-    order = np.argsort(code, kind="stable")
-    first = np.flatnonzero(np.diff(code[order], prepend=-1))
-    uses = np.diff(first, append=len(code))
-    pair = first[uses == 2]
-    return order[pair], order[pair + 1], int(uses.max(initial=0))
 
 
 def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -> npt.NDArray[np.float32]:

@@ -54,13 +54,8 @@ def seam_weights(vertices: F64, faces: Faces) -> F64:
 
 def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
     """Pairs of faces across each inner edge of a manifold, in a fixed order."""
-    e = meshes.edges(faces)
-    low, high = e.min(1), e.max(1)
-    code = low * (len(vertices) + 1) + high
-    order = np.argsort(code, kind="stable")
-    pair = np.flatnonzero(np.diff(code[order]) == 0)
-    first, second = order[pair], order[pair + 1]
-    edge = np.stack([low[first], high[first]], 1)
+    first, second, _ = meshes.paired_edges(faces, len(vertices))
+    edge = np.sort(meshes.edges(faces)[first], axis=1)
     length = np.linalg.norm(vertices[edge[:, 0]] - vertices[edge[:, 1]], axis=1)
     return Dual(first % len(faces), second % len(faces), edge, length, length * weights[edge].mean(1))
 
