@@ -171,15 +171,18 @@ def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -
     most = _best_order(t, full) if given.specular else None
     one, gains = evidence.alike(t), evidence.solve_response(t, most, gain=True)
     offsets = evidence.solve_response(t, most, gain=False)
+    gains_alone = evidence.solve_response(t, None, gain=True)
     without, with_gains, control = (evidence.held_out(t, most, r) for r in (one, gains, offsets))
-    differ = more(without, with_gains) > DIFFERENT and with_gains < control
+    alone = evidence.held_out(t, None, gains_alone)
+    differ = more(without, with_gains) > DIFFERENT and (with_gains < control or alone < without)
     calibrated = differ if s.calibration == AUTO else given.calibrated
     facts["calibration"] = _fact(calibrated, s.calibration, without, with_gains) | {
-        "error_with_offsets": round(control, 5)
+        "error_with_offsets": round(control, 5),
+        "error_with_gains_alone": round(alone, 5),
     }
     used = gains if calibrated else one
     orders = [evidence.held_out(t, order, used) for order in range(full + 1)]
-    dull = evidence.held_out(t, None, evidence.solve_response(t, None, gain=True) if calibrated else one)
+    dull = alone if calibrated else evidence.held_out(t, None, one)
     best = min(orders)
     specular = more(dull, best) > NEGLIGIBLE if s.specular == AUTO else given.specular
     facts["specular"] = _fact(specular, s.specular, dull, best)

@@ -9,8 +9,9 @@ training views is taken off, so that every model is a linear least-squares probl
 
 Held-out error: L and D_p come from the training views, the gain of a waiting view from every other point; the error is
 over the rest of that view's points. What a lobe leaves unexplained is added light and no gain: a gain has to do better
-than an offset a view. All errors are root mean squares in shares of the photos' mean radiance. A part of the model is
-wanted if the held-out error without it is larger, in quadrature, by more than a share `NEGLIGIBLE`.
+than an offset a view, or gains alone better than a lobe alone. All errors are root mean squares in shares of the
+photos' mean radiance. A part of the model is wanted if the held-out error without it is larger, in quadrature,
+by more than a share `NEGLIGIBLE`.
 
 Source: fixed-effects regression and reduced-rank regression, textbook statistics; the criterion is ours.
 """
@@ -37,7 +38,7 @@ NEGLIGIBLE = 0.005  # of the mean radiance: at middle grey an error of 52 dB, fa
 LEAST_TRAIN = 3  # training views that must see a point
 LEAST_TEST = 100  # observations without which nothing can be said
 RIDGE = 1e-9  # of the mean eigenvalue
-ROUNDS = 4
+ROUNDS = 20
 COSINE_POWERS = 4  # functions of n . wo from which bases are made up
 RANK_ROUNDS = 12
 RANK_RIDGE = 1e-4  # of the mean region's trace
@@ -178,6 +179,28 @@ def more(without: float, with_it: float) -> float:
     """How much larger an error is without a part of the model: sqrt(e_0^2 - e_1^2), negative where it is smaller."""
     d = without * without - with_it * with_it
     return math.copysign(math.sqrt(abs(d)), d)
+
+
+def gains_of(seen: Sightings) -> F64 | None:
+    """Gains of the views that see anything, (V, 3), while no lobe is known; None if no point is seen often enough."""
+    counts = np.bincount(seen.point, minlength=len(seen.x))
+    keep = counts[seen.point] >= LEAST_TRAIN
+    if not keep.any():
+        return None
+    point, view, colour, all_of_it = seen.point[keep], seen.view[keep], seen.colour[keep], np.ones(keep.sum(), bool)
+    t = Trial(
+        point,
+        view,
+        colour / max(float(colour.mean()), 1e-12),
+        np.zeros((len(point), 1)),
+        seen.cosine[keep],
+        seen.x.detach().cpu().double().numpy()[point],
+        all_of_it,
+        ~all_of_it,
+        ~all_of_it,
+        np.maximum(counts, 1).astype(np.float64),
+    )
+    return solve_response(t, None, gain=True).gain[np.unique(view)]
 
 
 # ------------------------------------------------------------------ the rank

@@ -154,6 +154,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.begin import new_trainer
     from stages.inverse_rendering.clock import LEAST_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
+    from stages.inverse_rendering.exposure import exposures_differ
     from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.gather import read_views
@@ -192,7 +193,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         context.progress(0, settings.steps, "stereo")
         start = start_from_photos(start, views, context.device, context.check)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
-    trainer = make(views, start, settings, calibrated(inputs, usable, config), context.device, prior)
+    own_colours = calibrated(inputs, usable, config) or (
+        config.calibration == AUTO and exposures_differ(views, start, context.device)
+    )
+    trainer = make(views, start, settings, own_colours, context.device, prior)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -220,11 +224,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
 
 
 def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
-    """Whether per-image colour matrices are fitted."""
-    if config.calibration != "auto":
+    """Whether settings, metadata or cameras say that photos have colours of their own."""
+    if config.calibration != AUTO:
         return config.calibration == "on"
     capture = inputs.capture.artifact
     return capture.colours_drift or len({v.camera_group for v in capture.views if v.index in set(usable)}) > 1
 
 
-STAGE = Stage(name="inverse_rendering", version=6, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=7, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.hull import BAND_CELLS, Hull, render_silhouette, visual_hull
@@ -96,6 +97,12 @@ def contradiction(inside: Bool, opinion: Opinion) -> float:
     extra = inside & ~dilated(opinion.possible, opinion.margin)
     extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
     return float(missing.sum() + extra.sum()) / max(1, int(inside.sum()))
+
+
+def hole(inside: Bool, opinion: Opinion) -> float:
+    """Share of the mask's area that the mask encloses without having it, where the hull clearly is."""
+    enclosed = ndimage.binary_fill_holes(inside) & ~inside
+    return float((enclosed & eroded(opinion.silhouette, opinion.margin)).sum()) / max(1, int(inside.sum()))
 
 
 def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:

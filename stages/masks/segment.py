@@ -17,7 +17,7 @@ from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
-from stages.masks.agree import Opinion, contradiction, opinions, outliers, trimap
+from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.face_labels import LABELS, face_labels
 from stages.masks.redraw import redrawn
@@ -30,6 +30,7 @@ from stages.masks.user_model import UserModel
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
+HOLE = 0.001  # or of a hole: one such in a single mask is a tunnel through the subject
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
 LEARNED = ("model", "person")  # cut out along a network's contour
@@ -219,7 +220,8 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    doubtful = made.source in COMPUTED and contradiction(inside, opinion) > CONTRADICTED
+    wrong = contradiction(inside, opinion) > CONTRADICTED or hole(inside, opinion) > HOLE
+    doubtful = made.source in COMPUTED and wrong
     if not (bad or doubtful):
         return made
     image = made.view.read()

@@ -45,12 +45,12 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
     pictures = [Picture(data_uri(to_bytes(encoded(view.photo)), side), "photo")]
     for image, scores, what in ((view.model, view.model_scores, "model"), (view.asset, view.asset_scores, "asset")):
         if image is not None:
-            note = f", {scores.psnr:.1f} dB" if scores else ""
-            pictures.append(Picture(data_uri(to_bytes(encoded(image[..., :3])), side), f"{what}{note}"))
+            shown = to_bytes(encoded(view.shown(image)[..., :3]))
+            pictures.append(Picture(data_uri(shown, side), what + _noted(scores, view.own_colours)))
     last = view.asset if view.asset is not None else view.model
     if last is not None:
         what = "asset" if view.asset is not None else "model"
-        heat = data_uri(error_map(last, view.photo, view.mask), side)
+        heat = data_uri(error_map(view.shown(last), view.photo, view.mask), side)
         pictures.append(Picture(heat, f"error of the {what}"))
     note = "held out" if view.held_out else "took part in the fit"
     return JudgedRow(
@@ -60,6 +60,12 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
         view.asset_scores,
         ViewRow(f"View {view.index}", f"{view.name}, {note}", pictures),
     )
+
+
+def _noted(scores: Scores | None, own_colours: bool) -> str:
+    if scores is None:
+        return ""
+    return f", {scores.psnr:.1f} dB" + (f", {scores.psnr_matched:.1f} in the photo's colours" if own_colours else "")
 
 
 def summary(rows: list[JudgedRow]) -> dict[str, Any]:

@@ -11,14 +11,17 @@ import numpy.typing as npt
 from pipeline.artifacts import HeldOutView, Located
 from pipeline.images import read_alpha, read_exr, read_linear, shrink
 from stages.report.gather import Results
-from stages.report.metrics import Scores, score
+from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedView:
-    """One view. photo (H, W, 3), mask (H, W), renders (H, W, 4); scores are None where there is no render."""
+    """One view. photo (H, W, 3), mask (H, W), renders (H, W, 4); scores are None where there is no render.
+
+    own_colours: photos differ in exposure or white balance, and nothing tells those of this one.
+    """
 
     index: int
     name: str
@@ -29,6 +32,11 @@ class JudgedView:
     asset: F32 | None
     model_scores: Scores | None
     asset_scores: Scores | None
+    own_colours: bool = False
+
+    def shown(self, render: F32) -> F32:
+        """A render as the pictures have it: in the photo's own colours where the fit gave each photo some."""
+        return matched(render, self.photo, self.mask) if self.own_colours and (self.mask > 0.5).any() else render
 
 
 def judged_views(r: Results) -> Iterator[JudgedView]:
@@ -36,6 +44,7 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
     predicted = {v.index: v for v in r.inverse_rendering.artifact.held_out}
     rendered = {v.index: v for v in r.usd.artifact.views}
     masks = {m.index: m for m in r.masks.artifact.masks}
+    own_colours = bool(r.inverse_rendering.artifact.model.get("calibration", {}).get("modelled"))
     for view in sorted(r.capture.artifact.views, key=lambda v: v.index):
         i = view.index
         if i not in predicted.keys() | rendered.keys() or i not in masks:
@@ -45,7 +54,7 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor)
         model, asset = _read(r.inverse_rendering, predicted.get(i)), _read(r.usd, rendered.get(i))
         scores = [score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset)]
-        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1])
+        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own_colours)
 
 
 def unjudged(r: Results) -> list[str]:

@@ -21,9 +21,11 @@ EQUAL = 100.0  # dB that stand for equal images, whose ratio would be infinite
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """psnr (dB, subject's pixels only), psnr_full (dB), ssim (-1..1), flip (0..1, 0 = equal), mask_iou (0..1)."""
+    """psnr (dB, subject's pixels only), psnr_matched (the same in the photo's own colours), psnr_full (dB),
+    ssim (-1..1), flip (0..1, 0 = equal), mask_iou (0..1)."""
 
     psnr: float
+    psnr_matched: float
     psnr_full: float
     ssim: float
     flip: float | None
@@ -43,6 +45,7 @@ def score(rendered: F32, photo: F32, mask: F32) -> Scores:
     shown, truth = encoded(rendered[..., :3] * rendered[..., 3:]), encoded(photo * mask[..., None])
     return Scores(
         psnr_fg(rendered[..., :3], photo, mask),
+        psnr_fg(matched(rendered, photo, mask)[..., :3], photo, mask),
         psnr(shown, truth),
         ssim(shown, truth),
         flip(truth, shown),
@@ -65,6 +68,16 @@ def psnr_fg(rendered: F32, photo: F32, mask: F32) -> float:
     """PSNR over the pixels with mask > 0.5, of linear images. The background can't flatter it."""
     inside = mask > 0.5
     return psnr(encoded(rendered[inside]), encoded(photo[inside]))
+
+
+def matched(rendered: F32, photo: F32, mask: F32) -> F32:
+    """The render with its colours through the 3 x 3 matrix that brings the subject nearest to the photo, least squares
+    in linear light. A photo that no fit has seen has an exposure and a white balance that nothing tells.
+    [NeuFace, evaluation protocol]"""
+    inside = mask > 0.5
+    known, wanted = (x[inside].astype(np.float64) for x in (rendered[..., :3], photo))
+    matrix = np.linalg.lstsq(known, wanted, rcond=1e-6)[0]
+    return np.concatenate([rendered[..., :3] @ matrix, rendered[..., 3:]], -1).astype(np.float32)
 
 
 def ssim(a: F32, b: F32) -> float:

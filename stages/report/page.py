@@ -59,6 +59,9 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     for prefix, what in (("", "model"), ("asset_", "exported asset")):
         if h.get(f"{prefix}psnr") is not None:
             out.append((f"{h[f'{prefix}psnr']:.1f} dB", f"PSNR, {what}", f"subject's pixels of {h['views']} {kind}"))
+    if own_colours(metrics) and h.get("asset_psnr_matched") is not None:
+        meaning = "as before, after a 3 x 3 matrix a photo: they differ in exposure or white balance"
+        out.append((f"{h['asset_psnr_matched']:.1f} dB", "PSNR in the photos' colours, exported asset", meaning))
     for key, what, meaning in (
         ("asset_ssim", "SSIM, exported asset", "1 is equal"),
         ("asset_flip", "FLIP, exported asset", "0 is equal, as an eye sees it"),
@@ -70,6 +73,11 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     times = f"{maps['tiles']} × " if maps["tiles"] > 1 else ""
     out.append((f"{times}{maps['size']}²", "texels", f"{100 * maps['covered_share']:.0f} % of them used"))
     return out
+
+
+def own_colours(metrics: Mapping[str, Any]) -> bool:
+    """Whether the fit gave every photo a colour response of its own."""
+    return bool(metrics["model"].get("calibration", {}).get("modelled"))
 
 
 def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

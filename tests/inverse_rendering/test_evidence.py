@@ -6,6 +6,7 @@ under test. tests/inverse_rendering/test_fit.py has it inside a fit.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -92,6 +93,22 @@ def test_cameras_of_several_colours_do() -> None:
     assert got.calibrated and not got.specular
     both = chosen(Ball(gloss(4), gain))
     assert both.calibrated and both.specular and both.light_order == 4
+
+
+def veil(view: int) -> float:
+    """Sunlight in the lens of some photos: more than any gain here."""
+    return 0.06 * math.sin(1 + 2.4 * view)
+
+
+def test_exposures_are_seen_behind_added_light() -> None:
+    """Photos taken automatically, against a light that shines into the lens now and then: offsets do better than gains,
+    but no lobe makes whole photos brighter like that."""
+
+    def gain(view: int) -> F64:
+        return np.full(3, 1 + 0.15 * math.sin(7.1 * view))
+
+    fact = chosen(Ball(gain=gain, veil=veil)).facts["calibration"]
+    assert fact["modelled"] and float(fact["error_with_offsets"]) < float(fact["error_with"])
 
 
 def test_gains_are_found() -> None:

@@ -16,7 +16,9 @@ from pipeline.errors import Cancelled, StageError, UsageError
 from pipeline.images import read_alpha, write_png
 from pipeline.store import Store
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
-from stages.masks.agree import Opinion, contradiction, opinions, outliers, tolerated, trimap
+from stages.masks import segment
+from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, tolerated, trimap
+from stages.masks.sources import View
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.masks.test_masks_user_model import write_red_detector
 
@@ -265,6 +267,36 @@ def test_contradiction_and_trimap() -> None:
     assert found[50, 70] == cv2.GC_FGD and found[5, 5] == cv2.GC_BGD
     elsewhere = replace(opinion, here=x < 0)
     assert (trimap(half, elsewhere)[:, 60:][body[:, 60:]] == cv2.GC_BGD).all()  # outside the region: its own word
+
+
+def test_a_hole_counts_where_the_hull_has_none() -> None:
+    y, x = np.mgrid[:100, :100]
+    body = np.hypot(x - 50, y - 50) < 30
+    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0)
+    spot = np.hypot(x - 60, y - 50) < 4
+    assert hole(body & ~spot, opinion) == pytest.approx(spot.sum() / (body & ~spot).sum())
+    assert hole(body & ~spot & ~((y == 50) & (x > 50)), opinion) == 0  # a cut that leads in from outside is none
+    ring = replace(opinion, silhouette=body & ~(np.hypot(x - 60, y - 50) < 9))  # the others look through there as well
+    assert hole(body & ~spot, ring) == 0 and hole(body, opinion) == 0
+    assert hole(np.zeros_like(body), opinion) == 0
+
+
+def test_a_hole_in_one_mask_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window through the subject that one photo has: too small for the rest of the check, yet a tunnel."""
+    scene = build(tmp_path / "capture", 12, 0.0)
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    spot = np.hypot(x - 4, y + 3) < 2.5
+
+    def made(view: View, *_: Any) -> tuple[F32, str]:
+        alpha = ball_alpha(scene.cameras[view.index])
+        return np.where(spot & (view.index == 5), np.float32(0), alpha), "grabcut"
+
+    monkeypatch.setattr(segment, "mask", made)
+    found, alphas = run(scene, tmp_path / "a")
+    assert [m.index for m in found.masks if m.source == "grabcut+hull"] == [5] and (alphas[5][spot] > 0.5).all()
+    monkeypatch.setattr(segment, "HOLE", 1.0)
+    _, alphas = run(scene, tmp_path / "b")
+    assert (alphas[5][spot] == 0).all()
 
 
 def test_inverted_masks_are_turned_and_named(scene: Scene, tmp_path: Path) -> None:

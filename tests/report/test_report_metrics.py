@@ -7,7 +7,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from pipeline.colour import linear_from_srgb
-from stages.report.metrics import Scores, encoded, flip, iou, mean_scores, psnr, score, ssim
+from stages.report.metrics import Scores, encoded, flip, iou, matched, mean_scores, psnr, score, ssim
 
 RNG = np.random.default_rng(5)
 
@@ -64,6 +64,33 @@ def test_values_are_compared_encoded_and_clipped() -> None:
     assert score(bright, np.ones((16, 16, 3), np.float32), mask).psnr == 100
 
 
+def test_colours_of_a_photo_are_matched_and_nothing_else_is() -> None:
+    """Another exposure and white balance, then a difference that no matrix makes."""
+    rng = np.random.default_rng(3)
+    mask = np.zeros((20, 20), np.float32)
+    mask[2:18, 3:17] = 1
+    rendered = np.concatenate([rng.uniform(0.1, 0.5, (20, 20, 3)), mask[..., None]], -1).astype(np.float32)
+    camera = np.float32([[1.4, 0.1, 0], [0, 1.3, 0.1], [0.05, 0, 1.5]])
+    photo = rendered[..., :3] @ camera
+    photo[mask == 0] = 1  # the background has no say
+    found = score(rendered, photo, mask)
+    assert found.psnr < 20 and found.psnr_matched > 90
+    np.testing.assert_allclose(
+        matched(rendered, photo, mask)[mask > 0], np.c_[photo, mask[..., None]][mask > 0], atol=1e-5
+    )
+    photo[::2] *= 0.8
+    assert score(rendered, photo, mask).psnr_matched < 30
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-8, 0.3, 1e4])
+def test_matching_one_colour(value: float) -> None:
+    """Grey renders, and black ones, leave a matrix open: the result is finite, and right where there is any light."""
+    mask, photo = np.ones((12, 12), np.float32), np.full((12, 12, 3), 0.2, np.float32)
+    got = matched(np.concatenate([np.full((12, 12, 3), value), mask[..., None]], -1).astype(np.float32), photo, mask)
+    assert np.isfinite(got).all()
+    np.testing.assert_allclose(got[..., :3], 0.2 if value else 0, rtol=1e-4)
+
+
 def test_flip_is_zero_for_equal_images_and_grows() -> None:
     a, b = pair(64)
     assert flip(a, a) == pytest.approx(0, abs=1e-6)
@@ -78,7 +105,7 @@ def test_flip_is_left_out_where_it_is_not_installed(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setitem(sys.modules, "flip_evaluator", None)
     assert flip(*pair()) is None
-    assert mean_scores([Scores(20, 21, 0.9, None, 1)])["flip"] is None
+    assert mean_scores([Scores(20, 20, 21, 0.9, None, 1)])["flip"] is None
 
 
 def test_iou_of_half_overlap() -> None:
@@ -89,15 +116,15 @@ def test_iou_of_half_overlap() -> None:
 
 
 def test_means_skip_what_is_not_there() -> None:
-    found = mean_scores([Scores(20, 22, float("nan"), 0.1, 1), Scores(30, 32, 0.8, 0.3, 0.5)])
-    assert found == {"psnr": 25, "psnr_full": 27, "ssim": 0.8, "flip": 0.2, "mask_iou": 0.75}
+    found = mean_scores([Scores(20, 21, 22, float("nan"), 0.1, 1), Scores(30, 35, 32, 0.8, 0.3, 0.5)])
+    assert found == {"psnr": 25, "psnr_matched": 28, "psnr_full": 27, "ssim": 0.8, "flip": 0.2, "mask_iou": 0.75}
     assert mean_scores([])["psnr"] is None
 
 
 def test_images_smaller_than_the_window_have_no_ssim() -> None:
     assert np.isnan(ssim(*pair(8)))
-    assert Scores(20, 20, float("nan"), None, 1).json() == {
-        "psnr": 20, "psnr_full": 20, "ssim": None, "flip": None, "mask_iou": 1
+    assert Scores(20, 20, 20, float("nan"), None, 1).json() == {
+        "psnr": 20, "psnr_matched": 20, "psnr_full": 20, "ssim": None, "flip": None, "mask_iou": 1
     }  # fmt: skip
 
 

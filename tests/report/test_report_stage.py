@@ -106,6 +106,22 @@ def test_scores_are_right(made: tuple[dict, str]) -> None:
     assert h["asset_psnr"] == pytest.approx(np.mean([v["asset_psnr"] for v in h["per_view"].values()]))
 
 
+def test_photos_with_colours_of_their_own_are_shown_in_them(results: SyntheticResults, tmp_path: Path) -> None:
+    """The asset is 0.75 as bright as the photo: that goes, where the fit found that photos differ."""
+    fit = results.inverse_rendering.artifact
+    facts = {**fit.model, "calibration": {"modelled": True}}
+    changed = replace(
+        results, inverse_rendering=Located(fit.model_copy(update={"model": facts}), results.inverse_rendering.folder)
+    )
+    metrics, page = run(changed, tmp_path / "work")
+    plain, plain_page = run(results, tmp_path / "plain")
+    assert metrics["holdout"] == plain["holdout"]
+    assert metrics["holdout"]["asset_psnr_matched"] > metrics["holdout"]["asset_psnr"]
+    assert "PSNR in the photos' colours" in page.replace("&#39;", "'")
+    assert "in the photos' colours" not in plain_page.replace("&#39;", "'")
+    assert len(set(Page(page).links) - set(Page(plain_page).links)) >= 2  # the asset and its error
+
+
 def test_warnings_come_before_figures(made: tuple[dict, str]) -> None:
     page = made[1]
     assert page.index("two floating pieces") < page.index("PSNR, model") < page.index("View 3")

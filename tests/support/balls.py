@@ -38,10 +38,12 @@ def alike(view: int) -> F64:
 
 @dataclass(frozen=True)
 class Ball:
-    """diffuse(n) (N, 3) and lobe(n, wo) (N,) radiance; gain(view) (3,) of its camera; views around the ball."""
+    """diffuse(n) (N, 3) and lobe(n, wo) (N,) radiance; gain(view) (3,) of its camera; veil(view), light that a lens
+    scatters over the whole photo; views around the ball."""
 
     lobe: Callable[[F64, F64], F64] = nothing
     gain: Callable[[int], F64] = alike
+    veil: Callable[[int], float] = lambda view: 0.0
     views: int = 24
 
     def photos(self) -> list[PhotoView]:
@@ -64,6 +66,7 @@ class Ball:
         n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d)[hit] / RADIUS
         rgb = np.zeros((len(d), 3))
         rgb[hit] = (texture(n) * (0.7 + 0.3 * n[:, 1:2]) + self.lobe(n, -d[hit])[:, None]) * self.gain(index)
+        rgb[hit] += self.veil(index)
         image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3))
         alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3))
         return PhotoView(index, image.astype(np.float32), alpha.astype(np.float32), K, world_from_cam, np.zeros(5))
