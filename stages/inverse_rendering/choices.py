@@ -36,6 +36,7 @@ LEAST_VIEWS = 8  # fewer can spare none
 WAITING_SHARE, MOST_WAITING = 0.12, 6
 DIFFUSE_ORDER = 3  # what diffuse skin tells of a light [NeuFace eq. 15]
 DIFFERENT = 0.02  # of the mean radiance: cameras that differ by less are not told from what the lobe leaves
+FAINT = 0.3  # of what stays unexplained: less than that is made up from it. Heads have 0.6 to 0.8, a dull stone one 0.2
 TELLING = 0.75  # of the lobe's own size: with a larger rest, bases are not told apart (docs/model.md)
 SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
 
@@ -184,7 +185,8 @@ def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -
     orders = [evidence.held_out(t, order, used) for order in range(full + 1)]
     dull = alone if calibrated else evidence.held_out(t, None, one)
     best = min(orders)
-    specular = more(dull, best) > NEGLIGIBLE if s.specular == AUTO else given.specular
+    clearly = more(dull, best) > max(NEGLIGIBLE, FAINT * best)
+    specular = clearly if s.specular == AUTO else given.specular
     facts["specular"] = _fact(specular, s.specular, dull, best)
     order = given.light_order
     if s.light_order == AUTO:

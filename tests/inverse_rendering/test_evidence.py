@@ -74,6 +74,19 @@ def test_a_glossy_ball_needs_one(glossy: Choices) -> None:
     assert float(glossy.facts["specular"]["error_without"]) > 3 * float(glossy.facts["specular"]["error_with"])
 
 
+def test_a_lobe_that_is_small_beside_what_stays_unexplained_is_none() -> None:
+    """The same lobe with and without noise, which its own errors are far below."""
+    faint, noise = gloss(4, 0.03), np.random.default_rng(0)
+
+    def grainy(n: F64, wo: F64) -> F64:
+        return faint(n, wo) + noise.normal(0, 0.2, len(n))
+
+    assert chosen(Ball(faint)).specular
+    got = chosen(Ball(grainy))
+    lobe = [float(got.facts["specular"][k]) for k in ("error_without", "error_with")]
+    assert not got.specular and evidence.more(*lobe) > 2 * evidence.NEGLIGIBLE
+
+
 @pytest.mark.parametrize("band", [1, 4, 7])
 def test_the_light_has_the_order_that_the_lobe_shows(band: int) -> None:
     """A light of bands 0 and l needs order l, and never less than diffuse shading does."""
