@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from pipeline.errors import StageError
 from pipeline.fields import build
-from pipeline.fields.appearance import IntegratedBasis, SpatialField
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis, SpatialField
 from pipeline.fields.calibration import Calibration
 from pipeline.fields.displaced import DisplacedSdf
 from pipeline.fields.geometry import GridSdf
@@ -195,10 +195,11 @@ class FittedField:
         return self.sdf_and_gradient(points)[0]
 
     def material(self, points: F32) -> Material:
-        """Appearance at points."""
+        """Appearance at points. Without a lobe its strength is 0 and its shape, which nothing was fitted to, the usual
+        one: a map of chance values would come to light as soon as somebody adds a gloss."""
         albedo, rho, c, inv_kappa = self._map(self.model.spatial, points)
         if not self.model.spec.specular:
-            rho = np.zeros_like(rho)
+            rho, c, inv_kappa = np.zeros_like(rho), np.ones_like(c), np.full_like(inv_kappa, TYPICAL_INV_KAPPA)
         if self.model.spec.shading == "phong":
             c = np.ones((len(rho), 1), np.float32)
         return Material(albedo, rho, c, inv_kappa)

@@ -29,13 +29,14 @@ REFERENCE_F0 = ((REFERENCE_IOR - 1) / (REFERENCE_IOR + 1)) ** 2
 INV_KAPPA_SCALE = 2.0  # the table's v is this times 1/kappa: 1/kappa up to 0.5, beyond which alpha is clamped
 ROWS = 64
 COSINES = (np.arange(16) + 0.5) / 16  # where F and R are compared
+NO_LOBE = 1e-6  # of a constant light: what reflects less was fitted without a lobe
 GROUP = 3  # coefficients in one picture: red, green, blue
 RESOLVED_KAPPA = 50.0  # above it a light of order 10 looks the same through the lobe
 
 
 @dataclass(frozen=True, slots=True)
 class LobeFit:
-    """residual (H, W): |F - R| over |F|, root mean square over c weighted by c. unresolved (H, W): kappa is a guess.
+    """residual (H, W): |F - R| over |F|, root mean square over c weighted by c; 0 where there is no lobe. unresolved (H, W): kappa is a guess.
     covered (H, W): texels under charts."""
 
     residual: F32
@@ -98,7 +99,7 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
         ggx = f0[y, x, None].astype(np.float64) * _rows_at(a, table_alpha, alpha) + _rows_at(b, table_alpha, alpha)
         error = ((fitted - ggx) ** 2 * weights).sum(1)
         scale = (fitted**2 * weights).sum(1)
-        residual[y, x] = np.sqrt(error / np.maximum(scale, 1e-12))
+        residual[y, x] = np.where(scale > NO_LOBE**2, np.sqrt(error / np.maximum(scale, NO_LOBE**2)), 0)
     unresolved = covered & (inv_kappa < 1 / RESOLVED_KAPPA)
     return LobeFit(residual, unresolved, covered)
 

@@ -12,6 +12,7 @@ from scipy import ndimage
 from pipeline.errors import StageError
 from pipeline.fields.appearance import IntegratedBasis
 from pipeline.fields.calibration import Calibration
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
 from pipeline.fields.geometry import coarse_distance, largest_solid
 from pipeline.fields.spec import FaceSpec
@@ -113,7 +114,14 @@ def test_fitted_field_answers_in_arrays() -> None:
     assert field.basis(p / 0.1, p / 0.1).shape == (300, 3) and field.light.shape == (121, 3)
     lo, hi = field.bounds
     assert (lo < -0.1).all() and (hi > 0.1).all() and field.cell == CELL
-    assert FittedField(ball_model(specular=False)).material(p).rho.max() == 0
+
+
+def test_a_surface_without_a_lobe_has_no_marks_in_its_lobe() -> None:
+    p = (0.1 * sphere_points(300)).numpy()
+    glossy, dull = (FittedField(ball_model(specular=on)).material(p) for on in (True, False))
+    assert np.ptp(glossy.inv_kappa) > 0 and np.ptp(glossy.coefficients) > 0
+    assert not dull.rho.any() and (dull.coefficients == 1).all() and np.allclose(dull.inv_kappa, TYPICAL_INV_KAPPA)
+    assert np.array_equal(dull.albedo, glossy.albedo)
 
 
 def test_refining_keeps_the_surface_and_cleans_the_volume() -> None:

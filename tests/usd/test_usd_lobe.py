@@ -46,6 +46,15 @@ def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
     assert len(COSINES) >= 8
 
 
+def test_where_there_is_no_lobe_nothing_is_left_over() -> None:
+    """A dull surface, and beside it a lobe as faint as a ten-thousandth, which counts."""
+    strength = np.array([[0.0, 1e-4]], np.float32)
+    shape = strength.shape
+    s, f0 = np.full(shape, 0.1, np.float32), np.zeros(shape, np.float32)
+    fit = lobe_fit(strength[..., None], s, f0, np.ones((8, 1), np.float32), np.ones(shape, bool))
+    assert fit.residual[0, 0] == 0 and fit.residual[0, 1] > 10
+
+
 def test_texels_whose_kappa_the_light_can_not_tell_are_flagged() -> None:
     s = np.array([[1e-6, 0.01], [0.03, 0.1]], np.float32)
     covered = np.array([[True, False], [True, True]])
