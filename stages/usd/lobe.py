@@ -36,7 +36,8 @@ RESOLVED_KAPPA = 50.0  # above it a light of order 10 looks the same through the
 
 @dataclass(frozen=True, slots=True)
 class LobeFit:
-    """residual (H, W): |F - R| over |F|, root mean square over c weighted by c; 0 where there is no lobe. unresolved (H, W): kappa is a guess.
+    """residual (H, W): |F - R| over |F|, root mean square over c weighted by c; 0 where there is no lobe.
+    unresolved (H, W): kappa is a guess.
     covered (H, W): texels under charts."""
 
     residual: F32

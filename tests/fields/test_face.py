@@ -10,9 +10,8 @@ import torch
 from scipy import ndimage
 
 from pipeline.errors import StageError
-from pipeline.fields.appearance import IntegratedBasis
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
 from pipeline.fields.geometry import coarse_distance, largest_solid
 from pipeline.fields.spec import FaceSpec
