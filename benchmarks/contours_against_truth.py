@@ -31,9 +31,8 @@ F64 = npt.NDArray[np.float64]
 def hits(camera: Camera, truth: trimesh.Trimesh, uv: F64) -> F32:
     """(N,) 1 where the ray through an image position (N, 2) meets the mesh, which is in the asset's space."""
     K, pose = transforms.matrix(camera.K), transforms.matrix(camera.world_from_cam)
-    xy = transforms.undistort(np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T, np.array(camera.distortion))
-    d = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ pose[:3, :3].T
-    return np.asarray(truth.ray.intersects_any(np.broadcast_to(pose[:3, 3], d.shape), d), np.float32)
+    origin, d = transforms.rays(K, pose, np.array(camera.distortion), uv)
+    return np.asarray(truth.ray.intersects_any(np.broadcast_to(origin, d.shape), d), np.float32)
 
 
 def silhouette(camera: Camera, truth: trimesh.Trimesh) -> F32:

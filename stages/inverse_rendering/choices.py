@@ -256,8 +256,7 @@ def _hits(geometry: GridSdf, o: Tensor, d: Tensor) -> Tensor:
 def prior_surface(fit: Fit) -> GridSdf:
     """The prior's surface, on the present grid."""
     assert fit.prior is not None
-    start = fit.prior
-    prior = GridSdf(torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    prior = fit.prior.surface("cpu")
     for _ in range(fit.level):
         prior.refine()
     prior.to(fit.device)

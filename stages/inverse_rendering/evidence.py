@@ -86,17 +86,23 @@ def trial(seen: Sightings, waiting: tuple[int, ...], model: FaceModel) -> Trial 
     odd = seen.point % 2 == 1
     if (keep & held & odd).sum() < LEAST_TEST or (keep & held & ~odd).sum() < LEAST_TEST:
         return None
+    return _of(seen, keep, lobe_features(model, seen, keep), counts, (~held, held & ~odd, held & odd))
+
+
+def _of(seen: Sightings, keep: BOOL, features: F64, counts: I64, parts: tuple[BOOL, BOOL, BOOL]) -> Trial:
+    """The sightings that are kept (M of them, whose features are given), in their parts train, tune and test."""
     point, colour = seen.point[keep], seen.colour[keep]
+    train, tune, test = (part[keep] for part in parts)
     return Trial(
         point,
         seen.view[keep],
         colour / max(float(colour.mean()), 1e-12),
-        lobe_features(model, seen, keep),
+        features,
         seen.cosine[keep],
         seen.x.detach().cpu().double().numpy()[point],
-        ~held[keep],
-        (held & ~odd)[keep],
-        (held & odd)[keep],
+        train,
+        tune,
+        test,
         np.maximum(counts, 1).astype(np.float64),
     )
 
@@ -164,6 +170,16 @@ def solve_response(t: Trial, order: int | None, *, gain: bool) -> Response:
     return r
 
 
+def gains_of(seen: Sightings) -> F64 | None:
+    """Gains of the views that see anything, (V, 3), while no lobe is known; None if no point is seen often enough."""
+    counts = np.bincount(seen.point, minlength=len(seen.x))
+    keep = counts[seen.point] >= LEAST_TRAIN
+    if not keep.any():
+        return None
+    t = _of(seen, keep, np.zeros((int(keep.sum()), 1)), counts, (keep, ~keep, ~keep))
+    return solve_response(t, None, gain=True).gain[np.unique(t.view)]
+
+
 def held_out(t: Trial, order: int | None, r: Response) -> float:
     """Held-out error (root mean square, shares of the mean radiance)."""
     left, _ = lobe(t, order, r)
@@ -179,28 +195,6 @@ def more(without: float, with_it: float) -> float:
     """How much larger an error is without a part of the model: sqrt(e_0^2 - e_1^2), negative where it is smaller."""
     d = without * without - with_it * with_it
     return math.copysign(math.sqrt(abs(d)), d)
-
-
-def gains_of(seen: Sightings) -> F64 | None:
-    """Gains of the views that see anything, (V, 3), while no lobe is known; None if no point is seen often enough."""
-    counts = np.bincount(seen.point, minlength=len(seen.x))
-    keep = counts[seen.point] >= LEAST_TRAIN
-    if not keep.any():
-        return None
-    point, view, colour, all_of_it = seen.point[keep], seen.view[keep], seen.colour[keep], np.ones(keep.sum(), bool)
-    t = Trial(
-        point,
-        view,
-        colour / max(float(colour.mean()), 1e-12),
-        np.zeros((len(point), 1)),
-        seen.cosine[keep],
-        seen.x.detach().cpu().double().numpy()[point],
-        all_of_it,
-        ~all_of_it,
-        ~all_of_it,
-        np.maximum(counts, 1).astype(np.float64),
-    )
-    return solve_response(t, None, gain=True).gain[np.unique(view)]
 
 
 # ------------------------------------------------------------------ the rank

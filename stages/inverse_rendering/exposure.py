@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pipeline.fields.geometry import GridSdf
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.sightings import pictures, sight
 from stages.inverse_rendering.start import Start
@@ -36,7 +35,5 @@ def gain_spread(views: list[PhotoView], start: Start, device: str) -> float:
     x, n = (torch.from_numpy(a[::every].astype(np.float32)).to(device) for a in (points, normals))
     if not len(x):
         return 0.0
-    geometry = GridSdf(torch.from_numpy(start.values.copy()), torch.from_numpy(start.lo), start.cell)
-    geometry.to(device).to_device(device)
-    gains = evidence.gains_of(sight(geometry, pictures(views), x, n))
+    gains = evidence.gains_of(sight(start.surface(device), pictures(views), x, n))
     return 0.0 if gains is None else float(gains.mean(1).std())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Any, Literal
 
@@ -193,9 +194,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         context.progress(0, settings.steps, "stereo")
         start = start_from_photos(start, views, context.device, context.check)
     make = new_paper_trainer if settings.method == "paper" else new_trainer
-    own_colours = calibrated(inputs, usable, config) or (
-        config.calibration == AUTO and exposures_differ(views, start, context.device)
-    )
+    own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
     trainer = make(views, start, settings, own_colours, context.device, prior)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
@@ -223,12 +222,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     )
 
 
-def calibrated(inputs: Inputs, usable: list[int], config: Config) -> bool:
-    """Whether settings, metadata or cameras say that photos have colours of their own."""
+def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_differ: Callable[[], bool]) -> bool:
+    """Whether per-image colour matrices are fitted: by the setting, else by metadata, cameras or the photos."""
     if config.calibration != AUTO:
         return config.calibration == "on"
     capture = inputs.capture.artifact
-    return capture.colours_drift or len({v.camera_group for v in capture.views if v.index in set(usable)}) > 1
+    cameras = {v.camera_group for v in capture.views if v.index in set(usable)}
+    return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
 STAGE = Stage(name="inverse_rendering", version=7, inputs=Inputs, config=Config, output=FittedFace, run=run)

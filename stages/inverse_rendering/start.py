@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.fields.geometry import GridSdf
 from pipeline.hull import hull_bounds, hull_sdf, visual_hull
 
 F32 = npt.NDArray[np.float32]
@@ -23,6 +25,11 @@ class Start:
     values: F32
     lo: F32
     cell: float
+
+    def surface(self, device: str) -> GridSdf:
+        """A copy of the samples that rays can meet."""
+        values, lo = (torch.from_numpy(a.astype(np.float32)) for a in (self.values, self.lo))
+        return GridSdf(values, lo, self.cell).to(device)
 
 
 def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int) -> Start:

@@ -186,7 +186,7 @@ def best_views(points: F64, normals: F64, start: Start, photos: Photos) -> tuple
     and a pixel's size on the surface (median)."""
     device = photos.grey.device
     p, n = (torch.from_numpy(x.astype(np.float32)).to(device) for x in (points, normals))
-    geometry = GridSdf(torch.from_numpy(start.values), torch.from_numpy(start.lo), start.cell).to(device)
+    geometry = start.surface(str(device))
     cosines, sizes = [], []
     for k in range(len(photos.centre)):
         way = photos.centre[k] - p

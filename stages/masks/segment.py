@@ -220,8 +220,9 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
         return made  # a photo that is all background shows no subject whose edge could be found
-    wrong = contradiction(inside, opinion) > CONTRADICTED or hole(inside, opinion) > HOLE
-    doubtful = made.source in COMPUTED and wrong
+    doubtful = made.source in COMPUTED and (
+        contradiction(inside, opinion) > CONTRADICTED or hole(inside, opinion) > HOLE
+    )
     if not (bad or doubtful):
         return made
     image = made.view.read()

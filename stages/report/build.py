@@ -43,14 +43,14 @@ class JudgedRow:
 def build_rows(view: JudgedView, side: int) -> JudgedRow:
     """photo | model | asset | error of the asset (of the model where there is no asset render)."""
     pictures = [Picture(data_uri(to_bytes(encoded(view.photo)), side), "photo")]
-    for image, scores, what in ((view.model, view.model_scores, "model"), (view.asset, view.asset_scores, "asset")):
-        if image is not None:
-            shown = to_bytes(encoded(view.shown(image)[..., :3]))
-            pictures.append(Picture(data_uri(shown, side), what + _noted(scores, view.own_colours)))
-    last = view.asset if view.asset is not None else view.model
-    if last is not None:
-        what = "asset" if view.asset is not None else "model"
-        heat = data_uri(error_map(view.shown(last), view.photo, view.mask), side)
+    known = (("model", view.model, view.model_scores), ("asset", view.asset, view.asset_scores))
+    renders = [(what, view.shown(image), scores) for what, image, scores in known if image is not None]
+    for what, shown, scores in renders:
+        picture = data_uri(to_bytes(encoded(shown[..., :3])), side)
+        pictures.append(Picture(picture, what + _noted(scores, view.own_colours)))
+    if renders:
+        what, shown, _ = renders[-1]
+        heat = data_uri(error_map(shown, view.photo, view.mask), side)
         pictures.append(Picture(heat, f"error of the {what}"))
     note = "held out" if view.held_out else "took part in the fit"
     return JudgedRow(

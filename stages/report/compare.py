@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import HeldOutView, Located
 from pipeline.images import read_alpha, read_exr, read_linear, shrink
-from stages.report.gather import Results
+from stages.report.gather import Results, own_colours
 from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]
@@ -44,7 +44,7 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
     predicted = {v.index: v for v in r.inverse_rendering.artifact.held_out}
     rendered = {v.index: v for v in r.usd.artifact.views}
     masks = {m.index: m for m in r.masks.artifact.masks}
-    own_colours = bool(r.inverse_rendering.artifact.model.get("calibration", {}).get("modelled"))
+    own = own_colours(r.inverse_rendering.artifact.model)
     for view in sorted(r.capture.artifact.views, key=lambda v: v.index):
         i = view.index
         if i not in predicted.keys() | rendered.keys() or i not in masks:
@@ -54,7 +54,7 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor)
         model, asset = _read(r.inverse_rendering, predicted.get(i)), _read(r.usd, rendered.get(i))
         scores = [score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset)]
-        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own_colours)
+        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own)
 
 
 def unjudged(r: Results) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from pipeline.artifacts import (
@@ -43,6 +44,11 @@ class Results(Started, Protocol):
     def bake(self) -> Located[TextureSet]: ...
     @property
     def usd(self) -> Located[UsdAsset]: ...
+
+
+def own_colours(model: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether the fit gave every photo a colour response of its own. model: how each part of it was decided."""
+    return bool(model.get("calibration", {}).get("modelled"))
 
 
 def figures(r: Results) -> dict[str, Any]:

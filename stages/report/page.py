@@ -13,6 +13,8 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
 
+from stages.report.gather import own_colours
+
 ISLAND = re.compile(r'(<script type="application/json" id="timing">).*?(</script>)', re.S)
 TABLE = re.compile(r"(<!-- timing -->).*?(<!-- /timing -->)", re.S)
 
@@ -59,7 +61,7 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     for prefix, what in (("", "model"), ("asset_", "exported asset")):
         if h.get(f"{prefix}psnr") is not None:
             out.append((f"{h[f'{prefix}psnr']:.1f} dB", f"PSNR, {what}", f"subject's pixels of {h['views']} {kind}"))
-    if own_colours(metrics) and h.get("asset_psnr_matched") is not None:
+    if own_colours(metrics["model"]) and h.get("asset_psnr_matched") is not None:
         meaning = "as before, after a 3 x 3 matrix a photo: they differ in exposure or white balance"
         out.append((f"{h['asset_psnr_matched']:.1f} dB", "PSNR in the photos' colours, exported asset", meaning))
     for key, what, meaning in (
@@ -73,11 +75,6 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     times = f"{maps['tiles']} × " if maps["tiles"] > 1 else ""
     out.append((f"{times}{maps['size']}²", "texels", f"{100 * maps['covered_share']:.0f} % of them used"))
     return out
-
-
-def own_colours(metrics: Mapping[str, Any]) -> bool:
-    """Whether the fit gave every photo a colour response of its own."""
-    return bool(metrics["model"].get("calibration", {}).get("modelled"))
 
 
 def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
