@@ -17,6 +17,8 @@ from typing import Annotated, Generic, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
+from pipeline.verdict import Finding
+
 Matrix = tuple[tuple[float, ...], ...]
 UNCHANGED: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -179,6 +181,7 @@ class Capture(Artifact):
     metres_from_world: Matrix | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ poses
@@ -217,6 +220,7 @@ class CameraSet(Artifact):
     view_errors_px: dict[str, float] = {}
     points: FileRef | None = None
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ masks
@@ -244,6 +248,7 @@ class MaskSet(Artifact):
     label_names: tuple[str, ...] = ()
     dropped: tuple[int, ...] = ()
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ inverse rendering
@@ -276,6 +281,7 @@ class FittedFace(Artifact):
     cell: float
     model: dict[str, dict[str, str | float | bool]]
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ mesh
@@ -295,6 +301,7 @@ class Surface(Artifact):
     handles_cut: int = 0
     handles_left: int = 0
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 class UvMesh(Artifact):
@@ -322,6 +329,7 @@ class UvMesh(Artifact):
     deviation_rms_mm: float = 0.0
     proxy_deviation_rms_mm: float = 0.0
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ maps
@@ -357,6 +365,7 @@ class TextureSet(Artifact):
     figures: dict[str, float] = {}
     regions: dict[str, float] = {}
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 # ------------------------------------------------------------------ asset and report
@@ -374,6 +383,7 @@ class UsdAsset(Artifact):
     stated: dict[str, str] = {}
     checks: int
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 class Report(Artifact):
@@ -381,3 +391,4 @@ class Report(Artifact):
 
     files: tuple[FileRef, ...]
     warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()

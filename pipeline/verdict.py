@@ -1,0 +1,96 @@
+"""How good a result is: each stage measures, compares with limits, and says in a sentence what to do.
+
+A `Finding` is one measured figure against its limits. The verdict of a stage is the worst of its findings, that of an
+asset the worst of all stages. `good`: nothing to do. `usable`: an artist can work with it, something is worse than it
+could be. `unusable`: do not hand it on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+Level = Literal["good", "usable", "unusable"]
+LEVELS: tuple[Level, ...] = ("good", "usable", "unusable")  # from best to worst
+
+
+class Finding(BaseModel):
+    """One measured figure of a stage and what follows from it.
+
+    check: its name, lower case with underscores, the same in every run. value: as measured, in `unit`. limit: what
+    `good` needs, in words and figures ("at least 0.9"). said: one plain sentence with the figure. remedy: what to do, for
+    levels other than good. views: names of the photos that it concerns, the worst first.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    check: str
+    level: Level
+    value: float | None
+    unit: str = ""
+    limit: str
+    said: str
+    remedy: str = ""
+    views: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        named = f" ({', '.join(self.views[:5])}{', ...' if len(self.views) > 5 else ''})" if self.views else ""
+        what = f"{self.level}: {self.said}{named}"
+        return f"{what} What to do: {self.remedy}." if self.remedy and self.level != "good" else what
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a figure must reach to be good, and to be usable; equal where there is nothing between.
+
+    lower: the figure must be at least so large (else: at most). A figure that is not finite is unusable.
+    """
+
+    good: float
+    usable: float
+    lower: bool = True
+
+    def __post_init__(self) -> None:
+        ordered = self.usable <= self.good if self.lower else self.usable >= self.good
+        if not ordered:
+            raise ValueError(f"usable ({self.usable}) must be no stricter than good ({self.good})")
+
+    def level(self, value: float) -> Level:
+        """The level of one figure."""
+        if not np.isfinite(value):
+            return "unusable"
+        sign = 1 if self.lower else -1
+        if sign * value >= sign * self.good:
+            return "good"
+        return "usable" if sign * value >= sign * self.usable else "unusable"
+
+    def words(self, unit: str = "") -> str:
+        """What `good` needs: "at least 0.9"."""
+        return f"at {'least' if self.lower else 'most'} {self.good:g}{' ' + unit if unit else ''}"
+
+
+def judged(
+    check: str, value: float, limits: Limits, said: str, remedy: str, *, unit: str = "", views: Sequence[str] = ()
+) -> Finding:
+    """The finding of one figure. views: kept for levels other than good alone."""
+    level = limits.level(float(value))
+    return Finding(
+        check=check,
+        level=level,
+        value=round(float(value), 5) if np.isfinite(value) else None,
+        unit=unit,
+        limit=limits.words(unit),
+        said=said,
+        remedy="" if level == "good" else remedy,
+        views=() if level == "good" else tuple(views),
+    )
+
+
+def worst(findings: Iterable[Finding | Level]) -> Level:
+    """The worst level of findings or levels; good where there are none."""
+    levels = [f if isinstance(f, str) else f.level for f in findings]
+    return max(levels, key=LEVELS.index, default="good")
