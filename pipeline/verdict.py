@@ -22,8 +22,8 @@ class Finding(BaseModel):
     """One measured figure of a stage and what follows from it.
 
     check: its name, lower case with underscores, the same in every run. value: as measured, in `unit`. limit: what
-    `good` needs, in words and figures ("at least 0.9"). said: one plain sentence with the figure. remedy: what to do, for
-    levels other than good. views: names of the photos that it concerns, the worst first.
+    `good` needs, in words and figures ("at least 0.9"). said: one plain sentence with the figure. remedy: what to do,
+    for levels other than good. views: names of the photos that it concerns, the worst first.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
