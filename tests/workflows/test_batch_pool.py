@@ -19,6 +19,7 @@ import pytest
 
 from pipeline.artifacts import sha256_of
 from tests.support.facescape_tree import write_heads, write_tree
+from tests.support.points import wait_for
 from tests.support.servers import (
     PREFECT,
     Process,
@@ -26,7 +27,6 @@ from tests.support.servers import (
     free_port,
     postgres,
     postgres_programs,
-    wait_for,
     wait_healthy,
 )
 from workflows.environment import SLOTS_ON_DISK

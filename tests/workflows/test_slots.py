@@ -16,7 +16,7 @@ import pytest
 
 from pipeline.contract import inputs_from, key
 from pipeline.errors import Cancelled, StageError
-from tests.support.servers import wait_for
+from tests.support.points import wait_for
 from tests.support.toy_stages import TOYS, source
 from workflows import adapter, slots
 from workflows.plan import RunRequest, make_plan
@@ -78,7 +78,7 @@ def test_a_slot_is_waited_for_kept_and_given_back(serving: Any) -> None:
     server = serving(TAKEN, AWAY, refused(503), TAKEN)
     with slots.slot("gpus", lambda: False):
         assert server.asked == ["take"] * 5
-        wait_for(lambda: server.asked.count("renew") >= 2, 10)
+        wait_for(lambda: server.asked.count("renew") >= 2)
     assert server.asked[-1] == "give back"
     seen = len(server.asked)
     time.sleep(0.1)
@@ -89,9 +89,9 @@ def test_a_server_that_is_away_costs_neither_the_slot_nor_the_fit(serving: Any) 
     server = serving()
     with slots.slot("gpus", lambda: False):
         server.script = [AWAY] * 4
-        wait_for(lambda: server.asked.count("renew") >= 6, 10)
+        wait_for(lambda: server.asked.count("renew") >= 6)
         server.script = [refused(410)]  # it took the slot back: the fit goes on
-        wait_for(lambda: not server.script, 10)
+        wait_for(lambda: not server.script)
         server.script = [AWAY, AWAY]
     assert server.asked[-3:] == ["give back"] * 3
 
