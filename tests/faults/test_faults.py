@@ -133,7 +133,7 @@ def test_a_stage_that_hangs_is_ended_and_the_next_capture_runs(
 ) -> None:
     rows = [{"capture": "1/1_neutral", "name": "good", "until": "capture"}, {"capture": "1/2_smile", "name": "bad"}]
     (tree / "list.json").write_text(json.dumps(rows))
-    options = ["--out", tree.parent / "out", "--stage-limit", "2s", "--set", f"work.fault={fault}", "--workers", "2"]
+    options = ["--out", tree.parent / "out", "--stage-limit", "15s", "--set", f"work.fault={fault}", "--workers", "2"]
     code, said = finish(start(environment, TOY_BATCH, "batch", tree / "list.json", *options))
     assert code == 1  # ended at all: the toy hangs for ever
     found = summary(tree)
