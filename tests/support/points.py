@@ -111,6 +111,12 @@ class Point:
         """Let the held processes go on."""
         (self.signs / "go").write_text("")
 
+    def take_back(self) -> None:
+        """Hold those that come from now on; the signs of those that came before are gone."""
+        (self.signs / "go").unlink()
+        for sign in self.signs.glob(f"{self.name.partition('@')[0]}.*"):
+            sign.unlink()
+
 
 def hold(name: str, signs: Path) -> Point:
     """A point at which a child waits for `release`."""

@@ -20,7 +20,7 @@ from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
 from pipeline.contract import Context, Stage, StageConfig
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
-from tests.support.points import reach
+from tests.support.points import instrument, reach
 from workflows import adapter, batch_local
 
 
@@ -106,7 +106,9 @@ def counted(stage: Stage[Any, Any, Any]) -> Stage[Any, Any, Any]:
 
 
 REAL = bool(os.environ.get("NEUFACE_REAL_STAGES"))
-if not REAL:
+if REAL:
+    instrument()
+else:
     adapter.FIT = "work"  # what holds a slot of the pool's GPUs
 registry.REGISTRY = tuple(counted(s) for s in (registry.REGISTRY if REAL else TOYS))
 batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
