@@ -20,6 +20,7 @@ from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
 from pipeline.contract import Context, Stage, StageConfig
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
+from tests.support.points import instrument, reach
 from workflows import adapter, batch_local
 
 
@@ -41,7 +42,6 @@ class UsdInputs:
 
 class WorkConfig(StageConfig):
     steps: int = 4
-    pause: float = 0.05
     fault: str = ""
 
 
@@ -56,9 +56,11 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
     for step in range(begin, config.steps):
         context.check()
         context.progress(step, config.steps, "working")
-        time.sleep(config.pause)
+        reach("work.step")
         checkpoint.write_text(str(step + 1))
+        reach("work.checkpoint", context.cancelled)
     if config.fault == "hangs":
+        reach("work.hangs")
         while True:
             time.sleep(0.05)
     if config.fault == "hangs in C":  # with Python's lock held: no thread of Python runs any more
@@ -104,7 +106,9 @@ def counted(stage: Stage[Any, Any, Any]) -> Stage[Any, Any, Any]:
 
 
 REAL = bool(os.environ.get("NEUFACE_REAL_STAGES"))
-if not REAL:
+if REAL:
+    instrument()
+else:
     adapter.FIT = "work"  # what holds a slot of the pool's GPUs
 registry.REGISTRY = tuple(counted(s) for s in (registry.REGISTRY if REAL else TOYS))
 batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from pipeline.artifacts import Artifact, FileRef, Located
 from pipeline.contract import Context, Stage, StageConfig, execute, inputs_from
 from pipeline.errors import StageError
 from pipeline.store import Store
+from tests.support.points import reach
 
 
 class Folder(Artifact):
@@ -59,7 +59,6 @@ class Config(StageConfig):
 
 class SlowConfig(Config):
     steps: int = Field(1, ge=1, description="files that are written one after the other")
-    pause: float = Field(0.0, ge=0, description="seconds between them")
 
 
 def source(folder: Path) -> Located[Folder]:
@@ -87,7 +86,7 @@ def run_second(inputs: SecondInputs, config: SlowConfig, context: Context) -> Nu
         context.check()
         context.progress(step, config.steps, "working", loss=1 / (step + 1))
         (context.workdir / f"part{step}.bin").write_bytes(bytes(100_000))
-        time.sleep(config.pause)
+        reach("second.step")
         checkpoint.write_text(str(step + 1))
     if config.fault == "stage":
         raise StageError("the toy is broken", where="part 7", value=3, limit="4", remedy="mend it")
@@ -119,10 +118,10 @@ def main() -> int:
     p.add_argument("folder", type=Path)
     p.add_argument("store", type=Path)
     p.add_argument("--steps", type=int, default=1)
-    p.add_argument("--pause", type=float, default=0)
+    p.add_argument("--seed", type=int, default=0)
     options = p.parse_args()
     finished: dict[str, Located[Any]] = {"source": source(options.folder)}
-    slow = SlowConfig(steps=options.steps, pause=options.pause)
+    slow = SlowConfig(steps=options.steps, seed=options.seed)
     for stage in TOYS:
         config = slow if stage is SECOND else Config()
         done = execute(stage, inputs_from(stage, finished), config, Store(options.store))

@@ -367,13 +367,19 @@ def test_the_page_escapes_and_links(tree: Path) -> None:
     assert [r["state"] for r in table] == ["failed", "done", "done", "done", "done"]
 
 
-def test_a_table_of_the_whole_data_set_is_quick(tmp_path: Path) -> None:
-    """7,180 captures: the page is written every few seconds while the batch runs."""
-    entries = [Entry(name=f"{s}/{e}", capture="/c") for s in range(359) for e in range(20)]
+def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: Path) -> None:
+    """7,180 captures: the page is written every few seconds while the batch runs. Ten times the captures of another
+    table may take thirty times as long on a busy machine; work that grows with their square would take a hundred."""
     asked = BatchRequest(root=str(tmp_path), out=str(tmp_path / "out"))
-    begin = time.perf_counter()
-    write_page(asked, Summary(entries))
-    assert time.perf_counter() - begin < 5
+
+    def seconds(subjects: int) -> float:
+        entries = [Entry(name=f"{s}/{e}", capture="/c") for s in range(subjects) for e in range(20)]
+        begin = time.process_time()
+        write_page(asked, Summary(entries))
+        return time.process_time() - begin
+
+    few = min(seconds(36) for _ in range(3))
+    assert min(seconds(359) for _ in range(3)) < 30 * few
     assert (asked.folder / "index.html").stat().st_size < 8e6
 
 
