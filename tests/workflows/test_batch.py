@@ -218,7 +218,7 @@ def go(tree: Path, script: dict[str, list[Fault | None]], **changes: Any) -> tup
 
 def test_one_bad_capture_costs_no_other_and_is_not_tried_again(tree: Path) -> None:
     summary, runner = go(tree, {"2/1_neutral": [BAD]})
-    assert summary.counts() == {"done": 4, "failed": 1, "submitted": 0, "waiting": 0}
+    assert summary.counts() == {"done": 4, "unusable": 0, "failed": 1, "submitted": 0, "waiting": 0}
     assert len(runner.started) == 5 and runner.most == 2
     assert summary.failed == 1
 
