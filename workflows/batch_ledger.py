@@ -13,10 +13,10 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.artifacts import RelativePath
+from pipeline.verdict import Level
 from stages import registry
 from workflows.batch_captures import Item
 from workflows.batch_faults import Fault
-from pipeline.verdict import Level
 from workflows.plan import RunRequest
 from workflows.verdict import is_refused
 
@@ -69,7 +69,9 @@ class Summary:
 
     def counts(self) -> dict[str, int]:
         """Captures by state."""
-        return {s: sum(e.state == s for e in self.entries) for s in ("done", "unusable", "failed", "submitted", "waiting")}
+        return {
+            s: sum(e.state == s for e in self.entries) for s in ("done", "unusable", "failed", "submitted", "waiting")
+        }
 
 
 class Ledger:

@@ -40,7 +40,8 @@ FIRST_LINE = 300  # characters of a fault that the table shows
 
 @dataclass(slots=True)
 class Row:
-    """One capture in the table. level: how good its result is; reason: the worst of why. odd: how far the oddest figure is from the others'; odd_in: which."""
+    """One capture in the table. level: how good its result is; reason: the worst of why. odd: how far the oddest figure
+    is from the others'; odd_in: which."""
 
     name: str
     state: str

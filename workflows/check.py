@@ -30,7 +30,7 @@ from workflows.verdict import REFUSED, headline, verdict_of_done
 NEXT = {
     "good": "go on: neuface run {capture} --out DIR",
     "usable": "it can be used as it is (neuface run {capture} --out DIR); what is said above makes it better",
-    "unusable": "do what is said above first; neuface run ends before the fit with these photos, unless --force is given",
+    "unusable": "do what is said above first; neuface run ends before the fit with these photos, but for --force",
 }
 NOT_SOLVED = "only the photos were judged: cameras and masks are not known yet; --solve finds and judges them (minutes)"
 

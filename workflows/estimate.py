@@ -12,9 +12,9 @@ from pipeline.contract import Done, StageConfig
 from workflows.plan import Plan, preview
 from workflows.session import current
 
-# Median seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: four captures of
-# 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, stages behind the fit as workflows/budget.py
-# has them. A table for orders of magnitude: earlier runs on the same machine replace it stage by stage.
+# Seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: medians of four captures
+# of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
+# workflows/budget.py. For orders of magnitude: earlier runs on the same machine replace it stage by stage.
 SECONDS: dict[str, dict[str, float]] = {
     "draft": {"inverse_rendering": 100, "surface": 10, "uv": 12, "bake": 20, "usd": 18, "report": 5},
     "studio": {"inverse_rendering": 780, "surface": 15, "uv": 25, "bake": 60, "usd": 45, "report": 10},

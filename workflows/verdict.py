@@ -38,9 +38,9 @@ def exit_code(record: Mapping[str, Any]) -> int:
     return REFUSED if is_refused(level_in(record), strict) else 0
 
 
-def state_name(level: Level | None) -> str:
-    """The name of the completed state that a run ends with on a Prefect server: "Completed", "Usable", "Unusable"."""
-    return "Completed" if level is None or level == "good" else level.capitalize()
+def state_name(level: Level | None) -> str | None:
+    """The name of the completed state that a run ends with on a Prefect server; None for Prefect's own."""
+    return None if level is None or level == "good" else level.capitalize()
 
 
 def level_of_state(name: str | None) -> Level:

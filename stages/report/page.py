@@ -47,6 +47,7 @@ class Pictures:
     scale: str = ""
     scale_top: float = 0.0
     captured: object | None = None  # stages.report.captured.Captured
+    verdict: object | None = None  # stages.report.verdict.VerdictShown
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:
