@@ -39,9 +39,14 @@ class Finding(BaseModel):
     views: tuple[str, ...] = ()
 
     def __str__(self) -> str:
+        return f"{self.level}: {self.sentence}"
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in which photos, and what to do."""
         named = f" ({', '.join(self.views[:5])}{', ...' if len(self.views) > 5 else ''})" if self.views else ""
-        what = f"{self.level}: {self.said}{named}"
-        return f"{what} What to do: {self.remedy}." if self.remedy and self.level != "good" else what
+        what = f"{self.said.rstrip('.')}{named}."
+        return f"{what} What to do: {self.remedy.rstrip('.')}." if self.remedy and self.level != "good" else what
 
 
 @dataclass(frozen=True, slots=True)

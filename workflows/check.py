@@ -111,7 +111,7 @@ def table(verdict: Verdict) -> list[str]:
     for line, (_, finding) in zip(lines[1:], rows, strict=True):
         out.append(line)
         if finding.level != "good":
-            out.append(f"    {str(finding).removeprefix(f'{finding.level}: ')}")
+            out.append(f"    {finding.sentence}")
     return out
 
 

@@ -45,7 +45,7 @@ def test_the_mark_is_read_by_others_and_breaks_nothing(asset: Path, name: str) -
     level, reasons = said(asset.with_name(name))
     assert level == "unusable"
     assert reasons == [f"surface: {BAD}", f"masks: {FAIR}"]
-    assert "20 %. (a.jpg) What to do: mask the neck." in reasons[0]
+    assert "20 % (a.jpg). What to do: mask the neck." in reasons[0]
     assert sorted(map(str, validate(asset))) == before and validate(asset.with_suffix(".usdz")) == []
     assert read_package(asset.with_suffix(".usdz"))[1:] == pictures
 

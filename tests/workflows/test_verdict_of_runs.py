@@ -92,7 +92,7 @@ def test_the_last_lines_say_what_is_wrong_in_which_stage(photos: Path) -> None:
     lines = last_lines(record)
     assert lines[0] == "verdict: unusable (third unusable; first usable; the other 1 good)"
     assert lines[1].strip() == (
-        "third: unusable: 20 % of the toys are whole. (a.jpg, b.jpg) What to do: take the broken toys again."
+        "third: unusable: 20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again."
     )
     many = {**record, "verdict": {**record["verdict"], "findings": record["verdict"]["findings"] * 4}}
     assert len(last_lines(many)) == 7 and last_lines(many)[-1].strip() == "and 3 more: see run.json"
@@ -112,7 +112,7 @@ def test_an_unusable_early_stage_ends_the_run_without_an_asset_and_nothing_is_lo
     assert "asset" not in record and list(record["stages"]) == ["first", "second"]
     assert record["verdict"]["level"] == "unusable" and exit_code(record) == 3
     told = "\n".join(notes)
-    assert "20 % of the toys are whole. (a.jpg, b.jpg) What to do: take the broken toys again." in told
+    assert "20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again." in told
     assert "photos to look at or to take again: a.jpg, b.jpg" in told
     assert "the run ends here, before third" in told and "--force goes on" in told
     done, record, notes = run(photos, ("second", "unusable"), force=True)
