@@ -166,6 +166,18 @@ def _outlines(r: Started, side: int, shown: int) -> list[Picture]:
     return out
 
 
+def photos_named(r: Started, names: Sequence[str], side: int) -> list[Picture]:
+    """The capture's photos of these names with the outlines of their masks. A name without a photo is left out."""
+    views = {v.name: v for v in r.capture.artifact.views}
+    masks = {m.index: m for m in r.masks.artifact.masks}
+    out = []
+    for view in (views[name] for name in names if name in views):
+        image, mask = read_encoded(r.capture.path(view.image)), masks.get(view.index)
+        alpha = np.zeros(image.shape[:2], np.float32) if mask is None else read_alpha(r.masks.path(mask.mask))
+        out.append(Picture(data_uri(outlined(image, alpha, side), side), view.name))
+    return out
+
+
 def outlined(
     image: npt.NDArray[np.generic], alpha: npt.NDArray[np.float32], side: int
 ) -> npt.NDArray[np.uint8]:  # fmt: skip

@@ -75,6 +75,20 @@ def test_one_captures_process_killed_costs_one_attempt(tree: Path, environment: 
     assert set(tally(tree).values()) == {1}
 
 
+def test_an_unusable_result_is_written_and_not_tried_again(tree: Path, environment: dict[str, str]) -> None:
+    write_tree(tree, {"2/1_neutral": True}, side=80)
+    options = ["--set", "work.doubted_width=80"]
+    code, said = finish(start(environment, *batch(tree, *options)))
+    assert code == 3, said
+    states = {name: (c["state"], c["level"], c["attempts"]) for name, c in summary(tree).items()}
+    assert states == {"1/1_neutral": ("done", "good", 1), "1/2_smile": ("done", "good", 1),
+                      "2/1_neutral": ("unusable", "unusable", 1)}  # fmt: skip
+    assert (tree.parent / "out/2/1_neutral/asset/head_2_1_neutral.usd").is_file()
+    code, said = finish(start(environment, *batch(tree, *options)))
+    assert code == 3 and "3 of them done before" in said
+    assert {c["attempts"] for c in summary(tree).values()} == {1}
+
+
 def test_the_batch_itself_killed_leaves_no_process_and_goes_on(tree: Path, environment: dict[str, str]) -> None:
     point = hold("work.checkpoint@2", tree.parent / "signs")
     child = start({**environment, **point.environment()}, *batch(tree, *slow(20), "--workers", "2"))

@@ -18,9 +18,11 @@ from typing import Any
 import pipeline.threads  # noqa: F401
 from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.verdict import Finding, Level
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
 from tests.support.points import instrument, reach
+from tests.support.toy_stages import finding
 from workflows import adapter, batch_local
 
 
@@ -28,6 +30,7 @@ class Worked(Artifact):
     """What the toy made."""
 
     file: FileRef
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +46,8 @@ class UsdInputs:
 class WorkConfig(StageConfig):
     steps: int = 4
     fault: str = ""
+    doubted_width: int = 0  # a capture whose photos are so wide is judged `doubted`
+    doubted: Level = "unusable"
 
 
 class UsdConfig(StageConfig):
@@ -73,7 +78,8 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         (context.scratch / "killed").write_text("")
         os.kill(os.getpid(), 9)
     (context.workdir / "w.bin").write_bytes(inputs.capture.artifact.digest().encode() * 1000)
-    return Worked(file=context.file("w.bin"))
+    doubtful = inputs.capture.artifact.views[0].width == config.doubted_width
+    return Worked(file=context.file("w.bin"), findings=(finding(config.doubted),) if doubtful else ())
 
 
 def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
@@ -84,8 +90,14 @@ def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
     return UsdAsset(name=config.name, root=f"asset/{config.name}.usd", files=(context.file(root),), checks=0)
 
 
+def run_capture(inputs: Any, config: Any, context: Context) -> Capture:
+    """The real stage without its findings: photos of noise are no good ones, and that is not what is tested here."""
+    made: Capture = CAPTURE.run(inputs, config, context)
+    return made.model_copy(update={"findings": ()})
+
+
 TOYS: tuple[Stage[Any, Any, Any], ...] = (
-    CAPTURE,
+    replace(CAPTURE, run=run_capture),
     Stage("work", 1, WorkInputs, WorkConfig, Worked, run_work),
     Stage("usd", 1, UsdInputs, UsdConfig, UsdAsset, run_usd),
 )

@@ -65,7 +65,19 @@ def test_unknown_words_are_exit_code_2_and_leave_nothing(
 
 
 def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("run", "demo", "validate", "render", "report", "view", "doctor", "batch", "serve", "schedule"):
+    for command in (
+        "run",
+        "demo",
+        "validate",
+        "render",
+        "report",
+        "view",
+        "doctor",
+        "batch",
+        "serve",
+        "schedule",
+        "check",
+    ):
         with pytest.raises(SystemExit) as e:
             parser().parse_args([command, "--help"])
         assert e.value.code == 0
@@ -133,6 +145,24 @@ def test_a_bug_shows_its_traceback_and_fails(photos: Path, child_environment: di
                            "second.fault=bug")  # fmt: skip
     assert code == 1
     assert "ZeroDivisionError: a bug of the stage" in err
+
+
+@pytest.mark.slow
+def test_verdicts_and_their_exit_codes_through_the_flow(photos: Path, child_environment: dict[str, str]) -> None:
+    out = photos.parent / "out"
+    bad = ("run", photos, "--out", out, "--set", "second.level=unusable")
+    code, stdout, err = neuface(child_environment, *bad)
+    assert code == 3, err
+    assert "--force goes on" in err and "Traceback" not in err
+    assert stdout.splitlines()[-2].startswith("verdict: unusable (second unusable")
+    assert "take the broken toys again" in stdout.splitlines()[-1]
+    assert list(json.loads((out / "run.json").read_text())["stages"]) == ["first", "second"]
+    code, stdout, err = neuface(child_environment, *bad, "--force")
+    assert code == 3 and "3 stages, 2 reused" in stdout, err
+    usable = ("run", photos, "--out", out, "--set", "third.level=usable")
+    assert neuface(child_environment, *usable)[0] == 0
+    code, stdout, err = neuface(child_environment, *usable, "--strict")
+    assert code == 3 and "3 stages, 3 reused" in stdout, err
 
 
 @pytest.mark.slow
