@@ -93,7 +93,7 @@ class CaptureSource(Artifact):
 
     photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
     plates: photos of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the
-    face along +Z, where a file beside the capture says it.
+    face along +Z, where a file beside the capture says it. passed_over: names of pictures whose format is not read.
     """
 
     kind: CaptureKind
@@ -102,6 +102,7 @@ class CaptureSource(Artifact):
     masks: tuple[FileRef, ...] = ()
     plates: tuple[FileRef, ...] = ()
     metres_from_world: Matrix | None = None
+    passed_over: tuple[str, ...] = ()
 
 
 class GivenCamera(Artifact):
