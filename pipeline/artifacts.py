@@ -207,7 +207,7 @@ class CameraSet(Artifact):
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
     reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
-    makes it metres.
+    makes it metres. seen_directions: how many fitted views see what faces each direction (pipeline.directions).
     """
 
     source: Literal["given", "colmap"]
@@ -220,6 +220,7 @@ class CameraSet(Artifact):
     reprojection_error_px: float | None = None
     view_errors_px: dict[str, float] = {}
     points: FileRef | None = None
+    seen_directions: tuple[tuple[int, ...], ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.transforms import F64
 from pipeline.verdict import Finding, Limits, judged
@@ -187,6 +188,6 @@ def _of_group(photos: Sequence[Photo], values: F64) -> F64:
     return out
 
 
-def _named(photos: Sequence[Photo], order: F64, which: F64) -> list[str]:
+def _named(photos: Sequence[Photo], order: F64, which: npt.NDArray[np.bool_]) -> list[str]:
     """Names of the photos that `which` (N,) holds for, the least of `order` (N,) first."""
     return [photos[int(i)].name for i in np.argsort(order, kind="stable") if which[i]]

@@ -29,11 +29,11 @@ MIDDLE, BRIGHT = 0.5, 0.9  # of the frame's edges; quantile that stands for the 
 class Look:
     """Figures of one photo's middle.
 
-    detail: E[(G1 I - G2 I)^2] / E[(G2 I - G8 I)^2], what blur takes away; unlike stages.capture.suspects.detail it hardly
-    counts a sensor's noise, which differs between cameras. clipped: share of its pixels at the end of the file's range. bright: level
-    (0 to 255, encoded) that a tenth of it exceeds. structure: mean of |G1 I - G4 I| in levels, what features need.
-    light: mean linear luminance. face: whether a face with its landmarks is found. faces: number of faces of similar
-    size. thumb: (THUMB, THUMB) mean levels of the whole frame.
+    detail: E[(G1 I - G2 I)^2] / E[(G2 I - G8 I)^2], what blur takes away; unlike stages.capture.suspects.detail it
+    hardly counts a sensor's noise, which differs between cameras. clipped: share of its pixels at the end of the file's
+    range. bright: level (0 to 255, encoded) that a tenth of it exceeds. structure: mean of |G1 I - G4 I| in levels,
+    what features need. light: mean linear luminance. face: whether a face with its landmarks is found. faces: number
+    of faces of similar size. thumb: (THUMB, THUMB) mean levels of the whole frame.
     """
 
     detail: float
@@ -89,7 +89,7 @@ def _small_colour(image: npt.NDArray[np.generic]) -> U8:
     plane = np.ascontiguousarray(np.repeat(image, 3, 2) if image.shape[2] == 1 else image[..., :3])
     values = plane if plane.dtype in (np.uint8, np.uint16) else plane.astype(np.float32)
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
-    small = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+    small = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA))
     if small.dtype == np.uint8:
         return np.asarray(small, np.uint8)
     if small.dtype == np.uint16:
