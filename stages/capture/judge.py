@@ -45,6 +45,8 @@ FACES = Limits(3, 0)
 STRUCTURE = Limits(0.6, 0.6)
 # files that nobody reads, as a share of all pictures in the folder
 FORMATS = Limits(0.0, 1.0, lower=False)
+# share of the masks: others are made from the photos, which mostly works
+GIVEN_MASKS = Limits(0.0, 1.0, lower=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,18 @@ def judge(photos: Sequence[Photo], left_out: Sequence[str], passed_over: Sequenc
         _doubles(photos),
         *_subject(photos),
     )
+
+
+def given_masks(masked: int, useless: Sequence[str]) -> list[Finding]:
+    """Given masks that are empty, full or of another size; nothing where no mask is given. masked: those of use."""
+    total = masked + len(useless)
+    if not total:
+        return []
+    return [judged("given_masks", len(useless) / total, GIVEN_MASKS,
+                   f"{len(useless)} of {total} given masks are empty, full or not of their photo's size; they are made "
+                   "from the photos instead" if useless else f"all {total} given masks can be used",
+                   "draw these masks again at the photo's size, 0 on the background and 255 on the subject",
+                   views=useless)]  # fmt: skip
 
 
 def _count(photos: Sequence[Photo]) -> Finding:

@@ -50,7 +50,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     """
     from stages.capture import views as made
     from stages.capture.candidates import candidates_of, useful, without_doubles
-    from stages.capture.judge import Photo, judge
+    from stages.capture.judge import Photo, given_masks, judge
 
     source = _photos_of_film(inputs.source, config, context)
     found = candidates_of(source)
@@ -70,7 +70,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     seen = [Photo(v.name, v.camera_group, v.width, v.height, v.exposure, v.holdout, p.look)
             for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
-    findings = judge(seen, [n for n in found.absent if n not in described], source.artifact.passed_over)
+    useless = [c.name for c, v in zip(candidates, views, strict=True) if c.mask is not None and v.mask is None]
+    masked = sum(v.mask is not None for v in views)
+    findings = (*judge(seen, [n for n in found.absent if n not in described], source.artifact.passed_over),
+                *given_masks(masked, useless))  # fmt: skip
     warnings = found.warnings + made.foreign_colours(candidates, photos) + made.partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world,

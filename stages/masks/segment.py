@@ -20,6 +20,7 @@ from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.face_labels import LABELS, face_labels
+from stages.masks.judge import Seen, judge
 from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
@@ -105,7 +106,10 @@ def segment(
     if settings.faces:
         labels = _each(lambda m: _labels(m, settings.hair, context), masked, context, "looking for a face")
     made = tuple(_manifest(m, found, context) for m, found in zip(masked, labels, strict=True))
-    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings))
+    seen = [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, m.iou, m.view.holdout, m.view.index in dropped)
+            for m in masked]  # fmt: skip
+    findings = judge(seen, poses.roi_radius, poses.metric, sum("face" in m.labelled for m in made))
+    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings), findings=findings)
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
@@ -172,13 +176,7 @@ def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Co
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
     if source == "given" and inverted(alpha, view.disc):
         alpha, source = 1 - alpha, INVERTED
-    made = _keep(use, camera, alpha, source, context)
-    if made.useless and source in ("given", INVERTED):
-        raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
-                         where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
-                         limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
-                         "background black), or remove it so that one is computed")  # fmt: skip
-    return made
+    return _keep(use, camera, alpha, source, context)
 
 
 def _keep(view: View, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:
