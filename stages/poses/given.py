@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid, matrix
 from pipeline.verdict import Finding
-from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
+from stages.poses.check import AGREE, FAR, IMPERFECT, check_cameras, features_of
 from stages.poses.judge import CONTRADICTED, contradicted, mirrored
 from stages.poses.measure import find_eyes, known_scale
 from stages.poses.mirrored import find_mirrored
@@ -107,8 +109,9 @@ def _contradicted(
     features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
     far = IMPERFECT if config.given == "refine" else FAR
     verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
-    right = [i for i in range(len(cameras)) if i not in verdict.wrong]
-    flipped = find_mirrored(photos, verdict.wrong, right or range(len(cameras)), config.seed)
+    right = [i for i in range(len(cameras)) if verdict.share[i] >= AGREE]
+    silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image matches nothing
+    flipped = find_mirrored(photos, [*verdict.wrong, *silent], right, config.seed)
     findings = (contradicted([cameras[i].name for i in verdict.wrong], verdict.known, len(cameras)),
                 mirrored([cameras[i].name for i in flipped], len(cameras)))  # fmt: skip
     most = len(verdict.wrong) > CONTRADICTED.usable * verdict.known

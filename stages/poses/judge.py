@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, CaptureView
+from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView
 from pipeline.directions import Counts, around, count_seen, parts, share_seen, spread, view_directions
-from pipeline.transforms import F64
+from pipeline.transforms import F64, matrix
 from pipeline.verdict import Finding, Limits, judged
 from stages.poses.normalise import PLAUSIBLE_ROI
 
@@ -35,13 +35,14 @@ SPREAD = Limits(60.0, 10.0)  # degrees: 174 and more all around, 27 an arc; belo
 MIRRORED = Limits(0.0, 0.5, lower=False)
 
 
-def judge(found: CameraSet, views: Sequence[CaptureView], points: F64 | None) -> tuple[Counts, tuple[Finding, ...]]:
+def judge(found: CameraSet, capture: Capture, points: F64 | None) -> tuple[Counts, tuple[Finding, ...]]:
     """Which directions the fitted views see, and all findings that cameras alone allow. points: (M, 3) sparse points in
     asset coordinates, None where cameras were given."""
+    views, stated = capture.views, found.source == "given" and capture.kind == "facescape"
     fitted = fitted_cameras(found.cameras, views)
     directions = view_directions(fitted)
     counts = count_seen(directions)
-    out = [_placed(found), *_errors(found), *_focal(found, views), _scale(found), *_points(found, points),
+    out = [_placed(found), *_errors(found), *_focal(found, views), _scale(found, stated), *_points(found, points),
            *_seen(counts), _spread(directions)]  # fmt: skip
     return counts, tuple(out)
 
@@ -116,16 +117,18 @@ def _focal(found: CameraSet, views: Sequence[CaptureView]) -> list[Finding]:
                    views=sorted(ratios, key=lambda n: -abs(ratios[n] - 1)))]  # fmt: skip
 
 
-def _scale(found: CameraSet) -> Finding:
-    """A size that is known must be a head's; one that is not known is no fault of the photos."""
+def _scale(found: CameraSet, stated: bool) -> Finding:
+    """A size in metres must be a head's. One that is not known is no fault of the photos; stated: but of cameras in a
+    format that says its unit, of which none makes a head."""
     low, high = PLAUSIBLE_ROI
-    radius = found.roi_radius
-    off = max(low / radius, radius / high, 1.0) if found.metric else 1.0
-    said = (
-        f"the views see {radius:.3g} m around the subject" if found.metric else "the size of the subject is not known"
-    )
+    capture_unit = float(np.cbrt(np.linalg.det(matrix(found.capture_from_asset)[:3, :3])))
+    radius = found.roi_radius * (1.0 if found.metric else capture_unit)
+    known = found.metric or stated
+    off = max(low / radius, radius / high, 1.0) if known else 1.0
+    said = f"the views see {radius:.3g} {'m' if found.metric else 'units'} around the subject"
     return judged("scale", off, Limits(1.0, float("inf"), lower=False),
-                  said + (f", where a head is {low} to {high} m" if off > 1 else ""),
+                  (said if known else "the size of the subject is not known, and made a head's")
+                  + (f", where a head is {low} to {high} m" if off > 1 else ""),
                   "check poses.unit, poses.distance, poses.marker_mm or poses.pupils_mm", unit="times")  # fmt: skip
 
 
