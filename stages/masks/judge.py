@@ -15,14 +15,16 @@ from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.directions import STEEP, elevations, grid
-from pipeline.hull import Hull, surface_points, visual_hull
+from pipeline.hull import Hull, render_silhouette, surface_points, visual_hull
 from pipeline.transforms import F64, matrix
 from pipeline.verdict import Finding, Limits, judged
 from stages.masks.agree import CUBE, WRONG_SHARE, tolerated
-from stages.masks.region import F32
+from stages.masks.region import F32, region
 
 CELLS = 48  # along each edge of the hull's cube: 5 mm for a head, .1 to .3 s
-POOR = 0.85  # IoU with the others' hull below which a mask is named; the worst one of a good capture has .92
+POOR = 0.85  # IoU with the others' hull below which one is looked for; the worst one of a good capture has .92
+APART, SPREADS = 0.06, 4.0  # IoU and robust standard deviations below the median: the intact differ by .03
+MOST_NAMED = 8  # photos that are told apart one by one, a hull of .1 to .3 s each
 SHOWS = 0.02, 0.9  # share of the photo: nearly empty, nearly full; heads take .28 to .67
 NECK = -30.0  # degrees of elevation below which a head goes on into neck and shoulders
 HEAD_LITRES, HEAD_SHARE = 5.5, 0.27  # inside r: measured 4.7 to 7.6 litres, .22 to .31 of the ball
@@ -60,16 +62,17 @@ class Seen:
         return not self.holdout and not self.dropped
 
 
-def judge(views: Sequence[Seen], roi_radius: float, metric: bool, faces: int) -> tuple[Finding, ...]:
-    """All findings of the masks. metric: asset units are metres. faces: photos in which the subject has a face."""
-    out = [*_agreement(views), _coverage(views), *_inverted(views), _guessed(views)]
+def judge(
+    views: Sequence[Seen], first: Sequence[Seen], roi_radius: float, metric: bool, faces: int
+) -> tuple[Finding, ...]:  # fmt: skip
+    """All findings of the masks. first: before any was mended: a mask that was cut out along the others' hull no longer
+    tells that its photo shows something else. metric: asset units are metres. faces: photos in which the subject has a
+    face."""
+    out = [*_agreement(views, disagreeing(first, roi_radius)), _coverage(views), *_inverted(views), _guessed(views)]
     carving = [v for v in views if v.fitted]
     if not carving:
         return tuple(out)
-    edge, lenient = CUBE * roi_radius, tolerated(len(carving))
-    hull = visual_hull([v.camera for v in carving], [v.alpha for v in carving], [-edge] * 3, [edge] * 3,
-                       2 * edge / CELLS, min_views=min(3, len(carving)), max_outside=lenient,
-                       outside_share=WRONG_SHARE)  # fmt: skip
+    hull = _carved(carving, roi_radius, tolerated(len(carving)))
     return (*out, *hull_findings(hull, [v.camera for v in carving], roi_radius, metric and faces > 0))
 
 
@@ -131,20 +134,64 @@ def unseen_share(hull: Hull, cameras: Sequence[Camera], roi_radius: float) -> fl
     return float((best < SEEN_SQUARE).mean())
 
 
-def _agreement(views: Sequence[Seen]) -> tuple[Finding, Finding]:
+def disagreeing(first: Sequence[Seen], roi_radius: float) -> list[str]:
+    """Names of the voting views whose masks show another body than the rest, the worst first.
+
+    Two wrong masks can cut the hull so that right ones differ from it more than they do: a hull that lets a tenth of
+    the views be wrong is carved, the view that differs most from it is taken out, and so on until the rest agree.
+    """
+    left = [v for v in first if not v.holdout and v.iou is not None]
+    lost = [v.name for v in first if not v.holdout and v.iou is None]
+    if all((v.iou or 0.0) >= POOR for v in left):
+        return lost
+    out: list[str] = []
+    for _ in range(MOST_NAMED):
+        if len(left) < 3:
+            break
+        ious = _ious(left, _carved(left, roi_radius, max(1, round(WRONG_SHARE * len(left)))), roi_radius)
+        middle = float(np.median(ious))
+        spread = 1.4826 * float(np.median(np.abs(ious - middle)))
+        worst = int(np.argmin(ious))
+        if ious[worst] >= middle - max(APART, SPREADS * spread):
+            break
+        out.append(left.pop(worst).name)
+    if not out:  # nobody stands out: all that agree poorly
+        out = [v.name for v in sorted(left, key=lambda v: v.iou or 0.0) if (v.iou or 0.0) < POOR]
+    return out + lost
+
+
+def _carved(views: Sequence[Seen], roi_radius: float, lenient: int) -> Hull:
+    edge = CUBE * roi_radius
+    return visual_hull([v.camera for v in views], [v.alpha for v in views], [-edge] * 3, [edge] * 3, 2 * edge / CELLS,
+                       min_views=min(3, len(views)), max_outside=lenient, outside_share=WRONG_SHARE)  # fmt: skip
+
+
+def _ious(views: Sequence[Seen], hull: Hull, roi_radius: float) -> F64:
+    """(N,) IoU of each mask with the hull's silhouette within the region of interest."""
+    out = []
+    for v in views:
+        h, w = v.alpha.shape
+        disc = region(v.camera, roi_radius)
+        here = np.ones((h, w), bool) if disc is None else disc.scaled(w / v.camera.width).covers(h, w)
+        mask, shown = v.alpha >= 0.5, render_silhouette(hull, v.camera, h, w) >= 0.5
+        out.append((mask & shown & here).sum() / max(1, ((mask | shown) & here).sum()))
+    return np.array(out, np.float64)
+
+
+def _agreement(views: Sequence[Seen], wrong: Sequence[str]) -> tuple[Finding, Finding]:
     voting = [v for v in views if not v.holdout]
     known = [v.iou for v in voting if v.iou is not None]
     middle = float(np.median(known)) if known else 0.0
-    poor = sorted((v for v in voting if v.dropped or v.iou is None or v.iou < POOR), key=lambda v: v.iou or 0.0)
+    named = list(wrong) or [v.name for v in voting if v.dropped]
     return (
         judged("mask_agreement", middle, AGREEMENT,
                f"the middle mask agrees to {middle:.0%} with the body that all masks allow",
                "look at the masks and the cameras: the subject must be the same, at rest, and white in every mask",
-               views=[v.name for v in poor]),
-        judged("masks_disagreeing", len(poor) / max(1, len(voting)), DISAGREEING,
-               f"{len(poor)} of {len(voting)} masks disagree with the others",
-               "mend these masks, or remove these photos: another subject, one that moved, or a wrong camera",
-               views=[v.name for v in poor]),
+               views=named),
+        judged("masks_disagreeing", len(named) / max(1, len(voting)), DISAGREEING,
+               f"{len(named)} of {len(voting)} photos show another outline than the others say",
+               "look at these photos and their masks: another subject, one that moved, a part that is missing, or a "
+               "wrong camera; mend or remove them", views=named),
     )  # fmt: skip
 
 

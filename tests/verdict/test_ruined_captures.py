@@ -127,7 +127,7 @@ def another_subject(_: Path, c: Path) -> None:
 
 
 def subject_moved(count: int, shift: tuple[int, int]) -> Ruin:
-    return lambda _, c: r.repaint(c, lambda image: r.moved(image, *shift), range(0, 2 * count, 2))
+    return lambda _, c: r.repaint(c, lambda image: r.moved(image, *shift), [(7 * n) % r.VIEWS for n in range(count)])
 
 
 def masked(change: Callable[[r.U8, int], r.U8]) -> Ruin:
@@ -182,7 +182,9 @@ CASES = (
     Case("cameras shuffled", shuffled, "masks", "mask_agreement", "unusable", "agrees to"),
     Case("another subject", another_subject, "masks", "masks_disagreeing", "usable", "1 of 20", ("5.png",)),
     Case("moved in three photos", subject_moved(3, (20, 0)), "masks", "masks_disagreeing", "usable", "3 of 20",
-         ("0.png", "2.png", "4.png")),
+         ("0.png", "7.png", "14.png")),
+    Case("moved in one photo", subject_moved(1, (20, 0)), "masks", "masks_disagreeing", "usable", "1 of 20",
+         ("0.png",)),
     Case("moved in half of them", subject_moved(10, (5, 0)), "masks", "mask_agreement", "usable", "agrees to"),
     Case("half of the masks inverted", masked(lambda a, i: 255 - a if i % 2 else a), "masks", "masks_inverted",
          "unusable", "10 of 20", ("1.png", "19.png")),
@@ -191,7 +193,7 @@ CASES = (
     Case("one mask full", masked(only(4, 255)), "capture", "given_masks", "usable", "1 of 20", ("4.png",)),
     Case("one mask a dot", masked(dot), "masks", "masks_empty_or_full", "usable", "1 of 20", ("6.png",)),
     Case("masks far too large", masked(grown(28)), "masks", "hull_volume", "usable", "litres"),
-    Case("masks that reach the frame", masked(grown(36)), "masks", "hull_open", "usable", "reaches the edge"),
+    Case("body open to one side", from_azimuth(-25, 25), "masks", "hull_open", "usable", "reaches the edge"),
     Case("masks far too small", masked(grown(-14)), "masks", "hull_volume", "unusable", "a head about"),
     Case("body seen from one side", from_azimuth(-40, 40), "masks", "hull_unseen", "usable", "no camera looks"),
 )  # fmt: skip
