@@ -20,6 +20,7 @@ from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.face_labels import LABELS, face_labels
+from stages.masks.judge import Seen, judge
 from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
@@ -91,6 +92,7 @@ def segment(
     support = how.solid.support if how.solid is not None else None
     found = _opinions(masked, voting, poses, settings, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
+    first = _seen(masked, [])
     if settings.mend:
         bad = _outliers(masked, settings)
         mended = _each(lambda t: _mend(t[0], t[1], t[2], settings, context),
@@ -105,7 +107,15 @@ def segment(
     if settings.faces:
         labels = _each(lambda m: _labels(m, settings.hair, context), masked, context, "looking for a face")
     made = tuple(_manifest(m, found, context) for m, found in zip(masked, labels, strict=True))
-    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings))
+    findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
+                     sum("face" in m.labelled for m in made))  # fmt: skip
+    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings), findings=findings)
+
+
+def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
+    """The masks as they are judged."""
+    return [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, None if m.useless else m.iou, m.view.holdout,
+                 m.view.index in dropped) for m in masked]  # fmt: skip
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:

@@ -142,13 +142,16 @@ def test_given_masks_are_kept_exactly(scene: Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
-def test_an_empty_or_full_given_mask_costs_its_view_and_no_more(scene: Scene, tmp_path: Path, value: float) -> None:
+def test_an_empty_and_a_full_given_mask_are_dropped_and_named(scene: Scene, tmp_path: Path, value: float) -> None:
+    for i, c in enumerate(scene.cameras):
+        scene.give(i, ball_alpha(c))
     scene.give(4, np.full((SIZE, SIZE), value, np.float32))
-    for i in set(range(12)) - {4}:
-        scene.give(i, ball_alpha(scene.cameras[i]))
     found, _ = run(scene, tmp_path / "s")
-    assert found.dropped == (4,)
-    assert [w for w in found.warnings if "view 4 (4.png) is not fitted: its mask shows nothing or everything" in w]
+    assert found.dropped == (4,) and any("view 4 (4.png)" in w for w in found.warnings)
+    told = {f.check: f for f in found.findings}["masks_empty_or_full"]
+    assert told.level == "usable" and told.views == ("4.png",)
+    others = [m.hull_iou for m in found.masks if m.index != 4]
+    assert min(v for v in others if v is not None) > 0.9  # it had no vote
 
 
 def test_given_mask_of_another_size(scene: Scene, tmp_path: Path) -> None:
