@@ -29,7 +29,8 @@ MIN_PHOTOS = 3  # fewer can agree by chance
 MET = 0.06  # of the face's size in a photo: median residual from which it shows another face, or none
 SOFT = 0.02  # s: the network's own scatter on sharp frontal photos is about 1 % of the face
 ROUNDS = 10
-MOST_PAIRS = 400
+MOST_PAIRS = 150
+SPREAD = 2.8  # of a face's landmarks: its whole size over the median distance from their middle
 WIDE = np.radians(4.0)  # rays of two photos must part by so much to say how far away the face is
 TOP, CHIN = 10, 152  # upper end of the forehead and lower end of the chin, in the middle
 SIDES = ((33, 263), (133, 362), (61, 291), (127, 356), (234, 454), (58, 288))  # right and left of the same place
@@ -137,11 +138,14 @@ def _parted(seen: _Sights, which: npt.NDArray[np.integer]) -> bool:
 
 
 def _size(seen: _Sights, xyz: F64) -> F64:
-    """(N,) how large the face is in each photo, pixels; from its points in space, so that a face that was seen wrongly
-    cannot choose its own size. NaN behind the camera, where no residual is small."""
-    extent = float(np.linalg.norm(xyz - xyz.mean(0), axis=1).max()) * 2 if np.isfinite(xyz).all() else np.nan
-    distance = np.linalg.norm(seen.centre - xyz.mean(0), axis=1)
-    return np.asarray(extent * seen.focal / np.maximum(distance, 1e-12), np.float64)
+    """(N,) about how large the face is in each photo, pixels: as its points in space say, or as the photo does, the
+    smaller, so that neither a face that was seen wrongly nor points far apart can choose their own measure."""
+    middle = np.median(xyz, 0)
+    radius = float(np.median(np.linalg.norm(xyz - middle, axis=1)))
+    distance = np.linalg.norm(seen.centre - middle, axis=1)
+    projected = radius * seen.focal / np.maximum(distance, 1e-12)
+    shown = np.median(np.linalg.norm(seen.uv - np.median(seen.uv, 1, keepdims=True), axis=2), 1)
+    return np.asarray(SPREAD * np.minimum(projected, shown), np.float64)
 
 
 def _points(seen: _Sights, weight: F64) -> F64:
