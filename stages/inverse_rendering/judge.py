@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.artifacts import Capture, MaskSet
+from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
 from stages.inverse_rendering.choices import FAINT, Facts
 from stages.inverse_rendering.evidence import more
@@ -39,7 +40,6 @@ AGREE = Limits(0.12, 0.35, lower=False)
 SHINE = Limits(FAINT, 0.0)
 ALWAYS = Limits(0.0, 0.0)
 MOST_NAMED = 12
-FACES = 3  # photos with a face from which the subject is a person: one alone may be a mistake
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +53,6 @@ class Fitted:
     history: Sequence[float]
     facts: Facts
     prior: str = "hull"
-
-    @property
-    def person(self) -> bool:
-        """Whether a few photos show a face."""
-        return sum("face" in m.labelled for m in self.masks.masks) >= FACES
 
 
 def findings(f: Fitted) -> tuple[Finding, ...]:
@@ -186,7 +181,7 @@ def _shine(f: Fitted) -> list[Finding]:
         "the asset looks matt under new light; photograph with fixed exposure under a light with edges (window, soft "
         "box) from more directions, or set inverse_rendering.specular=on"
     )
-    return [judged("specular", value, SHINE if f.person else ALWAYS, said, remedy)]
+    return [judged("specular", value, SHINE if shows_person(f.masks) else ALWAYS, said, remedy)]
 
 
 def _colours(f: Fitted) -> list[Finding]:
