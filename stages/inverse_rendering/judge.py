@@ -30,6 +30,9 @@ FELL = Limits(0.5, 3.0, lower=False)
 # Share of the subject's pixels that the field leaves empty: scanned head .0001, frayed shoulders .016, a blob of the
 # hull .022, the lost head .60.
 MISSING = Limits(0.02, 0.1, lower=False)
+# Share of the background's pixels near the subject, and beyond, where the field is not empty: scanned head .0005, an arc
+# of cameras .006, frayed shoulders .013, an arm that only a few photos show .041.
+BEYOND = Limits(0.05, 0.25, lower=False)
 # Share of rays that the hull answers otherwise than the masks: .002 on a scanned head, .017 and .035 on two people,
 # .315 where one wrong mask cut the head off.
 START = Limits(0.05, 0.15, lower=False)
@@ -123,14 +126,19 @@ def views(f: Fitted) -> list[Finding]:
 
 
 def empty(f: Fitted) -> list[Finding]:
-    """How much of the subject the field does not have."""
+    """How much of the subject the field does not have, and how much it has beside it."""
     if not f.errors:
         return []
     value = float(np.mean([e.missing for e in f.errors]))
     said = f"{value:.1%} of the subject's pixels in the fitted photos see nothing of the model"
     remedy = "a part of the subject is missing: look for masks or cameras that contradict the others"
     lacking = sorted((e for e in f.errors if e.missing > MISSING.usable), key=lambda e: -e.missing)
-    return [judged("fit_missing", value, MISSING, said, remedy, views=_names(f, lacking))]
+    out = [judged("fit_missing", value, MISSING, said, remedy, views=_names(f, lacking))]
+    value = float(np.mean([e.beyond for e in f.errors]))
+    said = f"{value:.1%} of the background's pixels around the subject in the fitted photos see the model"
+    remedy = "something that most masks leave out was modelled: look for masks that show more than the others"
+    covered = sorted((e for e in f.errors if e.beyond > BEYOND.usable), key=lambda e: -e.beyond)
+    return [*out, judged("fit_beyond", value, BEYOND, said, remedy, views=_names(f, covered))]
 
 
 def fell(f: Fitted) -> list[Finding]:

@@ -105,6 +105,12 @@ def test_a_part_of_the_subject_that_the_field_lacks(missing: float, level: str) 
     assert found.views == (tuple(f"p{i}.jpg" for i in range(19, 7, -1)) if level == "unusable" else ())
 
 
+@pytest.mark.parametrize(("beyond", "level"), [(0.0005, "good"), (0.1, "usable"), (0.3, "unusable")])
+def test_a_field_where_the_masks_show_nothing(beyond: float, level: str) -> None:
+    found = only(sound([error(i, beyond=beyond) for i in range(20)]), "fit_beyond")
+    assert found.level == level and len(found.views) == (12 if level == "unusable" else 0)
+
+
 @pytest.mark.parametrize(("last", "level"), [(37.4, "good"), (36.0, "usable"), (33.0, "unusable")])
 def test_a_fit_that_ends_below_its_best(last: float, level: str) -> None:
     assert only(sound(history=(*RISING, last)), "psnr_fell").level == level

@@ -61,9 +61,8 @@ def test_a_face_inside_a_blob() -> None:
     """The hull of an arc of cameras: the mesh reaches 30 mm further to the front."""
     found = by_name(ellipsoid(1.0, (0, 0, 0.03)))
     assert {found["face_shape_mm"].level, found["nose_buried_mm"].level} == {"unusable"}
-    assert (
-        found["nose_buried_mm"].value == pytest.approx(30, abs=5) and "behind the mesh" in found["nose_buried_mm"].said
-    )
+    value = found["nose_buried_mm"].value  # of the eyes, whose rays cross the blob askew
+    assert value is not None and 28 < value < 45 and "behind the mesh" in found["nose_buried_mm"].said
     assert found["face_reprojection_mm"].level != "good"
 
 
