@@ -30,7 +30,7 @@ FELL = Limits(0.5, 3.0, lower=False)
 # Share of the subject's pixels that the field leaves empty: scanned head .0001, frayed shoulders .016, a blob of the
 # hull .022, the lost head .60.
 MISSING = Limits(0.02, 0.1, lower=False)
-# Share of the background's pixels near the subject, and beyond, where the field is not empty: scanned head .0005, an arc
+# Share of the background near the subject, and beyond, where the field is not empty: scanned head .0005, an arc
 # of cameras .006, frayed shoulders .013, an arm that only a few photos show .041.
 BEYOND = Limits(0.05, 0.25, lower=False)
 # Share of rays that the hull answers otherwise than the masks: .002 on a scanned head, .017 and .035 on two people,
