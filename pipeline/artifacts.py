@@ -226,11 +226,33 @@ class CameraSet(Artifact):
 
 
 # ------------------------------------------------------------------ masks
+class Cut(Artifact):
+    """A plane: points with normal . x > offset lie beyond it. normal: unit, asset coordinates."""
+
+    normal: tuple[float, float, float]
+    offset: float
+
+
+class Extent(Artifact):
+    """The part of space that the asset is made of: an ellipsoid less what lies beyond its cuts, asset coordinates.
+
+    axes: unit vectors in rows (to the person's left, up, to the front); radii along them. head: length from chin to
+    the top of the forehead, by which all margins are measured.
+    """
+
+    centre: tuple[float, float, float]
+    axes: Matrix
+    radii: tuple[float, float, float]
+    cuts: tuple[Cut, ...] = ()
+    head: float
+
+
 class ViewMask(Artifact):
     """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
 
     labels: where face or hair was found, PNG of codes, whose names MaskSet.label_names has. labelled: the names of
-    those in this photo, the background not among them.
+    those in this photo, the background not among them. asked: 8-bit PNG at the photo's size, white where the photo
+    shows the subject inside its extent, or background; what is black is neither fitted nor scored. None: all is asked.
     """
 
     index: int
@@ -240,15 +262,24 @@ class ViewMask(Artifact):
     hull_iou: float | None = None
     labels: FileRef | None = None
     labelled: tuple[str, ...] = ()
+    asked: FileRef | None = None
 
 
 class MaskSet(Artifact):
     """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted. label_names: of
-    the codes 0, 1, ... in the views' labels."""
+    the codes 0, 1, ... in the views' labels.
+
+    landmarks: the face in space, None where fewer than three fitted photos agree on one. npz: views (N,) indices of
+    the fitted photos with a face, uv (N, 468, 2) pixels there, xyz (468, 3) asset coordinates, error_px (N,) median
+    distance of a photo's landmarks from where xyz projects to, kept (N,) photos that agree (pipeline.faces). extent:
+    the part of the subject that the asset is made of; None for objects, of which all in the region of interest is.
+    """
 
     masks: tuple[ViewMask, ...]
     label_names: tuple[str, ...] = ()
     dropped: tuple[int, ...] = ()
+    landmarks: FileRef | None = None
+    extent: Extent | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 
@@ -312,7 +343,8 @@ class UvMesh(Artifact):
     UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs. stretch: L2, stretch_max:
     Linf of [Sander 2001]. seam_front_mm: length of seams where the surface looks to the front. deviation: of the mesh
     and of the proxy from the dense mesh. tiles: UDIM tiles (pipeline.tiles) that the charts lie in; tile_utilisation:
-    share of each under charts, where there are several, and utilisation their mean.
+    share of each under charts, where there are several, and utilisation their mean. face_share: of the area under
+    charts that belongs to the face; None where no face is known.
     """
 
     mesh: FileRef
@@ -330,6 +362,7 @@ class UvMesh(Artifact):
     deviation_mm: float
     deviation_rms_mm: float = 0.0
     proxy_deviation_rms_mm: float = 0.0
+    face_share: float | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

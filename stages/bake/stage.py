@@ -39,9 +39,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     """Bake every map. Raises StageError when the mesh has no charts or the field is not finite on it."""
     from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
+    from pipeline.people import shows_person
     from pipeline.visibility import seen_by
     from stages.bake.build import Baker, Photos
     from stages.bake.deviation import zero_set_rms
+    from stages.bake.judge import chosen, judge
+    from stages.bake.judge import together as texels_of_all
     from stages.bake.tally import together
     from stages.bake.write import joined, write_maps
 
@@ -59,11 +62,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
 
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch)
-    parts, tallies, areas = [], [], Counter[int]()
+    parts, tallies, judged, areas = [], [], [], Counter[int]()
+    labels = inputs.masks.artifact.label_names
     for number in range(baker.tiles):
         baked = baker.tile(number)
         parts.append(write_maps(baked, context, number, baker.tiles))
         tallies.append(baked.tally)
+        judged.append(chosen(baked.samples, baked.texel, baked.size, baked.votes, labels))
         areas.update(baked.regions)
         del baked
     maps, all_tiles = joined(parts, [t.texels for t in tallies], context), together(tallies)
@@ -83,8 +88,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         zero_set_rms_mm=1000 * all_tiles.deviation,
         lod_rms_mm={name: round(1000 * zero_set_rms(field, level), 5) for name, level in levels.items()},
         figures=figures,
-        regions=region_shares(areas, inputs.masks.artifact.label_names),
+        regions=region_shares(areas, labels),
         warnings=all_tiles.warnings(baker.residual, len(views)),
+        findings=judge(texels_of_all(judged), figures, person=shows_person(inputs.masks.artifact)),
     )
 
 
@@ -110,4 +116,4 @@ def attenuation(face: FittedFace) -> str:
     return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
 
 
-STAGE = Stage(name="bake", version=6, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=7, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -45,6 +45,7 @@ SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved an
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
 COUNTED = ("step", "loss", "error", "shadows_solved", "allowance", "spent")  # plain numbers of a checkpoint
 SMOOTHING = 0.98  # of the running loss and error that are shown
+NOTED = 10  # times in a fit that the running PSNR is kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ class Trainer:
     spent: float = 0.0
     table: PixelTable | None = None
     choices: Choices | None = None
+    history: list[float] = field(default_factory=list)  # running PSNR after each tenth of the fit
     waiting: tuple[int, ...] = field(init=False)
     optimiser: torch.optim.Optimizer = field(init=False)
     guard: Guard = field(init=False)
@@ -91,6 +93,13 @@ class Trainer:
     def psnr(self) -> float:
         """Running PSNR over whole subject pixels of the fitted views."""
         return -10 * math.log10(max(self.error, 1e-10)) if math.isfinite(self.error) else float("nan")
+
+    @property
+    def pixels(self) -> PixelTable:
+        """The photos' pixels at the present level."""
+        self.enter_level()
+        assert self.table is not None
+        return self.table
 
     # ---------------------------------------------------------------- schedule
     def share(self) -> float:
@@ -188,6 +197,8 @@ class Trainer:
         begun = time.monotonic()
         self._advance()
         self.spent += time.monotonic() - begun
+        while len(self.history) < int(NOTED * self.share()):
+            self.history.append(self.psnr)
 
     def _advance(self) -> None:
         """Draw, evaluate, move."""
@@ -281,6 +292,7 @@ class Trainer:
         state = {
             "settings": repr(self.settings),
             "dropped": self.guard.causes,
+            "history": self.history,
             **{name: getattr(self, name) for name in COUNTED},
             **self.parts(),
         }
@@ -298,7 +310,7 @@ class Trainer:
         self.restore(state)
         for name in COUNTED:
             setattr(self, name, state[name])
-        self.guard.causes = list(state["dropped"])
+        self.guard.causes, self.history = list(state["dropped"]), list(state["history"])
         return True
 
     def parts(self) -> dict[str, Any]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from pipeline import transforms
 from pipeline.artifacts import Camera, CameraSet, Capture, FileRef, Located, MaskSet
-from pipeline.images import read_alpha, read_linear, shrink_whole
+from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
+from stages.inverse_rendering.residuals import U8
 from stages.inverse_rendering.views import F32, PhotoView, factor_for
 
 
@@ -40,6 +41,13 @@ def read_views(
             )
         )
     return views
+
+
+def read_labels(masks: Located[MaskSet], indices: list[int]) -> list[U8 | None]:
+    """(H, W) codes of some views' labels, None where a view has none."""
+    files = {m.index: m.labels for m in masks.artifact.masks}
+    found = (files.get(i) for i in indices)
+    return [None if f is None else np.asarray(read_encoded(masks.path(f))[..., 0], np.uint8) for f in found]
 
 
 def shrunk(view: PhotoView, side: int) -> PhotoView:

@@ -158,8 +158,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.exposure import exposures_differ
     from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
-    from stages.inverse_rendering.gather import read_views
+    from stages.inverse_rendering.gather import read_labels, read_views
+    from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.paper import new_paper_trainer
+    from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.start import agreed, hull_start, sphere_start
     from stages.inverse_rendering.stereo import start_from_photos
 
@@ -208,6 +210,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     held_out = predict_held_out(
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
+    facts = model_facts(trainer, looked)
+    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
+    left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
+    fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts, settings.prior)
     return FittedFace(
         field=context.file("field.npz"),
         light=context.file("light.json"),
@@ -220,7 +226,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         psnr=round(trainer.psnr, 4),
         beta=float(model.beta),
         cell=model.geometry.cell,
-        model=model_facts(trainer, looked),
+        model=facts,
+        findings=findings(fitted),
     )
 
 

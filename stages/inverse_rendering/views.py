@@ -141,8 +141,13 @@ class PixelTable:
         if not picks:  # photos of nothing
             picks, shares = [torch.zeros(0, dtype=torch.int64, device=self.view.device)], [self.alpha[:0]]
         i, share = torch.cat(picks), torch.cat(shares)
+        return self.at(i, share / share.mean())
+
+    def at(self, i: Tensor, share: Tensor | None = None) -> Batch:
+        """The pixels i (N,) of the table. share: see Batch; 1 where it is not told."""
         view = self.view[i].long()
-        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share / share.mean())
+        share = torch.ones_like(self.alpha[i]) if share is None else share
+        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share)
 
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)

@@ -24,13 +24,23 @@ CROP, SURE = 1.3, 0.5  # half-edge of what the network for hair sees, in such ra
 INSIDE = 0.85  # share of its points that must lie on the subject: a picture on the wall is no face of theirs
 
 
+def subjects_face(image: U8, alpha: F32, disc: Disc) -> Face | None:
+    """The face in the region of interest of a photo (H, W, 3) 8-bit sRGB, if it lies on the photo's mask (H, W)."""
+    face = find_face(image, disc.x, disc.y, REACH * disc.radius, disc.roll)
+    return face if face is not None and on_subject(face, alpha) >= INSIDE else None
+
+
 def face_labels(image: U8, alpha: F32, disc: Disc, hair: UserModel | None = None) -> U8 | None:
     """(H, W) labels of a photo (H, W, 3) 8-bit sRGB with its mask (H, W), or None without face and hair.
 
     hair: the user's network, if there is one; it has the last word, but for the eyes."""
+    return labels_with(subjects_face(image, alpha, disc), image, alpha, disc, hair)
+
+
+def labels_with(face: Face | None, image: U8, alpha: F32, disc: Disc, hair: UserModel | None) -> U8 | None:
+    """`face_labels` where the face was looked for before."""
     out = (alpha >= 0.5).astype(np.uint8) * SUBJECT
-    face = find_face(image, disc.x, disc.y, REACH * disc.radius, disc.roll)
-    if face is not None and on_subject(face, alpha) >= INSIDE:
+    if face is not None:
         # the hull and not the oval around the face, which runs through the nose where it is seen from the side
         hull = cv2.convexHull(face.points.astype(np.float32)).reshape(-1, 2)
         _fill(out, hull.astype(np.float64), FACE)

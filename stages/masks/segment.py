@@ -15,12 +15,14 @@ import numpy as np
 from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located, MaskSet, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
+from pipeline.faces.find import Face
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
-from stages.masks.face_labels import LABELS, face_labels
+from stages.masks.face_labels import LABELS, labels_with, subjects_face
 from stages.masks.judge import Seen, judge
+from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
@@ -75,6 +77,14 @@ class Masked:
         return not LIMITS[0] <= self.coverage <= LIMITS[1]
 
 
+@dataclass(frozen=True, slots=True)
+class Looked:
+    """What a photo shows of the face: where, and the file of its labels with the names of those in it."""
+
+    face: Face | None = None
+    labels: Labelled | None = None
+
+
 def segment(
     capture: Located[Capture], located: Located[CameraSet], settings: Settings, context: Context
 ) -> MaskSet:  # fmt: skip
@@ -103,13 +113,18 @@ def segment(
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
     dropped = _dropped(masked, settings, warnings)
-    labels: list[Labelled | None] = [None] * len(masked)
+    looked = [Looked()] * len(masked)
     if settings.faces:
-        labels = _each(lambda m: _labels(m, settings.hair, context), masked, context, "looking for a face")
-    made = tuple(_manifest(m, found, context) for m, found in zip(masked, labels, strict=True))
+        looked = _each(lambda m: _look(m, settings.hair, context), masked, context, "looking for a face")
+    fitted = [(m.camera, x.face) for m, x in zip(masked, looked, strict=True)
+              if x.face is not None and not m.view.holdout and m.view.index not in dropped]  # fmt: skip
+    found_face = agreed(fitted)
+    landmarks = None if found_face is None else save_landmarks(found_face, context)
+    made = tuple(_manifest(m, x.labels, context) for m, x in zip(masked, looked, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in made))  # fmt: skip
-    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), warnings=tuple(warnings), findings=findings)
+    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks,
+                   warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
 def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
@@ -281,14 +296,16 @@ def _enough(left: int, views: int, warnings: list[str]) -> None:
                          "choose another masks.method")  # fmt: skip
 
 
-def _labels(m: Masked, hair: UserModel | None, context: Context) -> Labelled | None:
-    """The file of the labels of a photo that shows the subject's face or hair, and which they are; else None."""
-    labels = face_labels(m.view.read(), read_alpha(_path(m.view.index, context)), m.view.disc, hair)
+def _look(m: Masked, hair: UserModel | None, context: Context) -> Looked:
+    """The subject's face in a photo, and the file of its labels where it shows face or hair."""
+    image, alpha = m.view.read(), read_alpha(_path(m.view.index, context))
+    face = subjects_face(image, alpha, m.view.disc)
+    labels = labels_with(face, image, alpha, m.view.disc, hair)
     if labels is None:
-        return None
+        return Looked(face)
     path = context.workdir / "labels" / f"{m.view.index}.png"
     write_png(path, labels / 255)
-    return path, tuple(LABELS[i] for i in np.unique(labels) if i)
+    return Looked(face, (path, tuple(LABELS[i] for i in np.unique(labels) if i)))
 
 
 def _manifest(m: Masked, labels: Labelled | None, context: Context) -> ViewMask:

@@ -19,7 +19,6 @@ from pipeline.artifacts import (
     UvMesh,
 )
 from pipeline.contract import Context, Stage, StageConfig
-from pipeline.verdict import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +51,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     from stages.report.build import build_page, build_rows, summary
     from stages.report.compare import judged_views, unjudged
     from stages.report.gather import figures
+    from stages.report.judge import judge
 
     rows, total = [], max(1, len(inputs.usd.artifact.views), len(inputs.inverse_rendering.artifact.held_out))
     for number, view in enumerate(judged_views(inputs)):
         context.check()
         rows.append(build_rows(view, config.picture_side))
         context.progress(number + 1, total + 1, f"view {view.index}")
-    findings: tuple[Finding, ...] = ()
+    findings = judge(rows, {v.index: v.name for v in inputs.capture.artifact.views})
     verdict = verdict_of_inputs(inputs, report=findings)
     metrics = {"verdict": verdict.record(every=True), "holdout": summary(rows), "timing": {}, **figures(inputs)}
     metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
@@ -66,11 +66,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     page = build_page(metrics, verdict, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
-    return Report(
-        files=(context.file("index.html"), context.file("metrics.json")),
-        warnings=tuple(unjudged(inputs)),
-        findings=findings,
-    )
+    files = context.file("index.html"), context.file("metrics.json")
+    return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
 STAGE = Stage(name="report", version=6, inputs=Inputs, config=Config, output=Report, run=run)

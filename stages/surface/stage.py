@@ -50,6 +50,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     from pipeline.fields.face import load_face
     from pipeline.visibility import Occluder, seen_by, sight
     from stages.surface.build import build
+    from stages.surface.judge_face import face_findings
 
     fitted = inputs.inverse_rendering
     field = load_face(fitted.path(fitted.artifact.field), context.device)
@@ -91,6 +92,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         handles_cut=built.handles[0],
         handles_left=built.handles[1],
         warnings=built.warnings,
+        findings=face_findings(inputs, built.mesh),
     )
 
 

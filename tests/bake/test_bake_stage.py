@@ -93,6 +93,10 @@ def test_run_writes_every_map(inputs: Inputs, tmp_path: Path) -> None:
     covered = read_exr(tmp_path / "textures/coverage.exr")[0][..., 0] > 0
     rho = read_exr(tmp_path / "textures/specular_intensity.exr")[0][covered]
     assert textures.maps["specular_intensity"].mean == pytest.approx(float(rho.mean()), rel=1e-5)
+    judged = {f.check: f for f in textures.findings}  # three cameras around a ball: no photo shows a face
+    assert judged["unseen"].value == pytest.approx(textures.figures["unseen"], abs=1e-5)
+    f0 = read_exr(tmp_path / "textures/f0.exr")[0][read_exr(tmp_path / "textures/coverage.exr")[0] == 1]
+    assert judged["f0_mean"].value == pytest.approx(float(f0.mean()), rel=0.02) and "f0_none" not in judged
     png = read_encoded(tmp_path / "textures/roughness.png")[..., 0] / 255
     assert np.abs(png - read_exr(tmp_path / "textures/roughness.exr")[0][..., 0]).max() < 0.003
 

@@ -1,0 +1,140 @@
+"""How good the maps are: how much of the surface a photo saw, and whether the material is one that exists."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.colour import LUMA
+from pipeline.maths import microfacet
+from pipeline.meshes import F32, Indices
+from pipeline.verdict import Finding, Limits, judged
+from stages.bake.regions import Votes
+from stages.bake.texels import Samples
+
+MOST = 100_000  # texels of a tile that are judged, an even choice: shares are then known to a thousandth
+LEAST = 200  # texels of skin below which they are not judged alone
+# Share of the texels that no photo saw. A head photographed all round in a rig: .25 (under the neck, inside the ears);
+# people photographed from three sides: .45; an arc of cameras before the face: .62 to .67.
+UNSEEN = Limits(0.35, 0.8, lower=False)
+# F0 = ((n - 1) / (n + 1))^2: skin .028, plastics and glass .04 to .05, gems .08 to .17. Beyond, only metals, which the
+# model does not have.
+F0_MEAN = Limits(0.08, 0.2, lower=False)
+F0_SKIN = Limits(0.06, 0.2, lower=False)
+F0_TOP = Limits(0.2, 1.0, lower=False)  # of the brightest texel in a thousand; above 1 more comes back than came
+F0_NONE = Limits(1e-3, 0.0)  # mean on a person; drafts of a scanned head have .006 to .008
+# GGX roughness of skin is .25 to .6; .1 is a wet or polished thing, 1 has no highlight at all.
+ROUGHNESS_RANGE, ROUGHNESS = (0.1, 0.9), Limits(0.05, 0.5, lower=False)
+# Linear albedo of skin, darkest to lightest people, shadowed folds and scars left room for.
+SKIN_RANGE, SKIN_ALBEDO = (0.03, 0.75), Limits(0.05, 0.5, lower=False)
+CLAMPED = Limits(
+    0.02, 0.2, lower=False
+)  # share of the texels; 0 on a scanned head, .02 to .04 where the shape is wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Texels:
+    """What is judged of some texels that a photo saw. f0, roughness, luma (N,); skin (N,) those labelled as a face."""
+
+    f0: F32
+    roughness: F32
+    luma: F32
+    skin: np.typing.NDArray[np.bool_]
+
+
+def chosen(s: Samples, texel: Indices, size: int, votes: Votes | None, names: Sequence[str]) -> Texels:
+    """An even choice of a tile's seen texels; texel (N,) their places in a picture of `size`."""
+    seen = np.flatnonzero(s.unseen < 0.5)
+    rows = seen[:: max(1, -(-len(seen) // MOST))]
+    face = names.index("face") if "face" in names else -1
+    skin = np.zeros(len(rows), np.bool_) if votes is None else votes.winners(texel[rows], size) == face
+    return Texels(
+        s.f0[rows],
+        np.asarray(microfacet.roughness_from_inv_kappa(s.inv_kappa[rows]), np.float32),
+        np.asarray(s.albedo[rows] @ np.array(LUMA), np.float32),
+        skin,
+    )
+
+
+def together(parts: Sequence[Texels]) -> Texels:
+    """Of all tiles."""
+    columns = zip(*((p.f0, p.roughness, p.luma, p.skin) for p in parts), strict=True)
+    return Texels(*(np.concatenate(c) for c in columns))
+
+
+def judge(t: Texels, figures: Mapping[str, float], *, person: bool) -> tuple[Finding, ...]:
+    """All findings. figures: the stage's own (pipeline.artifacts.TextureSet). person: whether photos show a face."""
+    return (*_seen(figures), *_clamped(figures), *_f0(t, person), *_roughness(t), *_skin(t))
+
+
+def _seen(figures: Mapping[str, float]) -> list[Finding]:
+    value = figures["unseen"]
+    said = f"{value:.0%} of the surface was seen by no photo; its shape and colour are a guess"
+    remedy = "photograph from the sides, from behind, from above and below as well"
+    return [judged("unseen", value, UNSEEN, said, remedy)]
+
+
+def _clamped(figures: Mapping[str, float]) -> list[Finding]:
+    value = figures["albedo_clamped"]
+    said = f"the albedo of {value:.1%} of the surface was outside of what exists and was clamped"
+    remedy = "look at clamped.png: shape, shadows or exposure are wrong there"
+    return [judged("albedo_clamped", value, CLAMPED, said, remedy)]
+
+
+def _f0(t: Texels, person: bool) -> list[Finding]:
+    if not len(t.f0):
+        return []
+    skin = t.skin.sum() >= LEAST
+    of = t.f0[t.skin] if skin else t.f0
+    where = "the skin's" if skin else "the surface's"
+    mean, top = float(of.mean()), float(np.quantile(of, 0.999))
+    remedy = (
+        "highlights were explained by a mirror: the photos are clipped, or light or subject moved; fix the exposure "
+        "below clipping and keep the light still, or set inverse_rendering.specular=off"
+    )
+    said = f"{where} F0 is {mean:.3f} on average (skin has .028, no stone or plastic more than .17)"
+    out = [
+        judged("f0_mean", mean, F0_SKIN if skin else F0_MEAN, said, remedy),
+        judged("f0_top", top, F0_TOP, f"{where} F0 is below {top:.3f} but for a thousandth", remedy),
+    ]
+    if person:
+        matt = (
+            "the asset looks matt under new light; photograph under a light with edges (window, soft box) and a fixed "
+            "exposure"
+        )
+        said = f"{where} F0 is {mean:.3f}" + (": nothing shines" if mean < F0_NONE.good else "")
+        out.append(judged("f0_none", mean, F0_NONE, said, matt))
+    return out
+
+
+def _roughness(t: Texels) -> list[Finding]:
+    """Where there is a lobe at all."""
+    of = t.roughness[t.f0 > 0]
+    if not len(of):
+        return []
+    low, high = ROUGHNESS_RANGE
+    value = float(((of < low) | (of > high)).mean())
+    said = f"roughness lies outside {low:g} to {high:g} on {value:.1%} of the seen surface ({_range(of)} on most of it)"
+    remedy = (
+        "the highlights do not tell how rough the surface is: photograph under a light with edges, from more directions"
+    )
+    return [judged("roughness", value, ROUGHNESS, said, remedy)]
+
+
+def _skin(t: Texels) -> list[Finding]:
+    if t.skin.sum() < LEAST:
+        return []
+    of, (low, high) = t.luma[t.skin], SKIN_RANGE
+    value = float(((of < low) | (of > high)).mean())
+    said = (
+        f"albedo of the face lies outside skin's {low:g} to {high:g} on {value:.1%} of it ({_range(of)} on most of it)"
+    )
+    remedy = "exposure or light is not what the fit found: photograph with a colour chart, and with a fixed exposure"
+    return [judged("albedo_skin", value, SKIN_ALBEDO, said, remedy)]
+
+
+def _range(values: F32) -> str:
+    low, high = np.quantile(values, (0.05, 0.95))
+    return f"{low:.2f} to {high:.2f}"

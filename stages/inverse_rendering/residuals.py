@@ -1,0 +1,161 @@
+"""What the finished fit leaves unexplained of the photos that it was fitted to: a sample of each photo's pixels,
+rendered and compared. It draws from generators of its own and changes nothing of the fit.
+
+Symbols: c the photo's colour, A_n I the rendered one with the photo's own colour response [NeuFace eq. 19], e the
+difference of both in sRGB.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from pipeline import transforms
+from pipeline.colour import linear_from_srgb, srgb_from_linear
+from pipeline.fields.face import FaceModel
+from pipeline.images import shrink_whole
+from stages.inverse_rendering.objective import calibrated_colours
+from stages.inverse_rendering.render import render_rays
+from stages.inverse_rendering.stereo import noise_of
+from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable, factor_for
+
+U8 = npt.NDArray[np.uint8]
+PIXELS = 60_000  # of all photos' subjects together: about a second on two cores
+MOST_PIXELS, LEAST_PIXELS = 2000, 300  # of one photo: its PSNR is then known to about 0.2 and 0.5 dB
+SEED = 40_961
+DARK = 1e-6  # mean radiance below which a photo is black
+HALF = 0.5  # opacity from which the field is taken to be there
+
+
+@dataclass(frozen=True, slots=True)
+class LabelError:
+    """pixels: how many of one label were compared. square: their mean squared error, sRGB."""
+
+    pixels: int
+    square: float
+
+
+@dataclass(frozen=True, slots=True)
+class ViewError:
+    """One photo. square: mean squared error over its subject's pixels, sRGB. relative: root mean square of the linear
+    residual over the mean linear radiance. missing: share of the subject's pixels where the field is empty. beyond:
+    share of the background's pixels, near the subject, where it is not. noise: standard deviation of the photo's own
+    noise, sRGB, at the fit's size. labels: the same error by the label's name, where the photo has labels.
+    """
+
+    index: int
+    pixels: int
+    square: float
+    relative: float
+    missing: float
+    beyond: float
+    noise: float
+    labels: Mapping[str, LabelError] = field(default_factory=dict)
+
+    @property
+    def psnr(self) -> float:
+        """dB, at most 100."""
+        return decibels(self.square)
+
+
+def decibels(square: float) -> float:
+    """-10 log10 of a mean squared error, at most 100."""
+    return float(-10 * np.log10(max(square, 1e-10)))
+
+
+def view_errors(
+    model: FaceModel,
+    table: PixelTable,
+    views: Sequence[PhotoView],
+    side: int,
+    samples: int,
+    labels: Sequence[U8 | None] = (),
+    names: Sequence[str] = (),
+) -> tuple[ViewError, ...]:
+    """The error of every view that has pixels of its subject in the table. table: all views at `side` pixels. labels:
+    (H, W) codes of each view at any size, None where there are none; names: what the codes mean."""
+    most = min(max(PIXELS // max(len(views), 1), LEAST_PIXELS), MOST_PIXELS)
+    inside = _sample(table, table.inside, len(views), most, SEED)
+    inside = [pool[table.alpha[pool] > WHOLE] for pool in inside]
+    outside = _sample(table, table.outside, len(views), most // 4, SEED + 1)
+    outside = [pool[table.alpha[pool] < 1 - WHOLE] for pool in outside]
+    if not any(len(pool) for pool in inside):
+        return ()
+    batch = table.at(torch.cat(inside))
+    colour, opacity = _rendered(model, batch, samples)
+    target = batch.target.float()
+    square = ((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean(-1).double()
+    truth = linear_from_srgb(target)
+    linear = ((colour - truth) ** 2).mean(-1).double()
+    there = _rendered(model, table.at(torch.cat(outside)), samples)[1] > HALF
+    first, behind, out = 0, 0, []
+    for n, view in enumerate(views):
+        own, beside = slice(first, first + len(inside[n])), slice(behind, behind + len(outside[n]))
+        first, behind = own.stop, beside.stop
+        if not len(inside[n]):
+            continue
+        out.append(
+            ViewError(
+                index=view.index,
+                pixels=len(inside[n]),
+                square=float(square[own].mean()),
+                relative=float(linear[own].mean().sqrt() / truth[own].mean().clamp(min=DARK)),
+                missing=float((opacity[own] < HALF).double().mean()),
+                beyond=float(there[beside].double().mean()) if len(outside[n]) else 0.0,
+                noise=photo_noise(view, side),
+                labels=_by_label(view, table.xy[inside[n]], square[own], labels[n], names) if labels else {},
+            )
+        )
+    return tuple(out)
+
+
+def photo_noise(view: PhotoView, side: int) -> float:
+    """Standard deviation of the noise of a photo's green channel within its subject, sRGB, at the size of the fit."""
+    f = factor_for(view.size, side)
+    green = srgb_from_linear(shrink_whole(np.ascontiguousarray(view.rgb[..., 1]), f)).astype(np.float32)
+    return noise_of(green, shrink_whole(view.alpha, f) > WHOLE)
+
+
+def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Tensor]:
+    """Linear colour (N, 3) as the photos' own cameras answer to it, and opacity (N,)."""
+    with torch.no_grad():
+        colour, opacity = render_rays(model, batch.rays, samples)
+        if model.spec.calibrated:
+            colour = calibrated_colours(model.calibration(), batch.view, colour)
+    return colour, opacity
+
+
+def _sample(table: PixelTable, pool: Tensor, count: int, most: int, seed: int) -> list[Tensor]:
+    """At most so many of a pool's pixels, which lie view by view, for each of `count` views; at random with a
+    generator of its own."""
+    generator = torch.Generator().manual_seed(seed)
+    of = table.view[pool].long()
+    ends = torch.searchsorted(of, torch.arange(count + 1, device=of.device)).tolist()
+    out = []
+    for first, last in zip(ends[:-1], ends[1:], strict=True):
+        if last - first > most:
+            out.append(pool[first + torch.randint(last - first, (most,), generator=generator).to(pool.device)])
+        else:
+            out.append(pool[first:last])
+    return out
+
+
+def _by_label(
+    view: PhotoView, xy: Tensor, square: Tensor, codes: U8 | None, names: Sequence[str]
+) -> dict[str, LabelError]:
+    """Errors of a view's pixels by the name of the label under each; xy (N, 2) on the z = 1 plane."""
+    if codes is None:
+        return {}
+    positions = np.asarray(xy.cpu().numpy(), np.float64)
+    uv = transforms.distort(positions, view.distortion) @ view.K[:2, :2].T + view.K[:2, 2]
+    height, width = codes.shape
+    column = (uv[:, 0] * width / view.size[0]).astype(np.int64).clip(0, width - 1)
+    row = (uv[:, 1] * height / view.size[1]).astype(np.int64).clip(0, height - 1)
+    found, errors = codes[row, column], square.cpu().numpy()
+    here = (int(c) for c in np.unique(found) if 0 < c < len(names))
+    return {names[c]: LabelError(int((found == c).sum()), float(errors[found == c].mean())) for c in here}
