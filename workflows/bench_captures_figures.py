@@ -110,7 +110,7 @@ def _masks(run: Run) -> Figures:
 # ------------------------------------------------------------------ texture
 def texture_of(run: Run) -> tuple[Figures, Ranges]:
     """Fragments and the face's share of the covered texels; ranges of F0 and roughness by label."""
-    if not run.manifest("uv") or not run.manifest("bake"):
+    if "mesh" not in run.manifest("uv") or "maps" not in run.manifest("bake"):
         return {}, {}
     from pipeline import meshes
     from stages.uv.measure import TINY_CHART

@@ -234,9 +234,15 @@ def _materials(rows: Mapping[str, Row]) -> str:
 
 
 def _made(rows: Mapping[str, Row]) -> str:
-    lines = [[n, r["holdout"], r["commit"], r["date"], f"`{r['command']}`", r["machine"]] for n, r in rows.items()]
-    titles = ["capture", "held out", "commit", "date", "command", "machine"]
-    return _section("How it was made", titles, lines, {"commit": "a + says that files differed from it"})
+    machines = list(dict.fromkeys(str(r["machine"]) for r in rows.values()))
+    lines = [
+        [n, str(machines.index(r["machine"]) + 1), r["commit"], r["date"], f"`{r['command']}`"] for n, r in rows.items()
+    ]
+    explained = {
+        "machine": "; ".join(f"{i}: {m}" for i, m in enumerate(machines, 1)),
+        "commit": "a + says that files differed from it",
+    }
+    return _section("How it was made", ["capture", "machine", "commit", "date", "command"], lines, explained)
 
 
 def _section(title: str, titles: Sequence[str], lines: Sequence[Sequence[str]], explained: Mapping[str, str]) -> str:
