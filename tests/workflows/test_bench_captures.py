@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,21 @@ def test_a_run_that_never_ends_is_stopped(root: Path) -> None:
     row = run(root, "--only", "good_2", "--limit", "1s")["good_2"]
     assert row["ended"]["how"] == "time limit" and row["figures"] == {}
     assert "time limit" in (root.parent / "table.md").read_text()
+
+
+def test_a_run_may_keep_its_checkpoint_before_it_ends(tmp_path: Path) -> None:
+    polite = (
+        "import pathlib, sys, time\ntry:\n    print('up', flush=True); time.sleep(600)\n"
+        "except KeyboardInterrupt:\n    pathlib.Path(sys.argv[1]).write_text('kept')\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", polite, str(tmp_path / "kept")], stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert process.stdout is not None
+    with process.stdout:
+        assert process.stdout.readline() == b"up\n"  # from here on it is in its try
+        child._stop(process)
+    assert (tmp_path / "kept").read_text() == "kept" and process.returncode == 0
 
 
 def test_what_does_not_let_go_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
