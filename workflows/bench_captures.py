@@ -144,7 +144,8 @@ def measured(run: Run | None, capture: Found, child: Ended) -> dict[str, Any]:
         out["figures"] |= true
     except Exception as e:  # noqa: BLE001
         faults.append(f"truth: {type(e).__name__}: {e}")
-    return finite(out | ({"fault": "; ".join(faults)} if faults else {}))
+    whole: dict[str, Any] = finite(out | ({"fault": "; ".join(faults)} if faults else {}))
+    return whole
 
 
 def finite(value: Any) -> Any:
