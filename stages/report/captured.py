@@ -57,7 +57,9 @@ def captured(r: Started, side: int, shown: int) -> Captured:
     """The drawing, the table and the outlines of the `shown` worst masks."""
     kinds = _kinds(r)
     rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
-    lost = [f"{n}: no place found for it" for n in r.poses.artifact.unregistered] + list(r.capture.artifact.left_out)
+    why = r.poses.artifact.left_out
+    lost = [f"{n}: no place found for it" + (f"; {why[n]}" if n in why else "") for n in r.poses.artifact.unregistered]
+    lost += r.capture.artifact.left_out
     outlines = _outlines(r, side, shown)
     return Captured(drawing(r.poses, kinds), list(KINDS.items()), rows, lost, outlines,
                     len(r.masks.artifact.masks) - len(outlines))  # fmt: skip
