@@ -65,15 +65,20 @@ def reasons(
         partners, most = best.get(i, (0, 0))
         few, soft = counts[i] < FEW_FEATURES * usual, details[i] < SOFT * sharp
         if i in inside:
-            out[i] = (f"other group: it fits {len(inside[i]) - 1} more photos that have no place either, "
-                      f"but not the {len(placed)} that have")  # fmt: skip
+            more = len(inside[i]) - 1
+            out[i] = (f"other group: it fits {_photos(more, 'more ')} without a place, but not the {len(placed)} that "
+                      "have one")  # fmt: skip
         elif few:
             out[i] = f"few features: {counts[i]} spots to match by, the photos have {usual:.0f} in the median"
         elif soft:
             out[i] = f"blurred: it has {details[i] / sharp:.0%} of the fine detail that the photos have in the median"
         elif partners:
-            out[i] = (f"weak match: it matches {partners} {'photos' if partners > 1 else 'photo'}, the best of them in "
-                      f"{most} spots, which does not tell its place")  # fmt: skip
+            out[i] = (f"weak match: it matches {_photos(partners)}, {most} spots at best; too few of these tie it "
+                      "to the photos that have a place")  # fmt: skip
         else:
             out[i] = f"no match: no other photo shares {MIN_INLIERS} spots with it that fit one geometry"
     return out
+
+
+def _photos(n: int, more: str = "") -> str:
+    return f"{n} {more}photo{'s' if n > 1 else ''}"

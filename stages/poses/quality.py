@@ -43,8 +43,8 @@ class Known(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """placed: share of the photos. focal_off: how many times the worst lens is longer or shorter than EXIF says, or
-    than lenses are. points: on the subject, per placed photo. error_px: mean reprojection error."""
+    """placed: share of the photos. focal_off: how many times the lenses are longer or shorter than EXIF says, or than
+    lenses are, median over the photos. points: on the subject, per placed photo. error_px: mean reprojection error."""
 
     placed: float
     focal_off: float
@@ -67,7 +67,7 @@ def quality(model: Model, photos: Sequence[Known]) -> Quality:
     """The figures of a solution of `photos`."""
     return Quality(
         placed=len(model.poses) / len(photos),
-        focal_off=max((_focal_off(p.K, photos[i]) for i, p in model.poses.items()), default=float("inf")),
+        focal_off=float(np.median([_focal_off(p.K, photos[i]) for i, p in model.poses.items()])),
         points=_on_subject(model) / max(len(model.poses), 1),
         error_px=model.reprojection_error_px,
     )
