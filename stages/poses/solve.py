@@ -27,6 +27,7 @@ MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
 MIN_POINTS = 100
+LOOSE_MODELS = 3  # a beginning anew costs more where more photos can be tried
 LOOSE_INLIERS, LOOSE_SHARE = 15, 0.15  # matches with the points so far, to place a photo; COLMAP's own: 30 and 0.25
 Mapper = Literal["incremental", "global"]
 PRINCIPAL_POINT_LIMIT = (
@@ -216,6 +217,7 @@ def _options(refine: Refine, seed: int, loose: bool) -> Any:
     if loose:
         options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
         options.mapper.abs_pose_min_inlier_ratio = LOOSE_SHARE
+        options.max_num_models = LOOSE_MODELS
     return options
 
 

@@ -45,7 +45,7 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
     warnings += found.warnings
     if missing:
-        told = "; ".join(f"{', '.join(names)} ({reason})" for reason, names in _by_reason(why).items())
+        told = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())
         warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {told}. Photograph "
                         "the way between them and the others, sharp and in steps of 15 degrees; photos of something "
                         "else and mirrored ones never fit")  # fmt: skip
@@ -56,11 +56,11 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     return result.model_copy(update={"left_out": why, "groups": tuple(len(g) for g in solution.groups)})
 
 
-def _by_reason(why: Mapping[str, str]) -> dict[str, list[str]]:
-    """Names of the photos that share a reason."""
+def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
+    """Names of the photos whose reasons begin alike: no match, other group, blurred, few features, weak match."""
     out: dict[str, list[str]] = {}
     for name, reason in why.items():
-        out.setdefault(reason, []).append(name)
+        out.setdefault(reason.split(":")[0], []).append(name)
     return out
 
 
