@@ -1,8 +1,8 @@
 """How good the exported asset is: faults that checks of the files found, and what was lost on the way from the model.
 
-Where the limits are from: the asset of a clean head and the fit's own renders of the same views differ by 40 dB, of a
-face shot by hand by 30, of a surface in shreds by 23. A lobe that is matt and clean is off its GGX lobe by a few
-per cent; fits without evidence for a lobe were off by 200 % and more.
+Where the limits are from: renders of the asset and of the fitted model differ by 39 to 43 dB for clean heads, 30 to 33
+for people shot by hand, 22 for a torso in shreds. The relative difference of the lobes is a mean over texels, most of
+which have a weak lobe: .4 to 1.3 for clean heads, 2 and 280 for fits whose F0 was out of its physical range.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stages.usd import findings as checks
 F32 = npt.NDArray[np.float32]
 AGAINST_MODEL = Limits(28.0, 20.0)  # dB
 OVERLAP = Limits(0.97, 0.9)  # of the silhouettes, intersection over union
-LOBE = Limits(0.25, 1.0, lower=False)  # |fitted - GGX| over |fitted|
+LOBE = Limits(1.6, 5.0, lower=False)  # |fitted - GGX| over |fitted|
 FAULTS = Limits(0, 0, lower=False)
 WARNINGS = Limits(0, np.inf, lower=False)
 SHOWN = 3  # faults that are quoted
