@@ -72,7 +72,7 @@ def build(
     step(4, 4, "done")
     short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
     span = float(np.ptp(mesh.vertices, axis=0).max())
-    findings = judge(quality, deviation, span, against, _opened(found, mesh))
+    findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
 
 
@@ -81,6 +81,12 @@ def _opened(dense: meshes.Topology, mesh: Mesh) -> float:
     if not dense.watertight:
         return 0.0
     return meshes.topology(mesh.faces, len(mesh.vertices)).boundary_edges / max(1.5 * len(mesh.faces), 1.0)
+
+
+def _crumpled(mesh: Mesh) -> float:
+    """Share of the faces that look against the normals at their own corners."""
+    mean = mesh.normals[mesh.faces].astype(np.float64).sum(1)
+    return float(((meshes.area_vectors(mesh.vertices, mesh.faces) * mean).sum(1) < 0).mean())
 
 
 def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, float]:

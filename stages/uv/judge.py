@@ -22,13 +22,17 @@ STRETCH = Limits(2.0, 50.0, lower=False)  # L2; a few slivers among 50,000 trian
 DEVIATION = Limits(5e-4, 3e-3, lower=False)  # of the longest side; of a head in a box of 0.6 m 0.3 and 1.8 mm
 AGAINST = Limits(2e-3, 0.02, lower=False)  # of the surface
 OPEN = Limits(0, 0.01, lower=False)  # of the edges
+CRUMPLED = Limits(5e-3, 0.02, lower=False)  # of the faces; 2 % is what the check of the USD file refuses
 
 SHAPE = "look at the surface in the report: masks and cameras decide how smooth it is"
 
 
-def judge(quality: Quality, deviation: Deviation, span: float, against: float, opened: float) -> tuple[Finding, ...]:
+def judge(
+    quality: Quality, deviation: Deviation, span: float, against: float, opened: float, crumpled: float
+) -> tuple[Finding, ...]:
     """All findings, good ones too. span: longest side of the mesh (m); against: share of the decimated surface that
-    looks against the dense one; opened: share of its edges that the decimation left open."""
+    looks against the dense one; opened: share of its edges that the decimation left open; crumpled: share of its faces
+    that look against the normals at their own corners."""
     q, off = quality, deviation.rms / max(span, 1e-30)
     return (
         judged("charts", q.charts, CHARTS, f"the surface comes apart into {q.charts} charts", SHAPE),
@@ -81,5 +85,12 @@ def judge(quality: Quality, deviation: Deviation, span: float, against: float, o
             OPEN,
             f"{opened:.2%} of the textured mesh's edges were left open by the decimation",
             "change uv.target_faces or surface.resolution a little",
+        ),
+        judged(
+            "crumpled",
+            crumpled,
+            CRUMPLED,
+            f"{crumpled:.2%} of the faces look against the normals at their corners: the surface is crumpled there",
+            SHAPE,
         ),
     )

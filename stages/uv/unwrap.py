@@ -213,8 +213,14 @@ def spread(uvs: F64, faces: Faces) -> F64:
 
 
 def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
-    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight."""
+    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight.
+
+    xatlas leaves faces out that are smaller than 1e-7 in the given unit, and puts them anywhere: on a surface in metres
+    a tenth of a square millimetre. So the charts are given to it larger.
+    """
     import xatlas
+
+    uvs = uvs * (UNIT * np.sqrt(len(faces) / max(float(np.abs(signed_areas(uvs, faces)).sum()), 1e-30)))
 
     atlas = xatlas.Atlas()
     settings = xatlas.PackOptions()

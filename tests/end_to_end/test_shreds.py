@@ -66,6 +66,10 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
         context("usd"),
     )
     assert (folders["usd"] / asset.root).is_file()
-    faults = {f.check: f for f in asset.findings}["usd_faults"]
-    assert faults.level == "good", faults.said
-    assert worst(textured.findings) != "good"  # but nobody is told that this is a good mesh
+    for preview in ("previews/front.png", f"asset/{asset.name}.glb", f"asset/{asset.name}.usdz"):
+        assert (folders["usd"] / preview).is_file()
+    (faults,) = (f for f in asset.findings if f.check == "usd_faults")
+    assert " st" not in faults.said, faults.said  # every face has texels of its own
+    found = {f.check: f.level for f in textured.findings}
+    assert worst(textured.findings) == found["crumpled"] == "unusable"  # and the stage that made it says what is wrong
+    assert {found[c] for c in ("overlap", "texels_missing", "mirrored")} == {"good"}

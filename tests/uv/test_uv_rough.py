@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.shreds import shredded, with_worthless_faces
 
-from pipeline import meshes
+from pipeline import meshes, raster
 from pipeline.artifacts import FileRef, Located, Surface
 from pipeline.contract import Context
 from pipeline.meshes import Charts, Mesh
@@ -57,7 +57,7 @@ def test_a_surface_in_shreds_gets_few_charts_that_all_have_texels(noise: float, 
 def test_thousands_of_loose_faces_stay_whole_and_are_judged() -> None:
     mesh = shredded(4, 2.0)
     q = sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
-    (charts,) = (f for f in judge(q, NEAR, 0.2, 0.0, 0.0) if f.check == "charts")
+    (charts,) = (f for f in judge(q, NEAR, 0.2, 0.0, 0.0, 0.0) if f.check == "charts")
     assert charts.level != "good" and charts.value == q.charts
 
 
@@ -82,6 +82,19 @@ def test_a_chart_that_collapsed_to_a_line_is_laid_flat_anew(monkeypatch: pytest.
     assert measure(mesh, broken).empty > 0.01
     monkeypatch.setattr(unwrap, "unwrapped", lambda *_: broken)
     sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
+
+
+def test_faces_smaller_than_a_tenth_of_a_square_millimetre_are_packed_too() -> None:
+    """xatlas leaves out what is below 1e-7 in the given unit, and puts it anywhere."""
+    rng = np.random.default_rng(2)
+    corners = rng.uniform(0.2, 1.0, (400, 3, 2)) * 3e-4
+    corners[:, 0], corners[:, 1, 1] = 0, 0
+    faces = np.arange(1200, dtype=np.int32).reshape(-1, 3)
+    uvs = unwrap.turned_over(corners.reshape(-1, 2), faces)
+    assert np.abs(unwrap.signed_areas(uvs, faces)).max() < 1e-7
+    charts = unwrap._packed(unwrap.spread(uvs, faces), faces, Options(1024, 1))
+    assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).all()
+    assert (raster.layers(raster.texel_corners(charts, 2048), 2048) > 1).sum() == 0
 
 
 def test_good_charts_are_left_as_they_are() -> None:
@@ -128,7 +141,7 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
     )  # fmt: skip
     inputs = Inputs(Located(artifact, tmp_path), None, None)  # type: ignore[arg-type]
     uv = run(inputs, Config(target_faces=3000, proxy_faces=300, texture_size=512), Context(tmp_path, tmp_path))
-    assert len(uv.findings) == 9 and {f.level for f in uv.findings} == {"good"}, [str(f) for f in uv.findings]
+    assert len(uv.findings) == 10 and {f.level for f in uv.findings} == {"good"}, [str(f) for f in uv.findings]
 
 
 @pytest.mark.parametrize(
@@ -156,8 +169,8 @@ def test_each_ruined_figure_has_its_level(check: str, ruin: dict[str, float], le
 
 
 def test_distance_from_the_dense_mesh_is_judged() -> None:
-    def levels(deviation: float, against: float, opened: float) -> dict[str, str]:
-        found = judge(GOOD, Deviation(deviation, deviation), 0.3, against, opened)
+    def levels(deviation: float, against: float, opened: float, crumpled: float = 0.0) -> dict[str, str]:
+        found = judge(GOOD, Deviation(deviation, deviation), 0.3, against, opened, crumpled)
         return {f.check: f.level for f in found if f.level != "good"}
 
     assert levels(1e-4, 0, 0) == {}
@@ -167,4 +180,7 @@ def test_distance_from_the_dense_mesh_is_judged() -> None:
     assert levels(1e-5, 0.2, 0) == {"against_dense": "unusable"}
     assert levels(1e-5, 0, 0.002) == {"opened": "usable"}
     assert levels(1e-5, 0, 0.2) == {"opened": "unusable"}
+    assert levels(1e-5, 0, 0, 0.01) == {"crumpled": "usable"}
+    assert levels(1e-5, 0, 0, 0.3) == {"crumpled": "unusable"}
+    assert building._crumpled(shredded(3, 2.0)) > 0.02 and building._crumpled(shredded(2, 0)) == 0
     assert building._opened(meshes.topology(np.zeros((0, 3), np.int32), 0), shredded(1, 0)) == 0
