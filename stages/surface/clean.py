@@ -14,6 +14,7 @@ from pipeline import meshes
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Mask
 from stages.surface.extract import QUERY, Lattice, box_distance
+from stages.surface.pieces import Votes, chosen
 
 NEWTON_STEPS = 3
 REACH = 0.5  # of h: a vertex of the right cell is never further away than that
@@ -30,21 +31,37 @@ class Landed:
     capped: Mask
 
 
-def largest_component(vertices: F64, faces: Faces) -> tuple[F64, Faces, int, float]:
-    """Keep the component with the largest area. Also how many were dropped, and the second's area over the first's.
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """The piece that is kept. removed: how many are not; second: area of the largest of them over the kept one's;
+    unshown: share of what the photos show of the surface that is theirs."""
 
-    Components are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but
-    only pieces outside compete for the second place.
+    vertices: F64
+    faces: Faces
+    removed: int
+    second: float
+    unshown: float
+
+
+def one_piece(vertices: F64, faces: Faces, vote: Votes | None = None) -> Kept:
+    """Keep the piece that the photos show most of, by their votes (stages.surface.pieces); without votes the one with
+    the largest area.
+
+    Pieces are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but only
+    pieces outside compete for the second place.
     """
     label = meshes.component_of_face(faces, len(vertices))
+    label = np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1), np.int64)
     vectors = meshes.area_vectors(vertices, faces)
-    area = np.bincount(label, np.linalg.norm(vectors, axis=1))
+    area = np.asarray(np.bincount(label, np.linalg.norm(vectors, axis=1)), np.float64)
     solid = np.bincount(label, (vertices[faces[:, 0]] * vectors).sum(1)) > 0
-    first = int(area.argmax())
+    first, unshown = int(area.argmax()), 0.0
+    if vote is not None:
+        first, unshown = chosen(vertices, faces, label, area, solid, vote)
     v, f, _ = meshes.compact(vertices, faces[label == first])
     others = np.where(solid, area, 0.0)
     others[first] = 0.0
-    return np.asarray(v, np.float64), f, int((area > 0).sum()) - 1, float(others.max() / area[first])
+    return Kept(np.asarray(v, np.float64), f, int((area > 0).sum()) - 1, float(others.max() / area[first]), unshown)
 
 
 def land(field: Field, grid: Lattice, start: F64, steps: int = NEWTON_STEPS) -> Landed:

@@ -6,11 +6,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeline import footprint, meshes
 from pipeline.errors import StageError
 from pipeline.meshes import Charts, Mesh
+from pipeline.verdict import Finding
 from stages.uv import decimate
 from stages.uv.decimate import Deviation
+from stages.uv.judge import judge
 from stages.uv.measure import Quality, measure
 from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, Options, unwrap
@@ -33,6 +37,7 @@ class Built:
     deviation: Deviation
     proxy_deviation: Deviation
     warnings: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def build(
@@ -66,7 +71,22 @@ def build(
     tiles = len(quality.tile_utilisation)
     step(4, 4, "done")
     short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
-    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short)
+    span = float(np.ptp(mesh.vertices, axis=0).max())
+    findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
+    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
+
+
+def _opened(dense: meshes.Topology, mesh: Mesh) -> float:
+    """Share of the edges that are open in the decimated mesh of a closed one."""
+    if not dense.watertight:
+        return 0.0
+    return meshes.topology(mesh.faces, len(mesh.vertices)).boundary_edges / max(1.5 * len(mesh.faces), 1.0)
+
+
+def _crumpled(mesh: Mesh) -> float:
+    """Share of the faces that look against the normals at their own corners."""
+    mean = mesh.normals[mesh.faces].astype(np.float64).sum(1)
+    return float(((meshes.area_vectors(mesh.vertices, mesh.faces) * mean).sum(1) < 0).mean())
 
 
 def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, float]:

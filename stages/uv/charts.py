@@ -29,8 +29,9 @@ CHECK = 768  # texels along a chart's longest side: where two layers of it would
 
 
 @dataclass(frozen=True, slots=True)
-class _Surface:
-    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one."""
+class Surface:
+    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one, and what a seam
+    costs at each vertex (V,)."""
 
     smooth: F64
     true: F64
@@ -40,22 +41,27 @@ class _Surface:
     weight: F64
 
 
+def surface_of(mesh: Mesh, smooth: F64) -> Surface:
+    """A mesh with its vertices smoothed (V, 3), ready to be cut."""
+    weight = seam_weights(smooth, mesh.faces)
+    pairs = dual(smooth, mesh.faces, weight)
+    area = meshes.areas(smooth, mesh.faces)
+    return Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight)
+
+
 def unwrapped(mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE) -> Charts | None:
     """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
 
     smooth: (V, 3) vertices without bumps. padding: between charts, in uv. They are made for one square; where that is
     not enough, only charts that are too large for a tile are cut further.
     """
-    weight = seam_weights(smooth, mesh.faces)
-    pairs = dual(smooth, mesh.faces, weight)
-    area = meshes.areas(smooth, mesh.faces)
-    surface = _Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight)
-    label = segment(smooth, mesh.faces, pairs)
+    surface = surface_of(mesh, smooth)
+    label = segment(smooth, mesh.faces, surface.pairs)
     known: dict[bytes, Flat] = {}
     best: tuple[float, Charts, Indices] | None = None
     tries = 0
     while tries < TRIES and int(label.max()) < MOST_CHARTS:
-        flats = _flats(surface, label, known)
+        flats = flats_of(surface, label, known)
         part = _must_part(surface, flats)
         if part is None:
             tries += 1
@@ -79,13 +85,13 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE) -> 
 
 
 def _tiled(
-    mesh: Mesh, surface: _Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling
+    mesh: Mesh, surface: Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling
 ) -> Charts | None:
     """The pieces in several tiles; those are cut further whose chart would fill a tile before others are large."""
     total = float(meshes.areas(mesh.vertices, mesh.faces).sum())
     limit = tiling.largest_chart(total)
     while True:
-        flats = _flats(surface, label, known)
+        flats = flats_of(surface, label, known)
         part = next((i for i, f in enumerate(flats) if not f.good or _longest(mesh, f) > limit), None)
         pieces = int(label.max())
         if part is None or pieces > MOST_CHARTS * tiling.most:
@@ -95,7 +101,7 @@ def _tiled(
             break
     if not all(f.good for f in flats):
         return None
-    uvs, faces, chart_of_face = _together(mesh, flats)
+    uvs, faces, chart_of_face = together(mesh, flats)
     placed = packed(uvs, faces, chart_of_face, total, padding, tiling)
     return None if placed is None else Charts(placed, faces)
 
@@ -105,7 +111,7 @@ def _longest(mesh: Mesh, flat: Flat) -> float:
     return float(np.ptp(boxed(_at_scale(mesh, flat)), axis=0).max())
 
 
-def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
+def flats_of(surface: Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
     """Every piece laid flat; pieces seen before are taken from `known`."""
     count = int(label.max()) + 1
     order = np.argsort(label, kind="stable")
@@ -116,7 +122,15 @@ def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[
     return [known[k] for k in keys]
 
 
-def _on_true_surface(surface: _Surface, flat: Flat) -> Flat:
+def laid_flat(surface: Surface, member: Indices) -> Flat:
+    """One piece, given by its faces (m,)."""
+    label = np.zeros(len(surface.area), np.int64)
+    label[member] = 1
+    wanted = np.array([False, True])
+    return _on_true_surface(surface, flattened(surface.smooth, surface.faces, surface.pairs, label, wanted)[0])
+
+
+def _on_true_surface(surface: Surface, flat: Flat) -> Flat:
     """The last steps on the true surface, unless the chart's jagged border came to lie over itself by them."""
     if not len(flat.uv):
         return flat
@@ -135,7 +149,7 @@ def lies_over_itself(uv: F64, faces: Faces) -> bool:
     return bool((raster.layers(raster.texel_corners(Charts(square, faces), CHECK), CHECK) > 1).any())
 
 
-def _must_part(surface: _Surface, flats: list[Flat]) -> int | None:
+def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
     """A piece that is no disc or folds over, else a large one that fills too little of its rectangle."""
     for i, flat in enumerate(flats):
         if not flat.good:
@@ -153,20 +167,20 @@ def _fill(flat: Flat) -> float:
     return float(0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum() / max(width * height, 1e-30))
 
 
-def _front(surface: _Surface, flat: Flat) -> float:
+def _front(surface: Surface, flat: Flat) -> float:
     """Mean over a chart of how costly its seams would be, 0 at the back, 1 in front."""
     w = surface.weight[surface.faces[flat.member]].mean(1)
     a = surface.area[flat.member]
     return float((a * (w - 1)).sum() / (a.sum() * max(float(surface.weight.max()) - 1, 1e-30)))
 
 
-def _worth_parting(surface: _Surface, flats: list[Flat]) -> int:
+def _worth_parting(surface: Surface, flats: list[Flat]) -> int:
     """The chart that leaves most of its rectangle empty, those in front last."""
     loss = [(1 - _fill(f)) * surface.area[f.member].sum() * (1 - _front(surface, f)) if f.good else 0.0 for f in flats]
     return int(np.argmax(loss))
 
 
-def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
+def _parted(surface: Surface, label: Indices, flat: Flat) -> Indices:
     """One piece in two, across its longest direction (in the chart where there is one, else in space)."""
     corners = flat.uv[flat.faces] if flat.good else surface.smooth[surface.faces[flat.member]]
     centre = corners.mean(1) - corners.mean((0, 1))
@@ -179,12 +193,12 @@ def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
 
 def _packed(mesh: Mesh, flats: list[Flat], padding: float, least: float) -> Charts | None:
     """All charts in one square at one scale against the true surface, if `least` of it comes under charts."""
-    uvs, faces, label = _together(mesh, flats)
+    uvs, faces, label = together(mesh, flats)
     placed: F32 | None = pack(uvs, faces, label, padding, least)
     return None if placed is None else Charts(placed, faces)
 
 
-def _together(mesh: Mesh, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
+def together(mesh: Mesh, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
     """All charts as one array of texture vertices, each at the scale of the true surface; faces, and their charts."""
     faces = np.zeros((len(mesh.faces), 3), np.int32)
     label = np.zeros(len(mesh.faces), np.int64)

@@ -15,19 +15,20 @@ import numpy as np
 
 from pipeline import meshes, raster, tiles
 from pipeline.meshes import F64, Charts, Mesh
+from stages.uv.rough import FRAGMENT
 from stages.uv.segment import FRONT
 from stages.uv.unwrap import chart_of_face, signed_areas
 
 RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
 FACING = 0.5
-TINY_CHART = 5e-4  # of the area: smaller charts are crumbs
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """charts; crumbs: charts with next to no area; utilisation: share of texels under a chart; overlap: share of
-    those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty: share of the area whose
-    charts are mirrored or flat; seam_front: length (m) of the seams in front; tile_utilisation: of each tile."""
+    """charts; crumbs: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
+    chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
+    share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
+    tile_utilisation: of each tile."""
 
     charts: int
     crumbs: int
@@ -54,7 +55,7 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     mean, most = stretch(mesh, charts, ~flat)
     return Quality(
         charts=int(label.max()) + 1,
-        crumbs=int((np.bincount(label, share) < TINY_CHART).sum()),
+        crumbs=int((np.bincount(label, share) < FRAGMENT).sum()),
         utilisation=sum(covered) / (len(layers) * RASTER**2),
         overlap=float(sum((layer > 1).sum() for layer in layers) / max(sum(covered), 1)),
         stretch=mean,

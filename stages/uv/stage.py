@@ -86,7 +86,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         deviation_rms_mm=1000 * built.deviation.rms,
         proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
         warnings=built.warnings,
+        findings=built.findings,
     )
 
 
-STAGE = Stage(name="uv", version=5, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=6, inputs=Inputs, config=Config, output=UvMesh, run=run)

@@ -10,6 +10,7 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from stages.surface import clean, extract
 from stages.surface.build import Built, build
+from stages.surface.judge import judge
 from tests.support.analytic_fields import AnalyticField, Distance, bumpy_head, ellipsoid, sphere, union
 
 
@@ -129,13 +130,21 @@ def test_small_ball_between_coarse_nodes_is_found() -> None:
     assert got.topology.euler == 2
 
 
-@pytest.mark.parametrize("shift", [0.5, -0.5])
-def test_no_surface(shift: float) -> None:
-    def constant(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.full(len(p), shift), np.tile([0.0, 1.0, 0.0], (len(p), 1))
+def constant(value: float) -> Distance:
+    """A field that is the same everywhere."""
+    return lambda p: (np.full(len(p), value), np.tile([0.0, 1.0, 0.0], (len(p), 1)))
 
-    with pytest.raises(StageError, match="no surface" if shift > 0 else "fills its box"):
-        built(constant)
+
+def test_no_surface() -> None:
+    with pytest.raises(StageError, match="no surface"):
+        built(constant(0.5))
+
+
+def test_a_solid_that_fills_its_box_is_handed_on_and_unusable() -> None:
+    got = built(constant(-0.5), 24)
+    assert got.topology.manifold and got.cap > 0.9
+    (cap,) = (f for f in judge(got) if f.check == "cap")
+    assert cap.level == "unusable" and "masks" in cap.remedy
 
 
 def test_nan_is_refused() -> None:
