@@ -2,20 +2,25 @@
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
 
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from prefect import flow
+from prefect.context import FlowRunContext
+from prefect.exceptions import TerminationSignal
 
+from pipeline.errors import Cancelled
+from workflows.access import check_folders
 from workflows.adapter import as_tasks, publish_result, report_batch
-from workflows.alone import alone
 from workflows.batch_request import BatchRequest
-from workflows.folders import writable
+from workflows.complete import complete
 from workflows.forms import takes
-from workflows.plan import Plan, RunRequest, make_plan
-from workflows.publish import publish
-from workflows.runner import run_plan
-from workflows.session import current
+from workflows.interrupt import PARENT, end_with, interruptible
+from workflows.plan import RunRequest, make_plan
+from workflows.session import Session, given, session
 
 
 @flow(name="capture-to-asset", flow_run_name="{capture} -> {out}", retries=0, persist_result=False)
@@ -23,12 +28,9 @@ from workflows.session import current
 def capture_to_asset(**asked: Any) -> dict[str, Any]:
     """Run the stages on one capture and publish asset/, report/ and run.json in `out`."""
     request = RunRequest(**asked)
-    watch = current()
-    out, store = Path(request.out).absolute(), request.store_path
-    with writable(out, store), alone(store, out, watch.stop.is_set, watch.observer.note):
-        prepared = watch.plan
-        plan: Plan = prepared if prepared is not None and prepared.request == request else make_plan(request)
-        record = publish(plan, run_plan(plan, as_tasks(plan)))
+    with _watched(asked):
+        plan = make_plan(request)
+        record = complete(plan, as_tasks(plan))
     publish_result(Path(request.out), record)
     return record
 
@@ -44,11 +46,35 @@ def facescape_batch(**asked: Any) -> dict[str, int]:
     from workflows.batch_prefect import Pool
 
     request = BatchRequest(**asked)
-    watch = current()
-    summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, said=watch.observer.note)
+    with _watched(asked) as watch:
+        summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, said=watch.observer.note)
     report_batch(Path(request.out), summary.counts())
     if summary.failed:
         raise RuntimeError(
             f"{summary.failed} of {summary.total} captures have no asset: {request.out}/batch/index.html"
         )
     return summary.counts()
+
+
+@contextmanager
+def _watched(asked: Mapping[str, Any]) -> Iterator[Session]:
+    """The session of this flow: the command's, or a new one. Signals stop it at a checkpoint, and not at any place, as
+    Prefect's own handler would.
+
+    A run that a server started may use the allowed folders alone, and ends with the worker that started it.
+    """
+    known = given()
+    from_server = known is None and FlowRunContext.get() is not None
+    if from_server:
+        end_with(int(os.environ.get(PARENT, os.getppid())))
+        check_folders(asked)
+    watch = known or Session()
+    with session(watch), interruptible(watch.stop, watch.observer.note) as caught:
+        try:
+            yield watch
+            return
+        except Cancelled as e:
+            if not from_server or caught.number is None:
+                raise
+            stopped = e
+    raise TerminationSignal(caught.number) from stopped  # Prefect then calls the run cancelled or crashed
