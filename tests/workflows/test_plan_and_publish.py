@@ -128,6 +128,18 @@ def test_failure_keeps_finished_stages_and_the_users_files(tmp_path: Path) -> No
     assert [p.name for p in mine.iterdir()] == ["notes.txt"]
 
 
+def test_a_file_that_came_into_a_new_store_is_not_swept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(ZeroDivisionError), writable(out, out / ".store"):
+        (out / ".store" / ".locks").mkdir()
+        (out / ".store" / "first" / "k.partial-1").mkdir(parents=True)
+        (out / ".store" / "notes.txt").write_text("mine")
+        raise ZeroDivisionError
+    left = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert left == {".store/notes.txt"}
+    assert not (out / ".store/first").exists() and not (out / ".store/.locks").exists()
+
+
 def test_a_store_of_others_is_never_swept(tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     (shared / "first").mkdir(parents=True)
