@@ -18,7 +18,7 @@ import pytest
 
 from pipeline.images import write_png
 from tests.support.facescape_tree import write_tree
-from tests.support.servers import LOGIN, ask, free_port, guarded, login_headers, wait_for, wait_healthy
+from tests.support.servers import LOGIN, ask, descendants, free_port, guarded, login_headers, wait_for, wait_healthy
 from workflows.batch_request import BatchRequest
 from workflows.plan import RunRequest
 
@@ -221,3 +221,39 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
     finally:
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 0), (signal.SIGHUP, 129)])
+def test_the_server_of_serve_ends_with_it(
+    tmp_path: Path, child_environment: dict[str, str], number: signal.Signals, code: int
+) -> None:
+    port = free_port()
+    url = f"http://127.0.0.1:{port}/api"
+    command = [sys.executable, "-m", "workflows.cli", "serve", "--port", str(port), "--home", str(tmp_path / "home")]
+    environment = {**child_environment, "PREFECT_HOME": str(tmp_path / "prefect")}
+    with (tmp_path / "log").open("wb") as log:
+        child = subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=log, stderr=log,
+                                 start_new_session=True)  # fmt: skip
+    try:
+        wait_healthy(url)
+        login = (tmp_path / "home/login").read_text().strip()
+        wait_for(lambda: len(ask(url, "/deployments/filter", {}, login)) == 2, 240)
+        servers = descendants(child.pid)
+        child.send_signal(number)
+        assert child.wait(240) == code, (tmp_path / "log").read_text()
+        wait_for(lambda: not any(is_alive(s) for s in servers), 60)
+        with pytest.raises(OSError):
+            ask(url, "/health")
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        child.wait()
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that nobody has waited for yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
