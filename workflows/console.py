@@ -41,19 +41,22 @@ class Console:
         """How far the stage is."""
         shown = " ".join([message, *(f"{k} {v:.4g}" for k, v in figures.items())]).strip()
         if self.bar is not None:
-            self.bar.total = max(total, 1)
-            self.bar.n = min(done, total)
-            self.bar.set_postfix_str(shown, refresh=False)
-            self.bar.update(0)
-            if time.monotonic() - self.last > 0.2 or done >= total:
-                self.last = time.monotonic()
-                try:
-                    self.bar.refresh()
-                except OSError:
-                    self._lost()
+            try:
+                self._draw(self.bar, done, total, shown)
+            except OSError:
+                self._lost()
         elif time.monotonic() - self.last >= PLAIN_EVERY:
             self.last = time.monotonic()
             self.note(f"{self.label}: {100 * done / max(total, 1):.0f} % {shown}".rstrip())
+
+    def _draw(self, bar: tqdm[Any], done: int, total: int, shown: str) -> None:
+        bar.total = max(total, 1)
+        bar.n = min(done, total)
+        bar.set_postfix_str(shown, refresh=False)
+        bar.update(0)
+        if time.monotonic() - self.last > 0.2 or done >= total:
+            self.last = time.monotonic()
+            bar.refresh()
 
     def finished(self, done: Done[Any]) -> None:
         """The stage is done."""

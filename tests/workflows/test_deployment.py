@@ -224,9 +224,9 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGTERM, 0), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
 def test_the_server_of_serve_ends_with_it(
-    tmp_path: Path, child_environment: dict[str, str], number: signal.Signals, code: int
+    tmp_path: Path, child_environment: dict[str, str], number: signal.Signals
 ) -> None:
     port = free_port()
     url = f"http://127.0.0.1:{port}/api"
@@ -241,7 +241,9 @@ def test_the_server_of_serve_ends_with_it(
         wait_for(lambda: len(ask(url, "/deployments/filter", {}, login)) == 2, 240)
         servers = descendants(child.pid)
         child.send_signal(number)
-        assert child.wait(240) == code, (tmp_path / "log").read_text()
+        # 0 where Prefect's own handler was there already: it calls that a regular end
+        allowed = (-9,) if number == signal.SIGKILL else (0, 128 + number)
+        assert child.wait(240) in allowed, (tmp_path / "log").read_text()
         wait_for(lambda: not any(is_alive(s) for s in servers), 60)
         with pytest.raises(OSError):
             ask(url, "/health")
