@@ -163,7 +163,7 @@ def measure(row: Row, given: argparse.Namespace, console: Console) -> Result:
     from workflows.session import Session, session
 
     plan = plan_of(given, settings_of(row, given))
-    with session(Session(console, plan=plan)):
+    with session(Session(console)):
         done = {d.stage: d for d in run_plan(plan, run_here(plan))}
     found: dict[str, Located[Any]] = {name: d.located for name, d in done.items()}
     views = [scores_of(v, found) for v in found["capture"].artifact.views if v.holdout]

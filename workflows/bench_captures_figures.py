@@ -113,14 +113,14 @@ def texture_of(run: Run) -> tuple[Figures, Ranges]:
     if "mesh" not in run.manifest("uv") or "maps" not in run.manifest("bake"):
         return {}, {}
     from pipeline import meshes
-    from stages.uv.measure import TINY_CHART
+    from stages.uv.rough import FRAGMENT
     from stages.uv.unwrap import chart_of_face
 
     path = run.path("uv", run.manifest("uv")["mesh"])
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     area = meshes.areas(mesh.vertices, mesh.faces)
     of_chart = np.bincount(chart_of_face(charts.faces, len(charts.uvs)), area / area.sum())
-    found: Figures = {"fragments": int((of_chart < TINY_CHART).sum())}
+    found: Figures = {"fragments": int((of_chart < FRAGMENT).sum())}
     covered = _covered(mesh, charts, int(run.manifest("bake")["size"]))
     code = _map(run, "region")
     names = run.manifest("masks").get("label_names", [])

@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, project, rigid
 from stages.poses.adjust import Refine, settle
 from stages.poses.features import Features
