@@ -42,4 +42,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
     return solved_cameras(inputs.capture, config, context)
 
 
-STAGE = Stage(name="poses", version=3, inputs=Inputs, config=Config, output=CameraSet, run=run)
+STAGE = Stage(name="poses", version=4, inputs=Inputs, config=Config, output=CameraSet, run=run)
