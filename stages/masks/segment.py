@@ -187,13 +187,7 @@ def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Co
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
     if source == "given" and inverted(alpha, view.disc):
         alpha, source = 1 - alpha, INVERTED
-    made = _keep(use, camera, alpha, source, context)
-    if made.useless and source in ("given", INVERTED):
-        raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
-                         where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
-                         limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
-                         "background black), or remove it so that one is computed")  # fmt: skip
-    return made
+    return _keep(use, camera, alpha, source, context)
 
 
 def _keep(view: View, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:
