@@ -65,4 +65,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     return Report(files=(context.file("index.html"), context.file("metrics.json")), warnings=tuple(unjudged(inputs)))
 
 
-STAGE = Stage(name="report", version=5, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=6, inputs=Inputs, config=Config, output=Report, run=run)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline import meshes
+from pipeline.artifacts import Extent
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F64, Faces, Mask, Mesh, Topology
@@ -42,14 +43,22 @@ class Built:
     handles: tuple[int, int] = (0, 0)
 
 
-def build(field: Field, resolution: int, step: Step, sees: Sees | None = None, handle: float = HANDLE) -> Built:
+def build(
+    field: Field,
+    resolution: int,
+    step: Step,
+    sees: Sees | None = None,
+    handle: float = HANDLE,
+    extent: Extent | None = None,
+) -> Built:
     """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
-    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut.
+    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut. `extent`: the
+    mesh is closed there.
 
     Raises:
         StageError: no zero crossing, a solid that fills its box, or a mesh that can't be closed.
     """
-    grid = extract.lattice(field, resolution)
+    grid = extract.lattice(field, resolution, extent)
     vertices, faces = extract.extract(field, grid, step)
     vertices, faces, removed, second = clean.largest_component(vertices, faces)
     vertices, faces, found, repairs = _closed(vertices, faces)
