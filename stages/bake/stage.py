@@ -110,4 +110,4 @@ def attenuation(face: FittedFace) -> str:
     return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
 
 
-STAGE = Stage(name="bake", version=6, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=7, inputs=Inputs, config=Config, output=TextureSet, run=run)

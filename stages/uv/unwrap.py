@@ -15,6 +15,7 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
+from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
 from stages.uv.tiling import Tiling, packed
 from stages.uv.unfold import folded, one_by_one, taken_apart
@@ -44,10 +45,10 @@ class Options:
     size: int = 1024
 
 
-def unwrap(mesh: Mesh, options: Options) -> Charts:
+def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
     """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
 
-    A mesh that only xatlas can take, in many charts, stays in one tile.
+    A mesh that only xatlas can take, in many charts, stays in one tile. front: the face, whose charts are larger.
 
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
@@ -57,13 +58,15 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = options.padding / options.texture_size
     tiling = Tiling(options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.size))
-    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
+    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
     if own is not None:
         return own
     log.info("uv: charts of our own do not lie flat; xatlas takes over")
     uvs, faces = _cut(points, mesh.faces, options)
     even, faces = _flat(uvs, faces, mesh, options)
     label = chart_of_face(faces, len(even))
+    if front is not None:
+        even = enlarged(even, faces, label, front, meshes.areas(mesh.vertices, mesh.faces))
     if label.max() < MANY_CHARTS:
         placed = pack(even, faces, label, padding)
         total = float(np.abs(signed_areas(even, faces)).sum())
