@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline import meshes
+from pipeline.artifacts import Extent
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F64, Faces, Mask, Mesh, Topology
@@ -56,10 +57,11 @@ def build(
     sees: Sees | None = None,
     handle: float = HANDLE,
     vote: Votes | None = None,
+    extent: Extent | None = None,
 ) -> Built:
     """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
     photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut. `vote`: how
-    much the photos show of each piece; without it the largest is kept.
+    much the photos show of each piece; without it the largest is kept. `extent`: the mesh is closed there.
 
     A mesh that can't be closed is handed on open, and one that is mostly box as it is: what they are worth is judged
     by the stage.
@@ -67,7 +69,7 @@ def build(
     Raises:
         StageError: no zero crossing.
     """
-    grid = extract.lattice(field, resolution)
+    grid = extract.lattice(field, resolution, extent)
     kept = clean.one_piece(*extract.extract(field, grid, step), vote)
     vertices, faces, found, repairs = _closed(kept.vertices, kept.faces)
     landed = clean.spread_degenerate(field, grid, clean.land(field, grid, vertices), faces)

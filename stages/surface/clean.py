@@ -1,7 +1,7 @@
 """From a marched mesh to a closed, outward surface on the zero set.
 
 Symbols: h lattice cell; d SDF; g its gradient. A vertex lies either on the zero set of the SDF or on the cap, the
-plane where the field's box cuts the solid; each is moved along its own gradient only.
+surface where the field's box or the subject's extent cuts the solid; each is moved along its own gradient only.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from pipeline import meshes
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Mask
-from stages.surface.extract import QUERY, Lattice, box_distance
+from stages.surface.extract import QUERY, Lattice, wall_distance
 from stages.surface.pieces import Votes, chosen
 
 NEWTON_STEPS = 3
@@ -110,12 +110,12 @@ def outward(vertices: F64, faces: Faces) -> Faces:
 
 
 def _solid(field: Field, grid: Lattice, points: F64) -> tuple[F64, F64, Mask]:
-    """The SDF cut by the box (see extract.cut) with its gradient, and where the box decides."""
+    """The SDF cut by the walls (see extract.cut) with its gradient, and where a wall decides."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     for start in range(0, len(points), QUERY):
         part = slice(start, start + QUERY)
         inside = np.clip(points[part], grid.lower, grid.upper).astype(np.float32)
         value[part], gradient[part] = field.sdf_and_gradient(inside)
-    wall, wall_gradient = box_distance(points, grid)
+    wall, wall_gradient = wall_distance(points, grid)
     capped = (wall > value) & (wall > -grid.h)
     return np.where(capped, wall, value), np.where(capped[:, None], wall_gradient, gradient), capped

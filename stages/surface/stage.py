@@ -76,7 +76,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
             seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
         return seen
 
-    built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None, config.handle, vote)
+    trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent
+    built = build(field, config.resolution, step, sees if trims else None, config.handle, vote, extent)
     meshes.save(context.workdir / MESH, built.mesh)
     context.log.info(
         "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g, %d handles cut",

@@ -10,10 +10,11 @@ import numpy as np
 
 from pipeline import footprint, meshes
 from pipeline.errors import StageError
-from pipeline.meshes import Charts, Mesh
+from pipeline.meshes import F64, Charts, Mesh
 from pipeline.verdict import Finding
 from stages.uv import decimate
 from stages.uv.decimate import Deviation
+from stages.uv.density import front_of
 from stages.uv.judge import judge
 from stages.uv.measure import Quality, measure
 from stages.uv.remesh import remeshed
@@ -41,9 +42,17 @@ class Built:
 
 
 def build(
-    dense: Mesh, target_faces: int, proxy_faces: int, options: Options, step: Step, *, even: bool = False
+    dense: Mesh,
+    target_faces: int,
+    proxy_faces: int,
+    options: Options,
+    step: Step,
+    *,
+    even: bool = False,
+    landmarks: F64 | None = None,
 ) -> Built:
     """Decimate, unwrap and measure. even: triangles of one size and shape in the place of few where it is flat.
+    landmarks: (468, 3) of the face, which then has more texels.
 
     Raises:
         StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
@@ -63,14 +72,17 @@ def build(
     with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
         away = beside.submit(_away, dense, mesh, proxy)
         step(1, 4, "unwrapping")
-        charts = unwrap(mesh, options)
+        front = front_of(mesh, landmarks)
+        charts = unwrap(mesh, options, front)
         step(2, 4, "measuring charts")
-        quality = measure(mesh, charts)
+        quality = measure(mesh, charts, None if front is None else front.face)
         step(3, 4, "measuring the decimation")
         deviation, rough, against = away.result()
     tiles = len(quality.tile_utilisation)
     step(4, 4, "done")
-    short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
+    rest = np.ones(len(mesh.faces), np.bool_) if front is None else ~front.region
+    others = Mesh(mesh.vertices, mesh.normals, mesh.faces[rest]), Charts(charts.uvs, charts.faces[rest])
+    short = _too_few(options, tiles, footprint.texel(*others, options.size))
     span = float(np.ptp(mesh.vertices, axis=0).max())
     findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)

@@ -52,7 +52,7 @@ def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
     flats = [one for f in flats for one in ([f] if f.good else _face_by_face(surface, f))]
     if len(flats) > MOST_PIECES:
         return None
-    return together(mesh, flats)
+    return together(surface, flats)
 
 
 def short(mesh: Mesh, charts: Charts) -> Mask:

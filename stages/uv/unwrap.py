@@ -16,6 +16,7 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
+from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
 from stages.uv.rough import in_pieces, short
 from stages.uv.tiling import Tiling, packed
@@ -47,10 +48,10 @@ class Options:
     size: int = 1024
 
 
-def unwrap(mesh: Mesh, options: Options) -> Charts:
+def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
     """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
 
-    A mesh that takes MANY_CHARTS or more stays in one tile.
+    A mesh that takes MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger.
 
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
@@ -60,9 +61,9 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = options.padding / options.texture_size
     tiling = Tiling(options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.size))
-    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
+    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
     if own is not None:
-        return _with_texels(own, mesh, options, tiling)
+        return _with_texels(own, mesh, options, tiling, front)
     log.info("uv: a few discs do not lie flat; cutting further")
     found = in_pieces(scaled, points)
     if found is not None:
@@ -71,12 +72,15 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     else:
         log.info("uv: too many pieces do not lie flat; xatlas takes over")
         even, faces = _flat(*_cut(points, mesh.faces, options), mesh, options)
-    return _with_texels(_placed(even, faces, options, tiling), mesh, options, tiling)
+    return _with_texels(_placed(even, faces, mesh, options, tiling, front), mesh, options, tiling, front)
 
 
-def _placed(even: F64, faces: Faces, options: Options, tiling: Tiling) -> Charts:
-    """Charts of one scale in one square, or in tiles where that is asked for and they are not too many."""
+def _placed(even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
+    """Charts of one scale, but for the face's, in one square, or in tiles where that is asked for and they are not too
+    many."""
     padding, label = options.padding / options.texture_size, chart_of_face(faces, len(even))
+    if front is not None:
+        even = enlarged(even, faces, label, front, meshes.areas(mesh.vertices, mesh.faces))
     if label.max() < MANY_CHARTS:
         placed = pack(even, faces, label, padding)
         total = float(np.abs(signed_areas(even, faces)).sum())
@@ -88,7 +92,7 @@ def _placed(even: F64, faces: Faces, options: Options, tiling: Tiling) -> Charts
     return _packed(spread(even, faces), faces, options)
 
 
-def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling) -> Charts:
+def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
     """The charts, those faces laid flat by themselves that have next to no texels, if they are worth it."""
     areas = meshes.areas(mesh.vertices, mesh.faces)
     out = short(mesh, charts)
@@ -97,7 +101,7 @@ def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling) -
     log.info("uv: %d faces have no texels and are laid flat by themselves", int(out.sum()))
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     uvs, faces = one_by_one(charts.uvs.astype(np.float64), charts.faces, out, corners)
-    return _placed(evened(uvs, faces, areas), faces, options, tiling)
+    return _placed(evened(uvs, faces, areas), faces, mesh, options, tiling, front)
 
 
 def _flat(uvs: F64, faces: Faces, mesh: Mesh, options: Options) -> tuple[F64, Faces]:
