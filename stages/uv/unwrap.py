@@ -75,7 +75,9 @@ def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
     return _with_texels(_placed(even, faces, mesh, options, tiling, front), mesh, options, tiling, front)
 
 
-def _placed(even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
+def _placed(
+    even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None = None
+) -> Charts:
     """Charts of one scale, but for the face's, in one square, or in tiles where that is asked for and they are not too
     many."""
     padding, label = options.padding / options.texture_size, chart_of_face(faces, len(even))
@@ -92,7 +94,7 @@ def _placed(even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tilin
     return _packed(spread(even, faces), faces, options)
 
 
-def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
+def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None = None) -> Charts:
     """The charts, those faces laid flat by themselves that have next to no texels, if they are worth it."""
     areas = meshes.areas(mesh.vertices, mesh.faces)
     out = short(mesh, charts)
