@@ -21,6 +21,7 @@ from stages.uv.unwrap import chart_of_face, signed_areas
 
 RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
 FACING = 0.5
+STRETCHED = 4.0  # times that some direction of a face is longer on the surface than in the texture, against the mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class Quality:
     """charts; crumbs: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
     chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
     share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
-    tile_utilisation: of each tile."""
+    tile_utilisation: of each tile; stretched: share of the area whose faces have a Linf above STRETCHED."""
 
     charts: int
     crumbs: int
@@ -40,6 +41,7 @@ class Quality:
     empty: float
     seam_front: float
     tile_utilisation: tuple[float, ...]
+    stretched: float = 0.0
 
 
 def measure(mesh: Mesh, charts: Charts) -> Quality:
@@ -53,6 +55,7 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     covered = [int((layer > 0).sum()) for layer in layers]
     flat = np.abs(uv_area) < 1e-12
     mean, most = stretch(mesh, charts, ~flat)
+    linf = _stretches(mesh, charts, ~flat)[1]
     return Quality(
         charts=int(label.max()) + 1,
         crumbs=int((np.bincount(label, share) < FRAGMENT).sum()),
@@ -64,6 +67,7 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
         empty=float(share[flat].sum()),
         seam_front=seam_length(mesh, charts),
         tile_utilisation=tuple(c / RASTER**2 for c in covered),
+        stretched=float(share[~flat][linf > STRETCHED].sum() + share[flat].sum()),
     )
 
 
@@ -90,6 +94,12 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
     L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
     """
     keep = np.ones(len(mesh.faces), np.bool_) if use is None else use
+    square, larger, area = _stretches(mesh, charts, keep)
+    return float(np.sqrt((square * square * area).sum() / area.sum())), float(larger.max())
+
+
+def _stretches(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
+    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas agree, and their areas."""
     x = mesh.vertices.astype(np.float64)[mesh.faces[keep]]
     t = charts.uvs.astype(np.float64)[charts.faces[keep]]
     e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -102,4 +112,4 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
     # singular values of J: those of J^T J by its trace and determinant
     determinant = (s_u * s_u).sum(1) * (s_v * s_v).sum(1) - (s_u * s_v).sum(1) ** 2
     larger = square + np.sqrt(np.maximum(square * square - determinant, 0))
-    return float(np.sqrt((square * area).sum() / area.sum() * scale)), float(np.sqrt(larger.max() * scale))
+    return np.sqrt(square * scale), np.sqrt(larger * scale), area
