@@ -22,6 +22,7 @@ from stages.uv.unwrap import chart_of_face, evened, signed_areas
 
 RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
 FACING = 0.5
+STRETCHED = 4.0  # times that some direction of a face is longer on the surface than in the texture, against the mean
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +30,8 @@ class Quality:
     """charts; crumbs: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
     chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
     share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
-    tile_utilisation: of each tile; face_share: of the area under charts."""
+    tile_utilisation: of each tile; stretched: share of the area whose faces have a Linf above STRETCHED; face_share: of
+    the area under charts."""
 
     charts: int
     crumbs: int
@@ -41,6 +43,7 @@ class Quality:
     empty: float
     seam_front: float
     tile_utilisation: tuple[float, ...]
+    stretched: float = 0.0
     face_share: float | None = None
 
 
@@ -59,6 +62,7 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Qual
     if face is not None:
         alike = Charts(evened(charts.uvs.astype(np.float64), charts.faces, area).astype(np.float32), charts.faces)
     mean, most = stretch(mesh, alike, ~flat)
+    linf = _stretches(mesh, alike, ~flat)[1]
     return Quality(
         charts=int(label.max()) + 1,
         crumbs=int((np.bincount(label, share) < FRAGMENT).sum()),
@@ -70,6 +74,7 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Qual
         empty=float(share[flat].sum()),
         seam_front=seam_length(mesh, charts),
         tile_utilisation=tuple(c / RASTER**2 for c in covered),
+        stretched=float(share[~flat][linf > STRETCHED].sum() + share[flat].sum()),
         face_share=None if face is None else face_share(charts, face),
     )
 
@@ -97,6 +102,12 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
     L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
     """
     keep = np.ones(len(mesh.faces), np.bool_) if use is None else use
+    square, larger, area = _stretches(mesh, charts, keep)
+    return float(np.sqrt((square * square * area).sum() / area.sum())), float(larger.max())
+
+
+def _stretches(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
+    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas agree, and their areas."""
     x = mesh.vertices.astype(np.float64)[mesh.faces[keep]]
     t = charts.uvs.astype(np.float64)[charts.faces[keep]]
     e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -109,4 +120,4 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
     # singular values of J: those of J^T J by its trace and determinant
     determinant = (s_u * s_u).sum(1) * (s_v * s_v).sum(1) - (s_u * s_v).sum(1) ** 2
     larger = square + np.sqrt(np.maximum(square * square - determinant, 0))
-    return float(np.sqrt((square * area).sum() / area.sum() * scale)), float(np.sqrt(larger.max() * scale))
+    return np.sqrt(square * scale), np.sqrt(larger * scale), area

@@ -125,4 +125,4 @@ def test_data_files_are_packaged(repo: Path) -> None:
 
 def test_console_script_is_installed() -> None:
     found = [e for e in importlib.metadata.entry_points(group="console_scripts") if e.name == "neuface"]
-    assert [e.value for e in found] == ["workflows.cli:main"]
+    assert [e.value for e in found] == ["workflows.entry:main"]

@@ -128,6 +128,10 @@ def test_votes_are_shares_of_the_pictures(tmp_path: Path) -> None:
     share = votes(mesh, piece, views, lambda: None)
     assert share.sum() == pytest.approx(1) and share[1] == pytest.approx(0.2, abs=0.02)
     assert not votes(mesh, piece, [], lambda: None).any()
+    near = mesh.vertices.copy()
+    near[len(big.vertices) :] += np.float32([0, -0.03, 0.3])  # half as far from the first camera: as large as the other
+    half = votes(Mesh(near, mesh.normals, mesh.faces), piece, views[:1], lambda: None)
+    assert half[1] == pytest.approx(0.5, abs=0.06)
 
 
 def test_a_mesh_that_cannot_be_closed_is_handed_on_and_unusable(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,6 +181,9 @@ def test_stretch_of_known_maps() -> None:
     wide = Charts(charts.uvs * np.float32([1, 0.25]), charts.faces)
     # singular values 2 and 1/2 after the areas are made equal: sqrt((4 + 1/4) / 2)
     assert stretch(mesh, wide) == pytest.approx((np.sqrt(2.125), 2), rel=1e-5)
+    long = charts.uvs.copy()
+    long[:2, 1] = 0.599  # the first face is drawn out to a line, nearly; the second keeps half of its height
+    assert measure(mesh, charts).stretched == 0 and measure(mesh, Charts(long, charts.faces)).stretched > 0.4
 
 
 def test_seams_in_front_are_measured() -> None:
@@ -276,7 +279,8 @@ def test_packing_a_line_and_a_point() -> None:
 
 def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unwrap, "MANY_CHARTS", 0)
-    monkeypatch.setattr(unwrap, "unwrapped", lambda *_: None)
+    for ours in ("unwrapped", "in_pieces"):
+        monkeypatch.setattr(unwrap, ours, lambda *_: None)
     charts = unwrap.unwrap(decimate.decimated(dense, 2000), unwrap.Options(512, 4))
     assert painted(charts, 500)[0].max() == 1
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).mean() > 0.99

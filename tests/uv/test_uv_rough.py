@@ -158,13 +158,13 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
         ("texels_missing", {"empty": 0.0061}, "unusable"),
         ("mirrored", {"flipped": 0.01}, "usable"),
         ("mirrored", {"flipped": 0.1}, "unusable"),
-        ("stretch", {"stretch": 9.3}, "usable"),
-        ("stretch", {"stretch": 200.0}, "unusable"),
-        ("stretch", {"stretch": float("nan")}, "unusable"),
+        ("stretch", {"stretched": 0.025}, "usable"),
+        ("stretch", {"stretched": 0.3}, "unusable"),
+        ("stretch", {"stretched": float("nan")}, "unusable"),
     ],
 )
 def test_each_ruined_figure_has_its_level(check: str, ruin: dict[str, float], level: str) -> None:
-    found = {f.check: f for f in judge(replace(GOOD, **ruin), NEAR, 0.3, 0.0, 0.0)}  # type: ignore[arg-type]
+    found = {f.check: f for f in judge(replace(GOOD, **ruin), NEAR, 0.3, 0.0, 0.0, 0.0)}  # type: ignore[arg-type]
     assert found[check].level == level and found[check].remedy
 
 
