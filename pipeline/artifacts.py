@@ -93,7 +93,7 @@ class CaptureSource(Artifact):
 
     photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
     plates: photos of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the
-    face along +Z, where a file beside the capture says it.
+    face along +Z, where a file beside the capture says it. passed_over: names of pictures whose format is not read.
     """
 
     kind: CaptureKind
@@ -102,6 +102,7 @@ class CaptureSource(Artifact):
     masks: tuple[FileRef, ...] = ()
     plates: tuple[FileRef, ...] = ()
     metres_from_world: Matrix | None = None
+    passed_over: tuple[str, ...] = ()
 
 
 class GivenCamera(Artifact):
@@ -206,7 +207,7 @@ class CameraSet(Artifact):
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
     reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
-    makes it metres.
+    makes it metres. seen_directions: how many fitted views see what faces each direction (pipeline.directions).
     """
 
     source: Literal["given", "colmap"]
@@ -219,6 +220,7 @@ class CameraSet(Artifact):
     reprojection_error_px: float | None = None
     view_errors_px: dict[str, float] = {}
     points: FileRef | None = None
+    seen_directions: tuple[tuple[int, ...], ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

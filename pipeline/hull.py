@@ -24,6 +24,7 @@ from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.pieces import subject_pieces
 from pipeline.silhouettes import Silhouette, lens_radius, outside, silhouette
 from pipeline.transforms import inverse_rigid, matrix, project
 
@@ -210,7 +211,7 @@ def hull_bounds(
     min_views: int = 3,
     max_outside: int = 0,
 ) -> tuple[F64, F64]:
-    """(3,) lower and upper corner of the subject's largest piece in the cube of half-edge 1.6 * roi_radius.
+    """(3,) lower and upper corner of the subject in the cube of half-edge 1.6 * roi_radius.
 
     `margin` is added on every side, as a fraction of the longest edge; the box stays inside the cube.
 
@@ -221,7 +222,7 @@ def hull_bounds(
     hull = visual_hull(
         cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / cells, min_views=min_views, max_outside=max_outside
     )
-    body = largest_piece(hull.occupied)
+    body = subject_pieces(hull.occupied, hull.lo + 0.5 * hull.cell, hull.cell)
     if not body.any():
         raise StageError(
             "no part of space is inside all silhouettes",
@@ -234,16 +235,6 @@ def hull_bounds(
     lo, hi = hull.lo + index.min(0) * hull.cell, hull.lo + (index.max(0) + 1) * hull.cell
     room = margin * float((hi - lo).max())
     return np.maximum(lo - room, -edge), np.minimum(hi + room, edge)
-
-
-def largest_piece(occupied: Bool) -> Bool:
-    """The largest 6-connected piece of a voxel mask."""
-    label, count = ndimage.label(occupied)
-    if count <= 1:
-        return occupied.copy()
-    sizes = np.bincount(label.ravel())
-    sizes[0] = 0
-    return np.asarray(label == sizes.argmax())
 
 
 def hull_sdf(hull: Hull) -> F32:

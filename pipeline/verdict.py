@@ -7,9 +7,10 @@ could be. `unusable`: do not hand it on.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -38,9 +39,14 @@ class Finding(BaseModel):
     views: tuple[str, ...] = ()
 
     def __str__(self) -> str:
+        return f"{self.level}: {self.sentence}"
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in which photos, and what to do."""
         named = f" ({', '.join(self.views[:5])}{', ...' if len(self.views) > 5 else ''})" if self.views else ""
-        what = f"{self.level}: {self.said}{named}"
-        return f"{what} What to do: {self.remedy}." if self.remedy and self.level != "good" else what
+        what = f"{self.said.rstrip('.')}{named}."
+        return f"{what} What to do: {self.remedy.rstrip('.')}." if self.remedy and self.level != "good" else what
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,3 +100,55 @@ def worst(findings: Iterable[Finding | Level]) -> Level:
     """The worst level of findings or levels; good where there are none."""
     levels = [f if isinstance(f, str) else f.level for f in findings]
     return max(levels, key=LEVELS.index, default="good")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What several stages found, together. findings: by the stage's name, in the order of the stages."""
+
+    findings: Mapping[str, tuple[Finding, ...]]
+
+    @property
+    def level(self) -> Level:
+        """The worst of all stages."""
+        return worst(self.stages.values())
+
+    @property
+    def stages(self) -> dict[str, Level]:
+        """Each stage's worst."""
+        return {name: worst(found) for name, found in self.findings.items()}
+
+    def in_order(self) -> list[tuple[str, Finding]]:
+        """(stage, finding) of all, in the order of the stages."""
+        return [(name, f) for name, found in self.findings.items() for f in found]
+
+    def troubles(self) -> list[tuple[str, Finding]]:
+        """Those that are not good, the worst first, else in the order of the stages."""
+        return sorted((x for x in self.in_order() if x[1].level != "good"), key=lambda x: -LEVELS.index(x[1].level))
+
+    def reasons(self) -> tuple[str, ...]:
+        """A sentence for each trouble: what is wrong, in which photos, and what to do."""
+        return tuple(f"{name}: {finding}" for name, finding in self.troubles())
+
+    def record(self, *, every: bool = False) -> dict[str, Any]:
+        """As plain values for JSON; with every finding, or with the troubles alone."""
+        listed = self.in_order() if every else self.troubles()
+        return {
+            "level": self.level,
+            "stages": self.stages,
+            "findings": [{"stage": name, **finding.model_dump(mode="json")} for name, finding in listed],
+        }
+
+
+def verdict_of(artifacts: Mapping[str, Any]) -> Verdict:
+    """The verdict of finished artifacts by their stages' names. One without findings is good."""
+    return Verdict({name: tuple(getattr(a, "findings", ())) for name, a in artifacts.items()})
+
+
+def verdict_of_inputs(inputs: Any, **own: Iterable[Finding]) -> Verdict:
+    """The verdict of a stage's inputs (a dataclass of located artifacts) and of what the stage itself found.
+
+    own: the findings by the name of that stage, which has made no artifact yet.
+    """
+    before = {f.name: getattr(inputs, f.name).artifact for f in dataclasses.fields(inputs)}
+    return Verdict({**verdict_of(before).findings, **{name: tuple(found) for name, found in own.items()}})

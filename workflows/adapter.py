@@ -32,6 +32,7 @@ from workflows.plan import Plan
 from workflows.runner import RunStage
 from workflows.session import current
 from workflows.slots import slot
+from workflows.verdict import last_lines
 from workflows.watchdog import time_limit
 
 log = logging.getLogger(__name__)
@@ -152,7 +153,8 @@ def publish_result(out: Path, record: dict[str, Any]) -> None:
     for name, s in record["stages"].items():
         lines.append(f"| {name} | {'reused' if s['reused'] else s['seconds']} | `{s['key'][:12]}` |")
     warnings = [f"- {name}: {w}" for name, s in record["stages"].items() for w in s["warnings"]]
-    text = "\n".join([f"# {out.name}", f"`{out.resolve()}`", "", *lines, "", *warnings])
+    verdict = [f"- {line.strip()}" for line in last_lines(record)]
+    text = "\n".join([f"# {out.name}", f"`{out.resolve()}`", "", *verdict, "", *lines, "", *warnings])
     page = out.resolve() / "report" / "index.html"
     try:
         create_markdown_artifact(text, key="run", description="stages of this run")

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.errors import Cancelled, StageError
+from pipeline.verdict import Level
 from workflows import batch_captures
 from workflows.alone import alone
 from workflows.batch_captures import Item
 from workflows.batch_faults import Fault, back_off, smaller
-from workflows.batch_ledger import Entry, Ledger, Summary, fingerprint
+from workflows.batch_ledger import ENDED, Entry, Ledger, Summary, fingerprint
 from workflows.batch_page import write_page
 from workflows.batch_request import BatchRequest
 from workflows.folders import writable
@@ -30,11 +31,13 @@ PAGE_EVERY = 20.0  # seconds between two updates of the page while the batch run
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How one attempt ended. fault: None when the capture's asset stands. batch: rays a step that the fit had."""
+    """How one attempt ended. fault: None when the run came to its end. batch: rays a step that the fit had. level: of
+    the result, where that is known."""
 
     name: str
     fault: Fault | None = None
     batch: int | None = None
+    level: Level | None = None
 
 
 class Runner(Protocol):
@@ -84,7 +87,7 @@ def run_batch(
     with writable(out, store), alone(store, request.folder, stopped, said):
         works = [_prepared(i, ledger, request) for i in items]
         summary = Summary([w.entry for w in works])
-        said(f"{len(items)} captures, {summary.counts()['done']} of them done before")
+        said(f"{len(items)} captures, {len(items) - summary.failed} of them done before")
         page = _Page(lambda: write_page(request, summary))
         try:
             _loop(works, request, runner, ledger, summary, stopped, said, page)
@@ -103,7 +106,7 @@ def _prepared(item: Item, ledger: Ledger, request: BatchRequest) -> Work:
     now = fingerprint(request.run_request(item.capture, item.name, (), item.own))
     if entry.fingerprint != now:
         entry = Entry(name=item.name, capture=str(item.capture), fingerprint=now, attempt=entry.attempt)
-    elif entry.state == "done" and not (Path(request.out) / item.name / "run.json").is_file():
+    elif entry.state in ENDED and not (Path(request.out) / item.name / "run.json").is_file():
         entry.state = "waiting"
     elif entry.state == "failed":
         entry.state, entry.fault, entry.earlier = "waiting", None, ()
@@ -152,7 +155,7 @@ def _start(work: Work, request: BatchRequest, runner: Runner, ledger: Ledger) ->
     entry = work.entry
     if entry.state == "waiting":
         entry.attempt += 1
-    entry.state, entry.fault = "submitted", None
+    entry.state, entry.fault, entry.level = "submitted", None, None
     ledger.write(entry)  # before it is submitted: a batch that dies here submits the same key again
     runner.start(entry, request.run_request(work.item.capture, work.item.name, entry.sets, work.item.own))
 
@@ -160,8 +163,8 @@ def _start(work: Work, request: BatchRequest, runner: Runner, ledger: Ledger) ->
 def _settle(work: Work, ended: Ended, request: BatchRequest, ledger: Ledger, said: Callable[[str], None]) -> None:
     entry, fault = work.entry, ended.fault
     if fault is None:
-        entry.state = "done"
-        said(f"{entry.name}: done")
+        entry.state, entry.level = "unusable" if ended.level == "unusable" else "done", ended.level
+        said(f"{entry.name}: {'done' if ended.level is None else f'done, {ended.level}'}")
     elif fault.kind == "stopped":
         entry.state = "waiting"
     else:

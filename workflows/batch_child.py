@@ -23,6 +23,7 @@ from workflows.plan import Plan, RunRequest, make_plan
 from workflows.publish import publish
 from workflows.runner import run_here, run_plan
 from workflows.session import Session, session
+from workflows.verdict import exit_code, level_in
 
 
 class Events:
@@ -67,7 +68,7 @@ def main(arguments: list[str]) -> int:
             plan = make_plan(request)
             events.tell(event="plan", batch=rays_a_step(plan))
             with writable(plan.out, plan.store.root), alone(plan.store.root, plan.out, watch.stopped, events.note):
-                publish(plan, run_plan(plan, run_here(plan)))
+                record = publish(plan, run_plan(plan, run_here(plan)))
     except Exception as e:
         fault = fault_of(e, events.stage)
         events.tell(event="failed", fault=fault.model_dump())
@@ -75,8 +76,8 @@ def main(arguments: list[str]) -> int:
             raise
         print(f"error: {e}", file=sys.stderr)
         return getattr(e, "exit_code", 1)
-    events.tell(event="done")
-    return 0
+    events.tell(event="done", level=level_in(record))
+    return exit_code(record)
 
 
 def rays_a_step(plan: Plan) -> int | None:

@@ -14,6 +14,7 @@ from stages.presets import DEFAULT_PRESET
 from workflows import environment
 from workflows.batch_request import DEPLOYMENT, PRIORITIES, BatchRequest
 from workflows.console import Console
+from workflows.verdict import REFUSED
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 
@@ -54,6 +55,7 @@ def add_commands(commands_of: Any) -> None:
     batch.add_argument("--stage-limit", type=a_time, default="6h", metavar="TIME", help="for one stage (%(default)s)")
     batch.add_argument("--attempts", type=int, default=3, help="tries where the fault may pass (%(default)s)")
     batch.add_argument("--workers", type=int, default=1, metavar="N", help="captures at a time here (%(default)s)")
+    add_verdict_options(batch)
     server = batch.add_argument_group("on a Prefect server with a pool of workers")
     server.add_argument("--server", action="store_true", help="submit a run for each capture to $PREFECT_API_URL")
     server.add_argument("--deployment", default=DEPLOYMENT, metavar="F/N", help="of one capture (%(default)s)")
@@ -70,8 +72,14 @@ def add_commands(commands_of: Any) -> None:
     serve.set_defaults(run=serve_command)
 
 
+def add_verdict_options(command: argparse.ArgumentParser) -> None:
+    """--force and --strict, of a run and of a batch."""
+    command.add_argument("--force", action="store_true", help="go on to the fit although what comes first is unusable")
+    command.add_argument("--strict", action="store_true", help="exit code 3 for a result that is only usable, too")
+
+
 def batch_command(options: argparse.Namespace, console: Console) -> int:
-    """neuface batch. Exit code 1 if a capture has no asset."""
+    """neuface batch. Exit code 1 if a capture failed, else 3 if a result is unusable (with --strict: only usable)."""
     from workflows.batch import run_batch
 
     request = request_from(options)
@@ -99,7 +107,7 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
     if summary.held is not None:
         print(f"stopped early: {summary.held.message}")
     print(f"page       {request.folder / 'index.html'}")
-    return 1 if summary.failed else 0
+    return 1 if summary.failed else REFUSED if summary.refused(request.strict) else 0
 
 
 def request_from(options: argparse.Namespace) -> BatchRequest:

@@ -13,18 +13,22 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.artifacts import RelativePath
+from pipeline.verdict import Level
 from stages import registry
 from workflows.batch_captures import Item
 from workflows.batch_faults import Fault
 from workflows.plan import RunRequest
+from workflows.verdict import is_refused
 
-State = Literal["waiting", "submitted", "done", "failed"]
+State = Literal["waiting", "submitted", "done", "unusable", "failed"]
+ENDED: tuple[State, ...] = ("done", "unusable")  # the run came to its end; "unusable": so its stages judged the result
 
 
 class Entry(BaseModel):
     """One capture's state.
 
     attempt: counts every try, over all commands; it is in the key that keeps a server from running one try twice.
+    level: how good the result is, where that is known.
     sets: settings that earlier attempts taught (a smaller batch). fingerprint: of what was asked and what it was of.
     """
 
@@ -33,6 +37,7 @@ class Entry(BaseModel):
     name: str
     capture: str
     state: State = "waiting"
+    level: Level | None = None
     attempt: int = 0
     fingerprint: str = ""
     sets: tuple[str, ...] = ()
@@ -55,12 +60,18 @@ class Summary:
 
     @property
     def failed(self) -> int:
-        """Captures that have no asset, for whatever reason."""
-        return sum(e.state != "done" for e in self.entries)
+        """Captures whose run did not come to its end, for whatever reason."""
+        return sum(e.state not in ENDED for e in self.entries)
+
+    def refused(self, strict: bool) -> int:
+        """Captures whose run ended with a result that is not good enough."""
+        return sum(e.state in ENDED and is_refused(e.level, strict) for e in self.entries)
 
     def counts(self) -> dict[str, int]:
         """Captures by state."""
-        return {s: sum(e.state == s for e in self.entries) for s in ("done", "failed", "submitted", "waiting")}
+        return {
+            s: sum(e.state == s for e in self.entries) for s in ("done", "unusable", "failed", "submitted", "waiting")
+        }
 
 
 class Ledger:
@@ -95,7 +106,7 @@ def fingerprint(request: RunRequest) -> str:
 
     It only decides whether a finished capture is looked at again; what is reused then, the store decides by content.
     """
-    asked = request.model_dump(mode="json", exclude={"stage_limit", "fit_slots", "store", "device"})
+    asked = request.model_dump(mode="json", exclude={"stage_limit", "fit_slots", "store", "device", "strict"})
     parts = [asked, [(s.name, s.version) for s in registry.REGISTRY], _files(Path(request.capture))]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
 

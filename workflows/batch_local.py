@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.verdict import Level
 from workflows.batch import Ended
 from workflows.batch_faults import Fault
 from workflows.batch_ledger import Entry
@@ -40,6 +41,7 @@ class _Child:
     fault: Fault | None = None
     batch: int | None = None
     done: bool = False
+    level: Level | None = None
     overdue: bool = False
 
 
@@ -125,7 +127,7 @@ class Processes:
         elif event["event"] == "plan":
             child.batch = event["batch"]
         elif event["event"] == "done":
-            child.done = True
+            child.done, child.level = True, event.get("level")
         elif event["event"] == "failed":
             child.fault = Fault.model_validate(event["fault"])
 
@@ -142,7 +144,7 @@ class Processes:
         _close_stdin(child)
         code = child.process.wait()
         if child.done:
-            return Ended(name)
+            return Ended(name, level=child.level)
         if child.fault is not None:
             return Ended(name, child.fault, child.batch)
         return Ended(name, _silent_end(child, code, time.monotonic()), child.batch)

@@ -16,9 +16,11 @@ from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined, Template
 
+from pipeline.verdict import LEVELS
 from workflows.batch_captures import natural
-from workflows.batch_ledger import Entry, Summary
+from workflows.batch_ledger import ENDED, Entry, Summary
 from workflows.batch_request import BatchRequest
+from workflows.verdict import level_in
 
 # figure -> where run.json or metrics.json has it
 FIGURES: dict[str, tuple[str, ...]] = {
@@ -38,11 +40,14 @@ FIRST_LINE = 300  # characters of a fault that the table shows
 
 @dataclass(slots=True)
 class Row:
-    """One capture in the table. odd: how far the oddest figure is from the others'; odd_in: which."""
+    """One capture in the table. level: how good its result is; reason: the worst of why. odd: how far the oddest figure
+    is from the others'; odd_in: which."""
 
     name: str
     state: str
     attempts: int
+    level: str = ""
+    reason: str = ""
     fault: str = ""
     figures: dict[str, float] = field(default_factory=dict)
     warnings: int = 0
@@ -58,6 +63,7 @@ def write_page(request: BatchRequest, summary: Summary) -> None:
     content = {
         "counts": summary.counts(),
         "held": summary.held.message if summary.held else None,
+        "levels": {x: sum(r.level == x for r in rows) for x in reversed(LEVELS)},
         "medians": _medians(rows),
         "captures": [asdict(r) for r in rows],
     }
@@ -67,10 +73,14 @@ def write_page(request: BatchRequest, summary: Summary) -> None:
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
-    """Failed ones first, then the oddest, then by name."""
+    """Failed ones first, then by verdict from the worst, then the oddest, then by name."""
     _find_odd(rows)
-    order = {"failed": 0}
-    return sorted(rows, key=lambda r: (order.get(r.state, 1), -r.odd if r.odd >= ODD else 0, natural(r.name)))
+    return sorted(rows, key=lambda r: (_rank(r), -r.odd if r.odd >= ODD else 0, natural(r.name)))
+
+
+def _rank(row: Row) -> int:
+    """0 for failed captures, 1 for unusable results, 2 for usable ones, 3 for the rest."""
+    return 0 if row.state == "failed" else {"unusable": 1, "usable": 2}.get(row.level, 3)
 
 
 def _find_odd(rows: Sequence[Row]) -> None:
@@ -97,12 +107,14 @@ def _row(entry: Entry, out: Path) -> Row:
     row = Row(entry.name, entry.state, entry.attempt)
     if entry.fault is not None:
         row.fault = entry.fault.message
-    if entry.state != "done":
+    if entry.state not in ENDED:
         return row
     folder, link = out / entry.name, f"../{quote(entry.name)}"
     run, metrics = _json(folder / "run.json"), _json(folder / "report" / "metrics.json")
     stages = run.get("stages", {})
     run["peak_memory_mb"] = max((s.get("peak_memory_mb") or 0 for s in stages.values()), default=None)
+    troubles = run.get("verdict", {}).get("findings", ())
+    row.level, row.reason = entry.level or level_in(run) or "", str(troubles[0].get("said", "")) if troubles else ""
     row.warnings = sum(len(s.get("warnings", ())) for s in stages.values())
     row.figures = {
         n: v for n, path in FIGURES.items() if (v := _at({"run": run, "metrics": metrics}, path)) is not None
@@ -132,11 +144,12 @@ def _at(content: Mapping[str, Any], path: Sequence[str]) -> float | None:
 def _csv(rows: Sequence[Row]) -> str:
     stream = io.StringIO()
     table = csv.writer(stream)
-    table.writerow(["name", "state", "attempts", *FIGURES, "warnings", "odd", "odd_in", "fault"])
+    table.writerow(["name", "state", "verdict", "attempts", *FIGURES, "warnings", "odd", "odd_in", "reason", "fault"])
     for r in rows:
         figures = [f"{r.figures[n]:.6g}" if n in r.figures else "" for n in FIGURES]
         fault = " ".join(r.fault.split())[:FIRST_LINE]
-        table.writerow([r.name, r.state, r.attempts, *figures, r.warnings, r.odd, r.odd_in, fault])
+        reason = " ".join(r.reason.split())[:FIRST_LINE]
+        table.writerow([r.name, r.state, r.level, r.attempts, *figures, r.warnings, r.odd, r.odd_in, reason, fault])
     return stream.getvalue()
 
 

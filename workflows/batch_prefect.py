@@ -32,6 +32,7 @@ from workflows.batch_ledger import Entry, idempotency_key
 from workflows.batch_request import PRIORITIES, BatchRequest
 from workflows.environment import SLOTS_ON_DISK
 from workflows.plan import RunRequest, make_plan
+from workflows.verdict import level_of_state
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -110,7 +111,7 @@ class Pool:
         state, now = seen.state_type, time.monotonic()
         message = (seen.state.message or "") if seen.state else ""
         if state == StateType.COMPLETED:
-            return Ended(run.name)
+            return Ended(run.name, level=level_of_state(seen.state.name if seen.state else None))
         if state == StateType.FAILED:
             fault = fault_in(message)
             return Ended(run.name, fault, _rays(run.request) if fault.kind == "memory" else None)

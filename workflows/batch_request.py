@@ -32,6 +32,8 @@ class BatchRequest(BaseModel):
     config: dict[str, dict[str, Any]] = Field({}, description="settings by stage, then by key")
     store: str | None = Field(None, description="folder of finished stages; OUT/.store by default")
     stage_limit: float | None = Field(6 * 3600.0, gt=0, description="seconds that one stage may take")
+    force: bool = Field(False, description="go on to the fit although photos, cameras or masks are unusable")
+    strict: bool = Field(False, description="results that are only usable count as refused; makes no other")
     attempts: int = Field(3, ge=1, le=20, description="times that a capture is tried whose fault may pass")
     deployment: str = Field(DEPLOYMENT, description="flow/name of the deployment that runs one capture")
     chunk: int = Field(50, ge=1, le=200, description="runs on the server at a time that are not finished")
@@ -58,7 +60,8 @@ class BatchRequest(BaseModel):
 
     def run_request(self, capture: Path, name: str, sets: tuple[str, ...], own: dict[str, Any]) -> RunRequest:
         """One capture's run. `own`: what a list says of this capture alone; `sets`: what earlier attempts taught."""
-        shared = self.model_dump(include={"preset", "holdout", "seed", "device", "until", "config", "stage_limit"})
+        of_all = {"preset", "holdout", "seed", "device", "until", "config", "stage_limit", "force", "strict"}
+        shared = self.model_dump(include=of_all)
         return RunRequest(
             **{**shared, **own},
             capture=str(capture),

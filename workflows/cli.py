@@ -1,6 +1,7 @@
 """The command line `neuface`.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage, 130 stopped by the user with finished stages kept.
+Exit codes: 0 done and the result is good or usable, 1 failed, 2 wrong usage, 3 the result is unusable (with --strict:
+or only usable), 130 stopped by the user with finished stages kept.
 """
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
@@ -13,12 +14,13 @@ from collections.abc import Sequence
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
-from workflows import batch_commands, bench, commands, schedule, store_commands
+from workflows import batch_commands, bench, check, commands, schedule, store_commands
 from workflows.console import Console
 
 EXAMPLES = """examples:
   neuface demo                                        a made-up head, start to end, checked against the truth
   neuface run photos/ --out runs/anna                 photos of a head -> asset and report
+  neuface check photos/                               are they good enough? seconds, no fit
   neuface run photos/ --out runs/anna --preset draft --holdout every:5:2 --set bake.size=2048
   neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
 """
@@ -35,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--verbose", action="store_true", help="also log what the stages say, and show tracebacks")
     commands_of = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_options(commands_of.add_parser("run", help="one capture -> asset and report"))
+    check.add_options(commands_of.add_parser("check", help="are these photos good enough? no fit, seconds"))
     demo = commands_of.add_parser("demo", help="the built-in demo capture -> asset, report, figures against the truth")
     demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
     demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
@@ -93,6 +96,7 @@ def _run_options(run: argparse.ArgumentParser) -> None:
         "--stage-limit", type=batch_commands.a_time, metavar="TIME", help="time that one stage may take: 90s, 30m, 2h"
     )
     run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")
+    batch_commands.add_verdict_options(run)
     run.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
     run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
     _where(run)

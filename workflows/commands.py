@@ -19,6 +19,7 @@ from workflows.console import Console
 from workflows.interrupt import deaf_children, interruptible
 from workflows.plan import RunRequest, make_plan, preview
 from workflows.session import Session, session
+from workflows.verdict import exit_code, last_lines
 
 # The demo: enough views and pixels to recognise the face, few enough for minutes on two cores.
 DEMO_VIEWS, DEMO_SIZE, DEMO_HOLDOUT = 40, 384, "every:5:2"
@@ -89,7 +90,8 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         raise
     if record:
         _tell(record, Path(options.out))
-    return 0
+        _tell_verdict(record)
+    return exit_code(record)
 
 
 def demo_command(options: argparse.Namespace, console: Console) -> int:
@@ -126,8 +128,10 @@ def demo_command(options: argparse.Namespace, console: Console) -> int:
         console.close()
         record = run(request, console)
     _tell(record, out)
-    _against_truth(out, capture, record, request)
-    return 0
+    if "asset" in record:
+        _against_truth(out, capture, record, request)
+    _tell_verdict(record)
+    return exit_code(record)
 
 
 def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest) -> None:
@@ -206,8 +210,10 @@ def report_command(options: argparse.Namespace, console: Console) -> int:
     request = RunRequest(
         **{**record["request"], "out": str(out), "store": record["store"], "from_stage": "report", "until": None}
     )
-    _tell(run(request, console), out)
-    return 0
+    record = run(request, console)
+    _tell(record, out)
+    _tell_verdict(record)
+    return exit_code(record)
 
 
 def view_command(options: argparse.Namespace, console: Console) -> int:
@@ -260,6 +266,8 @@ def request_from(options: argparse.Namespace) -> RunRequest:
         store=options.store,
         budget=options.budget,
         stage_limit=options.stage_limit,
+        force=options.force,
+        strict=options.strict,
     )
 
 
@@ -295,4 +303,11 @@ def _tell(record: dict[str, Any], out: Path) -> None:
         print(f"report {page}")
     reused = sum(s["reused"] for s in record["stages"].values())
     print(f"run    {out / 'run.json'} ({len(record['stages'])} stages, {reused} reused)")
+    sys.stdout.flush()
+
+
+def _tell_verdict(record: dict[str, Any]) -> None:
+    """The last lines on stdout: how good it is, and why."""
+    for line in last_lines(record):
+        print(line)
     sys.stdout.flush()

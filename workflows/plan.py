@@ -54,6 +54,8 @@ class RunRequest(BaseModel):
     fit_slots: str | None = Field(
         default=None, description="name of a global concurrency limit; the fit holds one of its slots (a GPU, say)"
     )
+    force: bool = Field(default=False, description="go on to the fit although photos, cameras or masks are unusable")
+    strict: bool = Field(default=False, description="a result that is only usable counts as refused; makes no other")
 
     @property
     def store_path(self) -> Path:

@@ -16,6 +16,7 @@ from pipeline.errors import stage_error_from_os_error
 from pipeline.store import sync, write_synced
 from workflows.plan import Plan
 from workflows.store_roots import note_root
+from workflows.verdict import verdict_of_done
 
 Copies = dict[str, Path]  # path below the published folder -> file in the store
 
@@ -70,6 +71,7 @@ def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
     """What run.json holds. Figures that may differ from run to run live here, not in any manifest."""
     taken = {n: float(d.run.get("seconds", 0.0)) for n, d in stages.items()}
     record: dict[str, Any] = {
+        "verdict": verdict_of_done(stages.values()).record(),
         "stages": {
             n: {
                 "key": d.key,

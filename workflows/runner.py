@@ -13,6 +13,7 @@ from pipeline.errors import Cancelled
 from stages import registry
 from stages.registry import FIT
 from workflows.budget import START_UP, planned
+from workflows.early import ends_early
 from workflows.plan import Plan, check_settings
 from workflows.session import current
 from workflows.watchdog import time_limit
@@ -22,6 +23,8 @@ RunStage = Callable[[Stage[Any, Any, Any], Any, StageConfig], Done[Any]]
 
 def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
     """Run the plan's stages in order and hand back what was done, first to last.
+
+    It ends before the fit where a stage before it finds its result unusable, unless the request says `force`.
 
     Raises:
         StageError: from the first stage that can't go on, or takes longer than it may; those before it stay in the
@@ -44,6 +47,8 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
         watch.observer.finished(result)
         finished[stage.name] = result.located
         done.append(result)
+        if ends_early(plan, done):
+            break
     return done
 
 

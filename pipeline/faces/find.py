@@ -51,8 +51,7 @@ def find_face(image: U8, x: float, y: float, half: float, roll: float = 0.0) -> 
     roll: radians, by which the person's up is turned from the photo's, clockwise positive.
     """
     photo_from_net = _square(x, y, half, roll, DETECTOR_SIDE)
-    logits, found = _run("face_detection_short_range", _sampled(image, photo_from_net, DETECTOR_SIDE) * 2 - 1,
-                         ("classificators", "regressors"))  # fmt: skip
+    logits, found = _detected(image, photo_from_net)
     best = int(np.argmax(logits.ravel()))
     if _probability(float(logits.ravel()[best])) < SURE:
         return None
@@ -63,6 +62,33 @@ def find_face(image: U8, x: float, y: float, half: float, roll: float = 0.0) -> 
     centre = photo_from_net[:, :2] @ middle + photo_from_net[:, 2] + 0.5
     scale = 2 * half / DETECTOR_SIDE
     return _landmarks(image, centre, ROOM * float(offsets[2:4].max()) * scale, roll + lean)
+
+
+def face_boxes(
+    image: U8, x: float, y: float, half: float, least: float, roll: float = 0.0
+) -> list[tuple[F64, float]]:  # fmt: skip
+    """Middle (2,) and edge of each face in the square, pixels of the photo, the surest first; see `find_face`.
+
+    least: probability from which one counts. Of finds that overlap by half the surest is kept.
+    """
+    photo_from_net = _square(x, y, half, roll, DETECTOR_SIDE)
+    logits, found = _detected(image, photo_from_net)
+    offsets, cells = found.reshape(-1, 16), _cells()
+    kept: list[tuple[F64, float]] = []
+    for k in np.argsort(-logits.ravel(), kind="stable"):
+        if _probability(float(logits.ravel()[k])) < least:
+            break
+        middle, size = offsets[k, :2] + cells[k], float(offsets[k, 2:4].max())
+        if all(np.hypot(*(middle - m)) > 0.5 * max(size, s) for m, s in kept):
+            kept.append((np.asarray(middle, np.float64), size))
+    scale = 2 * half / DETECTOR_SIDE
+    return [(photo_from_net[:, :2] @ m + photo_from_net[:, 2] + 0.5, s * scale) for m, s in kept]
+
+
+def _detected(image: U8, photo_from_net: F64) -> tuple[Any, Any]:
+    """Logits and offsets of the detector for the square that `photo_from_net` says."""
+    picture = _sampled(image, photo_from_net, DETECTOR_SIDE) * 2 - 1
+    return _run("face_detection_short_range", picture, ("classificators", "regressors"))
 
 
 def _landmarks(image: U8, centre: F64, half: float, roll: float) -> Face | None:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from pipeline.fields import kernels
 from pipeline.maths import sdf as spline
+from pipeline.pieces import filled, subject_pieces
 
 BAND = 4.0
 BETAS = (0.9, 0.99)
@@ -111,9 +112,9 @@ class GridSdf(nn.Module):
         self.sink.zero_()
 
     def redistance(self) -> None:
-        """Keep the zero set's largest piece, fill its cavities, and make the far field a distance again."""
+        """Keep the subject's pieces of the zero set, fill their cavities, and make the far field a distance again."""
         values = self.values.detach().cpu().numpy()
-        solid = largest_solid(values < 0)
+        solid = filled(subject_pieces(values < 0, self.lo.cpu().numpy(), self.cell))
         far = np.where(solid, -coarse_distance(solid), coarse_distance(~solid)) * np.float32(self.cell)
         keep = (np.abs(far) < (BAND - 1) * self.cell) & (solid == (values < 0))
         merged = np.where(keep, values, far)
@@ -172,20 +173,3 @@ def coarse_distance(free: np.ndarray) -> np.ndarray:
     distance = 2 * ndimage.distance_transform_edt(blocks).astype(np.float32) - 2
     full = distance.repeat(2, 0).repeat(2, 1).repeat(2, 2)[: free.shape[0], : free.shape[1], : free.shape[2]]
     return np.asarray(np.maximum(full, np.float32(0.5)))
-
-
-def largest_solid(inside: np.ndarray) -> np.ndarray:
-    """The largest connected piece of a boolean volume, with its cavities filled. An empty volume stays empty."""
-    labels, n = ndimage.label(inside)
-    if n == 0:
-        return inside
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    piece = labels == sizes.argmax()
-    empty, _ = ndimage.label(~piece)
-    border = np.unique(
-        np.concatenate(
-            [f.ravel() for f in (empty[0], empty[-1], empty[:, 0], empty[:, -1], empty[:, :, 0], empty[:, :, -1])]
-        )
-    )
-    return ~np.isin(empty, border[border > 0])

@@ -19,6 +19,7 @@ from pipeline.images import read_encoded, refuse_bombs
 from stages.capture.chart import Patches, find_chart
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
+from stages.capture.look import Look, look_at
 from stages.capture.photometry import clipped, mean_light
 from stages.capture.profile import profile_name
 from stages.capture.suspects import detail, is_blank, small_grey
@@ -33,7 +34,7 @@ class Gathered:
     """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
     stages.capture.suspects, None if the photo is blank. profile: the name of its colour profile, None without one.
     clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance.
-    chart: a colour chart in it, where one was looked for and seen."""
+    chart: a colour chart in it, where one was looked for and seen. look: its figures, None if it is blank."""
 
     image: Path
     width: int
@@ -45,6 +46,7 @@ class Gathered:
     clipped: Path | None = None
     light: float = 0.0
     chart: Patches | None = None
+    look: Look | None = None
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
@@ -95,14 +97,14 @@ def gather_photo(
     else:
         target.write_bytes(data)
     grey = small_grey(image)
-    sharpness = None if is_blank(grey) else detail(grey)
-    return Gathered(target, size[0], size[1], exif, turn, sharpness, profile_name(data), _write_clipped(image, target),
-                    mean_light(grey), find_chart(image) if chart else None)  # fmt: skip
+    blank, ends = is_blank(grey), clipped(image)
+    return Gathered(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile_name(data),
+                    _write_clipped(ends, target), mean_light(grey), find_chart(image) if chart else None,
+                    None if blank else look_at(image, grey, ends))  # fmt: skip
 
 
-def _write_clipped(image: Image, photo: Path) -> Path | None:
+def _write_clipped(where: npt.NDArray[np.bool_], photo: Path) -> Path | None:
     """The picture of a photo's clipped pixels (255) in clipped/ beside its folder, or None if there are none."""
-    where = clipped(image)
     if not where.any():
         return None
     path = photo.parent.parent / "clipped" / f"{photo.stem}.png"

@@ -80,7 +80,17 @@ def _source(
     refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
     world = metres_from_world(folder) if kind == "facescape" else None
     return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
-                         metres_from_world=None if world is None else rows(world))  # fmt: skip
+                         metres_from_world=None if world is None else rows(world),
+                         passed_over=_passed_over(photos))  # fmt: skip
+
+
+def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
+    """Names of the pictures beside the photos whose format is not read; a raw file or HEIC of the same name as a photo
+    is that photo's original, and needs no word."""
+    read = {(p.parent, p.stem) for p in photos}
+    beside = sorted({f for p in {q.parent for q in photos} for f in p.iterdir()}, key=lambda f: natural_key(f.name))
+    return tuple(f.name for f in beside if f.suffix.lower() in FOREIGN_SUFFIXES and not f.name.startswith(".")
+                 and (f.parent, f.stem) not in read)  # fmt: skip
 
 
 def _film(path: Path) -> Located[CaptureSource]:

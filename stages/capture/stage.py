@@ -50,9 +50,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     """
     from stages.capture import views as made
     from stages.capture.candidates import candidates_of, useful, without_doubles
+    from stages.capture.judge import Photo, given_masks, judge
 
     source = _photos_of_film(inputs.source, config, context)
     found = candidates_of(source)
+    described = set(found.absent)
     candidates = without_doubles(found, given=source.artifact.cameras != ())
     look = config.chart != "off"
     photos = [made.photo_of(source, c, (n, len(candidates)), look, context) for n, c in enumerate(candidates)]
@@ -66,10 +68,16 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     views = made.with_exposures(made.with_places(views, photos), photos, found.warnings)
     views, chart = made.with_chart(views, photos, found.warnings, config.chart == "on", context)
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
+    seen = [Photo(v.name, v.camera_group, v.width, v.height, v.exposure, v.holdout, p.look)
+            for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
+    useless = [c.name for c, v in zip(candidates, views, strict=True) if c.mask is not None and v.mask is None]
+    masked = sum(v.mask is not None for v in views)
+    findings = (*judge(seen, [n for n in found.absent if n not in described], source.artifact.passed_over),
+                *given_masks(masked, useless))  # fmt: skip
     warnings = found.warnings + made.foreign_colours(candidates, photos) + made.partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world,
-                   left_out=tuple(found.left_out), warnings=tuple(warnings))  # fmt: skip
+                   left_out=tuple(found.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
 def _photos_of_film(source: Located[CaptureSource], config: Config, context: Context) -> Located[CaptureSource]:
@@ -94,4 +102,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=4, inputs=Inputs, config=Config, output=Capture, run=run)
+STAGE = Stage(name="capture", version=5, inputs=Inputs, config=Config, output=Capture, run=run)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -162,7 +162,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.paper import new_paper_trainer
     from stages.inverse_rendering.residuals import view_errors
-    from stages.inverse_rendering.start import hull_start, sphere_start
+    from stages.inverse_rendering.start import agreed, hull_start, sphere_start
     from stages.inverse_rendering.stereo import start_from_photos
 
     clock, settings = Clock(), config.settings()
@@ -182,15 +182,17 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
     radius = inputs.poses.artifact.roi_radius
+    masks = agreed(cameras, [v.alpha for v in views], radius)
+    views = [replace(v, doubtful=masks.doubtful.get(n)) for n, v in enumerate(views)]
     if settings.prior == "sphere":
         start = sphere_start(radius, settings.grid_cells, settings.levels)
     else:
-        start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+        start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels)
     looked = footprint(start, views, settings.image_side)
     if settings.resolution == AUTO:
         settings, cells = supported(settings, looked, start), settings.grid_cells
         if settings.grid_cells < cells and settings.prior != "sphere":
-            start = hull_start(cameras, [v.alpha for v in views], radius, settings.grid_cells, settings.levels)
+            start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels)
     prior = start
     if settings.stereo and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")

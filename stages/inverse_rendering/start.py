@@ -1,9 +1,15 @@
-"""The geometry's start: the visual hull of the masks as a signed distance on the coarsest grid."""
+"""The geometry's start: the visual hull of the masks as a signed distance on the coarsest grid.
+
+A plain hull believes every mask: one that lacks the shirt cuts the body off at the collar in all views. So a hull that
+lets a few views be wrong comes first. Where it clearly shows the subject and a mask does not, that mask has no say;
+everywhere else all masks carve as they are, because a lenient hull is a thicker one.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -11,9 +17,19 @@ import torch
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.fields.geometry import GridSdf
-from pipeline.hull import hull_bounds, hull_sdf, visual_hull
+from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, visual_hull
+from pipeline.transforms import inverse_rigid, matrix
 
 F32 = npt.NDArray[np.float32]
+Bool = npt.NDArray[np.bool_]
+CELLS = 64  # voxels along the cube in which masks are compared
+CUBE = 1.6  # its half-edge in radii of the region of interest
+WRONG, WRONG_SHARE = 2, 0.1  # views that may be wrong about a voxel, and their share of those that see it
+SIDE = 320  # pixels: masks are compared at this size
+MARGIN = 1.0  # voxels by which the lenient hull may be too thick
+MISSING = (
+    0.02  # of the silhouette: one view may rightly carve a hollow; of a shoulder that took 1 % (head scan, measured)
+)
 SPHERE = 0.6  # share of the region of interest's radius
 MARGIN_CELLS = 4  # room for the band and the spline's border around the hull
 
@@ -30,6 +46,69 @@ class Start:
         """A copy of the samples that rays can meet."""
         values, lo = (torch.from_numpy(a.astype(np.float32)) for a in (self.values, self.lo))
         return GridSdf(values, lo, self.cell).to(device)
+
+
+@dataclass(frozen=True, slots=True)
+class Agreed:
+    """Masks as they may carve. alphas: one a view, the same objects where nothing was wrong; doubtful: (h, w) by number
+    of the view, where its mask lacks what the other views show: neither subject nor background can be learned there."""
+
+    alphas: list[F32]
+    doubtful: dict[int, Bool]
+
+
+def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agreed:
+    """The masks without what almost all other views contradict: a part of the subject that one mask lacks.
+
+    alphas: (H, W) each, in [0, 1]. Returns doubtful pixels at the size of that view's alpha.
+    """
+    edge = CUBE * roi_radius
+    cell = 2 * edge / CELLS
+    small = [_shrunk(a) for a in alphas]
+    lenient = visual_hull(cameras, small, [-edge] * 3, [edge] * 3, cell, max_outside=WRONG, outside_share=WRONG_SHARE)
+    out, doubtful = list(alphas), {}
+    for i, (camera, alpha) in enumerate(zip(cameras, small, strict=True)):
+        lacks = _lacks(lenient, camera, alpha, cell)
+        if lacks is not None:
+            h, w = alphas[i].shape
+            where = cv2.resize(lacks.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
+            doubtful[i] = where
+            out[i] = np.where(where, np.float32(1), alphas[i])
+    return Agreed(out, doubtful)
+
+
+def _shrunk(alpha: F32) -> F32:
+    factor = SIDE / max(alpha.shape)
+    if factor >= 1:
+        return alpha
+    size = (max(2, round(alpha.shape[1] * factor)), max(2, round(alpha.shape[0] * factor)))
+    return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _lacks(lenient: Hull, camera: Camera, alpha: F32, cell: float) -> Bool | None:
+    """(h, w) where a mask clearly lacks what the lenient hull shows; None where it lacks nothing of weight."""
+    h, w = alpha.shape
+    shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5
+    margin = max(1, round(MARGIN * _pixels_a_unit(camera) * cell * w / camera.width))
+    clear = ~_grown(~shown, margin) & ~_grown(inside, margin)
+    count, label, facts, _ = cv2.connectedComponentsWithStats(clear.astype(np.uint8), connectivity=4)
+    large = [k for k in range(1, count) if facts[k, cv2.CC_STAT_AREA] > MISSING * max(int(shown.sum()), 1)]
+    if not large:
+        return None
+    return np.asarray(_grown(np.isin(label, large), 2 * margin) & shown & ~inside)
+
+
+def _pixels_a_unit(camera: Camera) -> float:
+    """Pixels of the photo that an asset unit at the origin spans."""
+    depth = abs(float(inverse_rigid(matrix(camera.world_from_cam))[2, 3]))
+    K = matrix(camera.K)
+    return float(np.sqrt(K[0, 0] * K[1, 1])) / max(depth, 1e-9)
+
+
+def _grown(mask: Bool, radius: int) -> Bool:
+    """Pixels with the mask within `radius`; beyond the frame there is none."""
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc)) > 0
 
 
 def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int) -> Start:

@@ -22,11 +22,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline import transforms
-from pipeline.fields.geometry import GridSdf, largest_solid
+from pipeline.fields.geometry import GridSdf
 from pipeline.fields.kernels import look_up
 from pipeline.images import shrink_whole
 from pipeline.maths.correlation import FLOOR, agreement
 from pipeline.maths.tracing import box_interval
+from pipeline.pieces import filled, subject_pieces
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
 
@@ -287,14 +288,14 @@ def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float)
     shift = -(weight * offset[near]).sum(1) / np.maximum(weight.sum(1) + CERTAIN * kernel.sum(1), 1e-12)
     values = start.values.astype(np.float64)
     values[tuple(node.T)] += shift
-    return distances(values, cell)
+    return distances(values, start.lo, cell)
 
 
-def distances(values: F64, cell: float) -> F32:
-    """The zero set's largest piece as a signed distance: to first order nearby, by a transform further out."""
+def distances(values: F64, lo: F32, cell: float) -> F32:
+    """The subject's pieces of the zero set as a signed distance: to first order nearby, by a transform further out."""
     slope = np.sqrt(sum(g**2 for g in np.gradient(ndimage.gaussian_filter(values, 1.0), cell)))
     near = values / np.clip(slope, 0.5, 2.0)
-    solid = largest_solid(values < 0)
+    solid = filled(subject_pieces(values < 0, lo, cell))
     inside, outside = ndimage.distance_transform_edt(solid), ndimage.distance_transform_edt(~solid)
     far = np.where(solid, 0.5 - inside, outside - 0.5) * cell
     keep = (np.abs(far) < 2 * cell) & (solid == (values < 0))

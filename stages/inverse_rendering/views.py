@@ -21,6 +21,7 @@ from pipeline.images import shrink_whole
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
 NEAR_BAND = 0.05  # background pixels within this share of the image side of the subject are worth rays
 FAR_EVERY = 16  # of the background beyond, one pixel in so many keeps stray matter away
 DARKEST = 1e-4  # mean radiance that a light starts from at least
@@ -31,7 +32,8 @@ WHOLE = 0.99  # alpha from which a pixel shows the subject alone
 class PhotoView:
     """A photo with its camera: rgb (H, W, 3) linear, alpha (H, W) in [0, 1], at the photo's size.
 
-    clipped: (H, W) share of each pixel that is at the end of the camera's range, None if none is.
+    clipped: (H, W) share of each pixel that is at the end of the camera's range, None if none is. doubtful: (H, W)
+    where the mask contradicts the other views: neither subject nor background is learned there; None if nowhere.
     """
 
     index: int
@@ -41,6 +43,7 @@ class PhotoView:
     world_from_cam: F64
     distortion: F64
     clipped: F32 | None = None
+    doubtful: Bool | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -167,6 +170,8 @@ def _pixels_of(
     take = inside | near | far
     if view.clipped is not None:  # what is clipped shows a lower bound; of the background it still shows that it is one
         take &= ~(inside & (shrink_whole(view.clipped, factor) > 0))
+    if view.doubtful is not None:
+        take &= shrink_whole(view.doubtful.astype(np.float32), factor) == 0
     return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
 
 

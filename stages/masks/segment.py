@@ -21,6 +21,7 @@ from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
+from stages.masks.judge import Seen, judge
 from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
@@ -101,6 +102,7 @@ def segment(
     support = how.solid.support if how.solid is not None else None
     found = _opinions(masked, voting, poses, settings, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
+    first = _seen(masked, [])
     if settings.mend:
         bad = _outliers(masked, settings)
         mended = _each(lambda t: _mend(t[0], t[1], t[2], settings, context),
@@ -119,8 +121,16 @@ def segment(
     found_face = agreed(fitted)
     landmarks = None if found_face is None else save_landmarks(found_face, context)
     made = tuple(_manifest(m, x.labels, context) for m, x in zip(masked, looked, strict=True))
+    findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
+                     sum("face" in m.labelled for m in made))  # fmt: skip
     return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks,
-                   warnings=tuple(warnings))  # fmt: skip
+                   warnings=tuple(warnings), findings=findings)  # fmt: skip
+
+
+def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
+    """The masks as they are judged."""
+    return [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, None if m.useless else m.iou, m.view.holdout,
+                 m.view.index in dropped) for m in masked]  # fmt: skip
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
@@ -187,13 +197,7 @@ def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Co
     alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
     if source == "given" and inverted(alpha, view.disc):
         alpha, source = 1 - alpha, INVERTED
-    made = _keep(use, camera, alpha, source, context)
-    if made.useless and source in ("given", INVERTED):
-        raise StageError("the mask is empty" if made.coverage < 0.5 else "the mask covers the whole photo",
-                         where=f"view {view.index} ({view.name})", value=f"{made.coverage:.2%} of the photo is subject",
-                         limit=f"{LIMITS[0]:.1%} to {LIMITS[1]:.1%}", remedy="mend this mask (subject white, "
-                         "background black), or remove it so that one is computed")  # fmt: skip
-    return made
+    return _keep(use, camera, alpha, source, context)
 
 
 def _keep(view: View, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:

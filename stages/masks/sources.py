@@ -142,9 +142,11 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
     """Whether a given mask shows the background: all but empty in the middle of the region of interest and all but
-    full around it, where there is enough around it to tell."""
+    full around it: beyond the region, and along the frame's upper edge and sides where a head has no neck. A subject
+    that fills the frame is not empty in the middle."""
     h, w = alpha.shape
     core, around = disc.covers(h, w, INNER), ~disc.covers(h, w, OUTER)
+    around[0], around[:, 0], around[:, -1] = True, True, True
     if not core.any() or around.mean() < TELLING:
         return False
     return bool(alpha[core].mean() < WRONG_SIDE and alpha[around].mean() > 1 - WRONG_SIDE)

@@ -86,8 +86,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
     """Masks of all registered views.
 
     Raises:
-        StageError: a mask that is missing, empty, full or of the wrong size; no uniform background where one was
-            asked for; too few views left that agree.
+        StageError: a mask that is missing or of the wrong size; no uniform background where one was asked for; too few
+            views left that agree.
     """
     from stages.masks.segment import Settings, segment
     from stages.masks.user_model import UserModel

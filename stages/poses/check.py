@@ -8,15 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.transforms import F64, inverse_rigid, matrix, undistort
 from stages.poses.features import PLAIN, Features, detect, grey8
 from stages.poses.matching import match, verify
-from stages.poses.photos import StoredPhoto
 
 EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
 PARTNERS = 4  # photos that each is held against
@@ -65,7 +66,21 @@ def check_cameras(
     return Verdict(_shares(counts, len(cameras)))
 
 
-def features_of(photos: Sequence[StoredPhoto], tick: Callable[[int, int], None]) -> list[Features]:
+class Picture(Protocol):
+    """What features are looked for in: see stages.poses.photos.StoredPhoto."""
+
+    @property
+    def width(self) -> int: ...
+
+    @property
+    def height(self) -> int: ...
+
+    def pixels(self) -> npt.NDArray[np.generic]: ...
+
+    def inside(self) -> npt.NDArray[np.float32] | None: ...
+
+
+def features_of(photos: Sequence[Picture], tick: Callable[[int, int], None]) -> list[Features]:
     """Features of every photo, on the subject only where it has a mask. tick: done, total."""
     found = []
     for n, photo in enumerate(photos):

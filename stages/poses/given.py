@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pipeline.artifacts import Camera, CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid, matrix
-from stages.poses.check import FAR, IMPERFECT, check_cameras, features_of
+from pipeline.verdict import Finding
+from stages.poses.check import AGREE, FAR, IMPERFECT, check_cameras, features_of
+from stages.poses.judge import CONTRADICTED, contradicted, mirrored
 from stages.poses.measure import find_eyes, known_scale
+from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
 from stages.poses.place import camera_of, camera_set
@@ -22,10 +27,11 @@ if TYPE_CHECKING:
 
 
 def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
-    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict.
+    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict. Where most
+    do, nobody knows which are right: all stay, and the finding says it.
 
     Raises:
-        StageError: most photos contradict them, or share no point under them.
+        StageError: the photos share no point under them.
     """
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
@@ -35,7 +41,7 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
     # only FaceScape says what its numbers are: metres or millimetres; the others' worlds have any size
     auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
     unit: Unit = auto if config.unit == "auto" else config.unit
-    wrong = _contradicted(capture, cameras, config, context) if config.check else []
+    wrong, findings = _contradicted(capture, cameras, config, context) if config.check else ([], ())
     names = tuple(cameras[i].name for i in wrong)
     right = [i for i in range(len(cameras)) if i not in wrong]
     cameras = [cameras[i] for i in right]
@@ -56,7 +62,8 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
         known = published if known is None and config.scale == "auto" else known
     found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
     warnings = (*told, *found.warnings)
-    return camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
+    made = camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
+    return made.model_copy(update={"findings": findings})
 
 
 def _held_against_photos(
@@ -95,25 +102,17 @@ def _held_against_photos(
 
 def _contradicted(
     capture: Located[Capture], cameras: list[Camera], config: Config, context: Context
-) -> list[int]:  # fmt: skip
-    """Places of the views whose photos contradict their cameras.
-
-    Raises:
-        StageError: most of them do.
-    """
+) -> tuple[list[int], tuple[Finding, ...]]:  # fmt: skip
+    """Places of the views whose photos contradict their cameras, none if most do; and what follows from it."""
     progress = progress_of(context)
     photos = photos_of(capture, config.use_masks)
     features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
     far = IMPERFECT if config.given == "refine" else FAR
     verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
-    if verdict.known and len(verdict.wrong) > 0.5 * verdict.known:
-        raise StageError(
-            "the cameras do not belong to the photos",
-            where="poses",
-            value=f"{len(verdict.wrong)} of {verdict.known} views contradict their neighbours, such as "
-            + ", ".join(cameras[i].name for i in verdict.wrong[:5]),
-            limit="most views' features on each other's epipolar lines",
-            remedy="check that photos and cameras are in the same order and of the same size, or set "
-            "poses.method=colmap to have the cameras solved; poses.check=false uses them as they are",
-        )
-    return verdict.wrong
+    right = [i for i in range(len(cameras)) if verdict.share[i] >= AGREE]
+    silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image matches nothing
+    flipped = find_mirrored(photos, [*verdict.wrong, *silent], right, config.seed)
+    findings = (contradicted([cameras[i].name for i in verdict.wrong], verdict.known, len(cameras)),
+                mirrored([cameras[i].name for i in flipped], len(cameras)))  # fmt: skip
+    most = len(verdict.wrong) > CONTRADICTED.usable * verdict.known
+    return ([] if most else verdict.wrong), findings

@@ -111,7 +111,10 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
     parameters.loMethod, parameters.loIterations = cv2.LOCAL_OPTIM_SIGMA, 5
     parameters.final_polisher = cv2.MAGSAC
     uv_a, uv_b = a.uv[matches[:, 0]], b.uv[matches[:, 1]]
-    F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
+    try:
+        F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
+    except cv2.error:  # its own sampler asserts that it found something, on matches that no geometry explains
+        return None
     if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None
     return Verified(np.asarray(F, np.float64), matches[inliers.ravel() > 0])

@@ -51,6 +51,14 @@ def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
     )
 
 
+def sparse_points(found: CameraSet, folder: Path) -> F64 | None:
+    """(M, 3) what `save_points` wrote into the artifact's folder; None if there are no points."""
+    if found.points is None:
+        return None
+    with np.load(folder / found.points.path, allow_pickle=False) as data:
+        return np.asarray(data["points"], np.float64)
+
+
 def view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
     """Mean reprojection error of each view that has one, by its name. names: of the model's photos."""
     return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}

@@ -6,7 +6,9 @@ from pipeline.artifacts import CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from stages.poses.adjust import Refine
+from stages.poses.judge import groups, mirrored
 from stages.poses.measure import find_eyes, known_scale
+from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import normalise
 from stages.poses.photogrammetry import Settings, solve
 from stages.poses.photos import photos_of
@@ -46,7 +48,12 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     for group in model.others if strangers else ():
         warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
                         + "; if they show another subject, make a capture of their own")  # fmt: skip
-    return camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
+    made = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
+    lost = [i for i in range(len(views)) if i not in placed]
+    flipped = find_mirrored(photos_of(capture, config.use_masks), lost, placed, config.seed)
+    findings = (groups(len(placed), [[views[i].name for i in group] for group in model.others] if strangers else []),
+                mirrored([views[i].name for i in flipped], len(views)))  # fmt: skip
+    return made.model_copy(update={"findings": findings})
 
 
 def settings_of(capture: Located[Capture], config: Config) -> Settings:

@@ -22,9 +22,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
 
     Raises:
         UsageError: given cameras are asked for and there are none.
-        StageError: the given cameras share no view or contradict the photos, or the photos can't be placed.
+        StageError: the given cameras share no view, or the photos can't be placed.
     """
     from stages.poses.given import given_cameras
+    from stages.poses.judge import judge
+    from stages.poses.place import sparse_points
     from stages.poses.solved import solved_cameras
 
     views = inputs.capture.artifact.views
@@ -37,9 +39,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
             limit="a camera for every view (params.json)",
             remedy="use poses.method=auto or poses.method=colmap",
         )
-    if all_given and config.method != "colmap":
-        return given_cameras(inputs.capture, config, context)
-    return solved_cameras(inputs.capture, config, context)
+    given = all_given and config.method != "colmap"
+    found = (given_cameras if given else solved_cameras)(inputs.capture, config, context)
+    seen, findings = judge(found, inputs.capture.artifact, sparse_points(found, context.workdir))
+    return found.model_copy(update={"seen_directions": seen, "findings": found.findings + findings})
 
 
-STAGE = Stage(name="poses", version=3, inputs=Inputs, config=Config, output=CameraSet, run=run)
+STAGE = Stage(name="poses", version=4, inputs=Inputs, config=Config, output=CameraSet, run=run)

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline import tiles
 from pipeline.images import read_encoded, read_exr
+from pipeline.verdict import Verdict
 from stages.report.captured import captured
 from stages.report.compare import JudgedView
 from stages.report.gather import Results
@@ -24,6 +25,7 @@ from stages.report.pictures import (
     scale_bar,
     to_bytes,
 )
+from stages.report.verdict import verdict_shown
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
@@ -85,7 +87,9 @@ def _both(row: JudgedRow) -> dict[str, float | None]:
     return model | ({f"asset_{k}": v for k, v in row.asset.json().items()} if row.asset else {})
 
 
-def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, side: int, outlines: int) -> str:
+def build_page(
+    metrics: Mapping[str, Any], verdict: Verdict, rows: list[JudgedRow], r: Results, side: int, outlines: int
+) -> str:
     """The page with its pictures."""
     return render_page(
         metrics,
@@ -97,6 +101,7 @@ def build_page(metrics: Mapping[str, Any], rows: list[JudgedRow], r: Results, si
             scale=data_uri(scale_bar(), 256, lossless=True),
             scale_top=ERROR_RANGE,
             captured=captured(r, side // 2, outlines),
+            verdict=verdict_shown(verdict, r, side // 2),
         ),
     )
 

@@ -21,6 +21,7 @@ from stages.report.gather import Started
 from stages.report.metrics import encoded
 from stages.report.page import Picture
 from stages.report.pictures import data_uri, to_bytes
+from stages.report.sphere import hidden_parts, legend, sphere
 
 SIDE, MARGIN = 420, 26  # drawing units of a panel
 SHOWN_POINTS = 1500
@@ -43,9 +44,13 @@ class CameraRow:
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """Everything that the page shows of it. lost: photos without a place, or left out, and why."""
+    """Everything that the page shows of it. sphere: what of the subject photos see, hidden: the parts that they do not.
+    lost: photos without a place, or left out, and why."""
 
     drawing: Markup
+    sphere: Markup
+    seen: Sequence[tuple[str, str]]
+    hidden: Sequence[str]
     legend: Sequence[tuple[str, str]]
     rows: Sequence[CameraRow]
     lost: Sequence[str]
@@ -59,8 +64,9 @@ def captured(r: Started, side: int, shown: int) -> Captured:
     rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
     lost = [f"{n}: no place found for it" for n in r.poses.artifact.unregistered] + list(r.capture.artifact.left_out)
     outlines = _outlines(r, side, shown)
-    return Captured(drawing(r.poses, kinds), list(KINDS.items()), rows, lost, outlines,
-                    len(r.masks.artifact.masks) - len(outlines))  # fmt: skip
+    seen = r.poses.artifact.seen_directions
+    return Captured(drawing(r.poses, kinds), sphere(seen), legend(), hidden_parts(seen), list(KINDS.items()), rows,
+                    lost, outlines, len(r.masks.artifact.masks) - len(outlines))  # fmt: skip
 
 
 def _kinds(r: Started) -> dict[int, str]:
@@ -163,6 +169,18 @@ def _outlines(r: Started, side: int, shown: int) -> list[Picture]:
         agreement = "" if m.hull_iou is None else f", {m.hull_iou:.3f}"
         dropped = ", not fitted" if m.index in r.masks.artifact.dropped else ""
         out.append(Picture(data_uri(photo, side), f"{view.name}: {m.source}{agreement}{dropped}"))
+    return out
+
+
+def photos_named(r: Started, names: Sequence[str], side: int) -> list[Picture]:
+    """The capture's photos of these names with the outlines of their masks. A name without a photo is left out."""
+    views = {v.name: v for v in r.capture.artifact.views}
+    masks = {m.index: m for m in r.masks.artifact.masks}
+    out = []
+    for view in (views[name] for name in names if name in views):
+        image, mask = read_encoded(r.capture.path(view.image)), masks.get(view.index)
+        alpha = np.zeros(image.shape[:2], np.float32) if mask is None else read_alpha(r.masks.path(mask.mask))
+        out.append(Picture(data_uri(outlined(image, alpha, side), side), view.name))
     return out
 
 

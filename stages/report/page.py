@@ -47,6 +47,7 @@ class Pictures:
     scale: str = ""
     scale_top: float = 0.0
     captured: object | None = None  # stages.report.captured.Captured
+    verdict: object | None = None  # stages.report.verdict.VerdictShown
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:
@@ -117,6 +118,7 @@ def _template() -> Template:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["words"] = _words
     environment.filters["value"] = _value
+    environment.filters["sentence"] = lambda text: f"{text.rstrip('.')}."
     environment.filters["island"] = lambda x: Markup(json.dumps(x).replace("<", "\\u003c"))
     source = files("stages.report").joinpath("templates/page.html.j2").read_text(encoding="utf-8")
     return environment.from_string(source)

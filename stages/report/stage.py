@@ -47,6 +47,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     """Score the views, gather the figures, write metrics.json and index.html."""
     import json
 
+    from pipeline.verdict import verdict_of_inputs
     from stages.report.build import build_page, build_rows, summary
     from stages.report.compare import judged_views, unjudged
     from stages.report.gather import figures
@@ -58,14 +59,18 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
         rows.append(build_rows(view, config.picture_side))
         context.progress(number + 1, total + 1, f"view {view.index}")
     findings = judge(rows, {v.index: v.name for v in inputs.capture.artifact.views})
-    metrics = {"holdout": summary(rows), "timing": {}, **figures(inputs)}
+    verdict = verdict_of_inputs(inputs, report=findings)
+    metrics = {"verdict": verdict.record(every=True), "holdout": summary(rows), "timing": {}, **figures(inputs)}
     metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
     (context.workdir / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-    page = build_page(metrics, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
+    page = build_page(metrics, verdict, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
-    files = context.file("index.html"), context.file("metrics.json")
-    return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
+    return Report(
+        files=(context.file("index.html"), context.file("metrics.json")),
+        warnings=tuple(unjudged(inputs)),
+        findings=findings,
+    )
 
 
 STAGE = Stage(name="report", version=6, inputs=Inputs, config=Config, output=Report, run=run)

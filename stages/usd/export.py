@@ -95,7 +95,7 @@ def export(
     if high is not None:
         layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
     for file, (layer, form) in layers.items():
-        _write_layer(layer, folder / file, form)
+        write_layer(layer, folder / file, form)
     dome = environment(light, settings.environment_width)
     write_exr(folder / "environment.exr", dome)
     figures = maps.figures | environment_figures(light, dome)
@@ -116,7 +116,12 @@ def export(
     return Export(written, notes, figures, who.stated())
 
 
-def _write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
+def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
+    """A layer as a file; form: "usda" or "usdc", for the extension .usd, which may hold either.
+
+    Raises:
+        StageError: it can't be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     args = {"format": form} if path.suffix == ".usd" else {}
     if not layer.Export(str(path), args=args):
@@ -168,7 +173,7 @@ def _package(content: Sdf.Layer, folder: Path, name: str, look: Look, count: int
     """NAME.usdz: one binary layer and the PNG textures that it reads, of `count` tiles."""
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / f"{name}.usdc"
-        _write_layer(content, layer, "usdc")
+        write_layer(content, layer, "usdc")
         members = [(layer.name, layer.read_bytes())]
     for one in (look.on_tile(t) for t in range(count)):
         for file in (one.albedo, one.roughness, one.normal):

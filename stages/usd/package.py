@@ -33,6 +33,12 @@ def write_package(path: Path, members: list[tuple[str, bytes]]) -> None:
             z.writestr(info, content)
 
 
+def read_package(path: Path) -> list[tuple[str, bytes]]:
+    """The members of a package in their order."""
+    with zipfile.ZipFile(path) as z:
+        return [(name, z.read(name)) for name in z.namelist()]
+
+
 def _padding(offset: int) -> bytes:
     """An extra field that moves the data from `offset` to the next multiple of 64; its own header takes 4 bytes."""
     missing = -offset % ALIGNMENT

@@ -14,12 +14,14 @@ from pipeline.artifacts import (
     FittedFace,
     HeldOutView,
     Located,
+    MaskSet,
     Surface,
     TextureSet,
     UsdAsset,
     UvMesh,
 )
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.verdict import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,7 @@ class Inputs:
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     capture: Located[Capture]
+    masks: Located[MaskSet]  # for its findings: the asset is marked with the verdict
 
 
 class Config(StageConfig):
@@ -61,7 +64,9 @@ class Config(StageConfig):
 
 def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     """Write asset/, check it, then render from what was written."""
+    from pipeline.verdict import verdict_of_inputs
     from stages.usd.export import THUMBNAIL, export
+    from stages.usd.mark import mark
     from stages.usd.naming import check_name
     from stages.usd.previews import render_held_out, render_previews, render_thumbnail
     from stages.usd.validate import checks_run, require_valid
@@ -97,6 +102,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     views: tuple[HeldOutView, ...] = ()
     if config.render_views:
         views = render_held_out(root, inputs.poses.artifact, inputs.inverse_rendering.artifact, config.samples, context)
+    findings: tuple[Finding, ...] = ()
+    mark(root, verdict_of_inputs(inputs, usd=findings))
     context.progress(total, total, "done", checks=checks_run(), warnings=len(warnings))
     files = tuple(_refs(context, sorted(written)))
     return UsdAsset(
@@ -108,6 +115,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         stated=made.stated,
         checks=checks_run(),
         warnings=tuple(dict.fromkeys(warnings)),
+        findings=findings,
     )
 
 
@@ -119,4 +127,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=6, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=7, inputs=Inputs, config=Config, output=UsdAsset, run=run)

@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ from pipeline.artifacts import Located
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, StageError
 from pipeline.store import Store
+from tests.support.points import hold
 from tests.support.toy_stages import FIRST, SECOND, THIRD, Config, FirstInputs, Number, SlowConfig, source
 
 
@@ -229,41 +229,36 @@ def start(photos: Path, store: Store, environment: dict[str, str], *options: str
     )
 
 
-def wait_for(condition: Any, seconds: float = 30.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.005)
-
-
-@pytest.mark.parametrize("parts", [0, 1, 4, 9])
+@pytest.mark.parametrize("step", [1, 2, 5, 10])
 def test_killed_in_mid_stage_then_resumed(
-    photos: Path, store: Store, child_environment: dict[str, str], parts: int
+    photos: Path, store: Store, child_environment: dict[str, str], step: int, tmp_path: Path
 ) -> None:
-    child = start(photos, store, child_environment, "--steps", "10", "--pause", "0.1")
-    wait_for(
-        lambda: (
-            len(list((store.root / "second").glob("*.partial-*/part*.bin"))) >= parts
-            and (store.root / "second").is_dir()
-        )
-    )
+    point = hold(f"second.step@{step}", tmp_path / "signs")
+    child = start(photos, store, {**child_environment, **point.environment()}, "--steps", "10")
+    point.wait(child)
     child.send_signal(signal.SIGKILL)
     child.communicate()
     first = [e for e in entries(store, "first") if "." not in e]
     assert len(first) == 1
     assert [e for e in entries(store, "second") if "." not in e] == []
     assert entries(store, "third") == []
-    out, err = start(photos, store, child_environment, "--steps", "10", "--pause", "0").communicate()
-    # a different pause is a different config: the killed work is not taken for it
+    out, err = start(photos, store, child_environment, "--steps", "10", "--seed", "1").communicate()
+    # a different seed is a different config: the killed work is not taken for it
     assert out.split("\n")[:3] == ["first reused", "second made", "third made"], err
-    out, err = start(photos, store, child_environment, "--steps", "10", "--pause", "0.1").communicate()
+    out, err = start(photos, store, child_environment, "--steps", "10").communicate()
     assert out.split("\n")[:3] == ["first reused", "second made", "third reused"], err
     assert not list((store.root / "second").glob("*.partial-*"))
 
 
 @pytest.mark.slow
-def test_two_processes_on_one_key_do_it_once(photos: Path, store: Store, child_environment: dict[str, str]) -> None:
-    children = [start(photos, store, child_environment, "--steps", "5", "--pause", "0.1") for _ in range(3)]
+def test_two_processes_on_one_key_do_it_once(
+    photos: Path, store: Store, child_environment: dict[str, str], tmp_path: Path
+) -> None:
+    point = hold("second.step@3", tmp_path / "signs")
+    environment = {**child_environment, **point.environment()}
+    children = [start(photos, store, environment, "--steps", "5") for _ in range(3)]
+    point.wait(*children)  # one is at work; the others wait for it, or are not there yet
+    point.release()
     outputs = [c.communicate()[0] for c in children]
     assert all(c.returncode == 0 for c in children)
     for stage in ("first", "second", "third"):

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from pipeline.artifacts import Capture, Located
 from pipeline.demo.capture import write_demo_capture
+from tests.support.points import PATIENCE, kill
 
 pytestmark = pytest.mark.slow
 
@@ -41,9 +39,11 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start(environment: dict[str, str], capture: Path, out: Path, **changes: object) -> subprocess.Popen[bytes]:
+def start(
+    environment: dict[str, str], capture: Path, out: Path, program: str = "workflows.cli", **changes: object
+) -> subprocess.Popen[bytes]:
     sets = [f"--set={k}={v}" for k, v in {**SMALL, **changes}.items()]
-    command = [sys.executable, "-m", "workflows.cli", "run", str(capture), "--out", str(out), "--preset", "draft"]
+    command = [sys.executable, "-m", program, "run", str(capture), "--out", str(out), "--preset", "draft"]
     return subprocess.Popen(
         [*command, "--holdout", "every:5:2", *sets],
         env=environment,
@@ -55,7 +55,7 @@ def start(environment: dict[str, str], capture: Path, out: Path, **changes: obje
 
 def run(environment: dict[str, str], capture: Path, out: Path, **changes: object) -> dict[str, object]:
     child = start(environment, capture, out, **changes)
-    _, err = child.communicate(timeout=400)
+    _, err = child.communicate(timeout=PATIENCE)
     assert child.returncode == 0, err.decode()
     record: dict[str, object] = json.loads((out / "run.json").read_text())
     return record
@@ -117,26 +117,26 @@ def test_a_changed_photo_runs_everything_again(
     shutil.copy(copy / "1.png", copy / "0.png")
     command = [sys.executable, "-m", "workflows.cli", "run", str(copy), "--out", str(tmp_path / "out")]
     command += ["--holdout", "every:5:2", "--until", "poses", "--store", str(done / ".store")]
-    subprocess.run(command, env=child_environment, check=True, capture_output=True, timeout=200)
+    subprocess.run(command, env=child_environment, check=True, capture_output=True, timeout=PATIENCE)
     before, after = (len(list((done / ".store" / s).glob("*[0-9a-f]"))) for s in ("masks", "capture"))
     assert (before, after) == (1, 2)
 
 
 @pytest.fixture(scope="module")
 def killed(capture: Path, child_environment: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """SIGKILL to the whole process group: early, in the fit after a checkpoint, and after the fit."""
+    """SIGKILL to the whole process group: after the first stage, after the fit's 20th checkpoint, after the UVs."""
     out = tmp_path_factory.mktemp("killed") / "out"
-    for sign in ("capture/*", "inverse_rendering/*.scratch/checkpoint.pt", "uv/*"):
-        child = start(child_environment, capture, out)
-        deadline = time.monotonic() + 300
-        while not list((out / ".store").glob(sign)) and child.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.05)
-        time.sleep(0.5)
-        if child.poll() is None:
-            os.killpg(child.pid, signal.SIGKILL)
-        child.communicate()
+    for name, sign in (
+        ("capture.end", "capture/*"),
+        ("fit.checkpoint@20", "inverse_rendering/*.scratch/checkpoint.pt"),
+        ("uv.end", "uv/*"),
+    ):
+        point = kill(name, out.parent / name)
+        child = start({**child_environment, **point.environment()}, capture, out, "tests.support.points")
+        said = child.communicate(timeout=PATIENCE)
+        assert child.returncode == -9 and point.reached() == [child.pid], said
         assert list((out / ".store").glob(sign))
-        assert not (out / "asset").exists() or sign == "uv/*"
+        assert not (out / "asset").exists()
         finished = [p for p in (out / ".store").glob("*/*") if p.is_dir() and len(p.name) == 64]
         assert all((p / "manifest.json").is_file() for p in finished)
     run(child_environment, capture, out)

@@ -12,7 +12,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,12 +19,13 @@ from pathlib import Path
 import pytest
 
 from tests.support.facescape_tree import write_tree
-from tests.support.servers import wait_for
+from tests.support.points import PATIENCE, hold, read_until, wait_for
 from workflows.plan import RunRequest
 
 pytestmark = pytest.mark.slow
 SUPPORT = Path(__file__).parents[1] / "support"
 TOY_BATCH = SUPPORT / "toy_batch.py"
+STOPPING = "stopping at the next checkpoint"
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def start(environment: dict[str, str], *arguments: object) -> subprocess.Popen[s
 
 
 def finish(child: subprocess.Popen[str]) -> tuple[int, str]:
-    out, err = child.communicate(timeout=120)
+    out, err = child.communicate(timeout=PATIENCE)
     return child.returncode, out + err
 
 
@@ -53,8 +53,8 @@ def batch(tree: Path, *options: object) -> list[object]:
     return [TOY_BATCH, "batch", tree, "--out", tree.parent / "out", *options]
 
 
-def slow(steps: int, pause: float = 0.2) -> list[str]:
-    return ["--set", f"work.steps={steps}", "--set", f"work.pause={pause}"]
+def slow(steps: int) -> list[str]:
+    return ["--set", f"work.steps={steps}"]
 
 
 def summary(tree: Path) -> dict[str, dict[str, object]]:
@@ -75,14 +75,30 @@ def test_one_captures_process_killed_costs_one_attempt(tree: Path, environment: 
     assert set(tally(tree).values()) == {1}
 
 
+def test_an_unusable_result_is_written_and_not_tried_again(tree: Path, environment: dict[str, str]) -> None:
+    write_tree(tree, {"2/1_neutral": True}, side=80)
+    options = ["--set", "work.doubted_width=80"]
+    code, said = finish(start(environment, *batch(tree, *options)))
+    assert code == 3, said
+    states = {name: (c["state"], c["level"], c["attempts"]) for name, c in summary(tree).items()}
+    assert states == {"1/1_neutral": ("done", "good", 1), "1/2_smile": ("done", "good", 1),
+                      "2/1_neutral": ("unusable", "unusable", 1)}  # fmt: skip
+    assert (tree.parent / "out/2/1_neutral/asset/head_2_1_neutral.usd").is_file()
+    code, said = finish(start(environment, *batch(tree, *options)))
+    assert code == 3 and "3 of them done before" in said
+    assert {c["attempts"] for c in summary(tree).values()} == {1}
+
+
 def test_the_batch_itself_killed_leaves_no_process_and_goes_on(tree: Path, environment: dict[str, str]) -> None:
-    child = start(environment, *batch(tree, *slow(20), "--workers", "2"))
+    point = hold("work.checkpoint@2", tree.parent / "signs")
+    child = start({**environment, **point.environment()}, *batch(tree, *slow(20), "--workers", "2"))
     step = tree.parent / "out/.store/work"
-    wait_for(lambda: len(list(step.glob("*.scratch/step.txt"))) == 2)
+    point.wait(child, processes=2)
     os.kill(child.pid, signal.SIGKILL)
+    point.release()
     child.communicate()
-    wait_for(lambda: not alive_below(tree.parent))  # they stop at the next checkpoint: nobody reads them any more
-    assert sum(int(p.read_text()) for p in step.glob("*.scratch/step.txt")) >= 2
+    wait_for(lambda: not alive_below(tree.parent))  # nobody reads them any more
+    assert sum(int(p.read_text()) for p in step.glob("*.scratch/step.txt")) >= 4
     code, said = finish(start(environment, *batch(tree, *slow(20), "--workers", "2")))
     assert code == 0, said
     assert set(tally(tree).values()) == {1}
@@ -101,24 +117,23 @@ def alive_below(folder: Path) -> list[str]:
 
 
 def test_ctrl_c_stops_at_a_checkpoint_and_twice_at_once(tree: Path, environment: dict[str, str]) -> None:
-    child = start(environment, *batch(tree, *slow(30)))
-    scratch = tree.parent / "out/.store/work"
-    wait_for(lambda: list(scratch.glob("*.scratch/step.txt")))
+    point = hold("work.checkpoint", tree.parent / "signs")
+    child = start({**environment, **point.environment()}, *batch(tree, *slow(30)))
+    point.wait(child)
     child.send_signal(signal.SIGINT)
-    code, said = finish(child)
+    code, said = finish(child)  # the captures' processes are never released: they go on when they hear of it
     assert code == 130, said
     assert "the same command goes on" in said
-    assert list(scratch.glob("*.scratch/step.txt"))
-    hangs = start(environment, *batch(tree, "--set", "work.fault=hangs", *slow(1)))
-    wait_for(lambda: len(list(scratch.glob("*.scratch"))) >= 2 and list(scratch.glob("*.partial-*")))
-    time.sleep(0.5)
+    assert list((tree.parent / "out/.store/work").glob("*.scratch/step.txt"))
+    never = hold("work.hangs", tree.parent / "more signs")
+    hangs = start({**environment, **never.environment()}, *batch(tree, "--set", "work.fault=hangs", *slow(1)))
+    never.wait(hangs)
     hangs.send_signal(signal.SIGINT)
-    time.sleep(1)
+    assert hangs.stderr is not None
+    read_until(hangs.stderr, STOPPING)
     assert hangs.poll() is None
-    hangs.send_signal(signal.SIGINT)
-    begin = time.monotonic()
+    hangs.send_signal(signal.SIGINT)  # the stage is never released, and the batch ends all the same
     assert finish(hangs)[0] == 130
-    assert time.monotonic() - begin < 5
     wait_for(lambda: not alive_below(tree.parent))
 
 
@@ -132,11 +147,9 @@ def test_a_stage_that_hangs_is_ended_and_the_next_capture_runs(
 ) -> None:
     rows = [{"capture": "1/1_neutral", "name": "good", "until": "capture"}, {"capture": "1/2_smile", "name": "bad"}]
     (tree / "list.json").write_text(json.dumps(rows))
-    begin = time.monotonic()
-    options = ["--out", tree.parent / "out", "--stage-limit", "2s", "--set", f"work.fault={fault}", "--workers", "2"]
+    options = ["--out", tree.parent / "out", "--stage-limit", "15s", "--set", f"work.fault={fault}", "--workers", "2"]
     code, said = finish(start(environment, TOY_BATCH, "batch", tree / "list.json", *options))
-    assert code == 1
-    assert time.monotonic() - begin < 25
+    assert code == 1  # ended at all: the toy hangs for ever
     found = summary(tree)
     assert found["good"]["state"] == "done" and found["bad"]["state"] == "failed"
     assert told in str(found["bad"]["fault"]), said
@@ -199,18 +212,25 @@ def test_a_read_only_store_is_told_before_any_work(tree: Path, environment: dict
 def test_two_runs_of_one_capture_into_one_folder_at_once(tree: Path, environment: dict[str, str]) -> None:
     """One waits for the other and then finds everything done."""
     out = tree.parent / "one"
-    asked = RunRequest(capture=str(tree / "1/1_neutral"), out=str(out), sets=("work.steps=8", "work.pause=0.2"))
+    asked = RunRequest(capture=str(tree / "1/1_neutral"), out=str(out), sets=("work.steps=8",))
     children = []
+    point = hold("work.step@4", tree.parent / "signs")
     for _ in range(2):
-        child = subprocess.Popen([sys.executable, TOY_BATCH, "--child", "1"], env=environment, text=True,
+        child = subprocess.Popen([sys.executable, TOY_BATCH, "--child", "1"],
+                                 env={**environment, **point.environment()}, text=True,
                                  stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
         assert child.stdin is not None
         child.stdin.write(asked.model_dump_json() + "\n")
         child.stdin.flush()  # and not closed: its end would mean stop
         children.append(child)
-    assert [c.wait(60) for c in children] == [0, 0]
-    said = [c.communicate() for c in children]
-    assert sum("another run writes to" in err for _, err in said) == 1
+    point.wait(*children)
+    first = next(c for c in children if c.pid in point.reached())
+    second = next(c for c in children if c is not first)
+    assert second.stderr is not None
+    read_until(second.stderr, "another run writes to")
+    point.release()
+    assert [c.wait(PATIENCE) for c in children] == [0, 0]
+    assert all("another run writes to" not in c.communicate()[1] for c in children)  # told once, by the second
     assert set(tally(tree).values()) == {1}
     assert json.loads((out / "run.json").read_text())["stages"]["work"]["reused"]
     assert not [p for p in out.iterdir() if ".partial" in p.name or ".old" in p.name]
@@ -252,13 +272,15 @@ def test_the_wall_clock_jumps_back_a_year_in_mid_stage(tree: Path, tmp_path: Pat
     jumping = {**environment, "LD_PRELOAD": str(library), "CLOCK_JUMP": str(sign)}
     probe = [sys.executable, "-c", "import time; print(time.time())"]
     before = float(subprocess.run(probe, env=jumping, capture_output=True, check=True).stdout)
-    child = start(jumping, *batch(tree, *slow(10), "--stage-limit", "20s"))
-    wait_for(lambda: list((tree.parent / "out/.store/work").glob("*.scratch/step.txt")))
+    point = hold("work.checkpoint@3", tmp_path / "signs")
+    child = start({**jumping, **point.environment()}, *batch(tree, *slow(10), "--stage-limit", "600s"))
+    point.wait(child)
     sign.write_text("")
     after = float(subprocess.run(probe, env=jumping, capture_output=True, check=True).stdout)
     assert after < before - 3e7, "the clock did not jump"
+    point.release()
     code, said = finish(child)
     assert code == 0, said
     assert set(tally(tree).values()) == {1}
     seconds = [c["figures"]["seconds"] for c in summary(tree).values()]  # type: ignore[index]
-    assert all(1 < s < 60 for s in seconds)
+    assert all(0 < s < 3600 for s in seconds)  # and not a year, nor less than nothing

@@ -13,7 +13,7 @@ from pipeline.errors import StageError
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis
 from pipeline.fields.calibration import Calibration
 from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
-from pipeline.fields.geometry import coarse_distance, largest_solid
+from pipeline.fields.geometry import coarse_distance
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf
 
@@ -182,11 +182,3 @@ def test_coarse_distance_is_never_too_long(shape: tuple[int, int, int]) -> None:
     found = coarse_distance(free)
     assert found.shape == free.shape and found.min() == 0.5
     assert (found <= np.maximum(true, 0.5) + 1e-5).all() and (found >= true - 4).all()
-
-
-def test_largest_solid() -> None:
-    v = np.zeros((12, 12, 12), bool)
-    v[2:8, 2:8, 2:8], v[10, 10, 10], v[4, 4, 4] = True, True, False
-    out = largest_solid(v)
-    assert out[4, 4, 4] and not out[10, 10, 10] and out.sum() == 6**3
-    assert not largest_solid(np.zeros((3, 3, 3), bool)).any()

@@ -141,12 +141,17 @@ def test_given_masks_are_kept_exactly(scene: Scene, tmp_path: Path) -> None:
     assert {m.source for m in ignored.masks} == {"key"}
 
 
-@pytest.mark.parametrize(("value", "word"), [(0.0, "mask is empty"), (1.0, "covers the whole photo")])
-def test_empty_and_full_given_masks_name_the_view(scene: Scene, tmp_path: Path, value: float, word: str) -> None:
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_an_empty_and_a_full_given_mask_are_dropped_and_named(scene: Scene, tmp_path: Path, value: float) -> None:
+    for i, c in enumerate(scene.cameras):
+        scene.give(i, ball_alpha(c))
     scene.give(4, np.full((SIZE, SIZE), value, np.float32))
-    with pytest.raises(StageError, match=word) as caught:
-        run(scene, tmp_path / "s")
-    assert "view 4 (4.png)" in str(caught.value)
+    found, _ = run(scene, tmp_path / "s")
+    assert found.dropped == (4,) and any("view 4 (4.png)" in w for w in found.warnings)
+    told = {f.check: f for f in found.findings}["masks_empty_or_full"]
+    assert told.level == "usable" and told.views == ("4.png",)
+    others = [m.hull_iou for m in found.masks if m.index != 4]
+    assert min(v for v in others if v is not None) > 0.9  # it had no vote
 
 
 def test_given_mask_of_another_size(scene: Scene, tmp_path: Path) -> None:

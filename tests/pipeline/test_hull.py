@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
-from pipeline.hull import Hull, hull_bounds, hull_sdf, largest_piece, render_silhouette, surface_points, visual_hull
+from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, surface_points, visual_hull
 from pipeline.silhouettes import signed_pixels
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 
@@ -235,13 +235,6 @@ def test_signed_pixels_are_sub_pixel() -> None:
     assert np.abs(distance - expected).max() < 0.06
     assert (signed_pixels(np.zeros((4, 5), np.float32)) > 6).all()
     assert (signed_pixels(np.ones((4, 5), np.float32)) < -6).all()
-
-
-def test_largest_piece() -> None:
-    mask = np.zeros((6, 6, 6), bool)
-    mask[:2, :2, :2], mask[5, 5, 5] = True, True
-    assert largest_piece(mask).sum() == 8
-    assert not largest_piece(np.zeros((2, 2, 2), bool)).any()
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
 from pipeline.artifacts import FileRef, Located
+from pipeline.directions import count_seen
 from stages.report.captured import KINDS, _axes, captured, outlined
 
 
@@ -58,6 +59,19 @@ def test_spectator_sees_up_as_up() -> None:
     np.testing.assert_allclose([right, up], [[1, 0, 0], [0, 1, 0]], atol=1e-12)
     right, up = _axes(0.0, 90.0)  # from above: the face, +Z, points down the page
     np.testing.assert_allclose([right, up], [[1, 0, 0], [0, 0, -1]], atol=1e-12)
+
+
+def test_sphere_shows_what_no_photo_sees(results: SyntheticResults, tmp_path: Path) -> None:
+    counts = count_seen(np.array([[0, 0, 1.0], [0.1, 0, 0.995], [-0.1, 0, 0.995]]))  # from the front alone
+    poses = results.poses.artifact.model_copy(update={"seen_directions": counts})
+    found = captured(replace(results, poses=Located(poses, tmp_path)), 180, 0)
+    front, behind = ([p for p in re.findall(r'points="([\d.]+),[^"]*" fill="(#\w+)"', found.sphere)
+                      if (float(p[0]) > 210) == side] for side in (False, True))  # fmt: skip
+    assert len(front) == len(behind) == 144 and "nan" not in found.sphere
+    nobody, few, many = (colour for _, colour in found.seen)
+    assert {c for _, c in behind} == {nobody} and {c for _, c in front} == {nobody, few, many}
+    assert "the back (0% seen)" in found.hidden and not any("front" in h for h in found.hidden)
+    assert captured(results, 180, 0).sphere == "" or results.poses.artifact.seen_directions
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])

@@ -18,6 +18,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from tests.support.points import PATIENCE
+
 PREFECT = str(Path(sys.executable).parent / "prefect")
 
 
@@ -142,7 +144,7 @@ def ask(url: str, path: str, body: dict[str, Any] | None = None) -> Any:
         return json.loads(answer.read())
 
 
-def wait_healthy(url: str, seconds: float = 240) -> None:
+def wait_healthy(url: str, seconds: float = PATIENCE) -> None:
     """Until the server answers."""
     end = time.monotonic() + seconds
     while True:
@@ -152,11 +154,3 @@ def wait_healthy(url: str, seconds: float = 240) -> None:
         except OSError:
             assert time.monotonic() < end, "the server did not start"
             time.sleep(0.3)
-
-
-def wait_for(condition: Any, seconds: float = 60.0) -> None:
-    """Until something is true."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.05)

@@ -19,6 +19,7 @@ from pipeline.artifacts import (
     FittedFace,
     HeldOutView,
     Located,
+    MaskSet,
     Surface,
     TextureMap,
     TextureSet,
@@ -41,6 +42,7 @@ class SyntheticInputs:
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     capture: Located[Capture]
+    masks: Located[MaskSet]
 
 
 def ball(columns: int = 64, rings: int = 32, height: float = 1.25) -> dict[str, np.ndarray]:
@@ -296,6 +298,7 @@ def write_inputs(
         Located(face, made["face"]),
         Located(rig, made["poses"]),
         _capture(made["capture"], rig, held_out),
+        Located(MaskSet(masks=()), folder),
     )
 
 
@@ -326,6 +329,6 @@ def run_stage(inputs: SyntheticInputs, folder: Path, **config: object):
     from pipeline.contract import Context
     from stages.usd.stage import STAGE, Config, Inputs
 
-    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in Inputs.__slots__}
     small = {"preview_size": 64, "environment_width": 64, "samples": 1} | config
     return STAGE.run(Inputs(**named), Config(**small), Context(folder, folder / "scratch"))

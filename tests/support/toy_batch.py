@@ -18,8 +18,11 @@ from typing import Any
 import pipeline.threads  # noqa: F401
 from pipeline.artifacts import Artifact, Capture, FileRef, Located, UsdAsset
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.verdict import Finding, Level
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
+from tests.support.points import instrument, reach
+from tests.support.toy_stages import finding
 from workflows import adapter, batch_local
 
 
@@ -27,6 +30,7 @@ class Worked(Artifact):
     """What the toy made."""
 
     file: FileRef
+    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +45,9 @@ class UsdInputs:
 
 class WorkConfig(StageConfig):
     steps: int = 4
-    pause: float = 0.05
     fault: str = ""
+    doubted_width: int = 0  # a capture whose photos are so wide is judged `doubted`
+    doubted: Level = "unusable"
 
 
 class UsdConfig(StageConfig):
@@ -56,9 +61,11 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
     for step in range(begin, config.steps):
         context.check()
         context.progress(step, config.steps, "working")
-        time.sleep(config.pause)
+        reach("work.step")
         checkpoint.write_text(str(step + 1))
+        reach("work.checkpoint", context.cancelled)
     if config.fault == "hangs":
+        reach("work.hangs")
         while True:
             time.sleep(0.05)
     if config.fault == "hangs in C":  # with Python's lock held: no thread of Python runs any more
@@ -71,7 +78,8 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         (context.scratch / "killed").write_text("")
         os.kill(os.getpid(), 9)
     (context.workdir / "w.bin").write_bytes(inputs.capture.artifact.digest().encode() * 1000)
-    return Worked(file=context.file("w.bin"))
+    doubtful = inputs.capture.artifact.views[0].width == config.doubted_width
+    return Worked(file=context.file("w.bin"), findings=(finding(config.doubted),) if doubtful else ())
 
 
 def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
@@ -82,8 +90,14 @@ def run_usd(inputs: UsdInputs, config: UsdConfig, context: Context) -> UsdAsset:
     return UsdAsset(name=config.name, root=f"asset/{config.name}.usd", files=(context.file(root),), checks=0)
 
 
+def run_capture(inputs: Any, config: Any, context: Context) -> Capture:
+    """The real stage without its findings: photos of noise are no good ones, and that is not what is tested here."""
+    made: Capture = CAPTURE.run(inputs, config, context)
+    return made.model_copy(update={"findings": ()})
+
+
 TOYS: tuple[Stage[Any, Any, Any], ...] = (
-    CAPTURE,
+    replace(CAPTURE, run=run_capture),
     Stage("work", 1, WorkInputs, WorkConfig, Worked, run_work),
     Stage("usd", 1, UsdInputs, UsdConfig, UsdAsset, run_usd),
 )
@@ -104,7 +118,9 @@ def counted(stage: Stage[Any, Any, Any]) -> Stage[Any, Any, Any]:
 
 
 REAL = bool(os.environ.get("NEUFACE_REAL_STAGES"))
-if not REAL:
+if REAL:
+    instrument()
+else:
     adapter.FIT = "work"  # what holds a slot of the pool's GPUs
 registry.REGISTRY = tuple(counted(s) for s in (registry.REGISTRY if REAL else TOYS))
 batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")

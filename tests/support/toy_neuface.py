@@ -9,7 +9,7 @@ import stages.capture.scan
 from stages import registry
 from tests.support.toy_stages import TOYS, source
 
-registry.REGISTRY = TOYS
+registry.REGISTRY, registry.FIT = TOYS, "third"
 stages.capture.scan.scan_capture = source  # type: ignore[assignment]
 
 if __name__ == "__main__":

@@ -26,6 +26,6 @@ def exported(inputs: SyntheticInputs, tmp_path_factory: pytest.TempPathFactory):
 
     folder = tmp_path_factory.mktemp("exported")
     context = Context(folder / "work", folder / "scratch")
-    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in Inputs.__slots__}
     asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), context)
     return folder / "work", asset

@@ -158,7 +158,7 @@ from pipeline.contract import Context
 from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
-named = {n: getattr(made, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+named = {n: getattr(made, n) for n in Inputs.__slots__}
 work = Path(sys.argv[2]) / "work"
 asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), Context(work, work / "scratch"))
 print(asset.digest())
@@ -284,7 +284,7 @@ def test_broken_lights_are_refused(tmp_path: Path, light: np.ndarray) -> None:
 def test_a_cancelled_export_stops(inputs: SyntheticInputs, tmp_path: Path) -> None:
     from pipeline.errors import Cancelled
 
-    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in Inputs.__slots__}
     context = Context(tmp_path / "w", tmp_path / "s", cancelled=lambda: True)
     with pytest.raises(Cancelled):
         STAGE.run(Inputs(**named), Config(), context)

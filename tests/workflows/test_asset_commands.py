@@ -25,7 +25,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     folder = tmp_path_factory.mktemp("run")
     inputs = write_inputs(folder / "in")
-    named = {n: getattr(inputs, n) for n in ("surface", "uv", "bake", "inverse_rendering", "poses", "capture")}
+    named = {n: getattr(inputs, n) for n in Inputs.__slots__}
     STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=64), Context(folder, folder / "scratch"))
     turn = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])
     matrix = np.eye(4)

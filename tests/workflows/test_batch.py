@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import Cancelled, DiskError, StageError, TimeLimitError, UsageError
+from pipeline.verdict import Level
 from workflows import batch_captures, batch_faults
 from workflows.batch import Ended, run_batch
 from workflows.batch_captures import NAME, find, ranges
@@ -170,8 +171,14 @@ class Scripted:
 
     slots = 2
 
-    def __init__(self, out: Path, script: dict[str, list[Fault | None]], batch: int = 4096) -> None:
-        self.out, self.script, self.batch = out, script, batch
+    def __init__(
+        self,
+        out: Path,
+        script: dict[str, list[Fault | None]],
+        batch: int = 4096,
+        levels: dict[str, Level] | None = None,
+    ) -> None:
+        self.out, self.script, self.batch, self.levels = out, script, batch, levels or {}
         self.started: list[tuple[str, int, tuple[str, ...]]] = []
         self.under_way: list[str] = []
         self.most = 0
@@ -189,7 +196,7 @@ class Scripted:
         if fault is None:
             (self.out / name).mkdir(parents=True, exist_ok=True)
             (self.out / name / "run.json").write_text("{}")
-        return [Ended(name, fault, self.batch)]
+        return [Ended(name, fault, self.batch, self.levels.get(name))]
 
     def close(self, stopped: bool) -> Iterable[Ended]:
         ended = [Ended(n, Fault(kind="stopped", message="stopped")) for n in self.under_way]
@@ -218,7 +225,7 @@ def go(tree: Path, script: dict[str, list[Fault | None]], **changes: Any) -> tup
 
 def test_one_bad_capture_costs_no_other_and_is_not_tried_again(tree: Path) -> None:
     summary, runner = go(tree, {"2/1_neutral": [BAD]})
-    assert summary.counts() == {"done": 4, "failed": 1, "submitted": 0, "waiting": 0}
+    assert summary.counts() == {"done": 4, "unusable": 0, "failed": 1, "submitted": 0, "waiting": 0}
     assert len(runner.started) == 5 and runner.most == 2
     assert summary.failed == 1
 
@@ -228,6 +235,55 @@ def test_what_may_pass_is_tried_again_as_often_as_asked(tree: Path) -> None:
     tries = {n: [a for name, a, _ in runner.started if name == n] for n in ("1/1_neutral", "1/2_smile")}
     assert tries == {"1/1_neutral": [1, 2, 3], "1/2_smile": [1, 2, 3]}
     assert summary.counts()["failed"] == 1
+
+
+def test_an_unusable_result_is_an_end_and_is_not_tried_again(tree: Path) -> None:
+    asked = request(tree)
+    levels: dict[str, Level] = {"1/1_neutral": "unusable", "1/2_smile": "usable", "2/1_neutral": "good"}
+    summary = run_batch(asked, Scripted(Path(asked.out), {}, levels=levels))
+    assert summary.counts() == {"done": 4, "unusable": 1, "failed": 0, "submitted": 0, "waiting": 0}
+    assert (summary.failed, summary.refused(False), summary.refused(True)) == (0, 1, 2)
+    again = Scripted(Path(asked.out), {})
+    later = run_batch(asked, again)  # what is known is on disk
+    assert again.started == [] and later.counts()["unusable"] == 1 and later.refused(True) == 2
+    (Path(asked.out) / "1/1_neutral/run.json").unlink()
+    run_batch(asked, again)
+    assert [name for name, *_ in again.started] == ["1/1_neutral"]
+
+
+@pytest.mark.parametrize(("change", "again"), [({"strict": True}, 0), ({"force": True}, 5)])
+def test_strict_makes_nothing_anew_and_force_does(tree: Path, change: dict[str, bool], again: int) -> None:
+    go(tree, {})
+    _, runner = go(tree, {}, **change)
+    assert len(runner.started) == again
+
+
+@pytest.mark.parametrize(
+    ("script", "levels", "options", "code"),
+    [
+        ({}, {"2/1_neutral": "good"}, ["--strict"], 0),
+        ({}, {"2/1_neutral": "usable"}, [], 0),
+        ({}, {"2/1_neutral": "usable"}, ["--strict"], 3),
+        ({}, {"2/1_neutral": "unusable"}, [], 3),
+        ({"1/2_smile": [Fault(kind="capture", message="bad")]}, {"2/1_neutral": "unusable"}, [], 1),
+    ],
+)
+def test_exit_codes_of_a_batch(
+    tree: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    script: dict[str, list[Fault | None]],
+    levels: dict[str, Level],
+    options: list[str],
+    code: int,
+) -> None:
+    from workflows import batch_local
+    from workflows.cli import main
+
+    out = tree.parent / "out"
+    runner = Scripted(out, script, levels=levels)
+    runner.kill = lambda: None  # type: ignore[attr-defined]
+    monkeypatch.setattr(batch_local, "Processes", lambda request, slots: runner)
+    assert main(["batch", str(tree), "--out", str(out), *options]) == code
 
 
 def test_out_of_memory_is_tried_with_half_the_rays(tree: Path) -> None:
@@ -338,6 +394,29 @@ def test_failed_first_then_the_odd_ones_then_by_name() -> None:
     assert [r.name for r in ranked(table)] == ["z", "c3", "c6", "c0", "c1", "c2", "c4", "c5"]
 
 
+def test_the_verdict_comes_before_odd_figures() -> None:
+    table = rows([30, 31, 30.5, 12, 30.2, 29.8, 47])
+    table[5].level, table[4].level, table[6].level, table[0].level = "unusable", "usable", "usable", "good"
+    assert [r.name for r in ranked([*table, Row("z", "failed", 1)])] == ["z", "c5", "c6", "c4", "c3", "c0", "c1", "c2"]
+
+
+def test_the_page_shows_and_counts_verdicts(tree: Path) -> None:
+    asked = request(tree)
+    out = Path(asked.out)
+    run_batch(asked, Scripted(out, {}, levels={"2/1_neutral": "unusable", "1/1_neutral": "good"}))
+    finding = {"stage": "masks", "said": "36 <of> 40 masks are empty."}
+    (out / "2/1_neutral/run.json").write_text(json.dumps({"verdict": {"level": "unusable", "findings": [finding]}}))
+    run_batch(asked, Scripted(out, {}))
+    page = (out / "batch/index.html").read_text()
+    assert "1 unusable, 0 usable, 1 good" in page and '<td class="level unusable">unusable</td>' in page
+    assert "36 &lt;of&gt; 40 masks are empty." in page and "36 <of>" not in page
+    assert page.index("2/1_neutral") < page.index("1/1_neutral")
+    assert "<h1>5 of 5 captures done</h1>" in page
+    table = list(csv.DictReader((out / "batch/summary.csv").open()))
+    assert (table[0]["verdict"], table[0]["state"], table[0]["reason"]) == ("unusable", "unusable", finding["said"])
+    assert json.loads((out / "batch/summary.json").read_text())["levels"] == {"unusable": 1, "usable": 0, "good": 1}
+
+
 def test_robust_score_against_its_definition() -> None:
     values = [30.0, 31, 30.5, 12, 30.2, 29.8]
     found = {r.name: r.odd for r in ranked(rows(values))}
@@ -367,13 +446,19 @@ def test_the_page_escapes_and_links(tree: Path) -> None:
     assert [r["state"] for r in table] == ["failed", "done", "done", "done", "done"]
 
 
-def test_a_table_of_the_whole_data_set_is_quick(tmp_path: Path) -> None:
-    """7,180 captures: the page is written every few seconds while the batch runs."""
-    entries = [Entry(name=f"{s}/{e}", capture="/c") for s in range(359) for e in range(20)]
+def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: Path) -> None:
+    """7,180 captures: the page is written every few seconds while the batch runs. Ten times the captures of another
+    table may take thirty times as long on a busy machine; work that grows with their square would take a hundred."""
     asked = BatchRequest(root=str(tmp_path), out=str(tmp_path / "out"))
-    begin = time.perf_counter()
-    write_page(asked, Summary(entries))
-    assert time.perf_counter() - begin < 5
+
+    def seconds(subjects: int) -> float:
+        entries = [Entry(name=f"{s}/{e}", capture="/c") for s in range(subjects) for e in range(20)]
+        begin = time.process_time()
+        write_page(asked, Summary(entries))
+        return time.process_time() - begin
+
+    few = min(seconds(36) for _ in range(3))
+    assert min(seconds(359) for _ in range(3)) < 30 * few
     assert (asked.folder / "index.html").stat().st_size < 8e6
 
 

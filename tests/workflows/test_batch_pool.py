@@ -9,7 +9,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ import pytest
 
 from pipeline.artifacts import sha256_of
 from tests.support.facescape_tree import write_heads, write_tree
+from tests.support.points import Point, hold, wait_for
 from tests.support.servers import (
     PREFECT,
     Process,
@@ -26,7 +26,6 @@ from tests.support.servers import (
     free_port,
     postgres,
     postgres_programs,
-    wait_for,
     wait_healthy,
 )
 from workflows.environment import SLOTS_ON_DISK
@@ -39,9 +38,9 @@ SETTINGS = {
     "inverse_rendering.steps": 200, "inverse_rendering.batch": 512, "inverse_rendering.grid_cells": 48,
     "inverse_rendering.levels": 1, "inverse_rendering.hash_log2_size": 12, "inverse_rendering.hash_fine": 0.006,
     "surface.resolution": 48, "uv.target_faces": 1000, "uv.proxy_faces": 300, "bake.size": 256, "usd.preview_size": 64,
-} if REAL else {"work.steps": 6, "work.pause": 0.4}  # fmt: skip
+} if REAL else {"work.steps": 6}  # fmt: skip
 SETS = [x for k, v in SETTINGS.items() for x in ("--set", f"{k}={v}")]
-IN_MID_STAGE = "inverse_rendering/*.scratch/checkpoint.pt" if REAL else "work/*.scratch/step.txt"
+POINT = "fit.checkpoint" if REAL else "work.checkpoint@3"  # where a fit holds its slot
 PHOTO = "1.png" if REAL else "1.jpg"  # the one that is cut off
 PATIENCE = 1500 if REAL else 480  # seconds
 
@@ -50,9 +49,9 @@ def counts(tally: Path) -> Counter[str]:
     return Counter(tally.read_text().split("\n")[:-1])
 
 
-def in_mid_stage(store: Path) -> bool:
-    """Whether a stage wrote a checkpoint just now."""
-    return any(time.time() - p.stat().st_mtime < 1 for p in store.glob(IN_MID_STAGE))
+def at_the_point(point: Point) -> list[int]:
+    """Processes that live and are held there."""
+    return [pid for pid in point.reached() if (Path("/proc") / str(pid)).is_dir()]
 
 
 def damaged(store: Path) -> list[Path]:
@@ -106,6 +105,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
             "PREFECT_WORKER_QUERY_SECONDS": "2",
             SLOTS_ON_DISK[0]: SLOTS_ON_DISK[1],
             "NEUFACE_TALLY": str(tally),
+            **(point := hold(POINT, tmp_path / "signs")).environment(),
         }
         ours = (repo / "workflows/prefect.yaml").read_text()
         (tmp_path / "prefect.yaml").write_text(ours.replace("workflows.flows.", "tests.support.toy_batch."))
@@ -123,16 +123,19 @@ def test_a_night_with_a_killed_worker_server_and_database(
                  "local", cwd=tmp_path)  # fmt: skip
             with workers[0], workers[1], batch:
                 store = tmp_path / "out/.store"
-                wait_for(lambda: list(store.glob(IN_MID_STAGE)), PATIENCE)
+                wait_for(lambda: len(at_the_point(point)) == 2, PATIENCE)  # both workers are in a fit
                 workers[0].kill()
                 workers[0].start()
+                point.release()
                 wait_for(lambda: list((tmp_path / "out").glob("*/*/run.json")), PATIENCE)
+                point.take_back()
                 batch.kill()
                 batch.start()  # joins the runs that it left
-                wait_for(lambda: in_mid_stage(store), PATIENCE)  # a fit holds a slot while the server is away
+                wait_for(lambda: at_the_point(point), PATIENCE)  # a fit holds a slot while the server is away
                 server.kill()
                 database.restart()
                 server.start()
+                point.release()
                 assert batch.child is not None
                 code = batch.child.wait(PATIENCE)
             runs = ask(url, "/flow_runs/filter", {"limit": 50})

@@ -51,8 +51,9 @@ def pool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock) -> Pool:
     return made
 
 
-def look(pool: Pool, run: Any, state: StateType, message: str = "") -> Any:
-    return pool._look_at(run, SimpleNamespace(id=run.id, state_type=state, state=SimpleNamespace(message=message)))  # type: ignore[arg-type]
+def look(pool: Pool, run: Any, state: StateType, message: str = "", name: str = "") -> Any:
+    told = SimpleNamespace(message=message, name=name)
+    return pool._look_at(run, SimpleNamespace(id=run.id, state_type=state, state=told))  # type: ignore[arg-type]
 
 
 def new_run(pool: Pool, clock: Clock, name: str = "a") -> Any:
@@ -76,6 +77,12 @@ def new_run(pool: Pool, clock: Clock, name: str = "a") -> Any:
 def test_ends(pool: Pool, clock: Clock, state: StateType, message: str, kind: str | None) -> None:
     ended = look(pool, new_run(pool, clock), state, message)
     assert (ended.fault.kind if ended.fault else None) == kind
+
+
+@pytest.mark.parametrize(("name", "level"), [("Completed", "good"), ("Usable", "usable"), ("Unusable", "unusable")])
+def test_the_name_of_a_completed_state_tells_the_verdict(pool: Pool, clock: Clock, name: str, level: str) -> None:
+    ended = look(pool, new_run(pool, clock), StateType.COMPLETED, name=name)
+    assert (ended.fault, ended.level) == (None, level)
 
 
 def test_a_process_that_ended_itself_after_the_limit_hung(pool: Pool, clock: Clock) -> None:
@@ -196,3 +203,19 @@ def test_the_batch_flow_fails_when_a_capture_has_no_asset(
     else:
         assert flows.facescape_batch.fn(root="/r", out=str(tmp_path), gpus=2)["done"] == 2
     assert asked[0].gpus == 2 and asked[0].fit_slots == "neuface-fits"
+
+
+@pytest.mark.parametrize(("level", "strict", "name"), [("unusable", False, "Unusable"), ("usable", True, "Unusable"),
+                                                      ("usable", False, None), ("good", True, None)])  # fmt: skip
+def test_the_batch_flow_ends_in_a_state_of_its_own_when_results_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, level: Any, strict: bool, name: str | None
+) -> None:
+    state = "unusable" if level == "unusable" else "done"
+    summary = Summary([Entry(name="0", capture="/c", state=state, level=level)])  # type: ignore[arg-type]
+    monkeypatch.setattr(batch_prefect, "Pool", lambda request: None)
+    monkeypatch.setattr("workflows.batch.run_batch", lambda request, *a, **k: summary)
+    monkeypatch.setattr(flows, "report_batch", lambda out, counts: None)
+    ended = flows.facescape_batch.fn(root="/r", out=str(tmp_path), strict=strict)
+    assert getattr(ended, "name", None) == name
+    if name is not None:
+        assert ended.is_completed() and "1 of 1 results" in ended.message

@@ -16,7 +16,8 @@ import pytest
 
 from pipeline.images import write_png
 from tests.support.facescape_tree import write_tree
-from tests.support.servers import ask, free_port, wait_for, wait_healthy
+from tests.support.points import PATIENCE, wait_for
+from tests.support.servers import ask, free_port, wait_healthy
 from workflows.batch_request import BatchRequest
 from workflows.plan import RunRequest
 
@@ -25,7 +26,7 @@ PREFECT = Path(sys.executable).parent / "prefect"
 
 def call(environment: dict[str, str], *arguments: object, cwd: Path) -> str:
     done = subprocess.run([PREFECT, *map(str, arguments)], env=environment, cwd=cwd, text=True, capture_output=True,
-                          timeout=240)  # fmt: skip
+                          timeout=PATIENCE)  # fmt: skip
     assert done.returncode == 0, f"{arguments}: {done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -46,7 +47,7 @@ def running(environment: dict[str, str], log: Path, *arguments: object, cwd: Pat
     finally:
         os.killpg(child.pid, signal.SIGTERM)
         try:
-            child.wait(20)
+            child.wait(PATIENCE)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
@@ -81,18 +82,20 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "seed": 7, "device": "cpu", "until": "capture", "from_stage": "capture", "fit_slots": "gpus",
                 "sets": ["capture.min_views=3"], "config": {"capture": {"drop_blurred": False}},
                 "store": str(tmp_path / "store"), "stage_limit": 600.0, "budget": None,  # with a preset there is none
+                "force": True, "strict": True,
             }  # fmt: skip
             submit(environment, "capture-to-asset/local", good, "--watch", cwd=tmp_path)
             many = {
                 "root": "/photos", "out": "/runs", "subjects": "1-40", "expressions": "1,2", "preset": "film",
                 "holdout": "every:5:2", "seed": 3, "device": "cuda", "until": "bake", "sets": ["bake.size=512"],
                 "config": {"uv": {"padding": 8}}, "store": "/runs/.store", "stage_limit": 60.0, "attempts": 5,
+                "force": True, "strict": True,
                 "deployment": "capture-to-asset/docker", "chunk": 9, "priority": "low", "gpus": 8, "lost_after": 30.0,
             }  # fmt: skip
             submit(environment, "facescape-batch/batch-local", many, cwd=tmp_path)  # no worker takes it
             bad = subprocess.run([PREFECT, "deployment", "run", "capture-to-asset/local", "--param", "capture=/nowhere",
                                   "--param", f"out={tmp_path / 'bad'}", "--watch"], env=environment, cwd=tmp_path,
-                                 text=True, capture_output=True, timeout=240)  # fmt: skip
+                                 text=True, capture_output=True, timeout=PATIENCE)  # fmt: skip
         assert list(json.loads((out / "run.json").read_text())["stages"]) == ["capture"]
         runs = {r["state_type"]: r for r in ask(url, "/flow_runs/filter", {})}
         tasks = ask(url, "/task_runs/filter", {})

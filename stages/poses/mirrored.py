@@ -1,0 +1,75 @@
+"""Photos that are mirror images: their features match nothing, and those of the picture turned over match well.
+
+Phones save what the front camera sees as a mirror shows it. Only photos that found no place, or contradict their
+camera, are looked at, and each is held against a few others: it takes a fraction of a second a photo.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from stages.poses.check import features_of
+from stages.poses.features import PLAIN, Features
+from stages.poses.matching import match, verify
+from stages.poses.photos import StoredPhoto
+
+MOST_SUSPECTS, PARTNERS = 12, 12  # photos looked at, and photos that each is held against
+CLEAR, MANY = 2.0, 25  # matches of the flipped picture against the photo's own: so many times, and so many at least
+
+
+@dataclass(frozen=True, slots=True)
+class Flipped:
+    """A photo turned over from left to right."""
+
+    photo: StoredPhoto
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return self.photo.width
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        return self.photo.height
+
+    def pixels(self) -> npt.NDArray[np.generic]:
+        """(H, W, C)."""
+        return np.ascontiguousarray(self.photo.pixels()[:, ::-1])
+
+    def inside(self) -> npt.NDArray[np.float32] | None:
+        """(H, W) alpha of the subject, or None."""
+        alpha = self.photo.inside()
+        return None if alpha is None else np.ascontiguousarray(alpha[:, ::-1])
+
+
+def find_mirrored(photos: Sequence[StoredPhoto], suspects: Sequence[int], fine: Sequence[int], seed: int) -> list[int]:
+    """Which of the `suspects` fit the photos `fine` only when they are turned over. Both are places in `photos`."""
+    asked = list(suspects)[:MOST_SUSPECTS]
+    partners = list(fine)[:: max(1, -(-len(fine) // PARTNERS))]
+    if not asked or not partners:
+        return []
+    near = features_of([photos[i] for i in partners], _silent)
+    own = features_of([photos[i] for i in asked], _silent)
+    turned = features_of([Flipped(photos[i]) for i in asked], _silent)
+    out = []
+    for i, plain, flipped in zip(asked, own, turned, strict=True):
+        edge = max(photos[i].width, photos[i].height)
+        best, other = (max(_agreeing(f, n, edge, seed) for n in near) for f in (flipped, plain))
+        if best >= max(MANY, CLEAR * other):
+            out.append(i)
+    return out
+
+
+def _agreeing(a: Features, b: Features, edge: int, seed: int) -> int:
+    """Matches that one geometry explains."""
+    pair = verify(a, b, match(a.descriptors, b.descriptors, PLAIN.ratio), edge, seed)
+    return 0 if pair is None else len(pair.matches)
+
+
+def _silent(done: int, total: int) -> None:
+    """No progress: it takes a second."""

@@ -1,0 +1,102 @@
+"""The start's hull: masks that contradict all others do not cut the subject off."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from pipeline.artifacts import Camera
+from stages.inverse_rendering.start import agreed, hull_start
+
+F32 = npt.NDArray[np.float32]
+HEAD, TORSO = ((0.0, 0.02, 0.0), 0.09), ((0.0, -0.14, 0.0), 0.12)
+RADIUS, WIDTH, FOCAL, AWAY = 0.18, 160, 400.0, 1.0
+BOTTOM = 100  # rows from here on show the torso alone
+
+
+def camera(index: int, count: int) -> Camera:
+    """One of a ring of cameras that look at the origin from a little above."""
+    angle, up = 2 * np.pi * index / count, 0.15 * (-1) ** index
+    centre = AWAY * np.array([np.cos(up) * np.sin(angle), np.sin(up), np.cos(up) * np.cos(angle)])
+    z = -centre / AWAY
+    x = np.cross(z, [0, 1, 0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], 1), centre
+    K = ((FOCAL, 0.0, WIDTH / 2), (0.0, FOCAL, WIDTH / 2), (0.0, 0.0, 1.0))
+    rows = tuple(tuple(float(v) for v in r) for r in pose)
+    return Camera(index=index, name=f"{index}.png", width=WIDTH, height=WIDTH, K=K, world_from_cam=rows,
+                  distortion=(0.0,) * 5)  # fmt: skip
+
+
+def shown(c: Camera) -> F32:
+    """Alpha of two balls, by the angle between a pixel's ray and the way to a ball's centre."""
+    pose = np.array(c.world_from_cam)
+    v, u = np.mgrid[:WIDTH, :WIDTH] + 0.5
+    ray = np.stack([(u - WIDTH / 2) / FOCAL, (v - WIDTH / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    out = np.zeros((WIDTH, WIDTH), bool)
+    for middle, radius in (HEAD, TORSO):
+        way = np.array(middle) - pose[:3, 3]
+        along = ray @ way
+        out |= way @ way - along**2 < radius**2
+    return out.astype(np.float32)
+
+
+CAMERAS = [camera(i, 24) for i in range(24)]
+ALPHAS = [shown(c) for c in CAMERAS]
+
+
+def solid(alphas: list[F32]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
+    start = hull_start(CAMERAS, agreed(CAMERAS, alphas, RADIUS).alphas, RADIUS, 64, 1)
+    inside = start.values < 0
+    return inside, start.lo + start.cell * np.argwhere(inside)
+
+
+def volume(alphas: list[F32]) -> float:
+    start = hull_start(CAMERAS, agreed(CAMERAS, alphas, RADIUS).alphas, RADIUS, 64, 1)
+    return float((start.values < 0).sum() * start.cell**3)
+
+
+def test_masks_that_agree_stay_the_same_objects() -> None:
+    found = agreed(CAMERAS, ALPHAS, RADIUS)
+    assert not found.doubtful
+    assert all(a is b for a, b in zip(found.alphas, ALPHAS, strict=True))
+
+
+@pytest.mark.parametrize("lost", ["torso", "head"])
+def test_a_mask_that_lacks_a_part_cuts_nothing_off(lost: str) -> None:
+    alphas = [a.copy() for a in ALPHAS]
+    rows = slice(BOTTOM, None) if lost == "torso" else slice(None, BOTTOM)
+    alphas[7][rows] = 0
+    found = agreed(CAMERAS, alphas, RADIUS)
+    assert list(found.doubtful) == [7]
+    wrong = (ALPHAS[7] > 0.5) & (alphas[7] < 0.5)
+    assert (found.doubtful[7] & wrong).sum() > 0.9 * wrong.sum()
+    assert not (found.doubtful[7] & (alphas[7] > 0.5)).any()
+    assert volume(alphas) == pytest.approx(volume(ALPHAS), rel=0.02)
+    _, points = solid(alphas)
+    for middle, radius in (HEAD, TORSO):
+        assert (np.linalg.norm(points - np.array(middle), axis=1) < 0.5 * radius).any()
+
+
+def test_an_empty_mask_among_many() -> None:
+    alphas = [*ALPHAS[:5], np.zeros_like(ALPHAS[5]), *ALPHAS[6:]]
+    assert volume(alphas) == pytest.approx(volume(ALPHAS), rel=0.02)
+
+
+def test_what_many_masks_call_background_is_background() -> None:
+    """A quarter of the views outvotes the rest: a hollow that few views look into must stay one."""
+    alphas = [a.copy() for a in ALPHAS]
+    for i in range(0, 24, 4):
+        alphas[i][BOTTOM:] = 0
+    assert not agreed(CAMERAS, alphas, RADIUS).doubtful
+
+
+def test_a_narrow_strip_is_left_to_the_mask() -> None:
+    """A contour that lies a pixel or two inside the subject's is no contradiction: the lenient hull is a thick one."""
+    alphas = list(ALPHAS)
+    alphas[4] = np.asarray(cv2.erode(ALPHAS[4], np.ones((5, 5), np.uint8)), np.float32)
+    assert agreed(CAMERAS, alphas, RADIUS).alphas[4] is alphas[4]
