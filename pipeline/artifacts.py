@@ -207,7 +207,10 @@ class CameraSet(Artifact):
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
     reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
-    makes it metres. seen_directions: how many fitted views see what faces each direction (pipeline.directions).
+    makes it metres. left_out: why each of the `unregistered` photos has no place, in plain words, where that is known.
+    groups: numbers of photos that fit among themselves, of solved cameras: first that of the cameras, then the others,
+    the largest first. seen_directions: how many fitted views see what faces each
+    direction (pipeline.directions).
     """
 
     source: Literal["given", "colmap"]
@@ -217,6 +220,8 @@ class CameraSet(Artifact):
     roi_radius: float
     cameras: tuple[Camera, ...]
     unregistered: tuple[str, ...] = ()
+    left_out: dict[str, str] = {}
+    groups: tuple[int, ...] = ()
     reprojection_error_px: float | None = None
     view_errors_px: dict[str, float] = {}
     points: FileRef | None = None

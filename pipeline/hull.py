@@ -14,7 +14,7 @@ Source: Laurentini, The visual hull concept for silhouette-based image understan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -210,8 +210,10 @@ def hull_bounds(
     margin: float = 0.05,
     min_views: int = 3,
     max_outside: int = 0,
+    keep: Callable[[Hull], Hull] = lambda hull: hull,
 ) -> tuple[F64, F64]:
-    """(3,) lower and upper corner of the subject in the cube of half-edge 1.6 * roi_radius.
+    """(3,) lower and upper corner of the subject in the cube of half-edge 1.6 * roi_radius. keep: the part of the hull
+    that counts (pipeline.extent).
 
     `margin` is added on every side, as a fraction of the longest edge; the box stays inside the cube.
 
@@ -219,9 +221,10 @@ def hull_bounds(
         StageError: nothing is left of the subject.
     """
     edge = 1.6 * roi_radius
-    hull = visual_hull(
+    whole = visual_hull(
         cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / cells, min_views=min_views, max_outside=max_outside
     )
+    hull = keep(whole)
     body = subject_pieces(hull.occupied, hull.lo + 0.5 * hull.cell, hull.cell)
     if not body.any():
         raise StageError(

@@ -204,3 +204,25 @@ def compact(vertices: npt.NDArray[np.floating], faces: Faces) -> tuple[npt.NDArr
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     new = np.cumsum(used) - 1
     return vertices[used], new[faces].astype(np.int32), np.flatnonzero(used)
+
+
+def split_apart(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
+    """Sheets that touch along a crowded edge or in a point, each with vertices of its own there.
+
+    Collapsing edges pinches thin handles until two sheets share an edge. Corners of faces stay one vertex where they
+    are neighbours across an edge of two faces; elsewhere they become several at the same place.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(faces)
+    a, b, _ = paired_edges(faces, len(vertices))  # row r: from corner r // n of face r % n to its next corner
+    a_next, b_next = ((r + n) % (3 * n) for r in (a, b))
+    one, other = np.concatenate([a, a_next]), np.concatenate([b_next, b])
+    graph = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(3 * n, 3 * n))
+    corner = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    if corner.max() + 1 == len(np.unique(faces)):
+        return vertices, faces
+    source = np.zeros(corner.max() + 1, np.int64)
+    source[corner] = faces.T.ravel()
+    return vertices[source], corner.reshape(3, n).T.astype(np.int32)

@@ -65,8 +65,12 @@ class Occluder:
 
     def distance(self, origin: F64, directions: F64) -> F64:
         """(N,) to the mesh along unit directions (N, 3) from one origin (3,); infinite where they miss it."""
-        starts = np.broadcast_to((origin * self._scale).astype(np.float32), directions.shape)
-        found = self._scene.run(np.ascontiguousarray(starts), np.ascontiguousarray(directions, np.float32), output=True)
+        return self.distances(np.broadcast_to(origin, directions.shape), directions)
+
+    def distances(self, origins: F64, directions: F64) -> F64:
+        """(N,) to the mesh along unit directions (N, 3), each from its own origin (N, 3); infinite where they miss."""
+        starts = np.ascontiguousarray((origins * self._scale).astype(np.float32))
+        found = self._scene.run(starts, np.ascontiguousarray(directions, np.float32), output=True)
         return np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
 
     def blocks(self, origins: F64, directions: F64) -> Mask:

@@ -23,7 +23,6 @@ from prefect.artifacts import (
 )
 from prefect.cache_policies import NO_CACHE
 from prefect.logging import get_run_logger
-from prefect.settings import get_current_settings
 
 from pipeline.contract import Done, Stage, StageConfig, execute, key
 from pipeline.store import MANIFEST
@@ -37,11 +36,6 @@ from workflows.watchdog import time_limit
 
 log = logging.getLogger(__name__)
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
-
-
-def on_a_server() -> bool:
-    """Whether somebody can look at artifacts: a server that was named, not the throw-away one of a single run."""
-    return get_current_settings().api.url is not None
 
 
 def as_tasks(plan: Plan) -> RunStage:
@@ -75,12 +69,11 @@ class _Sealed:
 
 def _execute(work: _Sealed) -> Done[Any]:
     watch, run_log = current(), get_run_logger()
-    shown = _Published(work.stage.name) if on_a_server() else None
+    shown = _Published(work.stage.name)
 
     def progress(done: int, total: int, message: str = "", **figures: float) -> None:
         watch.observer.progress(done, total, message, **figures)
-        if shown is not None:
-            shown(done, total, message, figures)
+        shown(done, total, message, figures)
 
     plan = work.plan
     with _slot(work), time_limit(work.stage.name, plan.request.stage_limit, watch.late):  # a wait for a slot is no hang
@@ -96,8 +89,7 @@ def _execute(work: _Sealed) -> Done[Any]:
     run_log.info("%s: %s, %s", done.stage, "reused" if done.reused else f"{done.run['seconds']} s", done.key[:12])
     for warning in getattr(done.located.artifact, "warnings", ()):
         run_log.warning("%s: %s", done.stage, warning)
-    if shown is not None:
-        shown.close("reused from the store" if done.reused else f"done in {done.run['seconds']} s")
+    shown.close("reused from the store" if done.reused else f"done in {done.run['seconds']} s")
     return done
 
 
@@ -147,8 +139,6 @@ class _Published:
 
 def publish_result(out: Path, record: dict[str, Any]) -> None:
     """Show a finished run in Prefect: a table of its stages and a link to the report."""
-    if not on_a_server():
-        return
     lines = ["| stage | seconds | key |", "|---|---|---|"]
     for name, s in record["stages"].items():
         lines.append(f"| {name} | {'reused' if s['reused'] else s['seconds']} | `{s['key'][:12]}` |")

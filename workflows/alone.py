@@ -18,7 +18,6 @@ from typing import IO
 from pipeline.errors import Cancelled, stage_error_from_os_error
 
 POLL = 0.2  # seconds between two attempts
-_HELD: set[Path] = set()  # by this process: the command and the flow inside it both ask
 
 
 @contextmanager
@@ -29,9 +28,6 @@ def alone(store: Path, out: Path, stopped: Callable[[], bool], said: Callable[[s
         Cancelled: stopped by the user while waiting. StageError: the store can't be written.
     """
     path = _path(store, out)
-    if path in _HELD:
-        yield
-        return
     handle, told = _take(path), False
     while handle is None:
         if not told:
@@ -41,11 +37,9 @@ def alone(store: Path, out: Path, stopped: Callable[[], bool], said: Callable[[s
             raise Cancelled("stopped by the user while another run was at work")
         time.sleep(POLL)
         handle = _take(path)
-    _HELD.add(path)
     try:
         yield
     finally:  # the file stays, as those of the store do
-        _HELD.discard(path)
         handle.close()
 
 

@@ -1,27 +1,25 @@
 """One capture in a process of its own, without Prefect: what a local batch starts for each.
 
-    python -m workflows.batch_child EVENTS_FD < request
+    python -m workflows.batch_child EVENTS_FD PARENT < request
 
 The request comes as one line of JSON on stdin; what happens goes as lines of JSON to the file descriptor EVENTS_FD.
-The end of stdin means stop: so a batch that is killed leaves nothing that goes on without it.
+The end of stdin means stop. When the batch, process PARENT, dies, the kernel kills this process.
 """
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
 
 import json
 import os
-import signal
 import sys
 import threading
 from typing import Any
 
 from pipeline.contract import Done
-from workflows.alone import alone
 from workflows.batch_faults import fault_of
-from workflows.folders import writable
+from workflows.complete import complete
+from workflows.interrupt import end_with, interruptible
 from workflows.plan import Plan, RunRequest, make_plan
-from workflows.publish import publish
-from workflows.runner import run_here, run_plan
+from workflows.runner import run_here
 from workflows.session import Session, session
 from workflows.verdict import exit_code, level_in
 
@@ -58,17 +56,16 @@ class Events:
 
 def main(arguments: list[str]) -> int:
     """Exit code as in `neuface`; the last event says how it ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the batch decides
+    end_with(int(arguments[1]))
     events = Events(int(arguments[0]))
     watch = Session(events)
     request = RunRequest.model_validate_json(sys.stdin.buffer.readline())
     threading.Thread(target=_stop_at_the_end_of_stdin, args=(watch,), daemon=True).start()
     try:
-        with session(watch):
+        with session(watch), interruptible(watch.stop, events.note):  # it has a session of its own: no Ctrl-C
             plan = make_plan(request)
             events.tell(event="plan", batch=rays_a_step(plan))
-            with writable(plan.out, plan.store.root), alone(plan.store.root, plan.out, watch.stopped, events.note):
-                record = publish(plan, run_plan(plan, run_here(plan)))
+            record = complete(plan, run_here(plan))
     except Exception as e:
         fault = fault_of(e, events.stage)
         events.tell(event="failed", fault=fault.model_dump())

@@ -69,6 +69,13 @@ def add_commands(commands_of: Any) -> None:
     serve.add_argument("--port", type=int, default=4200, help="(%(default)s)")
     serve.add_argument("--limit", type=int, default=1, metavar="N", help="captures at a time (%(default)s)")
     serve.add_argument("--home", default="~/.neuface", metavar="DIR", help="the server's records (%(default)s)")
+    serve.add_argument(
+        "--root",
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="folder that runs may read and write; repeatable ($NEUFACE_ROOTS, else the current folder)",
+    )
     serve.set_defaults(run=serve_command)
 
 
@@ -90,14 +97,14 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
             from workflows.batch_prefect import Pool
             from workflows.interrupt import interruptible
 
-            with interruptible(stop, lambda: None, console.note):
+            with interruptible(stop, console.note):
                 summary = run_batch(request, Pool(request), stopped=stop.is_set, said=console.note)
         else:
             from workflows.batch_local import Processes
             from workflows.interrupt import interruptible
 
             runner = Processes(request, slots=max(1, options.workers))
-            with interruptible(stop, runner.kill, console.note):
+            with interruptible(stop, console.note, runner.kill):
                 summary = run_batch(request, runner, stopped=stop.is_set, said=console.note)
     except Cancelled:
         console.note("stopped; the same command goes on where this one left off")
@@ -141,4 +148,5 @@ def serve_command(options: argparse.Namespace, console: Console) -> int:
     """neuface serve"""
     from workflows.deployments import serve
 
-    return serve(options.host, options.port, options.limit, Path(options.home).expanduser(), console.note)
+    home = Path(options.home).expanduser()
+    return serve(options.host, options.port, options.limit, home, console.note, options.root)

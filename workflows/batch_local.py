@@ -62,7 +62,7 @@ class Processes:
         read_end, write_end = os.pipe()
         with log.open("ab") as stream:
             process = subprocess.Popen(
-                [*self.command, str(write_end)],
+                [*self.command, str(write_end), str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=stream,
                 stderr=stream,

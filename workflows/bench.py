@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from workflows import bench_ablations, bench_speed, bench_tradeoff
+from workflows import bench_ablations, bench_captures, bench_speed, bench_tradeoff
 from workflows.console import Console
 
 
@@ -20,6 +20,11 @@ class Bench:
 
 
 BENCHES: dict[str, Bench] = {
+    "captures": Bench(
+        "every capture of a folder with its split: one table, by which changes are judged",
+        bench_captures.options,
+        bench_captures.run,
+    ),
     "ablations": Bench(
         "the paper's other systems at one budget: Tables 2, 3, A2 and Fig. A3",
         bench_ablations.options,

@@ -163,7 +163,7 @@ def measure(row: Row, given: argparse.Namespace, console: Console) -> Result:
     from workflows.session import Session, session
 
     plan = plan_of(given, settings_of(row, given))
-    with session(Session(console, plan=plan)):
+    with session(Session(console)):
         done = {d.stage: d for d in run_plan(plan, run_here(plan))}
     found: dict[str, Located[Any]] = {name: d.located for name, d in done.items()}
     views = [scores_of(v, found) for v in found["capture"].artifact.views if v.holdout]
@@ -214,7 +214,8 @@ def chamfer(found: dict[str, Located[Any]], capture: Path) -> float:
 
     from pipeline import meshes
     from pipeline.transforms import apply, matrix
-    from workflows import truth
+    from workflows.truth import seen_by
+    from workflows.truth_geometry import distances
 
     surface = found["surface"]
     own = meshes.load(surface.path(surface.artifact.mesh))
@@ -222,8 +223,8 @@ def chamfer(found: dict[str, Located[Any]], capture: Path) -> float:
     mine = trimesh.Trimesh(apply(to_capture, own.vertices.astype(np.float64)), own.faces, process=False)
     true = trimesh.load(truth_path, process=False)
     views = [v for v in _capture(found["capture"]).views if not v.holdout]
-    there = truth._distances(true, truth._seen(mine, views))
-    back = truth._distances(mine, truth._seen(true, views))
+    there = distances(true, seen_by(mine, views))
+    back = distances(mine, seen_by(true, views))
     return float(500 * (there.mean() + back.mean()))
 
 

@@ -56,7 +56,7 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
         stack.enter_context(folders.writable(scratch, store))
         watch = Session(console)
         stack.enter_context(session(watch))
-        stack.enter_context(interruptible(watch.stop, lambda: None, console.note))
+        stack.enter_context(interruptible(watch.stop, console.note))
         for until in _untils(early_stages()):
             if until is None:
                 break

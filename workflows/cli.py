@@ -1,8 +1,13 @@
 """The command line `neuface`.
 
 Exit codes: 0 done and the result is good or usable, 1 failed, 2 wrong usage, 3 the result is unusable (with --strict:
-or only usable), 130 stopped by the user with finished stages kept.
+or only usable). Stopped with finished stages kept: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP).
 """
+
+if __name__ == "__main__":  # signals first: the imports take seconds
+    from workflows.interrupt import from_the_start  # isort: skip
+
+    from_the_start()
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
 
@@ -11,11 +16,13 @@ import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
 from workflows import batch_commands, bench, check, commands, schedule, store_commands
 from workflows.console import Console
+from workflows.interrupt import Interrupted, as_exceptions, code_of
 
 EXAMPLES = """examples:
   neuface demo                                        a made-up head, start to end, checked against the truth
@@ -144,7 +151,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
     console = Console()
     try:
-        code: int = options.run(options, console)
+        with as_exceptions():
+            code: int = options.run(options, console)
+    except Interrupted as e:
+        code = code_of(e.number)
+        with suppress(OSError):
+            console.close()
+            print("stopped", file=sys.stderr)
     except Exception as e:
         console.close()
         known = (
@@ -152,8 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if known is None or options.verbose:
             raise
-        print(f"error: {known}", file=sys.stderr)
         code = known.exit_code
+        with suppress(OSError):  # the terminal may be gone
+            print(f"error: {known}", file=sys.stderr)
     return code
 
 

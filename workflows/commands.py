@@ -1,23 +1,22 @@
-"""What each command of `neuface` does, given its parsed options. Prefect is imported only where a flow runs."""
+"""What each command of `neuface` does, given its parsed options. Prefect is imported only where it has a server."""
 
 from __future__ import annotations
 
 import argparse
-import atexit
 import dataclasses
 import json
-import logging
 import sys
 import webbrowser
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import Cancelled, StageError
-from workflows import environment, folders, server_tables
-from workflows.alone import alone
+from workflows import environment, folders
+from workflows.complete import complete
 from workflows.console import Console
-from workflows.interrupt import deaf_children, interruptible
+from workflows.interrupt import interruptible
 from workflows.plan import RunRequest, make_plan, preview
+from workflows.runner import run_here
 from workflows.session import Session, session
 from workflows.verdict import exit_code, last_lines
 
@@ -26,56 +25,32 @@ DEMO_VIEWS, DEMO_SIZE, DEMO_HOLDOUT = 40, 384, "every:5:2"
 
 
 def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, Any]:
-    """Plan, then run through the Prefect flow. Hands back what run.json holds.
+    """Plan, then run the stages: here, or as a flow of the Prefect server that PREFECT_API_URL names.
+
+    Hands back what run.json holds.
 
     Raises:
-        StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C.
+        StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C or another signal.
     """
     plan = make_plan(request)
     if dry:
         for step in preview(plan):
             print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
         return {}
-    made = folders.missing(plan.out) + folders.missing(plan.store.root)
-    with folders.writable(plan.out, plan.store.root):
-        # Prefect stops its server when Python exits and writes to its home until then: look again after that.
-        atexit.register(folders.sweep, made, plan.store.root)
-        home = environment.settle(plan.store.root, plan.out)
-        if home is not None:
-            server_tables.begin(home)
-        watch = Session(console, plan=plan)
-        with (
-            session(watch),
-            interruptible(watch.stop, _end_server, console.note),
-            alone(plan.store.root, plan.out, watch.stop.is_set, console.note),
-        ):
-            return _through_prefect(request, home)
+    watch = Session(console)
+    with session(watch):
+        if environment.has_server():
+            return _on_the_server(request)
+        with interruptible(watch.stop, console.note):
+            return complete(plan, run_here(plan))
 
 
-def _through_prefect(request: RunRequest, home: Path | None) -> dict[str, Any]:
-    from prefect.client.orchestration import get_client
-    from prefect.settings import get_current_settings
-
+def _on_the_server(request: RunRequest) -> dict[str, Any]:
+    environment.defaults()
     from workflows.flows import capture_to_asset
 
-    if get_current_settings().api.url is None:  # nobody reads Prefect's log of this run: the console tells it all
-        for name in ("prefect.flow_runs", "prefect.task_runs"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)
-    with deaf_children():  # Prefect's server outlives a Ctrl-C, so that the run can end in order
-        client = get_client(sync_client=True)
-    with client:
-        if home is not None:
-            server_tables.keep(home)
-        record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
+    record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
     return record
-
-
-def _end_server() -> None:
-    from prefect.server.api.server import SubprocessASGIServer
-
-    process = SubprocessASGIServer().server_process
-    if process is not None:
-        process.terminate()
 
 
 # ------------------------------------------------------------------ commands

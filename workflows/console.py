@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -38,16 +41,22 @@ class Console:
         """How far the stage is."""
         shown = " ".join([message, *(f"{k} {v:.4g}" for k, v in figures.items())]).strip()
         if self.bar is not None:
-            self.bar.total = max(total, 1)
-            self.bar.n = min(done, total)
-            self.bar.set_postfix_str(shown, refresh=False)
-            self.bar.update(0)
-            if time.monotonic() - self.last > 0.2 or done >= total:
-                self.last = time.monotonic()
-                self.bar.refresh()
+            try:
+                self._draw(self.bar, done, total, shown)
+            except OSError:
+                self._lost()
         elif time.monotonic() - self.last >= PLAIN_EVERY:
             self.last = time.monotonic()
             self.note(f"{self.label}: {100 * done / max(total, 1):.0f} % {shown}".rstrip())
+
+    def _draw(self, bar: tqdm[Any], done: int, total: int, shown: str) -> None:
+        bar.total = max(total, 1)
+        bar.n = min(done, total)
+        bar.set_postfix_str(shown, refresh=False)
+        bar.update(0)
+        if time.monotonic() - self.last > 0.2 or done >= total:
+            self.last = time.monotonic()
+            bar.refresh()
 
     def finished(self, done: Done[Any]) -> None:
         """The stage is done."""
@@ -59,12 +68,21 @@ class Console:
 
     def note(self, text: str) -> None:
         """A line of its own."""
-        if self.bar is not None:
-            self.bar.clear()
-        print(text, file=self.stream, flush=True)
+        try:
+            if self.bar is not None:
+                self.bar.clear()
+            print(text, file=self.stream, flush=True)
+        except OSError:
+            self._lost()
 
     def close(self) -> None:
         """Take the bar off the screen."""
-        if self.bar is not None:
-            self.bar.close()
-            self.bar = None
+        bar, self.bar = self.bar, None
+        if bar is not None:
+            with suppress(OSError):
+                bar.close()
+
+    def _lost(self) -> None:
+        """The terminal is gone, or who read the pipe: the run goes on, or stops, in silence."""
+        self.bar, self.bars = None, False
+        self.stream = Path(os.devnull).open("w")  # noqa: SIM115  (as long as the program)

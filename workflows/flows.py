@@ -2,21 +2,26 @@
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
 
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from prefect import flow
+from prefect.context import FlowRunContext
+from prefect.exceptions import TerminationSignal
 from prefect.states import Completed
 
+from pipeline.errors import Cancelled
+from workflows.access import check_folders
 from workflows.adapter import as_tasks, publish_result, report_batch
-from workflows.alone import alone
 from workflows.batch_request import BatchRequest
-from workflows.folders import writable
+from workflows.complete import complete
 from workflows.forms import takes
-from workflows.plan import Plan, RunRequest, make_plan
-from workflows.publish import publish
-from workflows.runner import run_plan
-from workflows.session import current
+from workflows.interrupt import PARENT, end_with, interruptible
+from workflows.plan import RunRequest, make_plan
+from workflows.session import Session, given, session
 from workflows.verdict import last_lines, level_in, state_name
 
 
@@ -29,12 +34,9 @@ def capture_to_asset(**asked: Any) -> Any:
     work, and nothing that tries failed runs again should do it twice. Called as a function it hands back run.json.
     """
     request = RunRequest(**asked)
-    watch = current()
-    out, store = Path(request.out).absolute(), request.store_path
-    with writable(out, store), alone(store, out, watch.stop.is_set, watch.observer.note):
-        prepared = watch.plan
-        plan: Plan = prepared if prepared is not None and prepared.request == request else make_plan(request)
-        record = publish(plan, run_plan(plan, as_tasks(plan)))
+    with _watched(asked):
+        plan = make_plan(request)
+        record = complete(plan, as_tasks(plan))
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))
     return record if name is None else Completed(name=name, message="\n".join(last_lines(record)), data=record)
@@ -51,8 +53,8 @@ def facescape_batch(**asked: Any) -> Any:
     from workflows.batch_prefect import Pool
 
     request = BatchRequest(**asked)
-    watch = current()
-    summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, said=watch.observer.note)
+    with _watched(asked) as watch:
+        summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, said=watch.observer.note)
     report_batch(Path(request.out), summary.counts())
     if summary.failed:
         raise RuntimeError(
@@ -61,3 +63,27 @@ def facescape_batch(**asked: Any) -> Any:
     refused, counts = summary.refused(request.strict), summary.counts()
     told = f"{refused} of {summary.total} results are not good enough"
     return Completed(name="Unusable", message=told, data=counts) if refused else counts
+
+
+@contextmanager
+def _watched(asked: Mapping[str, Any]) -> Iterator[Session]:
+    """The session of this flow: the command's, or a new one. Signals stop it at a checkpoint, and not at any place, as
+    Prefect's own handler would.
+
+    A run that a server started may use the allowed folders alone, and ends with the worker that started it.
+    """
+    known = given()
+    from_server = known is None and FlowRunContext.get() is not None
+    if from_server:
+        end_with(int(os.environ.get(PARENT, os.getppid())))
+        check_folders(asked)
+    watch = known or Session()
+    with session(watch), interruptible(watch.stop, watch.observer.note) as caught:
+        try:
+            yield watch
+            return
+        except Cancelled as e:
+            if not from_server or caught.number is None:
+                raise
+            stopped = e
+    raise TerminationSignal(caught.number) from stopped  # Prefect then calls the run cancelled or crashed

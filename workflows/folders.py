@@ -65,8 +65,11 @@ def sweep(made: list[Path], store: Path) -> None:
     """Remove the folders that this run made, unless the store holds something finished or worth resuming."""
     if store.is_dir() and any(_results(store)):
         return
-    if store in made:
-        shutil.rmtree(store, ignore_errors=True)
+    if store in made and store.is_dir():  # what a store holds and no more: a file of the user's own keeps its folder
+        for child in [c for c in store.iterdir() if c.is_dir() and not c.is_symlink()]:
+            for left in [child] if child.name in OWN else child.glob("*.partial-*"):
+                shutil.rmtree(left, ignore_errors=True)
+        made = [*(c for c in store.iterdir() if c.is_dir()), store, *made]
     for folder in made:
         try:
             folder.rmdir()

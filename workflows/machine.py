@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from workflows.interrupt import end_with
+
 T = TypeVar("T")
 
 
@@ -42,7 +44,9 @@ def told(m: dict[str, Any]) -> str:
 
 def apart(work: Callable[..., T], *arguments: Any) -> T:
     """What a function of a module returns, called in a process of its own: its peak memory is then its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        1, mp_context=multiprocessing.get_context("spawn"), initializer=end_with, initargs=(os.getpid(),)
+    ) as pool:
         return pool.submit(work, *arguments).result()
 
 

@@ -5,24 +5,29 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import uuid
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Done, versions
 from pipeline.errors import stage_error_from_os_error
-from pipeline.store import sync, write_synced
 from workflows.plan import Plan
+from workflows.published import note_published, published, write_whole
+from workflows.replace import drop, prepare, put, tidy
 from workflows.store_roots import note_root
 from workflows.verdict import verdict_of_done
 
 Copies = dict[str, Path]  # path below the published folder -> file in the store
+TIMED = ("index.html", "metrics.json")  # of the report: they get the seconds of the run
 
 
-def publish(plan: Plan, done: Iterable[Done[Any]]) -> dict[str, Any]:
+def publish(plan: Plan, done: Iterable[Done[Any]], said: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
     """Copy asset/ and report/ to `plan.out` and write run.json beside them. Hands back what run.json holds.
+
+    Files of the user's own in these folders stay. One whose name is needed, or that was published and then edited, is
+    renamed; `said` is told, and run.json names it under "moved_aside".
 
     Raises:
         StageError: the disk is full or can't be written; what was there before is still there.
@@ -30,16 +35,55 @@ def publish(plan: Plan, done: Iterable[Done[Any]]) -> dict[str, Any]:
     stages = {d.stage: d for d in done}
     record = run_record(plan, stages)
     try:
-        for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
-            if copies:
-                _replace_folder(plan.out / name, copies, record["timing"])
-        partial = plan.out / f".run.json.partial-{uuid.uuid4().hex[:8]}"
-        write_synced(partial, json.dumps(record, indent=1))
-        partial.replace(plan.out / "run.json")
+        moved = _replace_folders(plan.out, stages, record["timing"])
+        for before, now in moved.items():
+            said(f"{plan.out / before} is yours: kept as {plan.out / now}")
+        if moved:
+            record["moved_aside"] = moved
+        write_whole(plan.out / "run.json", json.dumps(record, indent=1))
         note_root(plan.store, plan.out, {n: d.key for n, d in stages.items()})
     except OSError as e:
         raise stage_error_from_os_error(e, plan.out) or e from e
     return record
+
+
+def _replace_folders(out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float]) -> dict[str, str]:
+    """asset/ and report/, whichever the stages made. Hands back the user's files that had to move: old path -> new."""
+    known = published(out)
+    moved: dict[str, str] = {}
+    for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
+        moved |= tidy(out, name, known)
+        if not copies:
+            continue
+        made = prepare(out, name, partial(_fill, name, copies, timing), known)
+        try:
+            both = {p: known.get(p, frozenset()) | {h} for p, h in made.hashes.items()}
+            note_published(out, {**known, **both})
+            put(made)
+        except BaseException:
+            drop(made)
+            raise
+        kept = {p: hashes for p, hashes in known.items() if not p.startswith(f"{name}/")}
+        known = {**kept, **{p: frozenset({h}) for p, h in made.hashes.items()}}
+        moved |= made.aside
+    note_published(out, known)
+    return moved
+
+
+def _fill(name: str, copies: Copies, timing: Mapping[str, float], folder: Path) -> None:
+    for path, source in copies.items():
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name == "report" and path in TIMED:
+            target.write_bytes(_with_timing(path, source.read_bytes(), timing))
+        else:
+            shutil.copyfile(source, target)
+
+
+def report_hash(folder: Path, path: str, timing: Mapping[str, float]) -> str:
+    """sha256 of a report's file as a run with these seconds published it."""
+    content = (folder / path).read_bytes()
+    return hashlib.sha256(_with_timing(path, content, timing) if path in TIMED else content).hexdigest()
 
 
 def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
@@ -102,42 +146,6 @@ def asset_hash(files: Iterable[FileRef]) -> str:
     """sha256 over the sorted (path, sha256) of the asset's files: equal hashes mean equal bytes."""
     pairs = sorted((f.path, f.sha256) for f in files)
     return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
-
-
-def _replace_folder(final: Path, copies: Copies, timing: Mapping[str, float]) -> None:
-    """Copy into a sibling, then swap it for what was there."""
-    partial = final.with_name(f".{final.name}.partial-{uuid.uuid4().hex[:8]}")
-    try:
-        for path, source in copies.items():
-            target = partial / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if final.name == "report" and path in ("index.html", "metrics.json"):
-                target.write_bytes(_with_timing(path, source.read_bytes(), timing))
-            else:
-                shutil.copyfile(source, target)
-            sync(target)
-        sync(partial)
-        swap(partial, final)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-
-
-def swap(new: Path, final: Path) -> None:
-    """Put `new` under the name `final`; what was there goes only when the new one stands."""
-    old = final.with_name(f".{final.name}.old-{uuid.uuid4().hex[:8]}")
-    if final.exists() or final.is_symlink():
-        final.rename(old)
-    try:
-        new.rename(final)
-    except OSError:
-        if old.exists():
-            old.rename(final)
-        raise
-    if old.is_dir() and not old.is_symlink():
-        shutil.rmtree(old)
-    else:
-        old.unlink(missing_ok=True)
 
 
 def _with_timing(path: str, content: bytes, timing: Mapping[str, float]) -> bytes:

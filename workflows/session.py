@@ -44,14 +44,13 @@ class Silent:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One run's watcher and its stop flags. `plan`: the one that was already made for these parameters, if any.
+    """One run's watcher and its stop flags.
 
     stop: the user's. late: the time limit's, of the stage at work. begun: when, by time.monotonic().
     """
 
     observer: Observer = field(default_factory=Silent)
     stop: threading.Event = field(default_factory=threading.Event)
-    plan: Any = None
     late: threading.Event = field(default_factory=threading.Event)
     begun: float = field(default_factory=time.monotonic)
 
@@ -61,6 +60,11 @@ class Session:
 
 
 _SESSION: ContextVar[Session | None] = ContextVar("neuface_session", default=None)
+
+
+def given() -> Session | None:
+    """The session that a command of this process made, if one did."""
+    return _SESSION.get()
 
 
 def current() -> Session:

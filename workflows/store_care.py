@@ -16,6 +16,7 @@ from stages.registry import SOURCE
 from workflows.alone import lock_is_free
 from workflows.batch_captures import RECORDS
 from workflows.batch_ledger import Entry
+from workflows.published import FOLDERS, LIST, published, split
 from workflows.store_roots import Root, forget_root, roots
 
 DAY = 86400.0
@@ -86,11 +87,15 @@ def _size(path: Path) -> int:
 # ------------------------------------------------------------------ purge
 @dataclass(frozen=True, slots=True)
 class Purge:
-    """All that a subject left: folders and files to remove, the runs among them, and the photos, which stay."""
+    """All that a subject left: folders and files to remove, and the runs among them.
+
+    What stays: the photos, and users: files of the user's own, and edited ones, in the folders of results.
+    """
 
     paths: tuple[Path, ...]
     outs: tuple[Path, ...]
     photos: tuple[Path, ...]
+    users: tuple[Path, ...]
 
     @property
     def size(self) -> int:
@@ -105,9 +110,11 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
     photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
-    paths: set[Path] = set(_made_from(photos, store)) | {o for o in outs if o.is_dir() and o != out}
-    if out in outs:  # the run's own folder: the store inside it may serve others
-        paths |= {out / n for n in ("asset", "report", "run.json", "truth", "truth.json") if (out / n).exists()}
+    paths, users = set(_made_from(photos, store)), set[Path]()
+    for o in (o for o in outs if o.is_dir()):
+        ours, theirs = _results(o)
+        users |= theirs
+        paths |= {o} if o != out and not theirs else ours  # the run's own folder: the store inside may serve others
     for path, entry in entries:
         log = out / RECORDS / "logs" / f"{entry.name.replace('/', '__')}.log"
         paths |= {p for p in (path, log) if p.exists()}
@@ -117,7 +124,22 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     for o in outs:  # the throw-away server of a run keeps its parameters
         home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
         paths |= {home} if home.is_dir() else set()
-    return Purge(tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)))
+    return Purge(tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+
+
+def _results(out: Path) -> tuple[set[Path], set[Path]]:
+    """What runs left in a folder of results, and what is the user's there: foreign files, and edited ones."""
+    known = published(out)
+    ours = {out / n for n in ("run.json", LIST, "truth", "truth.json") if (out / n).exists()}
+    for pattern in (".*.partial-*", ".probe-*"):
+        ours |= set(out.glob(pattern))
+    theirs = {p for p in out.iterdir() if p.name not in (*FOLDERS, ".store") and p not in ours}
+    for name in FOLDERS:
+        mine, users = split(out, name, known)
+        theirs |= {out / name / p for p in users}
+        if mine or not users:
+            ours |= {out / name / p for p in mine} if users else {p for p in (out / name,) if p.is_dir()}
+    return ours, theirs
 
 
 def purge(found: Purge, store: Store) -> list[Path]:
@@ -129,9 +151,20 @@ def purge(found: Purge, store: Store) -> list[Path]:
             path.unlink(missing_ok=True)
     for out in found.outs:
         forget_root(store, out)
+        for folder in [*(out / n for n in FOLDERS), out]:
+            _remove_empty(folder)
         if out.parent.is_dir() and not any(out.parent.iterdir()):
             out.parent.rmdir()
     return [p for p in found.paths if p.exists()]
+
+
+def _remove_empty(folder: Path) -> None:
+    """A folder and those below it, as far as they hold nothing."""
+    if folder.is_dir() and not folder.is_symlink():
+        for child in list(folder.iterdir()):
+            _remove_empty(child)
+        if not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def _roots_of(out: Path, store: Store) -> list[Root]:

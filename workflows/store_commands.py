@@ -86,6 +86,8 @@ def purge_command(options: argparse.Namespace, console: Console) -> int:
                 remedy="stop the runs that work on them, look at the permissions, and repeat the command",
             )
         print(f"{len(found.paths)} paths, {size / 1e6:.1f} MB removed")
+    for path in found.users:
+        print(f"a file of your own, yours to remove: {path}")
     for photos in found.photos:
         print(f"the photos themselves are yours to remove: {photos}")
     return 0

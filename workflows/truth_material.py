@@ -20,10 +20,9 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, write_png_from_linear
-from pipeline.transforms import apply, inverse_rigid, pixel_centres, rays
+from pipeline.transforms import apply, pixel_centres
 
 F64 = npt.NDArray[np.float64]
-NO_LENS: F64 = np.zeros(5)
 SAMPLES = 256  # light samples of each lobe at a pixel
 CHUNK = 200_000
 SPHERE = 4000  # directions in which lights are compared
@@ -128,11 +127,11 @@ def _seen_points(view: CaptureView, folder: Path) -> _Seen:
     import trimesh
 
     from pipeline.demo import head
-    from workflows.truth import _camera
+    from workflows.truth_geometry import of_view
 
-    K, cam_from_world = _camera(view)
+    camera = of_view(view)
     inner = np.flatnonzero(read_alpha(folder / f"truth/alpha/{view.index}.png").ravel() > 0.999)
-    origin, directions = rays(K, inverse_rigid(cam_from_world), NO_LENS, pixel_centres(view.width, view.height)[inner])
+    origin, directions = camera.rays(pixel_centres(view.width, view.height)[inner])
     mesh: Any = trimesh.load(folder / "truth" / "mesh_gt.ply", process=False)
     points, ray, _ = mesh.ray.intersects_location(
         np.broadcast_to(origin, directions.shape), directions, multiple_hits=False

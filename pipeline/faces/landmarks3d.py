@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -188,3 +189,9 @@ def off_frame(frame: HeadFrame, left_up_front: F64 | None = None) -> float:
     wanted = np.eye(3) if left_up_front is None else left_up_front
     cosine = np.einsum("ij,ij->i", frame.axes[1:], wanted[1:]).clip(-1, 1)
     return float(np.degrees(np.arccos(cosine)).max())
+
+
+def load_landmarks(path: Path) -> F64:
+    """xyz (468, 3) of the file that the masks hand on."""
+    with np.load(path, allow_pickle=False) as data:
+        return np.asarray(data["xyz"], np.float64)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline import meshes, raster, tangents, tiles
+from pipeline import footprint, meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
@@ -33,6 +33,7 @@ BAND = 262_144  # texels baked at once
 NEAREST_BAND = 1 << 24  # texels whose nearest chart is looked for at once: around each band some are looked at again
 SPARSE = 512  # texels along a side of the points that the detail's low band is made from; fewer in each of many tiles
 FEW_TEXELS = 100
+DENSER = 0.8  # of the mean texel: charts with smaller ones were made larger on purpose, the face's
 
 Step = Callable[[int, int, str], None]
 
@@ -158,6 +159,8 @@ def _detail(
     some = detail.joined([_spread(field, *tiles.alone(mesh, charts, t), sparse) for t in range(count)])
     area = float(meshes.areas(mesh.vertices, mesh.faces).sum())
     texel = float(np.sqrt(area / max(len(some.x), 1))) * sparse / size
+    fine = footprint.fine_texel(mesh, charts, size)
+    texel = fine if fine < DENSER * texel else texel
     read = detail_views.read_photos(
         views, photos.responses, mesh, texel, lambda done, total: step(done, total, "reading photos")
     )

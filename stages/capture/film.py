@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.errors import StageError
 from pipeline.images import write_png
-from stages.capture.suspects import detail
+from pipeline.sharpness import detail
 
 F64 = npt.NDArray[np.float64]
 SMALL, FLOW = 480, 160  # pixels, longest edge: for sharpness, for motion

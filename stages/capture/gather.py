@@ -16,13 +16,14 @@ import numpy.typing as npt
 from pipeline.artifacts import FileRef, sha256_of
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, refuse_bombs
+from pipeline.sharpness import detail
 from stages.capture.chart import Patches, find_chart
 from stages.capture.exif import Exif, read_exif
 from stages.capture.intact import fault_of
 from stages.capture.look import Look, look_at
 from stages.capture.photometry import clipped, mean_light
 from stages.capture.profile import profile_name
-from stages.capture.suspects import detail, is_blank, small_grey
+from stages.capture.suspects import is_blank, small_grey
 
 Image = npt.NDArray[np.generic]
 MIN_EDGE = 64  # pixels: below it neither features nor a fit have anything to hold on to

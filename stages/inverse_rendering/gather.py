@@ -36,6 +36,7 @@ def read_views(
                     transforms.matrix(c.world_from_cam),
                     np.array(c.distortion),
                     _clipped(capture, photos[i].clipped),
+                    asked=_asked(masks, alphas[i].asked),
                 ),
                 side,
             )
@@ -62,11 +63,16 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
     K[:2] /= f
     clipped = None if view.clipped is None else shrink_whole(view.clipped, f)
     rgb, alpha = shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)
-    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, K=K)
+    asked = None if view.asked is None else shrink_whole(view.asked, f)
+    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, K=K)
 
 
 def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
     return None if file is None else read_alpha(capture.path(file))
+
+
+def _asked(masks: Located[MaskSet], file: FileRef | None) -> F32 | None:
+    return None if file is None else read_alpha(masks.path(file))
 
 
 def camera_only(c: Camera) -> PhotoView:

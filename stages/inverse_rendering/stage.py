@@ -181,18 +181,18 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")
-    radius = inputs.poses.artifact.roi_radius
+    radius, extent = inputs.poses.artifact.roi_radius, inputs.masks.artifact.extent
     masks = agreed(cameras, [v.alpha for v in views], radius)
     views = [replace(v, doubtful=masks.doubtful.get(n)) for n, v in enumerate(views)]
     if settings.prior == "sphere":
         start = sphere_start(radius, settings.grid_cells, settings.levels)
     else:
-        start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels)
+        start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
     looked = footprint(start, views, settings.image_side)
     if settings.resolution == AUTO:
         settings, cells = supported(settings, looked, start), settings.grid_cells
         if settings.grid_cells < cells and settings.prior != "sphere":
-            start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels)
+            start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
     prior = start
     if settings.stereo and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")

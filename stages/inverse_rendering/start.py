@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.artifacts import Camera
+from pipeline.artifacts import Camera, Extent
 from pipeline.errors import StageError
+from pipeline.extent import GROWN, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, visual_hull
 from pipeline.transforms import inverse_rigid, matrix
@@ -111,15 +112,23 @@ def _grown(mask: Bool, radius: int) -> Bool:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc)) > 0
 
 
-def hull_start(cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int) -> Start:
+def hull_start(
+    cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int, extent: Extent | None = None
+) -> Start:
     """SDF samples of the hull, at a spacing that `levels` - 1 halvings bring to 1 / `cells` of the hull's longest side.
+
+    extent: what of the hull is fitted; a little more of it is kept, so that the fit has no rim where the mesh ends.
 
     Raises StageError if the masks leave nothing.
     """
-    lo, hi = hull_bounds(cameras, alphas, roi_radius)
+
+    def kept(hull: Hull) -> Hull:
+        return hull if extent is None else within(hull, extent, GROWN * extent.head)
+
+    lo, hi = hull_bounds(cameras, alphas, roi_radius, keep=kept)
     cell = float((hi - lo).max()) / cells * 2 ** (levels - 1)
     lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
-    hull = visual_hull(cameras, alphas, lo, hi, cell)
+    hull = kept(visual_hull(cameras, alphas, lo, hi, cell))
     if not hull.occupied.any():
         raise StageError(
             "the masks have no common body",

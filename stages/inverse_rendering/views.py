@@ -34,6 +34,7 @@ class PhotoView:
 
     clipped: (H, W) share of each pixel that is at the end of the camera's range, None if none is. doubtful: (H, W)
     where the mask contradicts the other views: neither subject nor background is learned there; None if nowhere.
+    asked: (H, W) in [0, 1], below 1 where the subject lies beyond its extent: as doubtful; None if nowhere.
     """
 
     index: int
@@ -44,6 +45,7 @@ class PhotoView:
     distortion: F64
     clipped: F32 | None = None
     doubtful: Bool | None = None
+    asked: F32 | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -172,6 +174,8 @@ def _pixels_of(
         take &= ~(inside & (shrink_whole(view.clipped, factor) > 0))
     if view.doubtful is not None:
         take &= shrink_whole(view.doubtful.astype(np.float32), factor) == 0
+    if view.asked is not None:
+        take &= shrink_whole(view.asked, factor) > WHOLE
     return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
 
 

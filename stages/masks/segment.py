@@ -12,14 +12,17 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located, MaskSet, ViewMask
+from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Extent, FileRef, Located, MaskSet, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
+from pipeline.extent import head_extent
 from pipeline.faces.find import Face
+from pipeline.faces.landmarks3d import head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
+from stages.masks.extent import asked, outline_points, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
 from stages.masks.judge import Seen, judge
 from stages.masks.landmarks import agreed, save_landmarks
@@ -120,10 +123,14 @@ def segment(
               if x.face is not None and not m.view.holdout and m.view.index not in dropped]  # fmt: skip
     found_face = agreed(fitted)
     landmarks = None if found_face is None else save_landmarks(found_face, context)
-    made = tuple(_manifest(m, x.labels, context) for m, x in zip(masked, looked, strict=True))
+    # what is cut out as an object is one, even with a face
+    people = found_face is not None and how.method != "object"
+    extent = head_extent(head_frame(found_face.face.xyz)) if found_face is not None and people else None
+    parts = _asked(masked, extent, set(dropped), context)
+    made = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, looked, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in made))  # fmt: skip
-    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks,
+    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks, extent=extent,
                    warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
@@ -131,6 +138,24 @@ def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
     """The masks as they are judged."""
     return [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, None if m.useless else m.iou, m.view.holdout,
                  m.view.index in dropped) for m in masked]  # fmt: skip
+
+
+def _asked(masked: list[Masked], extent: Extent | None, dropped: set[int], context: Context) -> dict[int, Path]:
+    """Files of what is asked of each view in which not all is, by the view's index."""
+    if extent is None:
+        return {}
+    votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in dropped]
+    points = outline_points(whole_hull([m.camera for m in votes], [m.small for m in votes], extent), extent)
+
+    def one(m: Masked) -> tuple[int, Path | None]:
+        part = asked(m.camera, read_alpha(_path(m.view.index, context)), extent, points)
+        path = context.workdir / "asked" / f"{m.view.index}.png"
+        if part is not None:
+            write_png(path, part)
+        return m.view.index, None if part is None else path
+
+    found = _each(one, masked, context, "finding the extent")
+    return {index: path for index, path in found if path is not None}
 
 
 def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
@@ -308,8 +333,9 @@ def _look(m: Masked, hair: UserModel | None, context: Context) -> Looked:
     return Looked(face, (path, tuple(LABELS[i] for i in np.unique(labels) if i)))
 
 
-def _manifest(m: Masked, labels: Labelled | None, context: Context) -> ViewMask:
+def _manifest(m: Masked, labels: Labelled | None, part: Path | None, context: Context) -> ViewMask:
     return ViewMask(index=m.view.index, mask=context.file(_path(m.view.index, context)), source=m.source,
                     coverage=round(m.coverage, 6), hull_iou=None if m.iou is None else round(m.iou, 4),
                     labels=None if labels is None else context.file(labels[0]),
-                    labelled=() if labels is None else labels[1])  # fmt: skip
+                    labelled=() if labels is None else labels[1],
+                    asked=None if part is None else context.file(part))  # fmt: skip

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 
+from pipeline.colmap import pycolmap
 from pipeline.transforms import F64
 
 ROBUST = 2.0  # c / s: less wastes what good matches say, more lets wrong ones speak

@@ -13,12 +13,12 @@ from pipeline.transforms import inverse_rigid, matrix
 from pipeline.verdict import Finding
 from stages.poses.check import AGREE, FAR, IMPERFECT, check_cameras, features_of
 from stages.poses.judge import CONTRADICTED, contradicted, mirrored
-from stages.poses.measure import find_eyes, known_scale
+from stages.poses.measure import find_faces, head_of, known_scale, some_of
 from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
 from stages.poses.place import camera_of, camera_set
-from stages.poses.scale import by_world
+from stages.poses.scale import by_world, eyes_of
 from stages.poses.settings import Config
 from stages.poses.ticks import progress_of
 
@@ -54,13 +54,14 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
             told.append(
                 "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
             )
-    eyes = find_eyes(capture, cameras, context.check) if config.pupils_mm else None
+    faces = find_faces(capture, some_of(capture, cameras), context.check)
+    eyes = eyes_of([(c, face.pupils) for c, face in faces]) if config.pupils_mm else None
     known = known_scale(capture, cameras, config, eyes, told)
     world, axes = capture.artifact.metres_from_world, None
     if world is not None and config.unit == "auto":
         published, axes = by_world(matrix(world))
         known = published if known is None and config.scale == "auto" else known
-    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes)
+    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces))
     warnings = (*told, *found.warnings)
     made = camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
     return made.model_copy(update={"findings": findings})

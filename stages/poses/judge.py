@@ -20,14 +20,14 @@ AROUND = "photograph all around the subject, a step of 15 degrees at a time, als
 HIDDEN = 0.5  # a part of the head of which less is seen is named
 PER = 1000.0  # pixels of the longer edge to which errors in pixels are brought
 
-PLACED = Limits(0.9, 0.6)  # 43 of 44 by hand, 30 of 66 of a skull under a flash, which is of no use
+PLACED = Limits(0.9, 0.6)  # 43 of 44 by hand; 30 of 66 of a skull under a flash, which is of no use
 GROUPS = Limits(
     0.1, 0.5, lower=False
 )  # largest other group against the photos placed: half as many is a second subject
 CONTRADICTED = Limits(0.05, 0.5, lower=False)  # one bumped camera of 20 is left out; from half on nobody knows which
 REPROJECTION = Limits(1.5, 3.0, lower=False)  # px per 1000: .5 and 1.0 in captures by hand that are right
 FOCAL = Limits(0.15, 0.4, lower=False)  # from EXIF: right solutions within 2 %, a wrong one was 41 % off
-POINTS = Limits(500, 100)  # 2,262 and 7,069 on people by hand; below 100 a principal point or a front is not told
+POINTS = Limits(500, 100)  # 651 on a person by hand, all around; below 100 a principal point or a front is not told
 FLAT = Limits(0.05, 0.05)  # thickness of the points against their length: a wall has .01, a face from the front .3
 SEEN = Limits(0.85, 0.3)  # of the directions around: rigs .96 and 1, by hand .92, an arc before a face .40
 FRONT_SEEN = Limits(0.9, 0.5)

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
 from pipeline.artifacts import Camera
+from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, matrix
 from stages.poses.adjust import settle_near
 from stages.poses.features import Features

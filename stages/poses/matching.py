@@ -113,7 +113,7 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
     uv_a, uv_b = a.uv[matches[:, 0]], b.uv[matches[:, 1]]
     try:
         F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
-    except cv2.error:  # its own sampler asserts that it found something, on matches that no geometry explains
+    except cv2.error:  # USAC's polisher asserts on some degenerate samples: such a pair says nothing
         return None
     if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None

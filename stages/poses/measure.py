@@ -9,11 +9,13 @@ import numpy as np
 
 from pipeline.artifacts import Camera, Capture, CaptureView, Located
 from pipeline.errors import StageError
-from pipeline.faces.find import find_face
+from pipeline.faces.find import Face, find_face
+from pipeline.faces.landmarks3d import HeadFrame, head_frame, triangulate
 from pipeline.images import read_encoded
 from stages.poses.features import U8, grey8
 from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, eyes_of, find_markers
 
+LOOKED_AT = 48  # photos in which the face of a given world is looked for
 NEEDS = {
     "markers": "markers of poses.marker_kind and poses.marker_mm in view",
     "pupils": "poses.pupils_mm, and a face in three photos or more",
@@ -74,9 +76,10 @@ def known_scale(
     return None
 
 
-def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]) -> Eyes | None:
-    """The subject's eyes in the cameras' world, or None if no face is seen alike in three photos. check: raises to
-    stop."""
+def find_faces(
+    capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]
+) -> list[tuple[Camera, Face]]:  # fmt: skip
+    """The photos in which a face is found, and where. check: raises to stop."""
     photos = {v.index: v for v in capture.artifact.views}
     out = []
     for c in cameras:
@@ -85,8 +88,27 @@ def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[
         grey = grey8(image, max(c.width, c.height))
         face = find_face(np.repeat(grey[..., None], 3, 2), c.width / 2, c.height / 2, max(c.width, c.height) / 2)
         if face is not None:
-            out.append((c, face.pupils))
-    return eyes_of(out)
+            out.append((c, face))
+    return out
+
+
+def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]) -> Eyes | None:
+    """The subject's eyes in the cameras' world, or None if no face is seen alike in three photos. check: raises to
+    stop."""
+    return eyes_of([(c, face.pupils) for c, face in find_faces(capture, cameras, check)])
+
+
+def head_of(faces: list[tuple[Camera, Face]]) -> HeadFrame | None:
+    """The head's axes in the cameras' world, or None if no face is seen alike in three photos."""
+    found = triangulate([c for c, _ in faces], np.stack([f.points for _, f in faces])) if faces else None
+    return None if found is None else head_frame(found.xyz)
+
+
+def some_of(capture: Located[Capture], cameras: list[Camera]) -> list[Camera]:
+    """At most LOOKED_AT of the cameras whose photos are fitted, evenly chosen."""
+    held = {v.index for v in capture.artifact.views if v.holdout}
+    fitted = [c for c in cameras if c.index not in held] or cameras
+    return fitted[:: -(-len(fitted) // LOOKED_AT)]
 
 
 def _grey(capture: Located[Capture], view: CaptureView) -> U8:

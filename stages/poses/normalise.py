@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.faces.landmarks3d import HeadFrame, off_frame
 from pipeline.support import find_support, is_level
 from pipeline.transforms import F64, matrix, rays, similarity
 from stages.poses.scale import Eyes, Scale
@@ -26,6 +27,7 @@ UNITS = {"metres": 1.0, "centimetres": 1e-2, "millimetres": 1e-3}
 Unit = Literal["guess", "unknown", "metres", "centimetres", "millimetres"]
 ONE_SPOT = 0.02  # of the cameras' distance: nearer together than this they turn on the spot, and see no depth
 LEVEL = 0.7  # of the eyes' distance must be level: a head that lies on its side has no front
+FACE_OFF = 10.0  # degrees: a face nearer to upright and +Z than that leaves a given world as it is
 UP_LIMIT = np.cos(np.radians(45.0))
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points, air around them
 POINTS_SHRINK = 0.95  # least share of what the frames see: hair and a bald head have few points, and must stay inside
@@ -49,13 +51,14 @@ class Normalisation:
 
 def normalise(
     cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
-    known: Scale | None = None, eyes: Eyes | None = None, axes: F64 | None = None,
+    known: Scale | None = None, eyes: Eyes | None = None, axes: F64 | None = None, head: HeadFrame | None = None,
 ) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is still in the capture's world.
 
     points: (M, 3) sparse points or None. given: the world has meaning (its axes and unit are kept where plausible).
     unit: of a given world; guess: the one under which the subject has a head's size. known: goes before both. eyes: of
     a solved world's subject, who then looks along +Z. axes: (3, 3) asset_from_capture of a given world, if known.
+    head: of a given world's subject, who is then upright and looks along +Z, unless the axes are known.
     Raises StageError if the cameras do not look at a common place, or stand in one spot.
     """
     centres, directions = viewing_rays(cameras)
@@ -75,7 +78,7 @@ def normalise(
     rotation = (
         axes
         if given and axes is not None
-        else given_axes(poses, warnings)
+        else given_axes(poses, warnings, _in_view(head, centre, radius))
         if given
         else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
     )
@@ -186,8 +189,16 @@ def points_centre(points: F64, start: F64, radius: float) -> F64:
     return start + shift * min(1.0, SHIFT_LIMIT * radius / max(length, 1e-12))
 
 
-def given_axes(poses: F64, warnings: list[str]) -> F64:
-    """(3, 3) asset_from_capture: the world's own axes if the cameras stand upright in it, else the least turn to +Y."""
+def given_axes(poses: F64, warnings: list[str], head: HeadFrame | None = None) -> F64:
+    """(3, 3) asset_from_capture: the head's own axes if they are known and the world's are not nearly those; else the
+    world's if the cameras stand upright in it, else the least turn to +Y."""
+    if head is not None:
+        off = off_frame(head)
+        if off <= FACE_OFF:
+            return np.eye(3)
+        warnings.append(f"the face is {off:.0f} degrees away from upright and +Z; the world is turned by its landmarks "
+                        "(run.json has the way back, capture_from_asset)")  # fmt: skip
+        return head.axes
     up = robust_direction(-poses[:, :3, 1])
     if up is None:
         warnings.append("the cameras' up directions cancel out; the capture's own axes are kept")
@@ -197,6 +208,11 @@ def given_axes(poses: F64, warnings: list[str]) -> F64:
     warnings.append(f"the cameras' mean up direction ({up[0]:.2f}, {up[1]:.2f}, {up[2]:.2f}) is far from +Y; the world "
                     "is turned so that it is +Y")  # fmt: skip
     return least_turn(up, np.array([0.0, 1.0, 0.0]))
+
+
+def _in_view(head: HeadFrame | None, centre: F64, radius: float) -> HeadFrame | None:
+    """The head, if it is where the cameras look and not on a picture behind."""
+    return head if head is not None and np.linalg.norm(head.eyes - centre) <= radius else None
 
 
 def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 | None:

@@ -6,7 +6,7 @@ Held-out views take part here: their cameras have to come from somewhere, and no
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,9 +19,11 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.sharpness import detail
 from stages.poses.adjust import Refine
 from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
 from stages.poses.known import triangulate
+from stages.poses.left_out import disjoint, linked, reasons
 from stages.poses.matching import (
     MIN_INLIERS,
     Pair,
@@ -33,15 +35,18 @@ from stages.poses.matching import (
     verify,
     without_repeats,
 )
+from stages.poses.quality import GOOD_SCORE, better, quality, score
 from stages.poses.solve import MIN_POINTS, Lens, Mapper, Model, reconstruct
 
-WORKERS = 2  # the result does not depend on it: each photo is a task of its own
-GOOD_SHARE = 0.9  # with fewer photos placed than this it is worth a second, slower look at the photos
-POOR_SHARE = 0.75  # and with fewer than this it is worth doubting that they share a lens
+WORKERS = 2  # the result does not depend on it: each photo, and each pair, is a task of its own
+SEEDS = 2  # more tries of the mapper where the first solution is doubted for more than the photos that it lacks
+POOR_SCORE = 0.75  # below it is worth doubting that the photos share a lens
 REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends are one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
+CHUNK = 64  # pairs between two looks at whether to stop
+DETAIL_EDGE = 1000  # pixels, at which the photos' sharpness is compared
 GLOBAL_FROM = 200  # photos: from here on all are placed at once, which takes minutes where one by one takes hours
-BETTER_BY = 1.05  # a try with a lens for each photo must place so many times more photos: it is the looser model
+BETTER_BY = 1.05  # a try with a lens for each photo must have so many times the score: it is the looser model
 
 
 class Photo(Protocol):
@@ -91,30 +96,57 @@ class Settings:
 Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
 
 
-def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: Progress) -> Model | None:
-    """The model with the most photos of all tries, or None if no two photos fit together.
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The best model, if any two photos fit together. left_out: why, by number of each photo without a place. groups:
+    of photos that fit among themselves; the first is that of the model, the others follow by size.
+    """
+
+    model: Model | None
+    left_out: dict[int, str]
+    groups: tuple[tuple[int, ...], ...]
+
+
+def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: Progress) -> Solution:
+    """The solution with the highest score (`quality`) of all tries.
 
     Raises:
         StageError: the photos were taken from one spot.
     """
     best: Model | None = None
+    shared, counts = settings.shared != "no", [0] * len(photos)
     for effort in (PLAIN, PATIENT)[: settings.patience]:
         features = detect_all(photos, settings, effort, progress)
+        counts = counts if any(counts) else [len(f.uv) for f in features]
         verified = match_all(photos, features, settings, effort, progress)
-        best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
-        if best is not None and len(best.poses) >= GOOD_SHARE * len(photos):
+        best = better(best, _place(photos, features, verified, settings, shared, scratch, progress), photos)
+        if score(best, photos) >= GOOD_SCORE:
             break
-    if settings.patience >= 3 and (best is None or len(best.poses) < GOOD_SHARE * len(photos)):
+    if settings.patience >= 3 and score(best, photos) < GOOD_SCORE:
         lost = [i for i in range(len(photos)) if best is None or i not in best.poses]
         features, verified = _askew(photos, features, verified, settings, progress, lost)
-        best = _larger(best, _place(photos, features, verified, settings, settings.shared != "no", scratch, progress))
-    if settings.shared == "auto" and (best is None or len(best.poses) < POOR_SHARE * len(photos)):
+        best = better(best, _place(photos, features, verified, settings, shared, scratch, progress), photos)
+    if settings.shared == "auto" and score(best, photos) < POOR_SCORE:
         separate = _place(photos, features, verified, settings, False, scratch, progress)
-        if best is None or (separate is not None and len(separate.poses) >= BETTER_BY * len(best.poses)):
+        if best is None or score(separate, photos) >= BETTER_BY * score(best, photos):
             best = separate
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
         _not_from_one_spot(photos, features, verified, settings.seed)
-    return best
+    return _explained(best, photos, counts, verified)
+
+
+def _explained(
+    model: Model | None, photos: Sequence[Photo], counts: Sequence[int], verified: dict[Pair, Verified]
+) -> Solution:
+    """The model, and a reason for each photo that it lacks."""
+    placed = sorted(model.poses) if model is not None else []
+    missing = [i for i in range(len(photos)) if i not in placed]
+    groups = disjoint([placed, *(model.others if model is not None else ())])
+    if not missing:
+        return Solution(model, {}, tuple(map(tuple, groups)))
+    details = [detail(grey8(p.pixels(), DETAIL_EDGE)) for p in photos]
+    others = groups[1:] if placed else groups
+    return Solution(model, reasons(missing, placed, others, counts, details, verified), tuple(map(tuple, groups)))
 
 
 def triangulate_given(
@@ -229,16 +261,19 @@ def match_pairs(
     progress: Progress,
 ) -> dict[Pair, Verified]:  # fmt: skip
     """Verified matches of the given pairs."""
+
+    def one(pair: Pair) -> Verified | None:
+        i, j = pair
+        matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
+        edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
+        return verify(features[i], features[j], matches, edge, settings.seed)
+
     found = {}
-    with _single_threaded_cv2():
-        for n, (i, j) in enumerate(pairs):
-            if n % 16 == 0:
-                progress(n, len(pairs), "matching photos")
-            matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
-            edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
-            pair = verify(features[i], features[j], matches, edge, settings.seed)
-            if pair is not None:
-                found[i, j] = pair
+    with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
+        for n in range(0, len(pairs), CHUNK):
+            progress(n, len(pairs), "matching photos")
+            some = pairs[n : n + CHUNK]
+            found.update({p: v for p, v in zip(some, pool.map(one, some), strict=True) if v is not None})
     return found
 
 
@@ -258,6 +293,7 @@ def _place(
     folder = scratch / "mapper"
     stopped: list[BaseException] = []
     placed = 0
+    together = set(next(iter(linked(verified, len(photos))), []))
 
     def next_image() -> bool:
         """Progress must not raise through COLMAP's own frames: the exception is kept and raised behind it."""
@@ -269,21 +305,43 @@ def _place(
         placed += 1
         return bool(stopped)
 
-    model = None
-    for mapper in mappers(len(photos), settings.mapper):
+    def attempt(mapper: Mapper, seed: int, loose: bool) -> Model | None:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         found = reconstruct(
             folder, lenses, lens_of, features, verified, camera_model=settings.camera_model, mapper=mapper,
-            refine=settings.refine, seed=settings.seed, next_image=next_image,
+            refine=settings.refine, seed=(settings.seed + seed) % 2**31, next_image=next_image, loose=loose,
         )  # fmt: skip
         shutil.rmtree(folder, ignore_errors=True)
         if stopped:
             raise stopped[0]
-        model = _larger(model, found)
-        if model is not None and len(model.poses) >= GOOD_SHARE * len(photos):
+        return found
+
+    return best_of(attempt, photos, together, mappers(len(photos), settings.mapper))
+
+
+def best_of(
+    attempt: Callable[[Mapper, int, bool], Model | None], photos: Sequence[Photo], together: Set[int],
+    ways: Sequence[Mapper],
+) -> Model | None:  # fmt: skip
+    """The best solution of the same matches; more are tried only while there is a doubt that they could dispel.
+
+    attempt(mapper, what is added to the seed, loose). together: photos that hang together by their matches. A mapper
+    that accepts fewer matches is worth a try where some of these lack a place; another seed where lenses, points or
+    errors are not as they should be. Both are for fewer than GLOBAL_FROM photos: of more, each try takes long.
+    """
+    best: Model | None = None
+    for mapper in ways:
+        best = better(best, attempt(mapper, 0, False), photos)
+        if score(best, photos) >= GOOD_SCORE:
+            return best
+    if "incremental" in ways and len(photos) < GLOBAL_FROM and together - set(best.poses if best else ()):
+        best = better(best, attempt("incremental", 1, True), photos)
+    for seed in range(2, 2 + SEEDS):
+        if len(photos) >= GLOBAL_FROM or best is None or quality(best, photos).trust >= 1:
             break
-    return model
+        best = better(best, attempt(ways[0], seed, False), photos)
+    return best
 
 
 def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tuple[Mapper, ...]:
@@ -291,12 +349,6 @@ def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tu
     if wanted != "auto":
         return (wanted,)
     return ("global", "incremental") if photos >= GLOBAL_FROM else ("incremental",)
-
-
-def _larger(a: Model | None, b: Model | None) -> Model | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return b if len(b.poses) > len(a.poses) else a
 
 
 @contextmanager

@@ -14,11 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, project, rigid
 from stages.poses.adjust import Refine, settle
 from stages.poses.features import Features
+from stages.poses.held import firmly_held
 from stages.poses.matching import Pair, Verified
 
 DEFAULT_FOCAL = 1.2  # of the longest edge: COLMAP's own guess, a 43 mm lens on full frame
@@ -26,6 +27,8 @@ MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
 MIN_POINTS = 100
+LOOSE_MODELS = 3  # a beginning anew costs more where more photos can be tried
+LOOSE_INLIERS, LOOSE_SHARE = 15, 0.15  # matches with the points so far, to place a photo; COLMAP's own: 30 and 0.25
 Mapper = Literal["incremental", "global"]
 PRINCIPAL_POINT_LIMIT = (
     1.5e-3  # of the longest edge, standard deviation: it turns a view by less than a tenth of a degree
@@ -77,19 +80,27 @@ def reconstruct(
     refine: Refine,
     seed: int,
     next_image: Callable[[], bool],
+    loose: bool = False,
 ) -> Model | None:
     """The largest model that COLMAP finds, or None. lens_of: for each photo, its place in `lenses`.
 
-    next_image: called before each photo is placed (by the global mapper, before all); True stops the mapper. scratch:
-    an empty folder.
+    loose: photos are placed by half as many matches as COLMAP asks for by itself, and those that in the end do not hang
+    on the rest by as many as it asks for are let go. next_image: called before each photo is placed (by the global
+    mapper, before all); True stops the mapper. scratch: an empty folder.
     """
     pycolmap.logging.minloglevel = GLOG_ERROR
     database = scratch / "matches.db"
     cameras = [_start(lens, camera_model) for lens in lenses]
     numbers = write_database(database, cameras, lens_of, features, verified)
-    found = (_all_at_once if mapper == "global" else _one_by_one)(database, scratch, refine, seed, next_image)
+    if mapper == "global":
+        found = _all_at_once(database, scratch, refine, seed, next_image)
+    else:
+        found = _one_by_one(database, scratch, _options(refine, seed, loose), next_image)
     if not found:
         return None
+    if loose:
+        for reconstruction in found.values():
+            _let_go(reconstruction)
     # the most photos; of equally large ones the one with more points
     ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
     largest, of_lens = ranked[0], np.array(lens_of, np.int64)
@@ -100,9 +111,7 @@ def reconstruct(
     return model_of(largest, numbers, ranked[1:])
 
 
-def _one_by_one(
-    database: Path, scratch: Path, refine: Refine, seed: int, next_image: Callable[[], bool]
-) -> dict[int, Any]:  # fmt: skip
+def _one_by_one(database: Path, scratch: Path, options: Any, next_image: Callable[[], bool]) -> dict[int, Any]:
     token = pycolmap.CancellationToken()
 
     def tick() -> None:
@@ -112,8 +121,7 @@ def _one_by_one(
     try:
         return dict(
             pycolmap.incremental_mapping(
-                database, scratch, scratch / "models", _options(refine, seed), next_image_callback=tick,
-                cancellation_token=token,
+                database, scratch, scratch / "models", options, next_image_callback=tick, cancellation_token=token,
             )
         )  # fmt: skip
     except InterruptedError:  # what a cancelled token raises; whoever cancelled knows why
@@ -188,7 +196,15 @@ def _sightings(image: Any) -> tuple[list[int], F64]:
     return [k for k, _ in found], np.array([uv for _, uv in found], np.float64).reshape(-1, 2)
 
 
-def _options(refine: Refine, seed: int) -> Any:
+def _let_go(reconstruction: Any) -> None:
+    """Photos that the rest does not hold lose their places. In place."""
+    seen = {number: {p.point3D_id for p in image.points2D if p.has_point3D()}
+            for number, image in reconstruction.images.items() if image.has_pose}  # fmt: skip
+    for number in sorted(set(seen) - set(firmly_held(seen))):
+        reconstruction.deregister_frame(reconstruction.images[number].frame_id)
+
+
+def _options(refine: Refine, seed: int, loose: bool) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -198,6 +214,10 @@ def _options(refine: Refine, seed: int) -> Any:
     options.ba_refine_focal_length = refine.focal
     options.ba_refine_extra_params = refine.distortion
     options.ba_refine_principal_point = refine.principal_point == "yes"
+    if loose:
+        options.mapper.abs_pose_min_num_inliers = LOOSE_INLIERS
+        options.mapper.abs_pose_min_inlier_ratio = LOOSE_SHARE
+        options.max_num_models = LOOSE_MODELS
     return options
 
 

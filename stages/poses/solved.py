@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from pipeline.artifacts import CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
@@ -26,15 +28,18 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
         StageError: fewer photos than `min_registered` of those that show the subject have a place.
     """
     views = capture.artifact.views
-    model = solve(
+    solution = solve(
         photos_of(capture, config.use_masks), settings_of(capture, config), context.scratch, progress_of(context)
     )
+    model = solution.model
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
-    strangers = {i for group in (model.others if model is not None else ()) for i in group} - set(placed)
+    others = solution.groups[1:]
+    strangers = {i for group in others for i in group}
+    why = {views[i].name: reason for i, reason in solution.left_out.items()}
     fitted = sum(not views[i].holdout for i in placed)
     if model is None or len(placed) < config.min_registered * (len(views) - len(strangers)) or fitted < MIN_FITTED:
-        raise _not_placed(len(views), len(placed), fitted, missing, config.min_registered)
+        raise _not_placed(len(views), len(placed), fitted, why, config.min_registered)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     warnings: list[str] = []
     eyes = find_eyes(capture, cameras, context.check)
@@ -42,18 +47,28 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
     warnings += found.warnings
     if missing:
-        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {', '.join(missing)}; "
-                        "they show something else, are mirrored or blurred, or stand too far from the others: "
-                        "photograph the way between")  # fmt: skip
-    for group in model.others if strangers else ():
+        told = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())
+        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: {told}. Photograph "
+                        "the way between them and the others, sharp and in steps of 15 degrees; photos of something "
+                        "else and mirrored ones never fit")  # fmt: skip
+    for group in others:
         warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
                         + "; if they show another subject, make a capture of their own")  # fmt: skip
     made = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
     lost = [i for i in range(len(views)) if i not in placed]
     flipped = find_mirrored(photos_of(capture, config.use_masks), lost, placed, config.seed)
-    findings = (groups(len(placed), [[views[i].name for i in group] for group in model.others] if strangers else []),
+    findings = (groups(len(placed), [[views[i].name for i in group] for group in others]),
                 mirrored([views[i].name for i in flipped], len(views)))  # fmt: skip
-    return made.model_copy(update={"findings": findings})
+    sizes = tuple(len(g) for g in solution.groups)
+    return made.model_copy(update={"findings": findings, "left_out": why, "groups": sizes})
+
+
+def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
+    """Names of the photos whose reasons begin alike: no match, other group, blurred, few features, weak match."""
+    out: dict[str, list[str]] = {}
+    for name, reason in why.items():
+        out.setdefault(reason.split(":")[0], []).append(name)
+    return out
 
 
 def settings_of(capture: Located[Capture], config: Config) -> Settings:
@@ -65,7 +80,8 @@ def settings_of(capture: Located[Capture], config: Config) -> Settings:
     )  # fmt: skip
 
 
-def _not_placed(total: int, placed: int, fitted: int, missing: tuple[str, ...], share: float) -> StageError:
+def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str], share: float) -> StageError:
+    missing = list(why)
     named = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
     if placed < share * total:
         value, limit = f"{placed} of {total} placed; without a place: {named}", f"at least {share:.0%}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from pipeline import tiles
 from pipeline.images import read_encoded, read_exr
 from pipeline.verdict import Verdict
+from stages.report.by_label import LabelErrors, pooled
 from stages.report.captured import captured
 from stages.report.compare import JudgedView
 from stages.report.gather import Results
@@ -40,6 +41,8 @@ class JudgedRow:
     model: Scores | None
     asset: Scores | None
     row: ViewRow
+    model_labels: LabelErrors = field(default_factory=dict)
+    asset_labels: LabelErrors = field(default_factory=dict)
 
 
 def build_rows(view: JudgedView, side: int) -> JudgedRow:
@@ -61,6 +64,8 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
         view.model_scores,
         view.asset_scores,
         ViewRow(f"View {view.index}", f"{view.name}, {note}", pictures),
+        view.model_labels,
+        view.asset_labels,
     )
 
 
@@ -78,6 +83,8 @@ def summary(rows: list[JudgedRow]) -> dict[str, Any]:
     out |= {f"asset_{k}": v for k, v in mean_scores(asset).items()}
     scored = [(s.psnr, r.index) for r in rows if (s := r.asset or r.model)]
     out["worst_view"] = min(scored)[1] if scored else None
+    labels = {"psnr": pooled(r.model_labels for r in rows), "asset_psnr": pooled(r.asset_labels for r in rows)}
+    out["by_label"] = {k: v for k, v in labels.items() if v}
     out["per_view"] = {str(r.index): _both(r) for r in rows}
     return out
 

@@ -62,7 +62,9 @@ def captured(r: Started, side: int, shown: int) -> Captured:
     """The drawing, the table and the outlines of the `shown` worst masks."""
     kinds = _kinds(r)
     rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
-    lost = [f"{n}: no place found for it" for n in r.poses.artifact.unregistered] + list(r.capture.artifact.left_out)
+    why = r.poses.artifact.left_out
+    lost = [f"{n}: no place found for it" + (f"; {why[n]}" if n in why else "") for n in r.poses.artifact.unregistered]
+    lost += r.capture.artifact.left_out
     outlines = _outlines(r, side, shown)
     seen = r.poses.artifact.seen_directions
     return Captured(drawing(r.poses, kinds), sphere(seen), legend(), hidden_parts(seen), list(KINDS.items()), rows,

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import HeldOutView, Located
-from pipeline.images import read_alpha, read_exr, read_linear, shrink
+from pipeline.artifacts import HeldOutView, Located, ViewMask
+from pipeline.images import read_alpha, read_encoded, read_exr, read_linear, shrink
+from stages.report.by_label import LabelErrors, label_errors
 from stages.report.gather import Results, own_colours
 from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]
+ASKED = 0.99  # share of a pixel from which it counts, as in the fit
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedView:
-    """One view. photo (H, W, 3), mask (H, W), renders (H, W, 4); scores are None where there is no render.
+    """One view. photo (H, W, 3), mask (H, W) of the subject in its extent, renders (H, W, 4) without what lies over the
+    subject beyond it; scores are None where there is no render.
 
-    own_colours: photos differ in exposure or white balance, and nothing tells those of this one.
+    own_colours: photos differ in exposure or white balance, and nothing tells those of this one. model_labels,
+    asset_labels: errors by the photo's labels, empty where it has none.
     """
 
     index: int
@@ -33,6 +37,8 @@ class JudgedView:
     model_scores: Scores | None
     asset_scores: Scores | None
     own_colours: bool = False
+    model_labels: LabelErrors = field(default_factory=dict)
+    asset_labels: LabelErrors = field(default_factory=dict)
 
     def shown(self, render: F32) -> F32:
         """A render as the pictures have it: in the photo's own colours where the fit gave each photo some."""
@@ -51,10 +57,28 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
             continue
         factor = (predicted.get(i) or rendered[i]).scale
         photo = shrink(read_linear(r.capture.path(view.image)), factor)
-        mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor)
+        asked = _asked(r, masks[i], factor)
+        mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor) * asked
         model, asset = _read(r.inverse_rendering, predicted.get(i)), _read(r.usd, rendered.get(i))
+        model, asset = (None if x is None else np.asarray(x * asked[..., None], np.float32) for x in (model, asset))
         scores = [score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset)]
-        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own)
+        errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
+        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own, *errors)
+
+
+def _asked(r: Results, mask: ViewMask, factor: int) -> F32:
+    """(H, W) 1 where the subject in its extent is asked, or background; (1, 1) where all is."""
+    if mask.asked is None:
+        return np.ones((1, 1), np.float32)
+    return np.asarray(shrink(read_alpha(r.masks.path(mask.asked)), factor) > ASKED, np.float32)
+
+
+def _by_label(r: Results, of: ViewMask, render: F32 | None, photo: F32, mask: F32, factor: int) -> LabelErrors:
+    if of.labels is None or render is None:
+        return {}
+    codes = read_encoded(r.masks.path(of.labels))[factor // 2 :: factor, factor // 2 :: factor, 0]
+    codes = codes[: mask.shape[0], : mask.shape[1]]
+    return label_errors(render, photo, mask, codes, r.masks.artifact.label_names) if codes.shape == mask.shape else {}
 
 
 def unjudged(r: Results) -> list[str]:

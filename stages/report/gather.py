@@ -82,6 +82,8 @@ def figures(r: Results) -> dict[str, Any]:
             "dropped": len(r.masks.artifact.dropped),
             "faces": sum("face" in m.labelled for m in r.masks.artifact.masks),
             "hair": sum("hair" in m.labelled for m in r.masks.artifact.masks),
+            "extent": "head" if r.masks.artifact.extent is not None else "region of interest",
+            "views_cut_by_extent": sum(m.asked is not None for m in r.masks.artifact.masks),
         },
         "surface": {
             "vertices": surface.vertices,
@@ -101,6 +103,7 @@ def figures(r: Results) -> dict[str, Any]:
             "utilisation": uv.utilisation,
             **{f"utilisation_{FIRST + t}": share for t, share in enumerate(uv.tile_utilisation)},
             "stretch": uv.stretch,
+            "face_share": uv.face_share,
             "overlap": uv.overlap,
             "stretch_max": uv.stretch_max,
             "seam_front_mm": uv.seam_front_mm,

@@ -66,11 +66,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     page = build_page(metrics, verdict, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
-    return Report(
-        files=(context.file("index.html"), context.file("metrics.json")),
-        warnings=tuple(unjudged(inputs)),
-        findings=findings,
-    )
+    files = context.file("index.html"), context.file("metrics.json")
+    return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
 STAGE = Stage(name="report", version=6, inputs=Inputs, config=Config, output=Report, run=run)

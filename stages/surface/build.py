@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline import meshes
+from pipeline.artifacts import Extent
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F64, Faces, Mask, Mesh, Topology
 from stages.surface import clean, extract
-from stages.surface.clean import Landed
+from stages.surface.clean import Kept, Landed
 from stages.surface.extract import Step
 from stages.surface.handles import Opened, without_handles
+from stages.surface.pieces import Votes
 from stages.surface.repair import repaired
+from stages.surface.thin import thin_share
 from stages.surface.trim import trimmed
 
+log = logging.getLogger("neuface.surface")
 LARGE_SECOND = 0.05  # area of a dropped piece over the kept one's, from which it is worth a warning
-MOSTLY_CAP = 0.5  # of the area: more cap than that is a box and not a head
-
 HANDLE = 0.1  # of the box's longest side: a handle with a shorter loop is a fault of the fit. Of a head, 4 cm
 
 Sees = Callable[[Mesh], Mask]
@@ -29,7 +32,9 @@ Sees = Callable[[Mesh], Mask]
 @dataclass(frozen=True, slots=True)
 class Built:
     """The finished mesh and what was found on the way. cell: lattice edge; cap: share of the area on the box; trimmed:
-    share of the area that no photo saw and that was cut off; handles: how many were cut, and how many are left."""
+    share of the area that no photo saw and that was cut off; handles: how many were cut, and how many are left;
+    unshown: share of what the photos show that was on dropped pieces; thin: share of the area on flakes and needles;
+    must_close: the mesh was not meant to have a border."""
 
     mesh: Mesh
     topology: Topology
@@ -40,45 +45,52 @@ class Built:
     warnings: tuple[str, ...]
     trimmed: float = 0.0
     handles: tuple[int, int] = (0, 0)
+    unshown: float = 0.0
+    thin: float = 0.0
+    must_close: bool = True
 
 
-def build(field: Field, resolution: int, step: Step, sees: Sees | None = None, handle: float = HANDLE) -> Built:
+def build(
+    field: Field,
+    resolution: int,
+    step: Step,
+    sees: Sees | None = None,
+    handle: float = HANDLE,
+    vote: Votes | None = None,
+    extent: Extent | None = None,
+) -> Built:
     """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
-    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut.
+    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut. `vote`: how
+    much the photos show of each piece; without it the largest is kept. `extent`: the mesh is closed there.
+
+    A mesh that can't be closed is handed on open, and one that is mostly box as it is: what they are worth is judged
+    by the stage.
 
     Raises:
-        StageError: no zero crossing, a solid that fills its box, or a mesh that can't be closed.
+        StageError: no zero crossing.
     """
-    grid = extract.lattice(field, resolution)
-    vertices, faces = extract.extract(field, grid, step)
-    vertices, faces, removed, second = clean.largest_component(vertices, faces)
-    vertices, faces, found, repairs = _closed(vertices, faces)
+    grid = extract.lattice(field, resolution, extent)
+    kept = clean.one_piece(*extract.extract(field, grid, step), vote)
+    vertices, faces, found, repairs = _closed(kept.vertices, kept.faces)
     landed = clean.spread_degenerate(field, grid, clean.land(field, grid, vertices), faces)
     faces = clean.outward(landed.vertices, faces)
     area = meshes.areas(landed.vertices, faces)
     on_cap = landed.capped[faces].all(1)
     cap = float(area[on_cap].sum() / area.sum())
-    if cap > MOSTLY_CAP:
-        raise StageError(
-            "the fitted solid fills its box",
-            where="inverse_rendering",
-            value=f"{cap:.0%} of the surface is the box itself",
-            limit=f"at most {MOSTLY_CAP:.0%}",
-            remedy="check the masks (is the background black?) and the region of interest",
-        )
     free = landed.vertices[~landed.capped]
-    residual = float(np.abs(field.sdf(free.astype(np.float32))).max(initial=0))
+    residual = float(np.abs(field.sdf(free.astype(np.float32))).max(initial=0)) if len(free) else 0.0
     mesh, handles = Mesh(landed.vertices.astype(np.float32), landed.normals, faces), (0, 0)
-    if found.euler < 2:
+    if found.manifold and found.euler < 2:
         opened = without_handles(landed.vertices, faces, handle * float((grid.upper - grid.lower).max()))
         mesh, handles = _mended(landed, opened), (opened.cut, opened.left)
         found = meshes.topology(mesh.faces, len(mesh.vertices))
-    warnings = _warnings(removed, second, repairs, handles[1])
-    if sees is None:
-        return Built(mesh, found, removed, grid.h, cap, residual, warnings, handles=handles)
-    cut = trimmed(field, grid, mesh, sees(mesh))
-    found = meshes.topology(cut.mesh.faces, len(cut.mesh.vertices))
-    return Built(cut.mesh, found, removed, grid.h, cap, residual, warnings, cut.share, handles)
+    warnings = _warnings(kept, repairs, handles[1])
+    built = Built(mesh, found, kept.removed, grid.h, cap, residual, warnings, handles=handles, unshown=kept.unshown)
+    if sees is not None and found.manifold:
+        cut = trimmed(field, grid, mesh, sees(mesh))
+        found = meshes.topology(cut.mesh.faces, len(cut.mesh.vertices))
+        built = replace(built, mesh=cut.mesh, topology=found, trimmed=cut.share, must_close=False)
+    return replace(built, thin=thin_share(built.mesh, grid.h))
 
 
 def _mended(landed: Landed, opened: Opened) -> Mesh:
@@ -92,29 +104,31 @@ def _mended(landed: Landed, opened: Opened) -> Mesh:
 
 
 def _closed(vertices: F64, faces: Faces) -> tuple[F64, Faces, Topology, Topology | None]:
-    """The mesh, its topology (moving vertices later does not change it), and what it was before a repair."""
+    """The mesh, its topology (moving vertices later does not change it), and what it was before a repair.
+
+    What can't be closed is parted where its sheets touch, so that every edge has two faces at most.
+    """
     found = meshes.topology(faces, len(vertices))
     if found.manifold:
         return vertices, faces, found, None
-    fixed_vertices, fixed_faces = repaired(vertices, faces, found)
-    fixed_vertices, fixed_faces, _, _ = clean.largest_component(fixed_vertices, fixed_faces)
-    now = meshes.topology(fixed_faces, len(fixed_vertices))
-    if not now.manifold:
-        raise StageError(
-            "the surface can't be closed",
-            where="surface",
-            value=now,
-            limit="a watertight manifold mesh",
-            remedy="change surface.resolution a little, or fit for longer",
-        )
-    return fixed_vertices, fixed_faces, now, found
+    try:
+        mended = clean.one_piece(*repaired(vertices, faces, found))
+        now = meshes.topology(mended.faces, len(mended.vertices))
+        if now.manifold:
+            return mended.vertices, mended.faces, now, found
+        vertices, faces = mended.vertices, mended.faces
+    except StageError as e:
+        log.warning("surface: the mesh stays open: %s", e.value)
+    parted = clean.one_piece(*meshes.split_apart(vertices, faces))
+    return parted.vertices, parted.faces, meshes.topology(parted.faces, len(parted.vertices)), found
 
 
-def _warnings(removed: int, second: float, repairs: Topology | None, handles: int) -> tuple[str, ...]:
+def _warnings(kept: Kept, repairs: Topology | None, handles: int) -> tuple[str, ...]:
     out = []
-    if second > LARGE_SECOND:
+    if kept.second > LARGE_SECOND:
         out.append(
-            f"a second piece with {second:.0%} of the head's area was dropped (of {removed} pieces): look at the masks"
+            f"a second piece with {kept.second:.0%} of the head's area was dropped (of {kept.removed} pieces): look at "
+            "the masks"
         )
     if repairs is not None:
         out.append(

@@ -1,7 +1,7 @@
 """From a marched mesh to a closed, outward surface on the zero set.
 
 Symbols: h lattice cell; d SDF; g its gradient. A vertex lies either on the zero set of the SDF or on the cap, the
-plane where the field's box cuts the solid; each is moved along its own gradient only.
+surface where the field's box or the subject's extent cuts the solid; each is moved along its own gradient only.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from pipeline import meshes
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Mask
-from stages.surface.extract import QUERY, Lattice, box_distance
+from stages.surface.extract import QUERY, Lattice, wall_distance
+from stages.surface.pieces import Votes, chosen
 
 NEWTON_STEPS = 3
 REACH = 0.5  # of h: a vertex of the right cell is never further away than that
@@ -30,21 +31,37 @@ class Landed:
     capped: Mask
 
 
-def largest_component(vertices: F64, faces: Faces) -> tuple[F64, Faces, int, float]:
-    """Keep the component with the largest area. Also how many were dropped, and the second's area over the first's.
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """The piece that is kept. removed: how many are not; second: area of the largest of them over the kept one's;
+    unshown: share of what the photos show of the surface that is theirs."""
 
-    Components are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but
-    only pieces outside compete for the second place.
+    vertices: F64
+    faces: Faces
+    removed: int
+    second: float
+    unshown: float
+
+
+def one_piece(vertices: F64, faces: Faces, vote: Votes | None = None) -> Kept:
+    """Keep the piece that the photos show most of, by their votes (stages.surface.pieces); without votes the one with
+    the largest area.
+
+    Pieces are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but only
+    pieces outside compete for the second place.
     """
     label = meshes.component_of_face(faces, len(vertices))
+    label = np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1), np.int64)
     vectors = meshes.area_vectors(vertices, faces)
-    area = np.bincount(label, np.linalg.norm(vectors, axis=1))
+    area = np.asarray(np.bincount(label, np.linalg.norm(vectors, axis=1)), np.float64)
     solid = np.bincount(label, (vertices[faces[:, 0]] * vectors).sum(1)) > 0
-    first = int(area.argmax())
+    first, unshown = int(area.argmax()), 0.0
+    if vote is not None:
+        first, unshown = chosen(vertices, faces, label, area, solid, vote)
     v, f, _ = meshes.compact(vertices, faces[label == first])
     others = np.where(solid, area, 0.0)
     others[first] = 0.0
-    return np.asarray(v, np.float64), f, int((area > 0).sum()) - 1, float(others.max() / area[first])
+    return Kept(np.asarray(v, np.float64), f, int((area > 0).sum()) - 1, float(others.max() / area[first]), unshown)
 
 
 def land(field: Field, grid: Lattice, start: F64, steps: int = NEWTON_STEPS) -> Landed:
@@ -93,12 +110,12 @@ def outward(vertices: F64, faces: Faces) -> Faces:
 
 
 def _solid(field: Field, grid: Lattice, points: F64) -> tuple[F64, F64, Mask]:
-    """The SDF cut by the box (see extract.cut) with its gradient, and where the box decides."""
+    """The SDF cut by the walls (see extract.cut) with its gradient, and where a wall decides."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     for start in range(0, len(points), QUERY):
         part = slice(start, start + QUERY)
         inside = np.clip(points[part], grid.lower, grid.upper).astype(np.float32)
         value[part], gradient[part] = field.sdf_and_gradient(inside)
-    wall, wall_gradient = box_distance(points, grid)
+    wall, wall_gradient = wall_distance(points, grid)
     capped = (wall > value) & (wall > -grid.h)
     return np.where(capped, wall, value), np.where(capped[:, None], wall_gradient, gradient), capped

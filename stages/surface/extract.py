@@ -4,7 +4,8 @@ Symbols
     h       edge of a lattice cell
     block   BLOCK^3 cells; only blocks that the surface may cross are evaluated
     slab    a run of block layers along x that is held in memory at one time
-    g       max(sdf, box) near the box's walls: the solid is cut by the field's box, so that the neck gets a flat cap
+    g       max(sdf, wall) near the walls: the solid is cut by the field's box and the subject's extent, so that the
+            neck gets a flat cap
 
 The lattice is marched slab by slab and welded over slabs by the lattice edge that each vertex lies on.
 """
@@ -17,7 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.artifacts import Extent
 from pipeline.errors import StageError
+from pipeline.extent import signed_and_gradient
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
@@ -33,12 +36,14 @@ Step = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """nodes at lower + h * index, index < shape. `blocks`: blocks along each axis; shape = blocks * BLOCK + 1."""
+    """nodes at lower + h * index, index < shape. `blocks`: blocks along each axis; shape = blocks * BLOCK + 1. extent:
+    the solid is cut by it as by the box."""
 
     lower: F64
     upper: F64
     h: float
     blocks: tuple[int, int, int]
+    extent: Extent | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -47,11 +52,11 @@ class Lattice:
         return x * BLOCK + 1, y * BLOCK + 1, z * BLOCK + 1
 
 
-def lattice(field: Field, resolution: int) -> Lattice:
+def lattice(field: Field, resolution: int, extent: Extent | None = None) -> Lattice:
     """A lattice over the field's box with `resolution` cells along its longest side; the others are rounded up."""
     lower, upper = (np.asarray(b, np.float64) for b in field.bounds)
-    extent = upper - lower
-    if not np.all(np.isfinite(extent)) or extent.min() <= 0:
+    sides = upper - lower
+    if not np.all(np.isfinite(sides)) or sides.min() <= 0:
         raise StageError(
             "the fitted field has no volume",
             where="bounds of the field",
@@ -59,9 +64,9 @@ def lattice(field: Field, resolution: int) -> Lattice:
             limit="a box with positive, finite sides",
             remedy="fit the model again",
         )
-    h = float(extent.max()) / resolution
-    x, y, z = (int(n) for n in np.ceil(np.round(extent / h / BLOCK, 6)))
-    return Lattice(lower, upper, h, (x, y, z))
+    h = float(sides.max()) / resolution
+    x, y, z = (int(n) for n in np.ceil(np.round(sides / h / BLOCK, 6)))
+    return Lattice(lower, upper, h, (x, y, z), extent)
 
 
 def extract(field: Field, grid: Lattice, step: Step) -> tuple[F64, Faces]:
@@ -84,15 +89,19 @@ def extract(field: Field, grid: Lattice, step: Step) -> tuple[F64, Faces]:
     return found
 
 
-def box_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
-    """Distance (N,) to the inset box, negative inside, by the nearest of its six planes, and its gradient (N, 3)."""
+def wall_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
+    """Distance (N,) to the inset box and the subject's extent, negative inside both, by the nearest of the box's six
+    planes and of the extent's surfaces, and its gradient (N, 3)."""
     sides = np.concatenate([grid.lower + INSET * grid.h - points, points - grid.upper + INSET * grid.h], 1)
-    nearest = sides.argmax(1)
-    return sides.max(1), np.concatenate([-np.eye(3), np.eye(3)])[nearest]
+    box, slope = sides.max(1), np.concatenate([-np.eye(3), np.eye(3)])[sides.argmax(1)]
+    if grid.extent is None:
+        return box, slope
+    beyond, away = signed_and_gradient(grid.extent, points)
+    return np.maximum(box, beyond), np.where((beyond > box)[:, None], away, slope)
 
 
 def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
-    """(N,) g: the larger of SDF and box distance within a cell of the wall, the SDF alone elsewhere.
+    """(N,) g: the larger of SDF and wall distance within a cell of the wall, the SDF alone elsewhere.
 
     Deep inside, an SDF that is steeper than a distance would fall below the box's and lose its say.
     """
@@ -133,7 +142,7 @@ def solid(field: Field, points: F64, grid: Lattice) -> F32:
                 limit="finite everywhere",
                 remedy="fit the model again with another seed or a smaller learning rate",
             )
-        out[start : start + QUERY] = cut(value, box_distance(p, grid)[0], grid)
+        out[start : start + QUERY] = cut(value, wall_distance(p, grid)[0], grid)
     return out
 
 

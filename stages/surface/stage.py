@@ -50,7 +50,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     from pipeline.fields.face import load_face
     from pipeline.visibility import Occluder, seen_by, sight
     from stages.surface.build import build
+    from stages.surface.judge import judge
     from stages.surface.judge_face import face_findings
+    from stages.surface.pieces import votes
 
     fitted = inputs.inverse_rendering
     field = load_face(fitted.path(fitted.artifact.field), context.device)
@@ -59,8 +61,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         context.check()
         context.progress(done, total, "marching cubes")
 
+    views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
+
+    def vote(mesh: meshes.Mesh, piece: meshes.Indices) -> meshes.F64:
+        return votes(mesh, piece, views, context.check)
+
     def sees(mesh: meshes.Mesh) -> meshes.Mask:
-        views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
         points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
         occluder, seen = Occluder(mesh), np.zeros(len(points), np.bool_)
         for i, view in enumerate(views):
@@ -70,7 +76,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
             seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
         return seen
 
-    built = build(field, config.resolution, step, sees if config.unseen == "trimmed" else None, config.handle)
+    trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent
+    built = build(field, config.resolution, step, sees if trims else None, config.handle, vote, extent)
     meshes.save(context.workdir / MESH, built.mesh)
     context.log.info(
         "surface: %d faces, cell %.4g, %.1f %% cap, largest residual %.2g, %d handles cut",
@@ -92,8 +99,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
         handles_cut=built.handles[0],
         handles_left=built.handles[1],
         warnings=built.warnings,
-        findings=face_findings(inputs, built.mesh),
+        findings=(*judge(built), *face_findings(inputs, built.mesh)),
     )
 
 
-STAGE = Stage(name="surface", version=3, inputs=Inputs, config=Config, output=Surface, run=run)
+STAGE = Stage(name="surface", version=4, inputs=Inputs, config=Config, output=Surface, run=run)

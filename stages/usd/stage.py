@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.artifacts import (
@@ -21,7 +24,6 @@ from pipeline.artifacts import (
     UvMesh,
 )
 from pipeline.contract import Context, Stage, StageConfig
-from pipeline.verdict import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +67,12 @@ class Config(StageConfig):
 def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     """Write asset/, check it, then render from what was written."""
     from pipeline.verdict import verdict_of_inputs
+    from stages.usd import judge
     from stages.usd.export import THUMBNAIL, export
     from stages.usd.mark import mark
     from stages.usd.naming import check_name
     from stages.usd.previews import render_held_out, render_previews, render_thumbnail
-    from stages.usd.validate import checks_run, require_valid
+    from stages.usd.validate import checks_run, found_in
 
     name = check_name(config.name)
     total = 4
@@ -91,18 +94,20 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     written.append(render_thumbnail(root, root.parent / THUMBNAIL, context.check))
     written += render_previews(root, config.preview_size, context.workdir / "previews", context.check)
     context.progress(2, total, "checking it")
+    found = []
     for file in [f for f in written if f.parent == context.workdir / "asset" and f.name in _roots(name)]:
         context.check()
-        warnings += [
-            f"{file.name}: {f.check}: {f.message} {f.where}".strip()
-            for f in require_valid(file)
-            if f.level == "warning"
-        ]
+        found += [(file.name, f) for f in found_in(file)]
+    warnings += [f"{file}: {f.check}: {f.message} {f.where}".strip() for file, f in found if f.level != "info"]
     context.progress(3, total, "rendering held-out views from the asset")
     views: tuple[HeldOutView, ...] = ()
     if config.render_views:
         views = render_held_out(root, inputs.poses.artifact, inputs.inverse_rendering.artifact, config.samples, context)
-    findings: tuple[Finding, ...] = ()
+    findings = (
+        *judge.validity(found),
+        *judge.against_model(_pictures(inputs, views, context)),
+        *judge.lobe(made.figures),
+    )
     mark(root, verdict_of_inputs(inputs, usd=findings))
     context.progress(total, total, "done", checks=checks_run(), warnings=len(warnings))
     files = tuple(_refs(context, sorted(written)))
@@ -121,6 +126,23 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
 
 def _roots(name: str) -> tuple[str, ...]:
     return (f"{name}.usd", "lookdev.usda", f"{name}.usdz")
+
+
+def _pictures(
+    inputs: Inputs, views: tuple[HeldOutView, ...], context: Context
+) -> Iterator[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
+    """The photo's name, the fit's render and the asset's of each view that was held out."""
+    from pipeline.images import read_exr
+
+    fitted = inputs.inverse_rendering
+    predicted = {v.index: v for v in fitted.artifact.held_out}
+    names = {c.index: c.name for c in inputs.poses.artifact.cameras}
+    for view in views:
+        if view.index in predicted:
+            model, _ = read_exr(fitted.path(predicted[view.index].exr))
+            asset, _ = read_exr(context.workdir / view.exr.path)
+            if model.shape == asset.shape:
+                yield names.get(view.index, str(view.index)), model, asset
 
 
 def _refs(context: Context, files: list[Path]) -> list[FileRef]:

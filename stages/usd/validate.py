@@ -20,7 +20,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from pipeline.errors import StageError
 from stages.usd import tile_checks
-from stages.usd.findings import Finding, errors
+from stages.usd.findings import Finding
 from stages.usd.geometry_checks import mesh_findings
 from stages.usd.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
 
@@ -45,19 +45,12 @@ def checks_run() -> int:
     return len(_validators()) + len(CHECKS) - 1
 
 
-def require_valid(path: Path) -> list[Finding]:
-    """The findings below error level; StageError that lists the errors if there are any."""
-    found = validate(path)
-    bad = errors(found)
-    if bad:
-        raise StageError(
-            f"the exported asset has {len(bad)} fault(s)",
-            where=path.name,
-            value="\n         ".join(str(f) for f in bad[:20]),
-            limit="no finding of level error",
-            remedy="report this with the run's log; the maps and the mesh of earlier stages are kept",
-        )
-    return found
+def found_in(path: Path) -> list[Finding]:
+    """As `validate`; a file that can't be opened is an error among the others."""
+    try:
+        return validate(path)
+    except StageError as e:
+        return [Finding("error", "open", f"{e.what}: {e.value}")]
 
 
 def _open(path: Path) -> Usd.Stage:

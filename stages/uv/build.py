@@ -6,11 +6,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeline import footprint, meshes
 from pipeline.errors import StageError
-from pipeline.meshes import Charts, Mesh
+from pipeline.meshes import F64, Charts, Mesh
+from pipeline.verdict import Finding
 from stages.uv import decimate
 from stages.uv.decimate import Deviation
+from stages.uv.density import front_of
+from stages.uv.judge import judge
 from stages.uv.measure import Quality, measure
 from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, Options, unwrap
@@ -33,12 +38,21 @@ class Built:
     deviation: Deviation
     proxy_deviation: Deviation
     warnings: tuple[str, ...]
+    findings: tuple[Finding, ...] = ()
 
 
 def build(
-    dense: Mesh, target_faces: int, proxy_faces: int, options: Options, step: Step, *, even: bool = False
+    dense: Mesh,
+    target_faces: int,
+    proxy_faces: int,
+    options: Options,
+    step: Step,
+    *,
+    even: bool = False,
+    landmarks: F64 | None = None,
 ) -> Built:
     """Decimate, unwrap and measure. even: triangles of one size and shape in the place of few where it is flat.
+    landmarks: (468, 3) of the face, which then has more texels.
 
     Raises:
         StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
@@ -58,15 +72,33 @@ def build(
     with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
         away = beside.submit(_away, dense, mesh, proxy)
         step(1, 4, "unwrapping")
-        charts = unwrap(mesh, options)
+        front = front_of(mesh, landmarks)
+        charts = unwrap(mesh, options, front)
         step(2, 4, "measuring charts")
-        quality = measure(mesh, charts)
+        quality = measure(mesh, charts, None if front is None else front.face)
         step(3, 4, "measuring the decimation")
         deviation, rough, against = away.result()
     tiles = len(quality.tile_utilisation)
     step(4, 4, "done")
-    short = _too_few(options, tiles, footprint.texel(mesh, charts, options.size))
-    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short)
+    rest = np.ones(len(mesh.faces), np.bool_) if front is None else ~front.region
+    others = Mesh(mesh.vertices, mesh.normals, mesh.faces[rest]), Charts(charts.uvs, charts.faces[rest])
+    short = _too_few(options, tiles, footprint.texel(*others, options.size))
+    span = float(np.ptp(mesh.vertices, axis=0).max())
+    findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
+    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
+
+
+def _opened(dense: meshes.Topology, mesh: Mesh) -> float:
+    """Share of the edges that are open in the decimated mesh of a closed one."""
+    if not dense.watertight:
+        return 0.0
+    return meshes.topology(mesh.faces, len(mesh.vertices)).boundary_edges / max(1.5 * len(mesh.faces), 1.0)
+
+
+def _crumpled(mesh: Mesh) -> float:
+    """Share of the faces that look against the normals at their own corners."""
+    mean = mesh.normals[mesh.faces].astype(np.float64).sum(1)
+    return float(((meshes.area_vectors(mesh.vertices, mesh.faces) * mean).sum(1) < 0).mean())
 
 
 def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, float]:

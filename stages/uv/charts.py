@@ -12,9 +12,10 @@ import numpy as np
 
 from pipeline import meshes, raster
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
+from stages.uv.density import Front, dense_charts, enlarged, face_parted, scale_for
 from stages.uv.flatten import Flat, flattened, rigid, signed, unfolded
 from stages.uv.pack import LOOSEST, boxed, pack
-from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment
+from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment, without_crumbs
 from stages.uv.tiling import Tiling, packed
 
 TRUE_STEPS = 6  # rigid steps on the true surface
@@ -29,8 +30,9 @@ CHECK = 768  # texels along a chart's longest side: where two layers of it would
 
 
 @dataclass(frozen=True, slots=True)
-class _Surface:
-    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one."""
+class Surface:
+    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one, and what a seam
+    costs at each vertex (V,)."""
 
     smooth: F64
     true: F64
@@ -38,28 +40,38 @@ class _Surface:
     area: F64
     pairs: Dual
     weight: F64
+    front: Front | None = None
 
 
-def unwrapped(mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE) -> Charts | None:
-    """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
-
-    smooth: (V, 3) vertices without bumps. padding: between charts, in uv. They are made for one square; where that is
-    not enough, only charts that are too large for a tile are cut further.
-    """
+def surface_of(mesh: Mesh, smooth: F64, front: Front | None = None) -> Surface:
+    """A mesh with its vertices smoothed (V, 3), ready to be cut. front: the face, whose charts are larger."""
     weight = seam_weights(smooth, mesh.faces)
     pairs = dual(smooth, mesh.faces, weight)
     area = meshes.areas(smooth, mesh.faces)
-    surface = _Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight)
-    label = segment(smooth, mesh.faces, pairs)
+    return Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight, front)
+
+
+def unwrapped(
+    mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE, front: Front | None = None
+) -> Charts | None:
+    """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
+
+    smooth: (V, 3) vertices without bumps. padding: between charts, in uv. They are made for one square; where that is
+    not enough, only charts that are too large for a tile are cut further. front: the face, whose charts are larger.
+    """
+    surface = surface_of(mesh, smooth, front)
+    label = segment(smooth, mesh.faces, surface.pairs)
+    if front is not None:
+        label = without_crumbs(smooth, mesh.faces, face_parted(label, front, surface.pairs), surface.pairs)
     known: dict[bytes, Flat] = {}
     best: tuple[float, Charts, Indices] | None = None
     tries = 0
     while tries < TRIES and int(label.max()) < MOST_CHARTS:
-        flats = _flats(surface, label, known)
+        flats = flats_of(surface, label, known)
         part = _must_part(surface, flats)
         if part is None:
             tries += 1
-            charts = _packed(mesh, flats, padding, LOOSEST if best is None else best[0] + WORTH)
+            charts = _packed(surface, flats, padding, LOOSEST if best is None else best[0] + WORTH)
             if charts is not None:
                 best = _share(charts), charts, label
             if best is not None and best[0] >= ENOUGH:
@@ -71,22 +83,20 @@ def unwrapped(mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE) -> 
             break
     if best is None:
         return None
-    total = float(meshes.areas(mesh.vertices, mesh.faces).sum())
+    total = _charted(surface, best[2])
     if tiling.content_with(best[0], total):
         return best[1]
-    tiled = _tiled(mesh, surface, best[2], known, padding, tiling)
+    tiled = _tiled(surface, best[2], known, padding, tiling)
     return best[1] if tiled is None else tiled
 
 
-def _tiled(
-    mesh: Mesh, surface: _Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling
-) -> Charts | None:
+def _tiled(surface: Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling) -> Charts | None:
     """The pieces in several tiles; those are cut further whose chart would fill a tile before others are large."""
-    total = float(meshes.areas(mesh.vertices, mesh.faces).sum())
+    total = _charted(surface, label)
     limit = tiling.largest_chart(total)
     while True:
-        flats = _flats(surface, label, known)
-        part = next((i for i, f in enumerate(flats) if not f.good or _longest(mesh, f) > limit), None)
+        flats = flats_of(surface, label, known)
+        part = next((i for i, f in enumerate(flats) if not f.good or _longest(surface, f) > limit), None)
         pieces = int(label.max())
         if part is None or pieces > MOST_CHARTS * tiling.most:
             break
@@ -95,17 +105,26 @@ def _tiled(
             break
     if not all(f.good for f in flats):
         return None
-    uvs, faces, chart_of_face = _together(mesh, flats)
+    uvs, faces, chart_of_face = together(surface, flats)
     placed = packed(uvs, faces, chart_of_face, total, padding, tiling)
     return None if placed is None else Charts(placed, faces)
 
 
-def _longest(mesh: Mesh, flat: Flat) -> float:
+def _longest(surface: Surface, flat: Flat) -> float:
     """Longer side of the smallest rectangle around a chart, at the scale of the true surface."""
-    return float(np.ptp(boxed(_at_scale(mesh, flat)), axis=0).max())
+    return float(np.ptp(boxed(_at_scale(surface, flat)), axis=0).max())
 
 
-def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
+def _charted(surface: Surface, label: Indices) -> float:
+    """Area of all charts at the scale of the true surface, the face's enlarged."""
+    area = meshes.areas(surface.true, surface.faces)
+    if surface.front is None:
+        return float(area.sum())
+    dense = dense_charts(label, surface.front, area)[label]
+    return float((area * np.where(dense, scale_for(surface.front, dense, area) ** 2, 1.0)).sum())
+
+
+def flats_of(surface: Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
     """Every piece laid flat; pieces seen before are taken from `known`."""
     count = int(label.max()) + 1
     order = np.argsort(label, kind="stable")
@@ -116,7 +135,15 @@ def _flats(surface: _Surface, label: Indices, known: dict[bytes, Flat]) -> list[
     return [known[k] for k in keys]
 
 
-def _on_true_surface(surface: _Surface, flat: Flat) -> Flat:
+def laid_flat(surface: Surface, member: Indices) -> Flat:
+    """One piece, given by its faces (m,)."""
+    label = np.zeros(len(surface.area), np.int64)
+    label[member] = 1
+    wanted = np.array([False, True])
+    return _on_true_surface(surface, flattened(surface.smooth, surface.faces, surface.pairs, label, wanted)[0])
+
+
+def _on_true_surface(surface: Surface, flat: Flat) -> Flat:
     """The last steps on the true surface, unless the chart's jagged border came to lie over itself by them."""
     if not len(flat.uv):
         return flat
@@ -135,7 +162,7 @@ def lies_over_itself(uv: F64, faces: Faces) -> bool:
     return bool((raster.layers(raster.texel_corners(Charts(square, faces), CHECK), CHECK) > 1).any())
 
 
-def _must_part(surface: _Surface, flats: list[Flat]) -> int | None:
+def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
     """A piece that is no disc or folds over, else a large one that fills too little of its rectangle."""
     for i, flat in enumerate(flats):
         if not flat.good:
@@ -153,20 +180,20 @@ def _fill(flat: Flat) -> float:
     return float(0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum() / max(width * height, 1e-30))
 
 
-def _front(surface: _Surface, flat: Flat) -> float:
+def _front(surface: Surface, flat: Flat) -> float:
     """Mean over a chart of how costly its seams would be, 0 at the back, 1 in front."""
     w = surface.weight[surface.faces[flat.member]].mean(1)
     a = surface.area[flat.member]
     return float((a * (w - 1)).sum() / (a.sum() * max(float(surface.weight.max()) - 1, 1e-30)))
 
 
-def _worth_parting(surface: _Surface, flats: list[Flat]) -> int:
+def _worth_parting(surface: Surface, flats: list[Flat]) -> int:
     """The chart that leaves most of its rectangle empty, those in front last."""
     loss = [(1 - _fill(f)) * surface.area[f.member].sum() * (1 - _front(surface, f)) if f.good else 0.0 for f in flats]
     return int(np.argmax(loss))
 
 
-def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
+def _parted(surface: Surface, label: Indices, flat: Flat) -> Indices:
     """One piece in two, across its longest direction (in the chart where there is one, else in space)."""
     corners = flat.uv[flat.faces] if flat.good else surface.smooth[surface.faces[flat.member]]
     centre = corners.mean(1) - corners.mean((0, 1))
@@ -177,29 +204,33 @@ def _parted(surface: _Surface, label: Indices, flat: Flat) -> Indices:
     return connected(parted, surface.pairs)
 
 
-def _packed(mesh: Mesh, flats: list[Flat], padding: float, least: float) -> Charts | None:
+def _packed(surface: Surface, flats: list[Flat], padding: float, least: float) -> Charts | None:
     """All charts in one square at one scale against the true surface, if `least` of it comes under charts."""
-    uvs, faces, label = _together(mesh, flats)
+    uvs, faces, label = together(surface, flats)
     placed: F32 | None = pack(uvs, faces, label, padding, least)
     return None if placed is None else Charts(placed, faces)
 
 
-def _together(mesh: Mesh, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
-    """All charts as one array of texture vertices, each at the scale of the true surface; faces, and their charts."""
-    faces = np.zeros((len(mesh.faces), 3), np.int32)
-    label = np.zeros(len(mesh.faces), np.int64)
+def together(surface: Surface, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
+    """All charts as one array of texture vertices, each at the scale of the true surface, the face's enlarged; faces,
+    and their charts."""
+    faces = np.zeros((len(surface.faces), 3), np.int32)
+    label = np.zeros(len(surface.faces), np.int64)
     parts, first = [], 0
     for i, flat in enumerate(flats):
-        parts.append(_at_scale(mesh, flat))
+        parts.append(_at_scale(surface, flat))
         faces[flat.member], label[flat.member] = flat.faces + first, i
         first += len(flat.uv)
-    return np.concatenate(parts), faces, label
+    uvs = np.concatenate(parts)
+    if surface.front is None:
+        return uvs, faces, label
+    return enlarged(uvs, faces, label, surface.front, meshes.areas(surface.true, surface.faces)), faces, label
 
 
-def _at_scale(mesh: Mesh, flat: Flat) -> F64:
+def _at_scale(surface: Surface, flat: Flat) -> F64:
     """A chart's texture vertices, scaled so that its area is that of the true surface."""
     own = 0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum()
-    area = meshes.areas(mesh.vertices, mesh.faces[flat.member]).sum()
+    area = meshes.areas(surface.true, surface.faces[flat.member]).sum()
     return np.asarray(flat.uv * np.sqrt(area / max(own, 1e-30)), np.float64)
 
 

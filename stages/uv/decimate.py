@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.errors import StageError
-from pipeline.meshes import F64, Faces, Indices, Mesh
+from pipeline.meshes import F64, Faces, Indices, Mesh, split_apart
 
 AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a manifold of the wanted size
 LOOP = 8  # edges of the largest hole that is closed
@@ -28,8 +28,8 @@ NEARLY = 1.05  # of the target: near enough to stop trying
 
 
 def decimated(dense: Mesh, target: int) -> Mesh:
-    """A manifold with about `target` triangles and smooth normals, closed if the dense mesh is. A mesh that is small
-    enough is kept.
+    """A manifold with about `target` triangles and smooth normals, closed if the dense mesh is and any setting gives
+    such a one. A mesh that is small enough is kept.
 
     Normals are those of the nearest dense vertex: they come from the field's gradient and know more than the faces.
 
@@ -42,6 +42,7 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     scale, origin = _scale(dense)
     points = (dense.vertices.astype(np.float64) - origin) * scale
     best: tuple[F64, Faces] | None = None
+    opened: tuple[F64, Faces] | None = None
     for aggressiveness in AGGRESSIVENESS:
         vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
         vertices, faces = split_apart(*without_bubbles(vertices, faces))
@@ -49,11 +50,14 @@ def decimated(dense: Mesh, target: int) -> Mesh:
             faces = filled(faces)
         found = meshes.topology(faces, len(vertices))
         if not (found.manifold if closed else found.sound):
+            if opened is None and found.sound:
+                opened = vertices, faces
             continue
         if best is None or len(faces) < len(best[1]):
             best = vertices, faces
         if len(faces) <= NEARLY * target:
             break
+    best = opened if best is None else best
     if best is not None:
         v = (best[0] / scale + origin).astype(np.float32)
         return Mesh(v, normals_from(dense, v, best[1]), best[1])
@@ -61,7 +65,7 @@ def decimated(dense: Mesh, target: int) -> Mesh:
         "the mesh can't be decimated",
         where="uv.target_faces",
         value=f"{len(dense.faces)} to {target} faces breaks the surface",
-        limit="a manifold, closed if the dense mesh is",
+        limit="every edge with two faces at most, one fan of faces around every vertex",
         remedy="choose more target_faces, or another surface.resolution",
     )
 
@@ -87,28 +91,6 @@ def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
         faces = filled(faces[label == np.bincount(label).argmax()])
     v, f, _ = meshes.compact(vertices, faces)
     return np.asarray(v, np.float64), f
-
-
-def split_apart(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
-    """Sheets that touch along a crowded edge or in a point, each with vertices of its own there.
-
-    Collapsing edges pinches thin handles until two sheets share an edge. Corners of faces stay one vertex where they
-    are neighbours across an edge of two faces; elsewhere they become several at the same place.
-    """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(faces)
-    a, b, _ = meshes.paired_edges(faces, len(vertices))  # row r: from corner r // n of face r % n to its next corner
-    a_next, b_next = ((r + n) % (3 * n) for r in (a, b))
-    one, other = np.concatenate([a, a_next]), np.concatenate([b_next, b])
-    graph = coo_array((np.ones(len(one), np.int8), (one, other)), shape=(3 * n, 3 * n))
-    corner = np.asarray(connected_components(graph, directed=False)[1], np.int64)
-    if corner.max() + 1 == len(np.unique(faces)):
-        return vertices, faces
-    source = np.zeros(corner.max() + 1, np.int64)
-    source[corner] = faces.T.ravel()
-    return vertices[source], corner.reshape(3, n).T.astype(np.int32)
 
 
 def filled(faces: Faces) -> Faces:

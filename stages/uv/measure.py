@@ -15,19 +15,21 @@ import numpy as np
 
 from pipeline import meshes, raster, tiles
 from pipeline.meshes import F64, Charts, Mesh
+from stages.uv.density import face_share
+from stages.uv.rough import FRAGMENT
 from stages.uv.segment import FRONT
-from stages.uv.unwrap import chart_of_face, signed_areas
+from stages.uv.unwrap import chart_of_face, evened, signed_areas
 
 RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
 FACING = 0.5
-TINY_CHART = 5e-4  # of the area: smaller charts are crumbs
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """charts; crumbs: charts with next to no area; utilisation: share of texels under a chart; overlap: share of
-    those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty: share of the area whose
-    charts are mirrored or flat; seam_front: length (m) of the seams in front; tile_utilisation: of each tile."""
+    """charts; crumbs: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
+    chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
+    share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
+    tile_utilisation: of each tile; face_share: of the area under charts."""
 
     charts: int
     crumbs: int
@@ -39,10 +41,12 @@ class Quality:
     empty: float
     seam_front: float
     tile_utilisation: tuple[float, ...]
+    face_share: float | None = None
 
 
-def measure(mesh: Mesh, charts: Charts) -> Quality:
-    """Every figure of a finished unwrap."""
+def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Quality:
+    """Every figure of a finished unwrap. face: (F,) faces of the face; charts may then have different scales, which do
+    not count as stretch."""
     uv_area = signed_areas(charts.uvs.astype(np.float64), charts.faces)
     area = meshes.areas(mesh.vertices, mesh.faces)
     share = area / area.sum()
@@ -51,10 +55,13 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
     layers = [raster.layers(raster.texel_corners(part, RASTER), RASTER) for part in parts]
     covered = [int((layer > 0).sum()) for layer in layers]
     flat = np.abs(uv_area) < 1e-12
-    mean, most = stretch(mesh, charts, ~flat)
+    alike = charts
+    if face is not None:
+        alike = Charts(evened(charts.uvs.astype(np.float64), charts.faces, area).astype(np.float32), charts.faces)
+    mean, most = stretch(mesh, alike, ~flat)
     return Quality(
         charts=int(label.max()) + 1,
-        crumbs=int((np.bincount(label, share) < TINY_CHART).sum()),
+        crumbs=int((np.bincount(label, share) < FRAGMENT).sum()),
         utilisation=sum(covered) / (len(layers) * RASTER**2),
         overlap=float(sum((layer > 1).sum() for layer in layers) / max(sum(covered), 1)),
         stretch=mean,
@@ -63,6 +70,7 @@ def measure(mesh: Mesh, charts: Charts) -> Quality:
         empty=float(share[flat].sum()),
         seam_front=seam_length(mesh, charts),
         tile_utilisation=tuple(c / RASTER**2 for c in covered),
+        face_share=None if face is None else face_share(charts, face),
     )
 
 

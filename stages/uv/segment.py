@@ -82,6 +82,12 @@ def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
+def without_crumbs(vertices: F64, faces: Faces, label: Indices, pairs: Dual) -> Indices:
+    """Pieces (F,) that were parted otherwise, small ones given to their neighbours."""
+    vectors = meshes.area_vectors(vertices, faces)
+    return _without_crumbs(label, vectors, np.linalg.norm(vectors, axis=1), pairs)
+
+
 def _bent(normal: F64, area: F64) -> F64:
     return np.asarray(area - np.linalg.norm(normal, axis=-1), np.float64)
 

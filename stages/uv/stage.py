@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, UvMesh
 from pipeline.contract import Context, Stage, StageConfig
 
 MESH, PROXY = "uv_mesh.npz", "proxy.npz"
@@ -15,11 +15,13 @@ MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The dense mesh; and for how fine the photos are on it, which of them were fitted and their cameras."""
+    """The dense mesh; and for how fine the photos are on it, which of them were fitted and their cameras;
+    and the face's landmarks."""
 
     surface: Located[Surface]
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
+    masks: Located[MaskSet]
 
 
 class Config(StageConfig):
@@ -42,12 +44,14 @@ class Config(StageConfig):
     max_cost: float = Field(
         12.0, gt=0, le=64, description="how bent a chart of xatlas may get; for meshes that our own charts do not suit"
     )
+    face: bool = Field(True, description="give the face 40 % of the texels under charts, where its landmarks are known")
     iterations: int = Field(1, ge=1, le=8, description="rounds in which xatlas grows charts from better seeds; slow")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     """Decimate, cut, flatten, pack, measure. Raises StageError when the mesh can't be unwrapped."""
     from pipeline import footprint, meshes, tiles
+    from pipeline.faces.landmarks3d import load_landmarks
     from stages.uv.build import build
     from stages.uv.unwrap import Options
 
@@ -66,7 +70,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     options = Options(
         config.texture_size, config.padding, config.max_cost, config.iterations, most, texel, config.tile_size
     )
-    built = build(dense, config.target_faces, config.proxy_faces, options, step, even=config.remesh == "even")
+    ref = inputs.masks.artifact.landmarks
+    landmarks = load_landmarks(inputs.masks.path(ref)) if ref is not None and config.face else None
+    built = build(
+        dense, config.target_faces, config.proxy_faces, options, step, even=config.remesh == "even", landmarks=landmarks
+    )
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
     return UvMesh(
@@ -85,8 +93,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         deviation_mm=1000 * built.deviation.mean,
         deviation_rms_mm=1000 * built.deviation.rms,
         proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
+        face_share=None if built.quality.face_share is None else round(built.quality.face_share, 5),
         warnings=built.warnings,
+        findings=built.findings,
     )
 
 
-STAGE = Stage(name="uv", version=5, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=6, inputs=Inputs, config=Config, output=UvMesh, run=run)

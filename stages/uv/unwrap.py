@@ -1,4 +1,5 @@
-"""Charts of our own (stages.uv.charts), and xatlas's (MIT) for what these can't lay flat.
+"""A few charts of our own (stages.uv.charts), more of them where the surface is rough (stages.uv.rough), and xatlas's
+(MIT) where even these do not lie flat.
 
 xatlas too cuts and flattens the mesh with its bumps smoothed away, in the same connectivity: noise in the surface
 would otherwise break its charts into hundreds of crumbs. Its mirrored charts are turned over.
@@ -15,7 +16,9 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
+from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
+from stages.uv.rough import in_pieces, short
 from stages.uv.tiling import Tiling, packed
 from stages.uv.unfold import folded, one_by_one, taken_apart
 
@@ -26,6 +29,7 @@ PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the p
 COARSER = 1.05  # of the texel that is wished for: a few per cent are not worth a further tile
 UNFOLDINGS = 6  # rounds in which what folds is taken apart; in the latter half face by face, which ends it
 FOLD_RASTER = 2048  # texels along a side on which folds are looked for
+WORTH_TEXELS = 1e-3  # of the surface without texels: with less, the charts stay as they are
 MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
 
 
@@ -44,10 +48,10 @@ class Options:
     size: int = 1024
 
 
-def unwrap(mesh: Mesh, options: Options) -> Charts:
+def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
     """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
 
-    A mesh that only xatlas can take, in many charts, stays in one tile.
+    A mesh that takes MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger.
 
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
@@ -57,13 +61,26 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = options.padding / options.texture_size
     tiling = Tiling(options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.size))
-    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT))
+    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
     if own is not None:
-        return own
-    log.info("uv: charts of our own do not lie flat; xatlas takes over")
-    uvs, faces = _cut(points, mesh.faces, options)
-    even, faces = _flat(uvs, faces, mesh, options)
-    label = chart_of_face(faces, len(even))
+        return _with_texels(own, mesh, options, tiling, front)
+    log.info("uv: a few discs do not lie flat; cutting further")
+    found = in_pieces(scaled, points)
+    if found is not None:
+        uvs, faces, _ = found
+        even = evened(uvs, faces, meshes.areas(mesh.vertices, mesh.faces))
+    else:
+        log.info("uv: too many pieces do not lie flat; xatlas takes over")
+        even, faces = _flat(*_cut(points, mesh.faces, options), mesh, options)
+    return _with_texels(_placed(even, faces, mesh, options, tiling, front), mesh, options, tiling, front)
+
+
+def _placed(even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
+    """Charts of one scale, but for the face's, in one square, or in tiles where that is asked for and they are not too
+    many."""
+    padding, label = options.padding / options.texture_size, chart_of_face(faces, len(even))
+    if front is not None:
+        even = enlarged(even, faces, label, front, meshes.areas(mesh.vertices, mesh.faces))
     if label.max() < MANY_CHARTS:
         placed = pack(even, faces, label, padding)
         total = float(np.abs(signed_areas(even, faces)).sum())
@@ -73,6 +90,18 @@ def unwrap(mesh: Mesh, options: Options) -> Charts:
         if placed is not None:
             return Charts(placed, faces)
     return _packed(spread(even, faces), faces, options)
+
+
+def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None) -> Charts:
+    """The charts, those faces laid flat by themselves that have next to no texels, if they are worth it."""
+    areas = meshes.areas(mesh.vertices, mesh.faces)
+    out = short(mesh, charts)
+    if areas[out].sum() <= WORTH_TEXELS * areas.sum():
+        return charts
+    log.info("uv: %d faces have no texels and are laid flat by themselves", int(out.sum()))
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    uvs, faces = one_by_one(charts.uvs.astype(np.float64), charts.faces, out, corners)
+    return _placed(evened(uvs, faces, areas), faces, mesh, options, tiling, front)
 
 
 def _flat(uvs: F64, faces: Faces, mesh: Mesh, options: Options) -> tuple[F64, Faces]:
@@ -188,8 +217,14 @@ def spread(uvs: F64, faces: Faces) -> F64:
 
 
 def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
-    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight."""
+    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight.
+
+    xatlas leaves faces out that are smaller than 1e-7 in the given unit, and puts them anywhere: on a surface in metres
+    a tenth of a square millimetre. So the charts are given to it larger.
+    """
     import xatlas
+
+    uvs = uvs * (UNIT * np.sqrt(len(faces) / max(float(np.abs(signed_areas(uvs, faces)).sum()), 1e-30)))
 
     atlas = xatlas.Atlas()
     settings = xatlas.PackOptions()

@@ -15,7 +15,10 @@ from typing import Any
 import pytest
 import yaml
 
+from workflows.access import CLIENT_LOGIN, CSRF, ORIGINS, ROOTS, SERVER_LOGIN
 from workflows.environment import SLOTS_ON_DISK
+
+CLOSED = {"type": "object", "properties": {}, "additionalProperties": False}  # no variable, and none can be added
 
 INSTRUCTIONS = {
     "ARG",
@@ -96,23 +99,31 @@ def test_the_linter_of_dockerfiles_has_nothing_to_say(repo: Path) -> None:
 @pytest.mark.skipif(shutil.which("docker-compose") is None, reason="docker-compose is not installed")
 def test_compose_reads_its_file_and_asks_for_the_password(repo: Path) -> None:
     command = ["docker-compose", "-f", repo / "docker/compose.yaml", "config"]
-    environment = {k: v for k, v in os.environ.items() if k != "POSTGRES_PASSWORD"}
+    environment = {k: v for k, v in os.environ.items() if k not in ("POSTGRES_PASSWORD", "PREFECT_LOGIN")}
     without = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert without.returncode != 0 and "set it in the environment" in without.stderr
-    done = subprocess.run(command, env={**environment, "POSTGRES_PASSWORD": "x"}, capture_output=True, text=True)
+    done = subprocess.run(
+        command, env={**environment, "POSTGRES_PASSWORD": "x", "PREFECT_LOGIN": "a:b"}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert set(yaml.safe_load(done.stdout)["services"]) == {"database", "server", "deploy", "worker", "batch-worker"}
 
 
 @pytest.mark.skipif(shutil.which("jq") is None, reason="jq is not installed")
 def test_a_job_of_a_cluster_mounts_what_prefect_yaml_says_and_has_no_root(repo: Path) -> None:
-    container = {"name": "prefect-job", "image": "{{ image }}", "args": "{{ command }}"}
-    base = {"job_configuration": {"job_manifest": {"spec": {"template": {"spec": {"containers": [container]}}}}}}
+    container = {"name": "prefect-job"}
+    asked = {"image": "{{ image }}", "args": "{{ command }}", "env": "{{ env }}"}
+    spec = {"serviceAccountName": "{{ service_account_name }}", "containers": [{**container, **asked}]}
+    manifest = {"metadata": {"generateName": "{{ name }}-"}, "spec": {"template": {"spec": spec}}}
+    configuration = {"command": "{{ command }}", "env": "{{ env }}", "job_manifest": manifest}
+    base = {"job_configuration": configuration, "variables": {"properties": {"command": {"type": "string"}}}}
     done = subprocess.run(["jq", "-f", repo / "docker/kubernetes-pool.jq"], input=json.dumps(base), check=True,
                           capture_output=True, text=True)  # fmt: skip
     pod = json.loads(done.stdout)["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
     made = pod["containers"][0]
-    assert made.items() >= container.items()
+    assert made.items() >= {**container, "image": "neuface:cpu"}.items()
+    assert "{{" not in done.stdout and "command" not in done.stdout  # nothing that a run could fill in
+    assert json.loads(done.stdout)["variables"] == CLOSED
     assert {m["name"]: m["mountPath"] for m in made["volumeMounts"]} == {
         "photos": "/photos",
         "runs": "/runs",
@@ -121,6 +132,33 @@ def test_a_job_of_a_cluster_mounts_what_prefect_yaml_says_and_has_no_root(repo: 
     assert {v["name"] for v in pod["volumes"]} == {"photos", "runs", "tmp"}
     assert pod["securityContext"]["runAsNonRoot"] and pod["securityContext"]["runAsUser"] == 10001
     assert made["securityContext"]["readOnlyRootFilesystem"] and not made["securityContext"]["allowPrivilegeEscalation"]
+
+
+def test_no_run_in_a_pool_can_carry_a_command_or_an_environment(repo: Path) -> None:
+    for path in (repo / "workflows/pools").glob("*.json"):
+        template = json.loads(path.read_text())
+        assert template["variables"] == CLOSED and "{{" not in path.read_text(), path.name
+    deployments = yaml.safe_load((repo / "workflows/prefect.yaml").read_text())["deployments"]
+    assert [d["name"] for d in deployments if "job_variables" in d["work_pool"]] == []
+    for name in ("docs/operations.md", "docs/running.md", "docker/compose.yaml", "workflows/prefect.yaml"):
+        for line in (repo / name).read_text().splitlines():
+            if "work-pool create" in line:
+                assert "--base-job-template" in line, f"{name}: {line}"
+
+
+def test_a_server_that_is_documented_asks_for_a_login_and_answers_no_other_origin(
+    compose: dict[str, Any], repo: Path
+) -> None:
+    server = compose["services"]["server"]["environment"]
+    for name in ("deploy", "worker", "batch-worker"):
+        assert compose["services"][name]["environment"][CLIENT_LOGIN] == "${PREFECT_LOGIN:?}", name
+    assert server[SERVER_LOGIN].startswith("${PREFECT_LOGIN:?") and server[CSRF] == "true"
+    assert set(server[ORIGINS].split(",")) == {"http://127.0.0.1:4200", "http://localhost:4200"}
+    for name in ("worker", "batch-worker"):
+        assert compose["services"][name]["environment"][ROOTS] == "/photos:/runs"
+    text = (repo / "docs/operations.md").read_text()
+    before = text.partition("prefect server start")[0]
+    assert all(x in before for x in (SERVER_LOGIN, ORIGINS, CSRF)) and ROOTS in text and CLIENT_LOGIN in text
 
 
 def test_a_restart_forgets_no_slot(compose: dict[str, Any]) -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.artifacts import Camera
+from pipeline.artifacts import Camera, Cut, Extent
+from pipeline.extent import GROWN
 from stages.inverse_rendering.start import agreed, hull_start
+from stages.inverse_rendering.views import PhotoView, PixelTable
 
 F32 = npt.NDArray[np.float32]
 HEAD, TORSO = ((0.0, 0.02, 0.0), 0.09), ((0.0, -0.14, 0.0), 0.12)
@@ -100,3 +104,28 @@ def test_a_narrow_strip_is_left_to_the_mask() -> None:
     alphas = list(ALPHAS)
     alphas[4] = np.asarray(cv2.erode(ALPHAS[4], np.ones((5, 5), np.uint8)), np.float32)
     assert agreed(CAMERAS, alphas, RADIUS).alphas[4] is alphas[4]
+
+
+def test_the_start_ends_a_little_beyond_the_extent() -> None:
+    """The torso is cut off below the neck; the head stays as it is."""
+    cut = Cut(normal=(0.0, -1.0, 0.0), offset=0.08)
+    ball = Extent(centre=(0, 0, 0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1)), radii=(0.2,) * 3, cuts=(cut,), head=0.1)
+    whole = hull_start(CAMERAS, ALPHAS, RADIUS, 64, 1)
+    start = hull_start(CAMERAS, ALPHAS, RADIUS, 64, 1, ball)
+    y = (start.lo + start.cell * np.argwhere(start.values < 0))[:, 1]
+    before = (whole.lo + whole.cell * np.argwhere(whole.values < 0))[:, 1]
+    assert before.min() < -0.2 and y.min() == pytest.approx(-0.08 - GROWN * 0.1, abs=1.5 * start.cell)
+    assert y.max() == pytest.approx(before.max(), abs=whole.cell + start.cell)
+    assert start.cell < whole.cell  # the same cells for less space
+
+
+def test_pixels_beyond_the_extent_are_not_drawn() -> None:
+    """Neither as subject nor as background."""
+    camera, alpha = CAMERAS[0], ALPHAS[0]
+    asked = np.where((np.arange(WIDTH) >= BOTTOM)[:, None] & (alpha > 0), 0, 1).astype(np.float32)
+    view = PhotoView(0, np.full((WIDTH, WIDTH, 3), 0.5, np.float32), alpha, np.array(camera.K),
+                     np.array(camera.world_from_cam), np.zeros(5))  # fmt: skip
+    all_of_it, part = (PixelTable([v], WIDTH, "cpu") for v in (view, replace(view, asked=asked)))
+    assert len(all_of_it.inside) - len(part.inside) == int((asked == 0).sum()) > 1000
+    assert len(part.outside) == len(all_of_it.outside)
+    assert float(part.xy[part.inside][:, 1].max()) < (BOTTOM - WIDTH / 2) / FOCAL

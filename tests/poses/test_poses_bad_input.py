@@ -114,4 +114,5 @@ def test_two_scenes_a_mirrored_and_a_rotated_photo(ball: Path, tmp_path: Path, c
     assert {c.name for c in found.cameras} >= {"40.png", "0.jpg"} and len(found.cameras) == 8
     assert set(found.view_errors_px) == {c.name for c in found.cameras}
     told = "\n".join(found.warnings)
-    assert "20.png, 21.png, 22.png" in told and "a capture of their own" in told
+    assert "20.png, 21.png, 22.png (other group)" in told and "a capture of their own" in told
+    assert found.groups == (8, 3) and all("fits 2 more photos" in reason for reason in found.left_out.values())

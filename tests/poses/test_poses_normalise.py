@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
+from pipeline.faces.landmarks3d import HeadFrame
 from pipeline.transforms import F64, apply, matrix, project, rescale_camera, rows, similarity
 from stages.poses.normalise import NOMINAL_ROI, Normalisation, least_turn, nearest_point, normalise, robust_direction
 from stages.poses.place import in_asset
@@ -245,3 +246,34 @@ def test_points_out_of_view() -> None:
     with pytest.raises(StageError, match="one spot") as caught:
         normalise(cameras(orbit()), points, given=False)
     assert "walk around" in caught.value.remedy
+
+
+# ------------------------------------------------------------------ a face in a given world
+def head_turned(turn: F64, eyes: F64 = TARGET) -> HeadFrame:
+    """A head whose left, up and front are the rows of `turn`, its eyes at a point."""
+    return HeadFrame(turn, eyes, eyes - 0.1 * turn[1], eyes + 0.08 * turn[1])
+
+
+@pytest.mark.parametrize(("yaw", "turned"), [(0, False), (8, False), (12, True), (45, True), (180, True)])
+def test_a_given_world_is_turned_to_the_face(yaw: float, turned: bool) -> None:
+    """The face looks along +Z afterwards, and the given world is found again through capture_from_asset."""
+    turn = Rotation.from_euler("y", yaw, degrees=True).as_matrix().T
+    found = normalise(cameras(orbit()), given=True, head=head_turned(turn))
+    linear = found.capture_from_asset[:3, :3] / np.cbrt(np.linalg.det(found.capture_from_asset[:3, :3]))
+    np.testing.assert_allclose(linear, turn.T if turned else np.eye(3), atol=1e-12)
+    assert any("turned by its landmarks" in w for w in found.warnings) == turned
+
+
+def test_a_given_world_whose_up_is_another_axis_stands_by_the_face() -> None:
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # +Z is up, the face looks along -Y
+    found = normalise(cameras(orbit()), given=True, head=head_turned(turn)).capture_from_asset
+    np.testing.assert_allclose(found[:3, 1] / np.linalg.norm(found[:3, 1]), [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(found[:3, 2] / np.linalg.norm(found[:3, 2]), [0, -1, 0], atol=1e-12)
+
+
+def test_a_face_elsewhere_and_published_axes_leave_a_given_world() -> None:
+    turn = Rotation.from_euler("y", 60, degrees=True).as_matrix().T
+    poster = normalise(cameras(orbit()), given=True, head=head_turned(turn, TARGET + [0, 0, -2.0]))
+    known = normalise(cameras(orbit()), given=True, head=head_turned(turn), axes=np.eye(3))
+    for found in (poster, known):
+        np.testing.assert_allclose(found.capture_from_asset[:3, 0] / found.capture_from_asset[0, 0], [1, 0, 0])

@@ -80,7 +80,9 @@ def test_photos_of_something_else_are_named(ball: Path, tmp_path: Path, capture_
         cv2.imwrite(str(folder / f"{i}.jpg"), cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX))
     capture = capture_of(folder, drop_blurred=False)
     found = place(capture, patience=2).artifact
-    assert found.unregistered == ("20.jpg", "21.jpg") and "20.jpg, 21.jpg" in found.warnings[-1]
+    assert found.unregistered == ("20.jpg", "21.jpg") and "20.jpg, 21.jpg (" in found.warnings[-1]
+    assert list(found.left_out) == ["20.jpg", "21.jpg"] and found.groups == (7,)
+    assert all(reason.split(":")[0] in ("no match", "blurred") for reason in found.left_out.values())
 
 
 @pytest.mark.slow

@@ -27,7 +27,8 @@ def changed(results: SyntheticResults, folder: Path) -> SyntheticResults:
     poses = results.poses.artifact
     errors = {c.name: 0.1 * (c.index + 1) for c in poses.cameras}
     poses = poses.model_copy(update={"points": FileRef.of(folder, "points.npz"), "view_errors_px": errors,
-                                     "unregistered": ("lost<1>.jpg",)})  # fmt: skip
+                                     "unregistered": ("lost<1>.jpg", "soft.jpg"),
+                                     "left_out": {"soft.jpg": "blurred: hardly any detail"}})  # fmt: skip
     masks = results.masks.artifact
     kept = tuple(m.model_copy(update={"hull_iou": 0.9 + 0.01 * m.index}) for m in masks.masks)
     masks = masks.model_copy(update={"masks": kept, "dropped": (kept[0].index,)})
@@ -47,6 +48,7 @@ def test_drawing_table_and_outlines(results: SyntheticResults, tmp_path: Path) -
     assert [p.caption.split(",")[1] for p in found.outlines] == [f" {w:.3f}" for w in worst]
     assert "not fitted" in found.outlines[0].caption and found.more == len(cameras) - 5
     assert "lost<1>.jpg: no place found for it" in found.lost
+    assert "soft.jpg: no place found for it; blurred: hardly any detail" in found.lost
 
 
 def test_given_cameras_without_points_and_no_masks_shown(results: SyntheticResults) -> None:

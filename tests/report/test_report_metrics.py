@@ -7,6 +7,7 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from pipeline.colour import linear_from_srgb
+from stages.report.by_label import label_errors, pooled
 from stages.report.metrics import Scores, encoded, flip, iou, matched, mean_scores, psnr, score, ssim
 
 RNG = np.random.default_rng(5)
@@ -132,3 +133,21 @@ def test_images_smaller_than_the_window_have_no_ssim() -> None:
 def test_bad_input(shape: tuple[int, ...], mask: np.ndarray) -> None:
     with pytest.raises(ValueError, match="sizes differ|empty"):
         score(np.zeros(shape, np.float32), np.zeros((8, 8, 3), np.float32), mask.astype(np.float32))
+
+
+def test_errors_by_label_are_pooled_over_views() -> None:
+    """0.1 off on the face of one view, 0.2 on that of another with as many pixels: the mean square of both."""
+    mask, labels = np.ones((8, 8), np.float32), np.ones((8, 8), np.uint8)
+    labels[:4] = 2
+    mask[0] = 0
+    names = ("background", "subject", "face", "eyes")
+    photo = np.full((8, 8, 3), linear_from_srgb(0.5), np.float32)
+    found = []
+    for off in (0.1, 0.2):
+        render = view(0.5, np.ones((8, 8), np.float32))
+        render[:4, :, :3] = linear_from_srgb(0.5 + off)
+        found.append(label_errors(render, photo, mask, labels, names))
+    assert {k: n for k, (_, n) in found[0].items()} == {"face": 24, "body": 32}
+    got = pooled(found)
+    assert got["face"] == pytest.approx(-10 * np.log10((0.01 + 0.04) / 2), abs=1e-3) and got["body"] == 100
+    assert pooled([{}]) == {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 import pwd
@@ -136,10 +137,32 @@ def descendants(pid: int) -> list[int]:
     return found
 
 
-def ask(url: str, path: str, body: dict[str, Any] | None = None) -> Any:
+LOGIN = "tests:secret"  # of the servers that tests start
+
+
+def guarded() -> dict[str, str]:
+    """Environment of a server behind a login, and of its clients, as docs/operations.md has it."""
+    return {
+        "PREFECT_SERVER_API_AUTH_STRING": LOGIN,
+        "PREFECT_API_AUTH_STRING": LOGIN,
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": "http://127.0.0.1:4200",
+        "PREFECT_SERVER_CSRF_PROTECTION_ENABLED": "true",
+    }
+
+
+def login_headers(url: str, login: str) -> dict[str, str]:
+    """What a client of a guarded server sends: its login, and a token against forged requests."""
+    basic = {"Authorization": f"Basic {base64.b64encode(login.encode()).decode()}"}
+    with urllib.request.urlopen(urllib.request.Request(f"{url}/csrf-token?client=t", headers=basic)) as answer:
+        token = json.loads(answer.read())["token"]
+    return {**basic, "Prefect-Csrf-Token": token, "Prefect-Csrf-Client": "t"}
+
+
+def ask(url: str, path: str, body: dict[str, Any] | None = None, login: str | None = None) -> Any:
     """One call of a Prefect server's API."""
     data = None if body is None else json.dumps(body).encode()
-    request = urllib.request.Request(f"{url}{path}", data, {"Content-Type": "application/json"})
+    headers = {"Content-Type": "application/json", **(login_headers(url, login) if login else {})}
+    request = urllib.request.Request(f"{url}{path}", data, headers)
     with urllib.request.urlopen(request, timeout=30) as answer:
         return json.loads(answer.read())
 

@@ -7,9 +7,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipeline import meshes
+from pipeline.artifacts import Cut, Extent
 from pipeline.errors import StageError
+from pipeline.extent import signed
 from stages.surface import clean, extract
 from stages.surface.build import Built, build
+from stages.surface.judge import judge
 from tests.support.analytic_fields import AnalyticField, Distance, bumpy_head, ellipsoid, sphere, union
 
 
@@ -129,13 +132,21 @@ def test_small_ball_between_coarse_nodes_is_found() -> None:
     assert got.topology.euler == 2
 
 
-@pytest.mark.parametrize("shift", [0.5, -0.5])
-def test_no_surface(shift: float) -> None:
-    def constant(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return np.full(len(p), shift), np.tile([0.0, 1.0, 0.0], (len(p), 1))
+def constant(value: float) -> Distance:
+    """A field that is the same everywhere."""
+    return lambda p: (np.full(len(p), value), np.tile([0.0, 1.0, 0.0], (len(p), 1)))
 
-    with pytest.raises(StageError, match="no surface" if shift > 0 else "fills its box"):
-        built(constant)
+
+def test_no_surface() -> None:
+    with pytest.raises(StageError, match="no surface"):
+        built(constant(0.5))
+
+
+def test_a_solid_that_fills_its_box_is_handed_on_and_unusable() -> None:
+    got = built(constant(-0.5), 24)
+    assert got.topology.manifold and got.cap > 0.9
+    (cap,) = (f for f in judge(got) if f.check == "cap")
+    assert cap.level == "unusable" and "masks" in cap.remedy
 
 
 def test_nan_is_refused() -> None:
@@ -176,3 +187,21 @@ def test_small_bumps_on_a_steep_field_are_not_walled_off() -> None:
     assert np.abs(warts(got.mesh.vertices.astype(np.float64))[0]).max() < 0.05 * got.cell  # no wall
     to_tip, _ = cKDTree(got.mesh.vertices).query(centres * 1.0696)
     assert to_tip.max() < 0.8 * got.cell
+
+
+def test_the_mesh_is_closed_at_the_extent() -> None:
+    """A sphere cut by a slanting plane and by a ball: closed, on the sphere inside, on plane or ball elsewhere."""
+    normal = np.array([0.3, -0.9, 0.1]) / np.linalg.norm([0.3, -0.9, 0.1])
+    extent = Extent(centre=(0.06, 0.02, 0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1)), radii=(0.12,) * 3,
+                    cuts=(Cut(normal=tuple(normal), offset=0.05),), head=0.15)  # fmt: skip
+    got = build(AnalyticField(sphere(0.1), (0.12, 0.13, 0.12)), 64, quiet, extent=extent)
+    assert got.topology.manifold and got.topology.euler == 2 and got.cap > 0.1
+    x = got.mesh.vertices.astype(np.float64)
+    outside = signed(extent, x)
+    assert outside.max() < 0.3 * got.cell  # the rim, where both meet
+    on_sphere = np.abs(np.linalg.norm(x, axis=1) - 0.1) < 0.02 * got.cell
+    on_wall = np.abs(outside) < 0.02 * got.cell
+    assert (on_sphere | on_wall).mean() > 0.95 and on_sphere.sum() > 500 and on_wall.sum() > 500
+    grid = np.random.default_rng(0).uniform(-0.1, 0.1, (200_000, 3))
+    kept = (np.linalg.norm(grid, axis=1) < 0.1) & (signed(extent, grid) < 0)
+    assert meshes.volume(x, got.mesh.faces) == pytest.approx(kept.mean() * 0.2**3, rel=0.02)

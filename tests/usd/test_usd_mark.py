@@ -50,9 +50,17 @@ def test_the_mark_is_read_by_others_and_breaks_nothing(asset: Path, name: str) -
     assert read_package(asset.with_suffix(".usdz"))[1:] == pictures
 
 
-def test_a_good_asset_says_so(exported) -> None:
+def test_a_good_asset_says_so(asset: Path) -> None:
+    mark(asset, Verdict({"masks": (GOOD,)}))
+    for file in (asset, asset.with_suffix(".usdz")):
+        assert said(file) == ("good", [])
+
+
+def test_the_export_marks_the_asset_with_its_own_findings_too(exported) -> None:
+    folder, made = exported
+    verdict = Verdict({"usd": made.findings})  # those before it found nothing
     for name in ("head.usd", "head.usdz"):
-        assert said(exported[0] / "asset" / name) == ("good", [])
+        assert said(folder / "asset" / name) == (verdict.level, list(verdict.reasons()))
 
 
 def test_a_mark_replaces_another_and_gives_the_same_bytes(asset: Path) -> None:

@@ -294,14 +294,14 @@ def tetrahedra(shared: int) -> tuple[np.ndarray, np.ndarray]:
 def test_sheets_that_touch_are_split_apart(shared: int) -> None:
     vertices, faces = tetrahedra(shared)
     assert not meshes.topology(faces, len(vertices)).manifold
-    v, f = decimate.split_apart(vertices, faces)
+    v, f = meshes.split_apart(vertices, faces)
     found = meshes.topology(f, len(v))
     assert found.manifold and found.components == 2 and len(v) == 8
     assert np.array_equal(v[f], vertices[faces])  # nothing moves
 
 
 def test_a_manifold_is_not_split(built: Built) -> None:
-    v, f = decimate.split_apart(built.mesh.vertices.astype(np.float64), built.mesh.faces)
+    v, f = meshes.split_apart(built.mesh.vertices.astype(np.float64), built.mesh.faces)
     assert len(v) == len(built.mesh.vertices) and np.array_equal(f, built.mesh.faces)
 
 

@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import FileRef, Located, Surface
+from pipeline.artifacts import FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
 from stages.surface.build import build
@@ -34,7 +34,8 @@ def inputs(tmp_path: Path) -> Inputs:
         cell=0.006,
     )
     # fitted photos and cameras are only asked for with tiles=auto (test_uv_tiles)
-    return Inputs(Located(artifact, tmp_path), None, None)  # type: ignore[arg-type]
+    masks = Located(MaskSet(masks=()), tmp_path)
+    return Inputs(Located(artifact, tmp_path), None, None, masks)  # type: ignore[arg-type]
 
 
 def test_run_writes_mesh_and_proxy(inputs: Inputs, tmp_path: Path) -> None:

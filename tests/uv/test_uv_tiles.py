@@ -11,7 +11,7 @@ import trimesh
 from pydantic import ValidationError
 
 from pipeline import footprint, meshes, raster, tiles
-from pipeline.artifacts import Camera, CameraSet, FileRef, FittedFace, Located, Surface
+from pipeline.artifacts import Camera, CameraSet, FileRef, FittedFace, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.meshes import Charts, Mesh
 from pipeline.transforms import rows
@@ -162,7 +162,8 @@ def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Pat
         field=FileRef.of(tmp_path, "surface.npz"), light=FileRef.of(tmp_path, "surface.npz"), rank=1, light_order=10,
         fitted_views=(0,), held_out=(), steps=1, loss=0, psnr=1, beta=1, cell=1, model={},
     )  # fmt: skip
-    inputs = Inputs(Located(surface, tmp_path), Located(face, tmp_path), Located(poses, tmp_path))
+    masks = Located(MaskSet(masks=()), tmp_path)
+    inputs = Inputs(Located(surface, tmp_path), Located(face, tmp_path), Located(poses, tmp_path), masks)
     out = run(inputs, Config(target_faces=1200, tile_size=256, tiles="auto"), Context(tmp_path, tmp_path))
     mesh, charts = meshes.load(tmp_path / out.mesh.path), meshes.load_charts(tmp_path / out.mesh.path)
     assert 1 < out.tiles == int(tiles.of_face(charts).max()) + 1 == len(out.tile_utilisation) <= 4

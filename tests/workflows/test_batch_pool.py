@@ -20,10 +20,12 @@ from pipeline.artifacts import sha256_of
 from tests.support.facescape_tree import write_heads, write_tree
 from tests.support.points import Point, hold, wait_for
 from tests.support.servers import (
+    LOGIN,
     PREFECT,
     Process,
     ask,
     free_port,
+    guarded,
     postgres,
     postgres_programs,
     wait_healthy,
@@ -104,6 +106,8 @@ def test_a_night_with_a_killed_worker_server_and_database(
             "PREFECT_API_DATABASE_CONNECTION_URL": database.url,
             "PREFECT_WORKER_QUERY_SECONDS": "2",
             SLOTS_ON_DISK[0]: SLOTS_ON_DISK[1],
+            "NEUFACE_ROOTS": str(tmp_path),
+            **guarded(),
             "NEUFACE_TALLY": str(tally),
             **(point := hold(POINT, tmp_path / "signs")).environment(),
         }
@@ -118,7 +122,8 @@ def test_a_night_with_a_killed_worker_server_and_database(
                         *SETS)  # fmt: skip
         with server:
             wait_healthy(url)
-            call(environment, PREFECT, "work-pool", "create", "heads", "--type", "process", cwd=tmp_path)
+            call(environment, PREFECT, "work-pool", "create", "heads", "--type", "process",
+                 "--base-job-template", repo / "workflows/pools/process.json", cwd=tmp_path)  # fmt: skip
             call(environment, PREFECT, "--no-prompt", "deploy", "--prefect-file", "prefect.yaml", "-n",
                  "local", cwd=tmp_path)  # fmt: skip
             with workers[0], workers[1], batch:
@@ -138,9 +143,9 @@ def test_a_night_with_a_killed_worker_server_and_database(
                 point.release()
                 assert batch.child is not None
                 code = batch.child.wait(PATIENCE)
-            runs = ask(url, "/flow_runs/filter", {"limit": 50})
-            limits = ask(url, "/v2/concurrency_limits/filter", {})
-            queues = ask(url, "/work_pools/heads/queues/filter", {})
+            runs = ask(url, "/flow_runs/filter", {"limit": 50}, LOGIN)
+            limits = ask(url, "/v2/concurrency_limits/filter", {}, LOGIN)
+            queues = ask(url, "/work_pools/heads/queues/filter", {}, LOGIN)
     said = (tmp_path / "batch.log").read_text()
     assert code == 1, said
     summary = json.loads((tmp_path / "out/batch/summary.json").read_text())

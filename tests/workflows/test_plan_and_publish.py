@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ import pytest
 from pipeline.artifacts import Artifact, FileRef, HeldOutView, Located, UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import Cancelled, StageError, UsageError
-from workflows import publish as publishing
 from workflows.folders import writable
 from workflows.plan import RunRequest, make_plan, preview
-from workflows.publish import asset_hash, publish, swap
+from workflows.publish import asset_hash, publish
+from workflows.published import LIST
+from workflows.replace import swap
 from workflows.runner import run_here, run_plan
 from workflows.session import Session, session
 
@@ -126,6 +128,18 @@ def test_failure_keeps_finished_stages_and_the_users_files(tmp_path: Path) -> No
     assert [p.name for p in mine.iterdir()] == ["notes.txt"]
 
 
+def test_a_file_that_came_into_a_new_store_is_not_swept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(ZeroDivisionError), writable(out, out / ".store"):
+        (out / ".store" / ".locks").mkdir()
+        (out / ".store" / "first" / "k.partial-1").mkdir(parents=True)
+        (out / ".store" / "notes.txt").write_text("mine")
+        raise ZeroDivisionError
+    left = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert left == {".store/notes.txt"}
+    assert not (out / ".store/first").exists() and not (out / ".store/.locks").exists()
+
+
 def test_a_store_of_others_is_never_swept(tmp_path: Path) -> None:
     shared = tmp_path / "shared"
     (shared / "first").mkdir(parents=True)
@@ -150,15 +164,17 @@ def fake_done(folder: Path, stage: str, artifact: Artifact) -> Done[Any]:
     return Done(stage, "k" * 64, Located(artifact, folder), False, {"seconds": 2.0, "peak_memory_mb": 5.0})
 
 
-def usd_done(folder: Path, text: str = "#usda 1.0") -> Done[Any]:
+def usd_done(folder: Path, text: str = "#usda 1.0", extra: str = "textures/a.png") -> Done[Any]:
     (folder / "asset/textures").mkdir(parents=True, exist_ok=True)
     (folder / "views").mkdir(exist_ok=True)
     (folder / "asset/head.usd").write_text(text)
     (folder / "asset/textures/a.png").write_bytes(b"png")
+    (folder / "asset" / extra).write_bytes(b"png")
     (folder / "preview.png").write_bytes(b"not of the asset")
     (folder / "views/x.exr").write_bytes(b"exr")
     (folder / "views/x.png").write_bytes(b"png")
-    refs = tuple(FileRef.of(folder, f) for f in ("asset/head.usd", "asset/textures/a.png", "preview.png"))
+    names = {"asset/head.usd", "asset/textures/a.png", f"asset/{extra}", "preview.png"}
+    refs = tuple(FileRef.of(folder, f) for f in sorted(names))
     view = HeldOutView(index=7, exr=FileRef.of(folder, "views/x.exr"), png=FileRef.of(folder, "views/x.png"), scale=1)
     asset = UsdAsset(name="head", root="asset/head.usd", files=refs, views=(view,), checks=1)
     return fake_done(folder, "usd", asset)
@@ -178,6 +194,7 @@ def test_publish_asset_views_and_record(photos: Path, tmp_path: Path) -> None:
         "report/asset_views/7.exr",
         "report/asset_views/7.png",
         "run.json",
+        LIST,
     }
     assert json.loads((plan.out / "run.json").read_text()) == json.loads(json.dumps(record))
     assert record["asset"] == "asset/head.usd"
@@ -188,11 +205,12 @@ def test_publish_asset_views_and_record(photos: Path, tmp_path: Path) -> None:
 
 def test_publishing_again_leaves_nothing_of_the_old(photos: Path, tmp_path: Path) -> None:
     plan = make_plan(request(photos))
-    (plan.out / "asset").mkdir(parents=True)
-    (plan.out / "asset" / "stale.usd").write_text("old")
+    plan.out.mkdir()
+    publish(plan, [usd_done(tmp_path / "old", extra="stale.usd")])
+    assert "asset/stale.usd" in listing(plan.out)
     publish(plan, [usd_done(tmp_path / "art")])
     assert "asset/stale.usd" not in listing(plan.out)
-    assert [p.name for p in plan.out.iterdir() if p.name.startswith(".")] == [".store"]  # nothing half-made
+    assert {p.name for p in plan.out.iterdir() if p.name.startswith(".")} == {".store", LIST}  # nothing half-made
 
 
 @pytest.mark.parametrize("fails_at", [1, 2, 4])
@@ -212,10 +230,10 @@ def test_a_full_disk_while_publishing_keeps_what_was_there(
             raise OSError(errno.ENOSPC, "No space left on device", str(target))
         target.write_bytes(source.read_bytes())
 
-    monkeypatch.setattr(publishing.shutil, "copyfile", copy)
+    monkeypatch.setattr(shutil, "copyfile", copy)
     with pytest.raises(StageError, match="no space is left"):
         publish(plan, [usd_done(tmp_path / "new", "#usda 1.0 new")])
-    assert [p.name for p in plan.out.iterdir() if p.name.startswith(".")] == [".store"]  # nothing half-made
+    assert {p.name for p in plan.out.iterdir() if p.name.startswith(".")} == {".store", LIST}  # nothing half-made
     whole = (plan.out / "asset/head.usd").read_text()
     assert whole == ("#usda 1.0" if fails_at < 3 else "#usda 1.0 new")
     assert b"half" not in {p.read_bytes() for p in plan.out.rglob("*") if p.is_file()}

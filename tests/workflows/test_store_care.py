@@ -9,12 +9,14 @@ from typing import Any
 
 import pytest
 
+from pipeline.artifacts import sha256_of
 from pipeline.store import LINEAGE, Store, lineage
 from workflows.alone import alone
 from workflows.batch_ledger import Entry, Ledger
 from workflows.cli import main
 from workflows.plan import RunRequest, make_plan
 from workflows.publish import publish
+from workflows.published import note_published
 from workflows.runner import run_here, run_plan
 from workflows.store_care import belongings, garbage, purge, remove
 
@@ -164,6 +166,29 @@ def test_checkpoints_of_unfinished_work_go_too(two_subjects: Path) -> None:
         purge(belongings(subject, two_subjects, store), store)
     assert [p for p in store.root.glob("[a-z]*/*")] == []
     assert list((store.root / LINEAGE).iterdir()) == []
+
+
+def test_purge_leaves_the_users_own_files_and_names_them(
+    two_subjects: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = two_subjects / "4/1_neutral"
+    (out / "asset").mkdir()
+    (out / "asset/head.usd").write_text("published, then edited")
+    (out / "asset/old.usd").write_text("published")
+    note_published(out, {"asset/head.usd": ["0" * 64], "asset/old.usd": [sha256_of(out / "asset/old.usd")]})
+    (out / "report/mine").mkdir(parents=True)
+    (out / "report/mine/thesis.txt").write_text("mine")
+    (out / "notes.txt").write_text("mine")
+    for dry in (["--dry-run"], []):
+        assert main(["store", "purge", "4", "--out", str(two_subjects), *dry]) == 0
+        said = capsys.readouterr().out
+        for name in ("asset/head.usd", "report/mine/thesis.txt", "notes.txt"):
+            assert f"a file of your own, yours to remove: {out / name}\n" in said
+            assert (out / name).is_file()
+        assert (out / "asset/old.usd").exists() == (out / "run.json").exists() == bool(dry)
+    left = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert left == {"asset/head.usd", "report/mine/thesis.txt", "notes.txt"}
+    assert not (two_subjects / "4/2_smile").exists()
 
 
 def test_the_same_photos_from_two_folders_are_found_from_both(photos: Path, tmp_path: Path) -> None:

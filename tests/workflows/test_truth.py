@@ -15,6 +15,7 @@ from pipeline.colour import srgb_from_linear
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import inverse_rigid, rigid, rows
 from workflows import truth
+from workflows import truth_geometry as geometry
 
 RADIUS, SIZE = 0.1, 96
 EYES = [np.array(e, float) for e in ((0, 0, 1), (0.3, 0.2, 1), (-0.3, 0.1, 1), (0, -0.3, 1))]
@@ -102,22 +103,22 @@ def test_a_gain_does_not_explain_a_pattern(run: tuple[Path, Path]) -> None:
 
 def test_tiles_are_read_side_by_side() -> None:
     texture = np.concatenate([np.full((8, 8, 3), v, np.float32) for v in (0.2, 0.6)], 1)
-    found = truth._bilinear(texture, np.array([[0.5, 0.5], [1.5, 0.5], [1.1, 0.9], [1.9, 0.1]]))
+    found = geometry.bilinear(texture, np.array([[0.5, 0.5], [1.5, 0.5], [1.1, 0.9], [1.9, 0.1]]))
     assert np.allclose(found[:, 0], [0.2, 0.6, 0.6, 0.6])
 
 
 def test_only_what_several_views_see_counts() -> None:
     mesh = trimesh.creation.icosphere(4, RADIUS)
-    seen = truth._seen(mesh, views())
+    seen = truth.seen_by(mesh, views())
     assert len(seen) > 1000
     assert seen[:, 2].min() > -0.02  # the back is not seen
-    assert len(truth._seen(mesh, views()[:2])) == 0
+    assert len(truth.seen_by(mesh, views()[:2])) == 0
 
 
 def test_a_surface_behind_another_is_not_seen() -> None:
     screen = trimesh.creation.box((0.06, 0.06, 0.002), transform=rigid(np.eye(3), np.array([0, 0, 0.13])))
     both = trimesh.util.concatenate([trimesh.creation.icosphere(4, RADIUS), screen])
-    seen = truth._seen(both, views())
+    seen = truth.seen_by(both, views())
     middle = np.hypot(seen[:, 0], seen[:, 1]) < 0.015  # 3 cm behind the screen: hidden from every one of these views
     assert (seen[middle, 2] > 0.12).all()
     assert middle.sum() > 50
@@ -127,5 +128,5 @@ def test_a_surface_behind_another_is_not_seen() -> None:
 def test_distances_are_exact_on_a_plane() -> None:
     plane = trimesh.Trimesh([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
     points = np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3))
-    assert np.allclose(truth._distances(plane, points), abs(points[:, 2]), atol=1e-12)
-    assert truth._distances(plane, np.array([[2.0, 0, 0]]))[0] == pytest.approx(1)
+    assert np.allclose(geometry.distances(plane, points), abs(points[:, 2]), atol=1e-12)
+    assert geometry.distances(plane, np.array([[2.0, 0, 0]]))[0] == pytest.approx(1)

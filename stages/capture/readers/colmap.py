@@ -66,7 +66,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 
 def _model(folder: Path, suffix: str) -> Any:
-    import pycolmap
+    from pipeline.colmap import pycolmap
 
     model = pycolmap.Reconstruction()
     try:

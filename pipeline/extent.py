@@ -1,0 +1,94 @@
+"""The part of the subject that the asset is made of: of a person the head, the neck and where the shoulders begin.
+
+Symbols: h length from the chin to the top of the forehead (the landmarks'); s(x) distance outside the extent, negative
+inside, asset units: the larger of the ellipsoid's and the planes'.
+
+What lies beyond is not asked for: photos show it, but it is neither fitted nor scored, and the mesh ends there. All
+stages share the one solid, with these margins: photos are asked inside ASKED h, so that what a hull a little too thick
+puts inside really is; the mesh is cut at the solid itself; the fit reaches GROWN h farther, so that it ends in no rim.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import Cut, Extent
+from pipeline.faces.landmarks3d import HeadFrame
+from pipeline.hull import BAND_CELLS, Hull
+
+F64 = npt.NDArray[np.float64]
+F32 = npt.NDArray[np.float32]
+
+BELOW = 0.65  # h from the chin down to the cut: a neck is 0.5 h long, the shoulders begin there
+MIDDLE = (0.0, -0.15, -0.5)  # h from between the eyes to the middle of the extent: left, up, to the front
+RADIUS = 1.45  # h: leaves 0.5 h around a head for hair, and the shoulders 0.9 h wide on each side
+CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.5)  # h: a ball that no head is smaller than, and its middle as above
+ASKED, GROWN = 0.04, 0.1  # h
+
+
+def head_extent(frame: HeadFrame) -> Extent:
+    """The extent of a person from the head's axes."""
+    h, axes = frame.height, frame.axes
+    centre = frame.eyes + h * np.asarray(MIDDLE) @ axes
+    down = -axes[1]
+    below = Cut(normal=_triple(down), offset=float(down @ frame.chin) + BELOW * h)
+    turn = tuple(_triple(row) for row in axes)
+    return Extent(centre=_triple(centre), axes=turn, radii=(RADIUS * h,) * 3, cuts=(below,), head=h)
+
+
+def core(extent: Extent) -> tuple[F64, float]:
+    """Middle (3,) and radius of a ball inside every head."""
+    axes = np.asarray(extent.axes, np.float64)
+    away = (np.asarray(CORE_MIDDLE) - np.asarray(MIDDLE)) * extent.head
+    return np.asarray(extent.centre, np.float64) + away @ axes, CORE * extent.head
+
+
+def signed(extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0) -> F64:
+    """(N,) s at points (N, 3), of the solid grown by `grown`; about a distance for radii that are not equal."""
+    return signed_and_gradient(extent, points, grown)[0]
+
+
+def signed_and_gradient(
+    extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0
+) -> tuple[F64, F64]:  # fmt: skip
+    """s (N,) and its gradient (N, 3), of unit length."""
+    axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
+    local = (np.asarray(points, np.float64) - np.asarray(extent.centre)) @ axes.T
+    first = np.linalg.norm(local / radii, axis=1)
+    second = np.maximum(np.linalg.norm(local / radii**2, axis=1), 1e-12)
+    # at the middle both vanish and the distance is the smallest radius
+    value = np.where(first > 1e-9, first * (first - 1) / second, -radii.min())
+    slope = local / radii**2 / second[:, None]
+    gradient = np.where(first[:, None] > 1e-9, slope, [0.0, 1.0, 0.0]) @ axes
+    for cut in extent.cuts:
+        normal = np.asarray(cut.normal)
+        beyond = np.asarray(points, np.float64) @ normal - cut.offset
+        larger = beyond > value
+        value = np.where(larger, beyond, value)
+        gradient = np.where(larger[:, None], normal, gradient)
+    return np.asarray(value - grown, np.float64), np.asarray(gradient, np.float64)
+
+
+def bounds(extent: Extent, grown: float = 0.0) -> tuple[F64, F64]:
+    """(3,) corners of the box around the ellipsoid, and below of the planes that are square to an axis of it."""
+    axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
+    centre = np.asarray(extent.centre, np.float64)
+    reach = np.sqrt(((axes * radii[:, None]) ** 2).sum(0)) + grown
+    return centre - reach, centre + reach
+
+
+def within(hull: Hull, extent: Extent, grown: float = 0.0) -> Hull:
+    """The part of a hull inside the extent."""
+    centres = hull.centres(np.ones(hull.level.shape, bool)).reshape(-1, 3)
+    outside = signed(extent, centres, grown).reshape(hull.level.shape).astype(np.float32)
+    band = np.float32(BAND_CELLS * hull.cell)
+    level = np.maximum(hull.level, outside.clip(-band, band))
+    return replace(hull, level=level, occupied=hull.occupied & (outside <= 0.5 * hull.cell))
+
+
+def _triple(v: npt.NDArray[np.floating] | Sequence[float]) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])

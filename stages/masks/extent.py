@@ -1,0 +1,104 @@
+"""Which pixels show the subject inside its extent: the others are neither fitted nor scored.
+
+A pixel is asked where the first surface that its ray meets is inside, and where the photo shows background. The
+surface is the hull of all masks, whose points are drawn nearest last at about one point a pixel. Where the subject is
+beside the hull (hair, a mask that others contradict) the nearest point of it tells, and far from any whether the ray
+meets the middle of the head: a head that the hull has lost must not fall out of the score.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from pipeline.artifacts import Camera, Extent
+from pipeline.extent import ASKED, bounds, core, signed
+from pipeline.hull import Hull, surface_points, visual_hull
+from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
+from stages.masks.agree import WRONG_SHARE, tolerated
+from stages.masks.region import F32, Bool
+
+CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head
+BEYOND = 1.25  # half-edge of that cube in radii of the extent: what is just beyond must be known as well
+POINT = 1.6  # cells a pixel of the picture that points are drawn into: no gaps
+NEAR = 0.15  # h: how far beside the hull its nearest point still tells
+FAINT = 0.01  # alpha below which a pixel is background
+NOTHING = 1e-3  # of the subject's pixels: where no more than that is left out, all is asked
+
+
+def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent) -> Hull:
+    """The hull of all masks in and around the extent; a few may be wrong. alphas: (h, w) of the voting views."""
+    lo, hi = bounds(extent)
+    middle, half = 0.5 * (lo + hi), 0.5 * BEYOND * float((hi - lo).max())
+    return visual_hull(cameras, alphas, middle - half, middle + half, 2 * half / CELLS, min_views=min(3, len(cameras)),
+                       max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
+
+
+def asked(camera: Camera, alpha: F32, extent: Extent, points: F64) -> F32 | None:
+    """(H, W) in [0, 1], at the size of alpha: 1 where the photo is asked. None where it is all over.
+
+    points: (N, 3) on the surface of the hull."""
+    depth = _inside(camera, extent, points)
+    h, w = alpha.shape
+    fine = np.asarray(cv2.resize(depth, (w, h), interpolation=cv2.INTER_LINEAR), np.float32)
+    subject = alpha > FAINT
+    out = np.where(subject, (fine + 0.5).clip(0, 1), np.float32(1)).astype(np.float32)
+    return out if (out < 0.5).sum() > NOTHING * max(int((alpha >= 0.5).sum()), 1) else None
+
+
+def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
+    """How far inside the extent, in pixels of the photo, the first surface of each pixel of a small picture lies."""
+    K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
+    uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, points)
+    middle, radius = core(extent)
+    away = float(np.linalg.norm(matrix(camera.world_from_cam)[:3, 3] - middle))
+    unit = away / float(np.sqrt(K[0, 0] * K[1, 1]))  # asset units a pixel of the photo, about
+    factor = min(1.0, unit / (POINT * _spacing(extent)))
+    w, h = max(2, round(camera.width * factor)), max(2, round(camera.height * factor))
+    value = np.full((h, w), np.nan, np.float32)
+    good = (z > 1e-9) & np.isfinite(uv).all(1)
+    at = np.floor(np.where(good[:, None], uv, -1) * (w / camera.width, h / camera.height)).astype(np.int64)
+    good &= (at >= 0).all(1) & (at[:, 0] < w) & (at[:, 1] < h)
+    order = np.flatnonzero(good)[np.argsort(-z[good], kind="stable")]
+    value[at[order, 1], at[order, 0]] = -signed(extent, points[order], -ASKED * extent.head)
+    whole = _filled(value, _meets(camera, w, h, middle, radius), NEAR * extent.head * factor / unit)
+    return np.asarray(cv2.medianBlur(whole, 5) / np.float32(unit), np.float32)  # specks where points were left out
+
+
+def _spacing(extent: Extent) -> float:
+    """Edge of the hull's cells."""
+    return 2 * BEYOND * max(extent.radii) / CELLS
+
+
+def _meets(camera: Camera, width: int, height: int, middle: F64, radius: float) -> Bool:
+    """(height, width) pixels whose ray passes through a ball."""
+    uv = pixel_centres(width, height) * (camera.width / width, camera.height / height)
+    origin, direction = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv)
+    along = direction @ (middle - origin)
+    off = np.linalg.norm(origin + along[:, None] * direction - middle, axis=1)
+    return np.asarray(((off <= radius) & (along > 0)).reshape(height, width))
+
+
+def _filled(value: F32, meets: Bool, near: float) -> F32:
+    """Pixels that no point was drawn into (NaN): as the nearest that has one within `near` pixels, else by the ray."""
+    known = np.isfinite(value)
+    far = np.where(meets, np.float32(1), np.float32(-1))
+    if not known.any():
+        return far
+    distance, label = cv2.distanceTransformWithLabels((~known).astype(np.uint8), cv2.DIST_L2, 5,
+                                                      labelType=cv2.DIST_LABEL_PIXEL)  # fmt: skip
+    of_label = np.zeros(int(label.max()) + 1, np.float32)
+    of_label[label[known]] = value[known]
+    return np.where(distance <= near, of_label[label], far).astype(np.float32)
+
+
+def outline_points(hull: Hull, extent: Extent) -> F64:
+    """(N, 3) points on the hull's surface, but for those beside the ellipsoid that no plane cuts off: in front of a
+    face that was photographed from one side a hull has tips that are air."""
+    points = np.asarray(surface_points(hull), np.float64)
+    cut = np.zeros(len(points), bool)
+    for plane in extent.cuts:
+        cut |= points @ np.asarray(plane.normal) > plane.offset
+    return points[cut | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)]

@@ -1,0 +1,122 @@
+"""How good the exported asset is: faults that checks of the files found, and what was lost on the way from the model.
+
+Where the limits are from: renders of the asset and of the fitted model differ by 39 to 43 dB for clean heads, 30 to 33
+for people shot by hand, 22 for a torso in shreds. The relative difference of the lobes is a mean over texels, most of
+which have a weak lobe: .4 to 1.3 for clean heads, 2 and 280 for fits whose F0 was out of its physical range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.colour import srgb_from_linear
+from pipeline.verdict import Finding, Limits, judged
+from stages.usd import findings as checks
+
+F32 = npt.NDArray[np.float32]
+AGAINST_MODEL = Limits(28.0, 20.0)  # dB
+OVERLAP = Limits(0.97, 0.9)  # of the silhouettes, intersection over union
+LOBE = Limits(1.6, 5.0, lower=False)  # |fitted - GGX| over |fitted|
+FAULTS = Limits(0, 0, lower=False)
+WARNINGS = Limits(0, np.inf, lower=False)
+SHOWN = 3  # faults that are quoted
+EQUAL = 1e-10  # mean squared difference of pictures that are the same: 100 dB
+
+
+def validity(found: Sequence[tuple[str, checks.Finding]]) -> tuple[Finding, ...]:
+    """Of the checks of all files: (name of the file, what was found)."""
+    bad, doubtful = (_texts(f for f in found if f[1].level == level) for level in ("error", "warning"))
+    return (
+        judged(
+            "usd_faults",
+            len(bad),
+            FAULTS,
+            f"the checks of the USD files found {len(bad)} faults{_quoted(bad)}",
+            "open the asset with care; report this with the run's log",
+        ),
+        judged(
+            "usd_warnings",
+            len(doubtful),
+            WARNINGS,
+            f"the checks of the USD files gave {len(doubtful)} warnings{_quoted(doubtful)}",
+            "look whether the programs that will open the asset mind",
+        ),
+    )
+
+
+def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
+    """The asset's renders against the model's of the same views: (photo's name, model's, asset's) with pictures
+    (H, W, 4) linear, premultiplied."""
+    seen = [(name, *_compared(model, asset)) for name, model, asset in views]
+    if not seen:
+        return ()
+    db = -10 * np.log10(max(float(np.mean([10 ** (-p / 10) for _, p, _ in seen])), EQUAL))
+    share = float(np.mean([s for _, _, s in seen]))
+    worst = [name for name, _, _ in sorted(seen, key=lambda s: s[1])]
+    remedy = "decimation and texels lose detail: raise bake.size and uv.target_faces, and look at the surface"
+    return (
+        judged(
+            "asset_against_model",
+            db,
+            AGAINST_MODEL,
+            f"renders of the asset agree with the fitted model's to {db:.1f} dB",
+            remedy,
+            unit="dB",
+            views=worst,
+        ),
+        judged(
+            "asset_silhouette",
+            share,
+            OVERLAP,
+            f"silhouettes of the asset agree with the fitted model's to {share:.1%}",
+            "a piece of the model is missing in the mesh: look at the surface stage's findings",
+            views=[name for name, _, _ in sorted(seen, key=lambda s: s[2])],
+        ),
+    )
+
+
+def lobe(figures: dict[str, float]) -> tuple[Finding, ...]:
+    """Whether a GGX lobe stands for the fitted one."""
+    if "ggx_residual_mean" not in figures:
+        return ()
+    off = figures["ggx_residual_mean"]
+    return (
+        judged(
+            "ggx_residual",
+            off,
+            LOBE,
+            f"the highlights that the shaders show differ by {off:.0%} from the fitted ones",
+            "photograph with light that moves or has an edge, so that highlights can be told from colour; use the "
+            "albedo alone",
+        ),
+    )
+
+
+def _compared(model: F32, asset: F32) -> tuple[float, float]:
+    """PSNR (dB) where the model's picture is covered, and the overlap of the silhouettes."""
+    a, b = model[..., 3] > 0.5, asset[..., 3] > 0.5
+    both = float((a & b).sum() / max(int((a | b).sum()), 1))
+    if not a.any():
+        return 0.0, both
+    difference = _encoded(model[a]) - _encoded(asset[a])
+    return -10 * float(np.log10(max(float((difference**2).mean()), EQUAL))), both
+
+
+def _encoded(linear: F32) -> npt.NDArray[np.float64]:
+    return np.asarray(srgb_from_linear(linear[..., :3].clip(0, 1)), np.float64)
+
+
+def _texts(found: Iterable[tuple[str, checks.Finding]]) -> list[str]:
+    """Each fault once: a component and the scene that refers to it show the same."""
+    said: dict[tuple[str, str, str], str] = {}
+    for file, f in found:
+        said.setdefault((f.check, f.message, f.where), f"{file}: {f.check}: {f.message} {f.where}".strip())
+    return list(said.values())
+
+
+def _quoted(texts: list[str]) -> str:
+    more = f"; and {len(texts) - SHOWN} more" if len(texts) > SHOWN else ""
+    return ": " + "; ".join(texts[:SHOWN]) + more if texts else ""

@@ -1,0 +1,110 @@
+"""Charts for surfaces that are rough: as many pieces as it takes until each lies flat, none left without area.
+
+A shredded surface does not come apart into a few discs. Its pieces are parted until each of them lies flat, all those
+that do not in one round; what is left after ROUNDS, a few faces in a tangle, is laid flat face by face. Fragments are
+then given to a neighbour where the two together still lie flat.
+
+Symbols
+    fragment  a chart with less than FRAGMENT of the area: nobody paints on it, and its seams show
+    short     a face whose area in the texture is less than SHORT of its share of the surface: it has no texels
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.meshes import F64, Charts, Faces, Indices, Mask, Mesh
+from stages.uv.charts import Surface, flats_of, laid_flat, surface_of, together
+from stages.uv.flatten import Flat, local_frames, signed
+from stages.uv.segment import connected, halved, segment
+
+log = logging.getLogger("neuface.uv")
+ROUNDS = 24  # of parting what does not lie flat; of a shredded torso with 50,000 faces 12 leave 0.1 % of the area
+MOST_PIECES = 1500  # from here on xatlas is quicker
+FRAGMENT = 5e-4  # of the area. Of a head's 0.15 m^2 75 mm^2, a square of 9 mm
+MERGES = 300  # of fragments that are tried, the smallest first: a fifth of a second each with large neighbours
+SHORT = 1e-3
+LEAST_HEIGHT = 1e-2  # of a face's length: faces without area are drawn as high, so that they have texels
+
+
+def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
+    """Texture vertices (U, 2) in one common scale, faces (F, 3) into them and the chart (F,) of each: not packed yet.
+    None where that would take more than MOST_PIECES charts.
+
+    smooth: (V, 3) vertices without bumps.
+    """
+    surface = surface_of(mesh, smooth)
+    label = segment(smooth, mesh.faces, surface.pairs)
+    known: dict[bytes, Flat] = {}
+    for _ in range(ROUNDS):
+        flats = flats_of(surface, label, known)
+        bad = [f for f in flats if not f.good and len(f.member) > 1]
+        if not bad or len(flats) > MOST_PIECES:
+            break
+        label = _all_parted(surface, label, bad)
+    flats = flats_of(surface, label, known)
+    flats = _merged(surface, flats)
+    log.info("uv: %d pieces, %d of them laid face by face", len(flats), sum(not f.good for f in flats))
+    flats = [one for f in flats for one in ([f] if f.good else _face_by_face(surface, f))]
+    if len(flats) > MOST_PIECES:
+        return None
+    return together(surface, flats)
+
+
+def short(mesh: Mesh, charts: Charts) -> Mask:
+    """(F,) faces with next to no area in the texture for the area that they have on the surface."""
+    t = np.abs(signed(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)))
+    area = meshes.areas(mesh.vertices, mesh.faces)
+    return np.asarray(t / max(float(t.sum()), 1e-30) < SHORT * area / max(float(area.sum()), 1e-30))
+
+
+def _all_parted(surface: Surface, label: Indices, bad: list[Flat]) -> Indices:
+    """Every one of the pieces in two, across its longest direction in space."""
+    for flat in bad:
+        centre = surface.smooth[surface.faces[flat.member]].mean(1)
+        centre = centre - centre.mean(0)
+        place = np.zeros(len(label))
+        place[flat.member] = centre @ np.linalg.svd(centre, full_matrices=False)[2][0]
+        label = halved(place, label, int(label[flat.member[0]]), surface.area, surface.pairs)
+    return connected(label, surface.pairs)
+
+
+def _merged(surface: Surface, flats: list[Flat]) -> list[Flat]:
+    """Fragments laid flat with the neighbour that they share the longest border with, where that lies flat."""
+    chart = np.zeros(len(surface.area), np.int64)
+    for i, flat in enumerate(flats):
+        chart[flat.member] = i
+    size = np.bincount(chart, surface.area, len(flats)) / surface.area.sum()
+    pairs = surface.pairs
+    small = np.flatnonzero(size < FRAGMENT)
+    for which in small[np.argsort(size[small], kind="stable")][:MERGES].tolist():
+        a, b = chart[pairs.a], chart[pairs.b]
+        border = (a == which) != (b == which)
+        if not border.any():
+            continue  # a piece of its own, or merged before
+        beside = np.where(a == which, b, a)[border]
+        length = np.bincount(beside, pairs.length[border])
+        for into in np.argsort(-length, kind="stable")[:3].tolist():
+            if not length[into] or not flats[into].good:
+                continue
+            joint = laid_flat(surface, np.flatnonzero((chart == into) | (chart == which)))
+            if joint.good:
+                flats[into], flats[which] = joint, replace(flats[which], member=np.zeros(0, np.int64))
+                chart[joint.member] = into
+                break
+    return [f for f in flats if len(f.member)]
+
+
+def _face_by_face(surface: Surface, flat: Flat) -> list[Flat]:
+    """Each face of a piece as a chart of its own, without stretch; one without area is drawn LEAST_HEIGHT high."""
+    faces = surface.faces[flat.member].astype(np.int64)
+    frame = local_frames(surface.true, faces)
+    span = float(np.ptp(surface.true, axis=0).max())
+    frame[:, 1, 0] = np.maximum(frame[:, 1, 0], 1e-6 * span)
+    frame[:, 2, 1] = np.maximum(frame[:, 2, 1], LEAST_HEIGHT * frame[:, 1, 0])
+    own = np.arange(3, dtype=np.int32)[None]
+    return [Flat(flat.member[i : i + 1], own, frame[i], faces[i], good=True) for i in range(len(faces))]

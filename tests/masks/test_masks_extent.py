@@ -1,0 +1,116 @@
+"""What is asked of photos of people: head and neck, not the chest, and never nothing of a head that was lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.artifacts import Camera
+from pipeline.contract import execute
+from pipeline.extent import head_extent
+from pipeline.faces.find import Face
+from pipeline.faces.landmarks3d import head_frame, load_landmarks
+from pipeline.images import read_alpha
+from pipeline.store import Store
+from pipeline.transforms import inverse_rigid, matrix, project
+from stages.masks import segment
+from stages.masks.extent import asked
+from stages.masks.segment import Looked, Masked
+from stages.masks.stage import STAGE, Config
+from tests.masks.test_masks_stage import Scene, ball_alpha, scene  # noqa: F401
+from tests.support.faces import camera, face
+
+F64 = np.typing.NDArray[np.float64]
+EXTENT = head_extent(head_frame(face()))
+
+
+def shell(centre: tuple[float, float, float], radii: tuple[float, float, float], count: int = 40_000) -> F64:
+    """(N, 3) on an ellipsoid, evenly."""
+    k = np.arange(count)
+    height = 1 - 2 * (k + 0.5) / count
+    ring, angle = np.sqrt(1 - height**2), k * 2.399963
+    return np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], 1) * radii + centre
+
+
+HEAD, CHEST = shell((0, 0, -0.02), (0.09, 0.13, 0.1)), shell((0, -0.42, -0.03), (0.2, 0.27, 0.11))
+
+
+def pixels(c: Camera, at: tuple[float, float, float]) -> tuple[int, int]:
+    uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), np.array([at]))
+    return int(uv[0, 1]), int(uv[0, 0])
+
+
+@pytest.mark.parametrize("azimuth", [0, 60, 180])
+def test_the_chest_is_not_asked(azimuth: float) -> None:
+    c = camera(0, azimuth, 10, 1.6)
+    alpha = np.zeros((c.height, c.width), np.float32)
+    alpha[:, 100:540] = 1
+    found = asked(c, alpha, EXTENT, np.concatenate([HEAD, CHEST]))
+    assert found is not None and found.shape == alpha.shape
+    side = np.array([np.sin(np.radians(azimuth)), 0, np.cos(np.radians(azimuth))])
+    assert (found[:, :100] == 1).all()  # background
+    for y, is_asked in ((0.1, 1), (0.0, 1), (-0.1, 1), (-0.3, 0), (-0.36, 0)):
+        row, column = pixels(c, tuple(np.array([0, y, -0.02]) + 0.09 * side))
+        assert found[row, column] == is_asked, y
+
+
+def test_a_shoulder_before_the_neck_hides_it() -> None:
+    """Seen from below: the ray through the neck meets the chest first."""
+    c = camera(0, 0, -50, 1.6)
+    alpha = np.ones((c.height, c.width), np.float32)
+    neck = pixels(c, (0, -0.13, 0.0))
+    open_, hidden = (asked(c, alpha, EXTENT, np.concatenate(parts)) for parts in
+                     ((HEAD, CHEST), (HEAD, CHEST, shell((0, -0.3, 0.2), (0.1, 0.1, 0.05)))))  # fmt: skip
+    assert open_ is not None and hidden is not None
+    assert open_[neck] == 1 and hidden[neck] == 0
+
+
+def test_a_head_that_the_hull_has_lost_is_asked_all_the_same() -> None:
+    c = camera(0, 0, 0, 1.6)
+    alpha = np.zeros((c.height, c.width), np.float32)
+    alpha[:, 200:440] = 1
+    found = asked(c, alpha, EXTENT, CHEST)
+    assert found is not None and found[pixels(c, (0, 0.05, 0.05))] == 1
+    assert found[pixels(c, (0, -0.35, 0.05))] == 0
+
+
+def test_nothing_is_left_out_of_a_head_alone() -> None:
+    c = camera(0, 0, 0, 1.6)
+    alpha = np.zeros((c.height, c.width), np.float32)
+    row, column = pixels(c, (0, 0, 0))
+    alpha[row - 45 : row + 45, column - 35 : column + 35] = 1
+    assert asked(c, alpha, EXTENT, HEAD) is None
+
+
+@pytest.mark.parametrize("method", ["key", "object"])
+def test_the_stage_hands_on_face_and_extent(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str  # noqa: F811
+) -> None:  # fmt: skip
+    """A small face on a ball: what lies beyond its neck is not asked; an object with a face is one."""
+    points = 0.35 * face() + (0, 0.05, 0.05)
+
+    def look(m: Masked, *_: object) -> Looked:
+        uv, _z = project(matrix(m.camera.K), inverse_rigid(matrix(m.camera.world_from_cam)), np.zeros(5), points)
+        return Looked(Face(uv, 1.0) if m.view.index % 3 else None)
+
+    real = segment.plan
+    monkeypatch.setattr(segment, "_look", look)
+    if method == "object":
+        monkeypatch.setattr(segment, "plan", lambda *a: replace(real(*a), method="object"))
+        monkeypatch.setattr(segment, "mask", lambda view, *_: (ball_alpha(view.camera), "object"))
+    found = execute(STAGE, scene.inputs(), Config(hull_cells=32), Store(tmp_path / "store")).located
+    assert found.artifact.landmarks is not None
+    np.testing.assert_allclose(load_landmarks(found.path(found.artifact.landmarks)), points, atol=1e-6)
+    if method == "object":
+        assert found.artifact.extent is None and all(m.asked is None for m in found.artifact.masks)
+        return
+    assert found.artifact.extent is not None
+    cut = [m for m in found.artifact.masks if m.asked is not None]
+    assert len(cut) > 0.8 * len(found.artifact.masks)
+    for m in cut:
+        assert m.asked is not None
+        part, alpha = read_alpha(found.path(m.asked)), read_alpha(found.path(m.mask))
+        assert (part[alpha == 0] == 1).all() and (part[alpha == 1] < 0.5).any()

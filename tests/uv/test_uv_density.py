@@ -1,0 +1,72 @@
+"""The face has 40 % of the texels, and is one chart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline import meshes
+from pipeline.faces.landmarks3d import head_frame
+from pipeline.faces.oval import on_face
+from pipeline.meshes import Mesh
+from stages.surface.build import build as surface_build
+from stages.uv.build import build
+from stages.uv.density import MOST, front_of, scale_for
+from stages.uv.unwrap import Options, chart_of_face, signed_areas
+from tests.support.analytic_fields import AnalyticField, bumpy_head
+from tests.support.faces import face
+
+
+def quiet(*_: object) -> None:
+    pass
+
+
+@pytest.fixture(scope="module")
+def head() -> Mesh:
+    return surface_build(AnalyticField(bumpy_head(0.0, 60.0)), 48, quiet).mesh
+
+
+def landmarks(share: float = 0.7) -> np.ndarray:
+    """On the front of the head, about as large as a face is on one."""
+    return face() * (share, share, 1.0) + (0, 0, 0.03)
+
+
+@pytest.mark.slow
+def test_the_face_is_a_chart_with_two_fifths_of_the_texels(head: Mesh) -> None:
+    plain = build(head, 4000, 400, Options(512, 3), quiet)
+    made = build(head, 4000, 400, Options(512, 3), quiet, landmarks=landmarks())
+    assert plain.quality.face_share is None
+    assert made.quality.face_share is not None and 0.4 <= made.quality.face_share < 0.5
+    assert made.quality.overlap == 0 and made.quality.flipped == 0 and made.warnings == ()
+    assert made.quality.charts <= plain.quality.charts + 6
+    assert made.quality.stretch < plain.quality.stretch + 0.05  # the scale of a chart is no stretch
+    front = front_of(made.mesh, landmarks())
+    assert front is not None
+    label = chart_of_face(made.charts.faces, len(made.charts.uvs))
+    assert len(np.unique(label[front.face])) == 1
+    area = meshes.areas(made.mesh.vertices, made.mesh.faces)
+    density = np.sqrt(np.abs(signed_areas(made.charts.uvs.astype(np.float64), made.charts.faces)) / area)
+    ratio = np.median(density[front.face]) / np.median(density[~front.region])
+    assert 1.2 < ratio <= MOST + 0.01
+
+
+def test_a_small_face_is_no_more_than_three_times_as_fine(head: Mesh) -> None:
+    area = meshes.areas(head.vertices, head.faces)
+    tiny = front_of(head, landmarks(0.2))
+    large = front_of(head, landmarks(1.2))
+    assert tiny is not None and large is not None
+    assert scale_for(tiny, tiny.face, area) == MOST
+    assert 1 <= scale_for(large, large.face, area) < MOST
+    everything = np.ones(len(area), np.bool_)
+    assert scale_for(large, everything, area) in (1.0, MOST)  # nothing is left to be coarser
+    assert front_of(head, None) is None and front_of(head, face() + (0, 5, 0)) is None
+
+
+def test_which_places_are_in_the_face() -> None:
+    points = landmarks()
+    frame = head_frame(points)
+    nose, back, top = np.array([[0, 0, 0.09], [0, 0, -0.09], [0, 0.2, 0.05]])
+    normals = np.array([[0, 0, 1.0], [0, 0, -1.0], [0, 0.5, 0.8]])
+    assert on_face(np.stack([nose, back, top]), normals, points).tolist() == [True, False, False]
+    assert not on_face(nose[None], -normals[:1], points)[0]  # the inside of a thin sheet
+    assert frame.axes[2] @ [0, 0, 1] == pytest.approx(1)
