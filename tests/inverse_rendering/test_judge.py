@@ -144,8 +144,10 @@ def test_matt_people_are_told_and_matt_stones_are_not() -> None:
 
 def test_what_a_user_has_set_is_not_judged() -> None:
     facts = {k: {**v, "why": "setting"} for k, v in FACTS.items()}
-    facts["specular"] = {"modelled": False, "why": "setting"}
-    assert not {"specular", "photos_agree", "calibration"} & {f.check for f in findings(sound(facts=facts))}
+    facts["specular"] |= {"modelled": False}
+    assert not {"specular", "calibration"} & {f.check for f in findings(sound(facts=facts))}
+    facts["specular"] = {"modelled": False, "why": "setting"}  # nothing was measured at all
+    assert "photos_agree" not in {f.check for f in findings(sound(facts=facts))}
 
 
 def test_no_pixels_at_all() -> None:
@@ -206,6 +208,13 @@ def test_a_field_that_lacks_a_part_is_found(ball: Trainer) -> None:
     assert only(replace(sound(), errors=errors), "fit_missing").level == "unusable"
     large = measured(new_trainer(ball.views, ball_start(0.13), SMALL, False, "cpu"))
     assert np.mean([e.beyond for e in large]) > 0.3 and all(e.missing == 0 for e in large)
+
+
+def test_a_mask_that_lacks_half_of_the_subject_is_told_from_the_others(ball: Trainer) -> None:
+    halved = [replace(v, alpha=v.alpha * (np.arange(64) < 32)) if v.index == 4 else v for v in ball.views]
+    table = new_trainer(halved, ball_start(), SMALL, False, "cpu").pixels
+    errors = view_errors(ball.model, table, halved, SMALL.image_side, SMALL.samples)
+    assert all((e.beyond > 0.1) == (e.index == 4) for e in errors)
 
 
 def test_own_colours_are_taken_off() -> None:

@@ -32,6 +32,9 @@ def found(results: SyntheticResults, **findings: tuple[Finding, ...]) -> Synthet
     return replace(results, **changed)
 
 
+HELD_OUT = ("held_out_psnr", "held_out_mask_iou", "held_out_worst", "asset_against_model")  # the report's own, all good
+
+
 def page_of(results: SyntheticResults, folder: Path) -> tuple[dict, str]:
     folder.mkdir(parents=True)
     STAGE.run(Inputs(**{n: getattr(results, n) for n in Inputs.__slots__}), Config(), Context(folder, folder / "s"))
@@ -53,20 +56,27 @@ def test_level_sentence_remedy_photo_and_table(results: SyntheticResults, tmp_pa
         and "<b>agree" not in page
     )
     assert top.count("data:image/jpeg") == 2 and 'alt="3.png"' in top and 'alt="9.png"' in top
-    assert "<summary>All 2 checks</summary>" in top and "All photos were placed." in top
+    assert "<summary>All 6 checks</summary>" in top and "All photos were placed." in top
     verdict = metrics["verdict"]
     assert verdict["level"] == "unusable" and verdict["stages"]["masks"] == "unusable"
     assert list(verdict["stages"]) == [*Inputs.__slots__, "report"]
     assert [(f["stage"], f["check"], f["level"]) for f in verdict["findings"]] == [
         ("poses", "photos_placed", "good"),
         ("masks", "mask_agreement", "unusable"),
+        *(("report", check, "good") for check in HELD_OUT),
     ]
 
 
 def test_good_results_say_so(results: SyntheticResults, tmp_path: Path) -> None:
     metrics, page = page_of(results, tmp_path / "work")
-    assert metrics["verdict"]["level"] == "good" and metrics["verdict"]["findings"] == []
-    assert '<section class="verdict good"' in page and "\u2713 Good" in page and "<summary>All" not in page
+    assert metrics["verdict"]["level"] == "good"
+    assert [f["check"] for f in metrics["verdict"]["findings"]] == list(HELD_OUT)
+    assert '<section class="verdict good"' in page and "\u2713 Good" in page and "<summary>All 4 checks" in page
+
+
+def test_without_any_check_there_is_no_table(tmp_path: Path) -> None:
+    metrics, page = page_of(write_results(tmp_path / "results", held_out=()), tmp_path / "work")
+    assert metrics["verdict"]["findings"] == [] and "<summary>All" not in page
 
 
 def test_few_photos_and_few_troubles_the_worst_first(results: SyntheticResults) -> None:
