@@ -23,10 +23,10 @@ from pipeline.hull import BAND_CELLS, Hull
 F64 = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 
-BELOW = 0.65  # h from the chin down to the cut: a neck is 0.5 h long, the shoulders begin there
-MIDDLE = (0.0, -0.15, -0.5)  # h from between the eyes to the middle of the extent: left, up, to the front
-RADIUS = 1.45  # h: leaves 0.5 h around a head for hair, and the shoulders 0.9 h wide on each side
-CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.5)  # h: a ball that no head is smaller than, and its middle as above
+BELOW = 0.6  # h from the chin down to the cut: a neck is 0.5 h long, the shoulders begin there
+MIDDLE = (0.0, 0.0, -0.55)  # h from between the eyes to the middle of the extent: left, up, to the front
+RADIUS = 1.4  # h: leaves 0.6 h around a head for hair, and 0.9 h of the shoulders on each side
+CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.55)  # h: a ball that no head is smaller than, and its middle as above
 ASKED, GROWN = 0.04, 0.1  # h
 
 

@@ -1,9 +1,9 @@
 """Which pixels show the subject inside its extent: the others are neither fitted nor scored.
 
-A pixel is asked where the first surface that its ray meets is inside, and where the photo shows background. The
-surface is the hull of all masks, whose points are drawn nearest last at about one point a pixel. Where the subject is
-beside the hull (hair, a mask that others contradict) the nearest point of it tells, and far from any whether the ray
-meets the middle of the head: a head that the hull has lost must not fall out of the score.
+A pixel is asked where the first surface that its ray meets is inside, a little behind it too, and where the photo shows
+background. The surface is the hull of all masks, whose points are drawn nearest last at about one point a pixel. Where
+the subject is beside the hull (hair, a mask that others contradict) the nearest point of it tells, and far from any
+whether the ray meets the middle of the head: a head that the hull has lost must not fall out of the score.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera, Extent
-from pipeline.extent import ASKED, bounds, core, signed
+from pipeline.extent import ASKED, BELOW, bounds, core, signed
 from pipeline.hull import Hull, surface_points, visual_hull
 from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
 from stages.masks.agree import WRONG_SHARE, tolerated
@@ -23,16 +23,22 @@ from stages.masks.region import F32, Bool
 CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head
 BEYOND = 1.25  # half-edge of that cube in radii of the extent: what is just beyond must be known as well
 POINT = 1.6  # cells a pixel of the picture that points are drawn into: no gaps
+THICK = (
+    0.2  # h: a hull is thicker than the body by so much where few photos see it; asked if inside so far along the ray
+)
 NEAR = 0.15  # h: how far beside the hull its nearest point still tells
 FAINT = 0.01  # alpha below which a pixel is background
 NOTHING = 1e-3  # of the subject's pixels: where no more than that is left out, all is asked
 
 
 def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent) -> Hull:
-    """The hull of all masks in and around the extent; a few may be wrong. alphas: (h, w) of the voting views."""
+    """The hull of all masks in and around the extent; a few may be wrong. alphas: (h, w) of the voting views.
+
+    A single view is enough to speak for a place: shoulders leave most frames, and without them what is beyond the cut
+    would pass for what is above it."""
     lo, hi = bounds(extent)
     middle, half = 0.5 * (lo + hi), 0.5 * BEYOND * float((hi - lo).max())
-    return visual_hull(cameras, alphas, middle - half, middle + half, 2 * half / CELLS, min_views=min(3, len(cameras)),
+    return visual_hull(cameras, alphas, middle - half, middle + half, 2 * half / CELLS, min_views=1,
                        max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
 
 
@@ -62,9 +68,12 @@ def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
     at = np.floor(np.where(good[:, None], uv, -1) * (w / camera.width, h / camera.height)).astype(np.int64)
     good &= (at >= 0).all(1) & (at[:, 0] < w) & (at[:, 1] < h)
     order = np.flatnonzero(good)[np.argsort(-z[good], kind="stable")]
-    value[at[order, 1], at[order, 0]] = -signed(extent, points[order], -ASKED * extent.head)
+    ahead = points[order] - matrix(camera.world_from_cam)[:3, 3]
+    ahead *= THICK * extent.head / np.linalg.norm(ahead, axis=1, keepdims=True)
+    depths = [signed(extent, points[order] + step, -ASKED * extent.head) for step in (0.0, ahead)]
+    value[at[order, 1], at[order, 0]] = -np.maximum(*depths)
     whole = _filled(value, _meets(camera, w, h, middle, radius), NEAR * extent.head * factor / unit)
-    return np.asarray(cv2.medianBlur(whole, 5) / np.float32(unit), np.float32)  # specks where points were left out
+    return np.asarray(cv2.medianBlur(whole, 3) / np.float32(unit), np.float32)  # specks where points were left out
 
 
 def _spacing(extent: Extent) -> float:
@@ -95,10 +104,10 @@ def _filled(value: F32, meets: Bool, near: float) -> F32:
 
 
 def outline_points(hull: Hull, extent: Extent) -> F64:
-    """(N, 3) points on the hull's surface, but for those beside the ellipsoid that no plane cuts off: in front of a
-    face that was photographed from one side a hull has tips that are air."""
+    """(N, 3) points on the hull's surface, but for those beside the ellipsoid and above the chin: in front of a face
+    that was photographed from one side a hull has tips that are air. Below are shoulders."""
     points = np.asarray(surface_points(hull), np.float64)
-    cut = np.zeros(len(points), bool)
+    above = np.ones(len(points), bool)
     for plane in extent.cuts:
-        cut |= points @ np.asarray(plane.normal) > plane.offset
-    return points[cut | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)]
+        above &= points @ np.asarray(plane.normal) < plane.offset - BELOW * extent.head
+    return points[~above | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)]

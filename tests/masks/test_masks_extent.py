@@ -114,3 +114,14 @@ def test_the_stage_hands_on_face_and_extent(
         assert m.asked is not None
         part, alpha = read_alpha(found.path(m.asked)), read_alpha(found.path(m.mask))
         assert (part[alpha == 0] == 1).all() and (part[alpha == 1] < 0.5).any()
+
+
+def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:
+    """Seen from above the body lies lower than the hull in front of it, by most of the way that the ray goes on."""
+    front = shell((0, -0.19, -0.06), (0.1, 0.1, 0.1))
+    level, above = (camera(0, 0, e, 1.6) for e in (0, 45))
+    alpha = np.ones((level.height, level.width), np.float32)
+    at = (0.0, -0.165, 0.037)  # 2 cm above the cut
+    for c, wanted in ((level, 1), (above, 0)):
+        found = asked(c, alpha, EXTENT, front)
+        assert found is not None and found[pixels(c, at)] == pytest.approx(wanted, abs=0.3)
