@@ -17,14 +17,16 @@ from pipeline.artifacts import Camera, Extent
 from pipeline.extent import ASKED, BELOW, bounds, core, signed
 from pipeline.hull import Hull, surface_points, visual_hull
 from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
-from stages.masks.agree import WRONG_SHARE, tolerated
+from stages.masks.agree import CUBE, WRONG_SHARE, tolerated
 from stages.masks.region import F32, Bool
 
 CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head
 BEYOND = 1.25  # half-edge of that cube in radii of the extent: what is just beyond must be known as well
 POINT = 1.6  # cells a pixel of the picture that points are drawn into: no gaps
-THICK = (
-    0.2  # h: a hull is thicker than the body by so much where few photos see it; asked if inside so far along the ray
+THICK = 0.2  # h: so much is a hull thicker than the body where few photos see it: asked if inside so far along the ray
+COARSE = 48  # cells along the cube in which the subject is weighed against what lies beyond the extent
+BUST = (
+    1.25  # volume beyond over that inside, up to which the subject stays whole: head scans .75 to .9, a seated man 1.8
 )
 NEAR = 0.15  # h: how far beside the hull its nearest point still tells
 FAINT = 0.01  # alpha below which a pixel is background
@@ -40,6 +42,15 @@ def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent)
     middle, half = 0.5 * (lo + hi), 0.5 * BEYOND * float((hi - lo).max())
     return visual_hull(cameras, alphas, middle - half, middle + half, 2 * half / CELLS, min_views=1,
                        max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
+
+
+def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent, roi_radius: float) -> float:
+    """Volume of the masks' hull beyond the extent over that inside it, in the cube of the region of interest."""
+    edge = CUBE * roi_radius
+    hull = visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / COARSE, min_views=min(3, len(cameras)),
+                       max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
+    beyond = signed(extent, hull.centres(hull.occupied)) > 0
+    return float(beyond.sum() / max(int((~beyond).sum()), 1))
 
 
 def asked(camera: Camera, alpha: F32, extent: Extent, points: F64) -> F32 | None:

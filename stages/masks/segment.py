@@ -22,7 +22,7 @@ from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.cut_out import cut
-from stages.masks.extent import asked, outline_points, whole_hull
+from stages.masks.extent import BUST, asked, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
 from stages.masks.judge import Seen, judge
 from stages.masks.landmarks import agreed, save_landmarks
@@ -126,7 +126,10 @@ def segment(
     # what is cut out as an object is one, even with a face
     people = found_face is not None and how.method != "object"
     extent = head_extent(head_frame(found_face.face.xyz)) if found_face is not None and people else None
-    parts = _asked(masked, extent, set(dropped), context)
+    votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
+    if extent is not None and _is_bust(votes, extent, poses.roi_radius):
+        extent = None
+    parts = _asked(masked, votes, extent, context)
     made = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, looked, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in made))  # fmt: skip
@@ -140,11 +143,16 @@ def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
                  m.view.index in dropped) for m in masked]  # fmt: skip
 
 
-def _asked(masked: list[Masked], extent: Extent | None, dropped: set[int], context: Context) -> dict[int, Path]:
+def _is_bust(votes: list[Masked], extent: Extent, roi_radius: float) -> bool:
+    """Whether there is so little beyond the extent that the subject stays whole: a head scan ends in its shoulders."""
+    beyond = share_beyond([m.camera for m in votes], [m.small for m in votes], extent, roi_radius)
+    return beyond <= BUST
+
+
+def _asked(masked: list[Masked], votes: list[Masked], extent: Extent | None, context: Context) -> dict[int, Path]:
     """Files of what is asked of each view in which not all is, by the view's index."""
     if extent is None:
         return {}
-    votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in dropped]
     points = outline_points(whole_hull([m.camera for m in votes], [m.small for m in votes], extent), extent)
 
     def one(m: Masked) -> tuple[int, Path | None]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,7 +18,7 @@ from pipeline.images import read_alpha
 from pipeline.store import Store
 from pipeline.transforms import inverse_rigid, matrix, project
 from stages.masks import segment
-from stages.masks.extent import asked
+from stages.masks.extent import BUST, asked, share_beyond
 from stages.masks.segment import Looked, Masked
 from stages.masks.stage import STAGE, Config
 from tests.masks.test_masks_stage import Scene, ball_alpha, scene  # noqa: F401
@@ -125,3 +126,21 @@ def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:
     for c, wanted in ((level, 1), (above, 0)):
         found = asked(c, alpha, EXTENT, front)
         assert found is not None and found[pixels(c, at)] == pytest.approx(wanted, abs=0.3)
+
+
+def test_how_much_goes_on_beyond_the_extent() -> None:
+    """A head alone has nothing beyond it; with a chest as large as a person's more is beyond than inside."""
+    cameras = [camera(i, 30 * i, 5, 2.4) for i in range(12)]
+
+    def share(points: F64) -> float:
+        alphas = []
+        for c in cameras:
+            uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), points)
+            alpha = np.zeros((c.height, c.width), np.uint8)
+            for part in np.split(uv.astype(np.int32), len(uv) // 40_000):
+                cv2.fillConvexPoly(alpha, cv2.convexHull(part), 1)
+            alphas.append(alpha.astype(np.float32))
+        return share_beyond(cameras, alphas, EXTENT, 0.28)
+
+    assert share(HEAD) < 0.05
+    assert share(np.concatenate([HEAD, CHEST])) > 1.3 > BUST

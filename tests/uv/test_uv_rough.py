@@ -10,7 +10,7 @@ import pytest
 from support.shreds import shredded, with_worthless_faces
 
 from pipeline import meshes, raster
-from pipeline.artifacts import FileRef, Located, Surface
+from pipeline.artifacts import FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
@@ -139,7 +139,8 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
         mesh=FileRef.of(tmp_path, "surface.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), watertight=True,
         components=1, removed_components=0, cell=0.006,
     )  # fmt: skip
-    inputs = Inputs(Located(artifact, tmp_path), None, None)  # type: ignore[arg-type]
+    masks = Located(MaskSet(masks=()), tmp_path)
+    inputs = Inputs(Located(artifact, tmp_path), None, None, masks)  # type: ignore[arg-type]
     uv = run(inputs, Config(target_faces=3000, proxy_faces=300, texture_size=512), Context(tmp_path, tmp_path))
     assert len(uv.findings) == 10 and {f.level for f in uv.findings} == {"good"}, [str(f) for f in uv.findings]
 
