@@ -26,8 +26,6 @@ POINT = 1.6  # cells a pixel of the picture that points are drawn into: no gaps
 THICK = 0.2  # h: so much is a hull thicker than the body where few photos see it: asked if inside so far along the ray
 COARSE = 48  # cells along the cube in which the subject is weighed against what lies beyond the extent
 BUST = 1.25  # volume beyond over that inside, up to which the subject stays whole (head scans .9, a seated man 1.8)
-    1.25  # volume beyond over that inside, up to which the subject stays whole: head scans .75 to .9, a seated man 1.8
-)
 NEAR = 0.15  # h: how far beside the hull its nearest point still tells
 FAINT = 0.01  # alpha below which a pixel is background
 NOTHING = 1e-3  # of the subject's pixels: where no more than that is left out, all is asked
