@@ -125,3 +125,14 @@ def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:
     for c, wanted in ((level, 1), (above, 0)):
         found = asked(c, alpha, EXTENT, front)
         assert found is not None and found[pixels(c, at)] == pytest.approx(wanted, abs=0.3)
+
+
+def test_a_gap_in_the_hull_does_not_take_a_piece_of_the_face() -> None:
+    """Through it the back of a hull is seen that reaches far behind the head."""
+    c = camera(0, 0, 0, 1.6)
+    alpha = np.ones((c.height, c.width), np.float32)
+    back = shell((0, 0.05, -0.3), (0.1, 0.1, 0.02))
+    gap = HEAD[~((np.abs(HEAD[:, 0]) < 0.04) & (np.abs(HEAD[:, 1] - 0.03) < 0.04))]
+    found = asked(c, alpha, EXTENT, np.concatenate([gap, back, CHEST]))
+    assert found is not None and found[pixels(c, (0, 0.03, 0.07))] == 1
+    assert found[pixels(c, (0, -0.35, 0.05))] == 0
