@@ -81,7 +81,11 @@ def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
     ahead *= THICK * extent.head / np.linalg.norm(ahead, axis=1, keepdims=True)
     depths = [signed(extent, points[order] + step, -ASKED * extent.head) for step in (0.0, ahead)]
     value[at[order, 1], at[order, 0]] = -np.maximum(*depths)
-    whole = _filled(value, _meets(camera, w, h, middle, radius), NEAR * extent.head * factor / unit)
+    meets = _meets(camera, w, h, middle, radius)
+    high = np.zeros((h, w), bool)
+    high[at[order, 1], at[order, 0]] = _above(extent, points[order])
+    value[meets & high] = extent.head  # the head itself, though its hull may have a gap through which its back is seen
+    whole = _filled(value, meets, NEAR * extent.head * factor / unit)
     return np.asarray(cv2.medianBlur(whole, 3) / np.float32(unit), np.float32)  # specks where points were left out
 
 
@@ -116,7 +120,14 @@ def outline_points(hull: Hull, extent: Extent) -> F64:
     """(N, 3) points on the hull's surface, but for those beside the ellipsoid and above the chin: in front of a face
     that was photographed from one side a hull has tips that are air. Below are shoulders."""
     points = np.asarray(surface_points(hull), np.float64)
-    above = np.ones(len(points), bool)
+    return points[
+        ~_above(extent, points) | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)
+    ]
+
+
+def _above(extent: Extent, points: F64) -> Bool:
+    """(N,) points above the chin."""
+    out = np.ones(len(points), bool)
     for plane in extent.cuts:
-        above &= points @ np.asarray(plane.normal) < plane.offset - BELOW * extent.head
-    return points[~above | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)]
+        out &= points @ np.asarray(plane.normal) < plane.offset - BELOW * extent.head
+    return out

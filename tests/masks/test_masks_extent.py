@@ -144,3 +144,14 @@ def test_how_much_goes_on_beyond_the_extent() -> None:
 
     assert share(HEAD) < 0.05
     assert share(np.concatenate([HEAD, CHEST])) > 1.3 > BUST
+
+
+def test_a_gap_in_the_hull_does_not_take_a_piece_of_the_face() -> None:
+    """Through it the back of a hull is seen that reaches far behind the head."""
+    c = camera(0, 0, 0, 1.6)
+    alpha = np.ones((c.height, c.width), np.float32)
+    back = shell((0, 0.05, -0.3), (0.1, 0.1, 0.02))
+    gap = HEAD[~((np.abs(HEAD[:, 0]) < 0.04) & (np.abs(HEAD[:, 1] - 0.03) < 0.04))]
+    found = asked(c, alpha, EXTENT, np.concatenate([gap, back, CHEST]))
+    assert found is not None and found[pixels(c, (0, 0.03, 0.07))] == 1
+    assert found[pixels(c, (0, -0.35, 0.05))] == 0
