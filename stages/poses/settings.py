@@ -64,7 +64,9 @@ class Config(StageConfig):
     pupils_mm: float = Field(
         0.0, ge=0, le=100, description="distance between the subject's pupils, if you know it; 0: it is not used"
     )
-    min_registered: float = Field(0.6, gt=0, le=1, description="least share of the photos that must find their place")
+    min_registered: float = Field(
+        0.6, gt=0, le=1, description="share of the photos that must find their place; with less the result is unusable"
+    )
 
     @field_validator("distance")
     @classmethod

@@ -25,7 +25,8 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     """Cameras from the photos alone.
 
     Raises:
-        StageError: fewer photos than `min_registered` of those that show the subject have a place.
+        StageError: fewer than MIN_FITTED photos that are not held out have a place. With few more the finding
+            `photos_placed` says that the result is unusable.
     """
     views = capture.artifact.views
     solution = solve(
@@ -35,11 +36,10 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
     others = solution.groups[1:]
-    strangers = {i for group in others for i in group}
     why = {views[i].name: reason for i, reason in solution.left_out.items()}
     fitted = sum(not views[i].holdout for i in placed)
-    if model is None or len(placed) < config.min_registered * (len(views) - len(strangers)) or fitted < MIN_FITTED:
-        raise _not_placed(len(views), len(placed), fitted, why, config.min_registered)
+    if model is None or fitted < MIN_FITTED:
+        raise _not_placed(len(views), len(placed), fitted, why)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     warnings: list[str] = []
     eyes = find_eyes(capture, cameras, context.check)
@@ -80,18 +80,14 @@ def settings_of(capture: Located[Capture], config: Config) -> Settings:
     )  # fmt: skip
 
 
-def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str], share: float) -> StageError:
+def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str]) -> StageError:
     missing = list(why)
     named = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
-    if placed < share * total:
-        value, limit = f"{placed} of {total} placed; without a place: {named}", f"at least {share:.0%}"
-    else:
-        value, limit = f"{fitted} placed views that are not held out", f"at least {MIN_FITTED}"
     return StageError(
         "the photos do not fit together" if placed else "the photos show nothing in common",
         where="poses",
-        value=value,
-        limit=limit,
+        value=f"{placed} of {total} placed, {fitted} of them not held out; without a place: {named}",
+        limit=f"at least {MIN_FITTED} that are not held out",
         remedy="take the photos around one still subject, sharp, each overlapping the next by two thirds (15 degrees "
         "or less apart), with the lens at one zoom; remove those named if they show something else; or give the "
         "cameras in params.json",

@@ -41,7 +41,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
         )
     given = all_given and config.method != "colmap"
     found = (given_cameras if given else solved_cameras)(inputs.capture, config, context)
-    seen, findings = judge(found, inputs.capture.artifact, sparse_points(found, context.workdir))
+    seen, findings = judge(found, inputs.capture.artifact, sparse_points(found, context.workdir), config.min_registered)
     return found.model_copy(update={"seen_directions": seen, "findings": found.findings + findings})
 
 
