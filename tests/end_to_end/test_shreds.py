@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.shreds import shredded, with_worthless_faces
-from support.synthetic_asset import smooth_light
 
 from pipeline import meshes
 from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, ViewMask
@@ -19,6 +17,8 @@ from stages.usd import stage as usd
 from stages.uv import stage as uv
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.field_artifacts import fitted, poses
+from tests.support.shreds import shredded, with_worthless_faces
+from tests.support.synthetic_asset import smooth_light
 
 
 @pytest.mark.slow
@@ -45,23 +45,24 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
         views.append(CaptureView(index=i, name=f"{i}.png", image=image, width=64, height=64))
     capture = Located(Capture(kind="facescape", views=tuple(views)), given)
     mask = ViewMask(index=1, mask=FileRef.of(given, "mask.png"), source="given", coverage=1.0)
+    masks = Located(MaskSet(masks=(mask,)), given)
 
     def context(name: str) -> Context:
         return Context(folders[name], folders[name] / "scratch")
 
     textured = uv.run(
-        uv.Inputs(surface, face, rig),
+        uv.Inputs(surface, face, rig, masks),
         uv.Config(target_faces=5000, proxy_faces=300, texture_size=512),
         context("uv"),
     )
     at_uv = Located(textured, folders["uv"])
     maps = bake.run(
-        bake.Inputs(surface, at_uv, face, rig, Located(MaskSet(masks=(mask,)), given), capture),
+        bake.Inputs(surface, at_uv, face, rig, masks, capture),
         bake.Config(size=256),
         context("bake"),
     )
     asset = usd.run(
-        usd.Inputs(surface, at_uv, Located(maps, folders["bake"]), face, rig, capture),
+        usd.Inputs(surface, at_uv, Located(maps, folders["bake"]), face, rig, capture, masks),
         usd.Config(preview_size=64, environment_width=64, samples=1),
         context("usd"),
     )
