@@ -216,7 +216,7 @@ def test_two_runs_of_one_capture_into_one_folder_at_once(tree: Path, environment
     children = []
     point = hold("work.step@4", tree.parent / "signs")
     for _ in range(2):
-        child = subprocess.Popen([sys.executable, TOY_BATCH, "--child", "1"],
+        child = subprocess.Popen([sys.executable, TOY_BATCH, "--child", "1", str(os.getpid())],
                                  env={**environment, **point.environment()}, text=True,
                                  stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
         assert child.stdin is not None
