@@ -23,21 +23,23 @@ from pipeline.hull import BAND_CELLS, Hull
 F64 = npt.NDArray[np.float64]
 F32 = npt.NDArray[np.float32]
 
-BELOW = 0.6  # h from the chin down to the cut: a neck is 0.5 h long, the shoulders begin there
+BELOW = 0.95  # h from the chin down to the cut: a neck is 0.5 h long; skin that an open collar shows goes on
 MIDDLE = (0.0, 0.0, -0.55)  # h from between the eyes to the middle of the extent: left, up, to the front
-RADIUS = 1.4  # h: leaves 0.6 h around a head for hair, and 0.9 h of the shoulders on each side
+RADIUS = 1.65  # h: leaves 0.8 h around a head for hair, and as much of the shoulders as the cut
+# The same of the head and neck alone, against which the rest of the subject is weighed.
+HEAD_BELOW, HEAD_RADIUS = 0.6, 1.4
 CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.55)  # h: a ball that no head is smaller than, and its middle as above
 ASKED, GROWN = 0.04, 0.1  # h
 
 
-def head_extent(frame: HeadFrame) -> Extent:
-    """The extent of a person from the head's axes."""
+def head_extent(frame: HeadFrame, below_chin: float = BELOW, radius: float = RADIUS) -> Extent:
+    """The extent of a person from the head's axes. below_chin, radius: see BELOW and RADIUS."""
     h, axes = frame.height, frame.axes
     centre = frame.eyes + h * np.asarray(MIDDLE) @ axes
     down = -axes[1]
-    below = Cut(normal=_triple(down), offset=float(down @ frame.chin) + BELOW * h)
+    below = Cut(normal=_triple(down), offset=float(down @ frame.chin) + below_chin * h)
     turn = tuple(_triple(row) for row in axes)
-    return Extent(centre=_triple(centre), axes=turn, radii=(RADIUS * h,) * 3, cuts=(below,), head=h)
+    return Extent(centre=_triple(centre), axes=turn, radii=(radius * h,) * 3, cuts=(below,), head=h)
 
 
 def core(extent: Extent) -> tuple[F64, float]:

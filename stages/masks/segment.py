@@ -15,9 +15,9 @@ import numpy as np
 from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Extent, FileRef, Located, MaskSet, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.extent import head_extent
+from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
 from pipeline.faces.find import Face
-from pipeline.faces.landmarks3d import head_frame
+from pipeline.faces.landmarks3d import HeadFrame, head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
@@ -125,10 +125,9 @@ def segment(
     landmarks = None if found_face is None else save_landmarks(found_face, context)
     # what is cut out as an object is one, even with a face
     people = found_face is not None and how.method != "object"
-    extent = head_extent(head_frame(found_face.face.xyz)) if found_face is not None and people else None
+    frame = head_frame(found_face.face.xyz) if found_face is not None and people else None
     votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
-    if extent is not None and _is_bust(votes, extent, poses.roi_radius):
-        extent = None
+    extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
     parts = _asked(masked, votes, extent, context)
     made = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, looked, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
@@ -143,9 +142,10 @@ def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
                  m.view.index in dropped) for m in masked]  # fmt: skip
 
 
-def _is_bust(votes: list[Masked], extent: Extent, roi_radius: float) -> bool:
-    """Whether there is so little beyond the extent that the subject stays whole: a head scan ends in its shoulders."""
-    beyond = share_beyond([m.camera for m in votes], [m.small for m in votes], extent, roi_radius)
+def _is_bust(votes: list[Masked], frame: HeadFrame, roi_radius: float) -> bool:
+    """Whether so little is beyond head and neck that the subject stays whole: a head scan ends in its shoulders."""
+    head = head_extent(frame, HEAD_BELOW, HEAD_RADIUS)
+    beyond = share_beyond([m.camera for m in votes], [m.small for m in votes], head, roi_radius)
     return beyond <= BUST
 
 

@@ -131,9 +131,12 @@ def _roots(name: str) -> tuple[str, ...]:
 def _pictures(
     inputs: Inputs, views: tuple[HeldOutView, ...], context: Context
 ) -> Iterator[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
-    """The photo's name, the fit's render and the asset's of each view that was held out."""
-    from pipeline.images import read_exr
+    """The photo's name, the fit's render and the asset's of each view that was held out, where the photo is asked."""
+    import cv2
 
+    from pipeline.images import read_alpha, read_exr
+
+    asked = {m.index: inputs.masks.path(m.asked) for m in inputs.masks.artifact.masks if m.asked is not None}
     fitted = inputs.inverse_rendering
     predicted = {v.index: v for v in fitted.artifact.held_out}
     names = {c.index: c.name for c in inputs.poses.artifact.cameras}
@@ -141,6 +144,9 @@ def _pictures(
         if view.index in predicted:
             model, _ = read_exr(fitted.path(predicted[view.index].exr))
             asset, _ = read_exr(context.workdir / view.exr.path)
+            if view.index in asked:  # the fit goes a little beyond the extent, where the mesh ends
+                part = cv2.resize(read_alpha(asked[view.index]), model.shape[1::-1], interpolation=cv2.INTER_AREA)
+                model, asset = (x * (np.asarray(part) > 0.99)[..., None] for x in (model, asset))
             if model.shape == asset.shape:
                 yield names.get(view.index, str(view.index)), model, asset
 
@@ -149,4 +155,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=7, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=8, inputs=Inputs, config=Config, output=UsdAsset, run=run)

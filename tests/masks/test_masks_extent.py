@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.contract import execute
-from pipeline.extent import head_extent
+from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
 from pipeline.faces.find import Face
 from pipeline.faces.landmarks3d import head_frame, load_landmarks
 from pipeline.images import read_alpha
@@ -25,7 +25,7 @@ from tests.masks.test_masks_stage import Scene, ball_alpha, scene  # noqa: F401
 from tests.support.faces import camera, face
 
 F64 = np.typing.NDArray[np.float64]
-EXTENT = head_extent(head_frame(face()))
+EXTENT = head_extent(head_frame(face()), HEAD_BELOW, HEAD_RADIUS)
 
 
 def shell(centre: tuple[float, float, float], radii: tuple[float, float, float], count: int = 40_000) -> F64:

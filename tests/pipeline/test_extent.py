@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.artifacts import Cut, Extent
-from pipeline.extent import bounds, core, head_extent, signed, signed_and_gradient, within
+from pipeline.extent import BELOW, bounds, core, head_extent, signed, signed_and_gradient, within
 from pipeline.faces.landmarks3d import head_frame
 from pipeline.hull import Hull
 from tests.support.faces import face
@@ -23,11 +23,11 @@ def test_a_head_and_neck_are_inside_and_the_chest_is_not(degrees: tuple[float, f
     def at(x: float, y: float, z: float, start: np.ndarray) -> float:
         return float(signed(extent, (start + h * (x * left + y * up + z * front))[None])[0])
 
-    assert np.isclose(signed(extent, np.array([extent.centre]))[0], -(0.6 + frame.axes[1] @ (
+    assert np.isclose(signed(extent, np.array([extent.centre]))[0], -(BELOW + frame.axes[1] @ (
         np.asarray(extent.centre) - frame.chin) / h) * h)  # fmt: skip
     for inside in ((0, 0, 0), (0, -0.5, -0.2), (0.5, -0.55, -0.5), (0, 1.2, -0.4), (0, 0.6, -1.3)):
         assert at(*inside, frame.chin) < 0, inside
-    for outside in ((0, -0.7, 0), (0, -0.7, -1), (1.6, 0.5, -0.5), (0, 0.5, 1.2), (0, 0.5, -2.2)):
+    for outside in ((0, -1.0, 0), (0, -0.7, -1), (1.6, 0.5, -0.5), (0, 0.5, 1.2), (0, 0.5, -2.2)):
         assert at(*outside, frame.chin) > 0, outside
     middle, radius = core(extent)
     ring = middle + radius * np.stack([left, -left, up, -up, front, -front])
