@@ -27,7 +27,7 @@ def test_a_head_and_neck_are_inside_and_the_chest_is_not(degrees: tuple[float, f
         np.asarray(extent.centre) - frame.chin) / h) * h)  # fmt: skip
     for inside in ((0, 0, 0), (0, -0.5, -0.2), (0.5, -0.55, -0.5), (0, 1.2, -0.4), (0, 0.6, -1.3)):
         assert at(*inside, frame.chin) < 0, inside
-    for outside in ((0, -1.0, 0), (0, -0.7, -1), (1.6, 0.5, -0.5), (0, 0.5, 1.2), (0, 0.5, -2.2)):
+    for outside in ((0, -1.0, 0), (0, -1.0, -1), (1.8, 0.5, -0.5), (0, 0.5, 1.4), (0, 0.5, -2.2)):
         assert at(*outside, frame.chin) > 0, outside
     middle, radius = core(extent)
     ring = middle + radius * np.stack([left, -left, up, -up, front, -front])
