@@ -149,7 +149,7 @@ def test_a_night_with_a_killed_worker_server_and_database(
     said = (tmp_path / "batch.log").read_text()
     assert code == 1, said
     summary = json.loads((tmp_path / "out/batch/summary.json").read_text())
-    assert summary["counts"] == {"done": 5, "failed": 1, "submitted": 0, "waiting": 0}, said
+    assert summary["counts"] == {"done": 5, "unusable": 0, "failed": 1, "submitted": 0, "waiting": 0}, said
     failed = summary["captures"][0]
     assert failed["name"] == "2/1_neutral" and PHOTO in failed["fault"]
     assert "2/1_neutral: trying again" not in said and said.count("2/1_neutral: FAILED") == failed["attempts"]
