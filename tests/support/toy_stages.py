@@ -62,6 +62,7 @@ class Config(StageConfig):
 
 class SlowConfig(Config):
     steps: int = Field(1, ge=1, description="files that are written one after the other")
+    share: float = Field(0.0, ge=0, description="a number that need not be whole; it changes nothing")
 
 
 def source(folder: Path) -> Located[Folder]:
