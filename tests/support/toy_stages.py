@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ class Config(StageConfig):
 
 class SlowConfig(Config):
     steps: int = Field(1, ge=1, description="files that are written one after the other")
-    share: float = Field(0.0, ge=0, description="a number that need not be whole; it changes nothing")
+    pause: float = Field(0.0, ge=0, description="seconds between them, for a stage that is still at work")
 
 
 def source(folder: Path) -> Located[Folder]:
@@ -98,6 +99,7 @@ def run_second(inputs: SecondInputs, config: SlowConfig, context: Context) -> Nu
         context.progress(step, config.steps, "working", loss=1 / (step + 1))
         (context.workdir / f"part{step}.bin").write_bytes(bytes(100_000))
         reach("second.step")
+        time.sleep(config.pause)
         checkpoint.write_text(str(step + 1))
     if config.fault == "stage":
         raise StageError("the toy is broken", where="part 7", value=3, limit="4", remedy="mend it")

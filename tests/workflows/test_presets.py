@@ -47,10 +47,10 @@ def test_the_later_source_wins() -> None:
 
 
 def test_values_take_the_settings_own_type() -> None:
-    sets = parse_sets(["second.steps=12", "second.share=0.5", "second.fault=", "first.holdout=7"])
+    sets = parse_sets(["second.steps=12", "second.pause=0.5", "second.fault=", "first.holdout=7"])
     configs = configs_for("draft", sets, registry=TOYS)
     assert configs["second"].model_dump()["steps"] == 12
-    assert configs["second"].model_dump()["share"] == 0.5
+    assert configs["second"].model_dump()["pause"] == 0.5
     assert configs["first"].model_dump()["holdout"] == "7"
     assert parse_sets(["a.b=[1, 2]", "a.c=null", "a.d=x=y", "a.e=[broken"]) == {
         "a": {"b": [1, 2], "c": None, "d": "x=y", "e": "[broken"}
