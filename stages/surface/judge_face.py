@@ -36,7 +36,7 @@ MIN_PHOTOS, MOST_PHOTOS, MOST_PAIRS = 3, 30, 200
 # On a scanned head of exact cameras the network's landmarks lie 2.2 mm from the true surface in the median, single ones
 # up to 8 mm, and reproject with 3.4 mm; where a blob of the visual hull hides the face, 58, 80 and 13 mm.
 SHAPE = Limits(5.0, 12.0, lower=False)
-BURIED = Limits(6.0, 12.0, lower=False)
+BURIED = Limits(8.0, 12.0, lower=False)  # single landmarks are up to 8 mm off in depth on clean head scans
 REPROJECTED = Limits(6.0, 10.0, lower=False)
 REMEDY = (
     "the mesh does not have the face that the photos show: photograph from more directions, up to both profiles and "
