@@ -240,4 +240,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
-STAGE = Stage(name="inverse_rendering", version=8, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=9, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -34,6 +34,7 @@ AGREEMENT = Limits(0.93, 0.8)  # median IoU: .966 to .989
 DISAGREEING = Limits(0.02, 0.25, lower=False)  # share of the fitted views
 EMPTY_OR_FULL = Limits(0.02, 0.25, lower=False)  # share of the views
 BOTH_WAYS = Limits(0.0, 0.25, lower=False)  # share of the given masks that are the other way round than most
+FACES = Limits(3.0, 0.0)  # photos with the face that agree, below which head and extent are not known
 GUESSED = Limits(0.0, 1.0, lower=False)  # share of the views
 OPEN = Limits(0.06, 0.6, lower=False)  # 0 to .02 all around, .19 from three sides, .47 an arc before a face
 SIZE = Limits(2.2, 6.0, lower=False)  # times: a child's head has half of an adult's
@@ -74,6 +75,25 @@ def judge(
         return tuple(out)
     hull = _carved(carving, roi_radius, tolerated(len(carving)))
     return (*out, *hull_findings(hull, [v.camera for v in carving], roi_radius, metric and faces > 0))
+
+
+def extent_finding(faces: int, agreeing: int, cut: bool) -> Finding | None:
+    """Whether it is known which part of a person the asset is made of; None where no photo shows a face.
+
+    faces, agreeing: fitted photos with a face, and those whose landmarks are of one head in space. cut: the subject
+    goes on beyond its extent."""
+    if not faces:
+        return None
+    if agreeing:
+        what = "the head, the neck and the beginning of the shoulders" if cut else "the whole of what the masks show"
+        said = f"{agreeing} photos agree on where the head is; the asset is {what}"
+    else:
+        said = (
+            f"a face is found in {faces} photos, but they do not agree on where it is: all that the masks show is asked"
+        )
+    return judged("extent", agreeing, FACES, said,
+                  "take photos in which the face is seen from the front and from both sides, evenly lit, and check the "
+                  "cameras")  # fmt: skip
 
 
 def hull_findings(

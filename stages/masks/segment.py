@@ -24,7 +24,7 @@ from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers,
 from stages.masks.cut_out import cut
 from stages.masks.extent import BUST, asked, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
-from stages.masks.judge import Seen, judge
+from stages.masks.judge import Seen, extent_finding, judge
 from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
@@ -132,6 +132,10 @@ def segment(
     made = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, looked, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in made))  # fmt: skip
+    if how.method != "object":
+        agreeing = 0 if found_face is None else int(found_face.face.kept.sum())
+        known = extent_finding(len(fitted), agreeing, extent is not None)
+        findings = findings if known is None else (*findings, known)
     return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks, extent=extent,
                    warnings=tuple(warnings), findings=findings)  # fmt: skip
 

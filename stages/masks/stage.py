@@ -116,4 +116,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
     return segment(inputs.capture, inputs.poses, settings, context)
 
 
-STAGE = Stage(name="masks", version=8, inputs=Inputs, config=Config, output=MaskSet, run=run)
+STAGE = Stage(name="masks", version=9, inputs=Inputs, config=Config, output=MaskSet, run=run)

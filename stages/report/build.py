@@ -156,8 +156,8 @@ def _lobe_fit(r: Results, side: int) -> list[Picture]:
     if not files:
         return []
     picture = np.concatenate([_thinned(read_encoded(r.usd.path(f))[..., :3], side) for f in files], 1)
-    mean = r.usd.artifact.figures.get("ggx_residual_mean", 0.0)
-    caption = f"GGX against the fitted lobe: red, residual (mean {mean:.1%}); green, kappa not resolved"
+    off = r.usd.artifact.figures.get("ggx_residual", 0.0)
+    caption = f"GGX against the fitted lobe: red, residual ({off:.1%} in all); green, kappa not resolved"
     return [Picture(data_uri(picture, side), caption)]
 
 

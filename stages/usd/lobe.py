@@ -38,23 +38,31 @@ RESOLVED_KAPPA = 50.0  # above it a light of order 10 looks the same through the
 class LobeFit:
     """residual (H, W): |F - R| over |F|, root mean square over c weighted by c; 0 where there is no lobe.
     unresolved (H, W): kappa is a guess.
-    covered (H, W): texels under charts."""
+    covered (H, W): texels under charts.
+    error, power: |F - R|^2 and |F|^2, sums over the covered texels."""
 
     residual: F32
     unresolved: Mask
     covered: Mask
+    error: float
+    power: float
 
     def shown(self, step: int = 1) -> tuple[F32, Mask]:
         """(N,) residual and unresolved of every step-th covered texel."""
         return self.residual[self.covered][::step], self.unresolved[self.covered][::step]
 
 
-def fit_figures(parts: Sequence[tuple[F32, Mask]]) -> dict[str, float]:
-    """Means over the covered texels of all tiles (LobeFit.shown), for the report."""
-    if not parts:
+def fit_figures(fits: Sequence[LobeFit]) -> dict[str, float]:
+    """Over the covered texels of all tiles, for the report.
+
+    ggx_residual: |F - R| over |F|, both summed first, so that a lobe counts by what it reflects. The mean of the
+    texels' own ratios is ruled by those with next to no lobe."""
+    if not fits:
         return {}
-    shown, unresolved = (np.concatenate(p) for p in zip(*parts, strict=True))
+    shown, unresolved = (np.concatenate(p) for p in zip(*(f.shown(len(fits)) for f in fits), strict=True))
+    power = sum(f.power for f in fits)
     figures = {
+        "ggx_residual": float(np.sqrt(sum(f.error for f in fits) / power)) if power > 0 else 0.0,
         "ggx_residual_mean": float(shown.mean(dtype=np.float64)) if shown.size else 0.0,
         "ggx_residual_p95": float(np.percentile(shown, 95)) if shown.size else 0.0,
         "kappa_unresolved_share": float(unresolved.sum() / max(unresolved.size, 1)),
@@ -87,6 +95,7 @@ def in_groups(image: F32) -> list[F32]:
 def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Mask) -> LobeFit:
     """How well a GGX lobe stands for the fitted one at each texel: (H, W, k), (H, W), (H, W), (W, k), (H, W)."""
     residual = np.zeros(covered.shape, np.float32)
+    errors = powers = 0.0
     weights = COSINES / COSINES.sum()
     at = lookup(basis, COSINES).T.astype(np.float64)  # (k, 16)
     rows, columns = np.nonzero(covered)
@@ -100,9 +109,10 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
         ggx = f0[y, x, None].astype(np.float64) * _rows_at(a, table_alpha, alpha) + _rows_at(b, table_alpha, alpha)
         error = ((fitted - ggx) ** 2 * weights).sum(1)
         scale = (fitted**2 * weights).sum(1)
+        errors, powers = errors + float(error.sum()), powers + float(scale.sum())
         residual[y, x] = np.where(scale > NO_LOBE**2, np.sqrt(error / np.maximum(scale, NO_LOBE**2)), 0)
     unresolved = covered & (inv_kappa < 1 / RESOLVED_KAPPA)
-    return LobeFit(residual, unresolved, covered)
+    return LobeFit(residual, unresolved, covered, errors, powers)
 
 
 def _rows_at(

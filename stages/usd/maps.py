@@ -22,7 +22,7 @@ from pipeline.nearest import filled
 from stages.usd.exported import numbered
 from stages.usd.lamps import lamps
 from stages.usd.light import environment
-from stages.usd.lobe import basis_table, fit_figures, in_groups, lobe_fit
+from stages.usd.lobe import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.mesh import UvSurface, on_tile
 from stages.usd.render import bilinear
 from stages.usd.shading import Look, ior_from_f0
@@ -85,8 +85,8 @@ def write_maps(
 
 def _derived(
     bake: Located[TextureSet], tile: int, name: str, folder: Path, basis: F32, *, acescg: bool
-) -> tuple[list[Path], tuple[F32, Mask] | None]:
-    """One tile's maps that are made from others, and how well a GGX lobe serves there (LobeFit.shown)."""
+) -> tuple[list[Path], LobeFit | None]:
+    """One tile's maps that are made from others, and how well a GGX lobe serves there."""
     exr, png = (tiles.form(k, tile, bake.artifact.tiles) for k in ("exr", "png"))
     written = []
     if acescg:
@@ -106,7 +106,7 @@ def _derived(
     written.append(folder / f"{name}_lobe_fit.{png}")
     # red: the residual of the GGX lobe, 1 = 100 %; green: 1 where kappa can't be told; blue: nothing
     write_png(written[-1], np.stack([fit.residual, fit.unresolved, np.zeros_like(fit.residual)], -1))
-    return written, fit.shown(bake.artifact.tiles)  # as many in all as one tile would have
+    return written, fit
 
 
 def shadows_fitted(bake: Located[TextureSet]) -> bool:

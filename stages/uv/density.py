@@ -2,7 +2,8 @@
 
 Symbols: F faces with true areas a; face: what is measured; region: what may be cut out as a chart of its own, somewhat
 more than the face, so that the seam around it lies where it costs little (stages.uv.segment); s how much
-larger, in length, a chart of the region is than one of the rest; p, q, A areas of face, region and all.
+larger, in length, a chart of the region is than one of the rest; p, q, A areas of face, region and all, in the texture,
+since a chart that lies flat makes some of the face smaller than it is.
 
     s^2 p / (s^2 q + A - q) = SHARE
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.faces.landmarks3d import head_frame
@@ -20,8 +22,9 @@ from pipeline.least_cut import ENDLESS, least_cut
 from pipeline.meshes import F64, Charts, Faces, Indices, Mask, Mesh
 from stages.uv.segment import FLOW, Dual, connected
 
-SHARE = 0.42  # of the area under charts for the face: 0.40 is promised, and stretch takes some
-MOST = 3.0  # s at most: beyond, the rest would be blurred for little
+SHARE = 0.42  # of the area under charts for the face: 0.40 is promised, and texels on borders take some
+MOST = 5.0  # s at most: a head with shoulders needs 4; beyond, the rest would be blurred for little
+SHOWS = 0.25  # share of a chart that is face, from which on it is enlarged
 WIDER = 1.35  # the region's outline over the face's, from the middle of the face
 
 
@@ -69,21 +72,28 @@ def scale_for(front: Front, dense: Mask, area: F64) -> float:
 
 
 def dense_charts(label: Indices, front: Front, area: F64) -> Mask:
-    """(C,) charts that are mostly of the region."""
-    whole = np.bincount(label, area)
-    return np.asarray(np.bincount(label, np.where(front.region, area, 0.0)) > 0.5 * np.maximum(whole, 1e-300))
+    """(C,) charts that are mostly of the region and show enough of the face: a ring around it is not enlarged."""
+    whole = np.maximum(np.bincount(label, area), 1e-300)
+    region, face = (np.bincount(label, np.where(m, area, 0.0)) for m in (front.region, front.face))
+    return np.asarray((region > 0.5 * whole) & (face > SHOWS * whole))
 
 
 def enlarged(uvs: F64, faces: Faces, label: Indices, front: Front, area: F64) -> F64:
     """uvs (U, 2) with the charts of the region enlarged. label: (F,) chart of each face; area: (F,) true."""
     dense = dense_charts(label, front, area)[label]
     of_vertex = np.ones(len(uvs))
-    of_vertex[faces[dense].ravel()] = scale_for(front, dense, area)
+    of_vertex[faces[dense].ravel()] = scale_for(front, dense, flat_areas(uvs, faces))
     return np.asarray(uvs * of_vertex[:, None], np.float64)
+
+
+def flat_areas(uvs: npt.NDArray[np.floating], faces: Faces) -> F64:
+    """(F,) areas of texture triangles."""
+    a, b, c = uvs.astype(np.float64)[faces].transpose(1, 0, 2)
+    twice = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    return np.asarray(0.5 * twice, np.float64)
 
 
 def face_share(charts: Charts, face: Mask) -> float:
     """Of the area under charts."""
-    a, b, c = charts.uvs.astype(np.float64)[charts.faces].transpose(1, 0, 2)
-    flat = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    flat = flat_areas(charts.uvs, charts.faces)
     return float(flat[face].sum() / max(float(flat.sum()), 1e-300))

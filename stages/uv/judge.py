@@ -11,9 +11,9 @@ from pipeline.verdict import Finding, Limits, judged
 from stages.uv.decimate import Deviation
 from stages.uv.measure import STRETCHED, Quality
 
-CHARTS = Limits(
-    40, 400, lower=False
-)  # more than 40: the surface does not come apart into a few discs (stages.uv.charts)
+# more than 40: the surface does not come apart into a few discs (stages.uv.charts)
+CHARTS = Limits(40, 400, lower=False)
+FACE = Limits(0.40, 0.0)  # of the area under charts: .416 to .420 on people whose face is in the mesh, .07 in a blob
 FRAGMENTS = Limits(10, 200, lower=False)
 OVERLAP = Limits(0.002, 0.01, lower=False)  # of the covered texels; what the check of the USD file warns of and refuses
 EMPTY = Limits(1e-3, 5e-3, lower=False)  # of the surface; half a per cent is what the check of the USD file refuses
@@ -35,6 +35,7 @@ def judge(
     that look against the normals at their own corners."""
     q, off = quality, deviation.rms / max(span, 1e-30)
     return (
+        *_face(q.face_share),
         judged("charts", q.charts, CHARTS, f"the surface comes apart into {q.charts} charts", SHAPE),
         judged(
             "fragments",
@@ -94,3 +95,15 @@ def judge(
             SHAPE,
         ),
     )
+
+
+def _face(share: float | None) -> tuple[Finding, ...]:
+    """Of the texels; nothing where no landmarks say what the face is, or uv.face is off."""
+    if share is None:
+        return ()
+    said = f"the face has {share:.1%} of the area under charts"
+    remedy = (
+        "the mesh does not have the face where the photos show it (look at face_shape_mm), or the face is a small part "
+        "of it: check the masks"
+    )
+    return (judged("face_share", share, FACE, said, remedy),)

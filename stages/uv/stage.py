@@ -99,4 +99,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=6, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=7, inputs=Inputs, config=Config, output=UvMesh, run=run)

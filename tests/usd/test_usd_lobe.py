@@ -42,7 +42,8 @@ def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
     assert lobe_fit(one, s, f0, basis, covered).residual.max() < 0.01
     wrong = lobe_fit(one, s, f0, basis * 2, covered)
     np.testing.assert_allclose(wrong.residual, 0.5, atol=0.01)  # |2 R - R| / |2 R|
-    assert fit_figures([wrong.shown()])["ggx_residual_mean"] == pytest.approx(0.5, abs=0.01)
+    for known in ("ggx_residual_mean", "ggx_residual"):
+        assert fit_figures([wrong])[known] == pytest.approx(0.5, abs=0.01)
     assert len(COSINES) >= 8
 
 
@@ -55,6 +56,30 @@ def test_where_there_is_no_lobe_nothing_is_left_over() -> None:
     assert fit.residual[0, 0] == 0 and fit.residual[0, 1] > 10
 
 
+def test_a_lobe_counts_by_what_it_reflects() -> None:
+    """One texel with half of its lobe explained, and a hundred with next to no lobe, whose ratios are huge; each tile
+    adds its sums. Against sums of its own, by quadrature in float64."""
+    alpha = microfacet.alpha_from_kappa(12.0)
+    c = (np.arange(512) + 0.5) / 512
+    a, b = microfacet.split_albedo(c, alpha)
+    basis = (2 * (0.03 * a + b))[:, None].astype(np.float32)
+    strength = np.full((1, 101), 1e-5, np.float32)
+    strength[0, 0] = 1
+    s, f0 = np.full(strength.shape, 1 / 12, np.float32), np.zeros(strength.shape, np.float32)
+    f0[0, 0] = 0.03
+    covered = np.ones(strength.shape, bool)
+    fit = lobe_fit(strength[..., None], s, f0, basis, covered)
+    f1, r1, r0 = 2 * (0.03 * a + b), 0.03 * a + b, b
+    error = (c * (f1 - r1) ** 2).sum() + 100 * (c * (1e-5 * f1 - r0) ** 2).sum()
+    power = (c * f1**2).sum() * (1 + 100 * 1e-10)
+    figures = fit_figures([fit])
+    assert figures["ggx_residual"] == pytest.approx(np.sqrt(error / power), rel=0.01)
+    assert figures["ggx_residual_mean"] > 100 * figures["ggx_residual"]
+    assert fit_figures([fit, fit])["ggx_residual"] == pytest.approx(figures["ggx_residual"], abs=1e-4)
+    dull = lobe_fit(0 * strength[..., None], s, f0, basis, covered)
+    assert fit_figures([dull])["ggx_residual"] == 0
+
+
 def test_texels_whose_kappa_the_light_can_not_tell_are_flagged() -> None:
     s = np.array([[1e-6, 0.01], [0.03, 0.1]], np.float32)
     covered = np.array([[True, False], [True, True]])
@@ -63,5 +88,5 @@ def test_texels_whose_kappa_the_light_can_not_tell_are_flagged() -> None:
         np.ones((*shape, 1), np.float32), s, np.full(shape, 0.03, np.float32), np.ones((8, 1), np.float32), covered
     )
     np.testing.assert_array_equal(fit.unresolved, [[True, False], [False, False]])
-    assert fit_figures([fit.shown()])["kappa_unresolved_share"] == pytest.approx(1 / 3, abs=1e-4)
+    assert fit_figures([fit])["kappa_unresolved_share"] == pytest.approx(1 / 3, abs=1e-4)
     assert not fit.residual[0, 1]

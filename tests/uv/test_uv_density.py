@@ -8,10 +8,10 @@ import pytest
 from pipeline import meshes
 from pipeline.faces.landmarks3d import head_frame
 from pipeline.faces.oval import on_face
-from pipeline.meshes import Mesh
+from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
 from stages.uv.build import build
-from stages.uv.density import MOST, front_of, scale_for
+from stages.uv.density import MOST, SHARE, Front, dense_charts, enlarged, face_share, front_of, scale_for
 from stages.uv.unwrap import Options, chart_of_face, signed_areas
 from tests.support.analytic_fields import AnalyticField, bumpy_head
 from tests.support.faces import face
@@ -36,7 +36,7 @@ def test_the_face_is_a_chart_with_two_fifths_of_the_texels(head: Mesh) -> None:
     plain = build(head, 4000, 400, Options(512, 3), quiet)
     made = build(head, 4000, 400, Options(512, 3), quiet, landmarks=landmarks())
     assert plain.quality.face_share is None
-    assert made.quality.face_share is not None and 0.4 <= made.quality.face_share < 0.5
+    assert made.quality.face_share is not None and made.quality.face_share == pytest.approx(SHARE, abs=0.01)
     assert made.quality.overlap == 0 and made.quality.flipped == 0 and made.warnings == ()
     assert made.quality.charts <= plain.quality.charts + 6
     assert made.quality.stretch < plain.quality.stretch + 0.05  # the scale of a chart is no stretch
@@ -50,7 +50,7 @@ def test_the_face_is_a_chart_with_two_fifths_of_the_texels(head: Mesh) -> None:
     assert 1.2 < ratio <= MOST + 0.01
 
 
-def test_a_small_face_is_no_more_than_three_times_as_fine(head: Mesh) -> None:
+def test_a_small_face_is_enlarged_up_to_a_limit(head: Mesh) -> None:
     area = meshes.areas(head.vertices, head.faces)
     tiny = front_of(head, landmarks(0.2))
     large = front_of(head, landmarks(1.2))
@@ -60,6 +60,24 @@ def test_a_small_face_is_no_more_than_three_times_as_fine(head: Mesh) -> None:
     everything = np.ones(len(area), np.bool_)
     assert scale_for(large, everything, area) in (1.0, MOST)  # nothing is left to be coarser
     assert front_of(head, None) is None and front_of(head, face() + (0, 5, 0)) is None
+
+
+def test_the_share_is_that_in_the_texture_and_a_ring_around_the_face_is_not_enlarged() -> None:
+    """Four squares of two triangles: the face, which the chart made half as large as it is; a ring around it; and two
+    of the rest."""
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float64)
+    small = square * np.sqrt(0.5)
+    uvs = np.concatenate([small, square + 3, square + 5, square + 7])
+    faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * i for i in range(4)]).astype(np.int32)
+    label = np.repeat(np.arange(4), 2)
+    face = label == 0
+    front = Front(face, label <= 1)
+    true = np.full(8, 0.5)
+    assert dense_charts(label, front, true).tolist() == [True, False, False, False]
+    made = enlarged(uvs, faces, label, front, true)
+    np.testing.assert_array_equal(made[4:], uvs[4:])
+    assert face_share(Charts(made.astype(np.float32), faces), face) == pytest.approx(SHARE, abs=1e-6)
+    assert face_share(Charts(uvs.astype(np.float32), faces), face) == pytest.approx(0.5 / 3.5, abs=1e-6)
 
 
 def test_which_places_are_in_the_face() -> None:
