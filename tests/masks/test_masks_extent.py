@@ -19,6 +19,7 @@ from pipeline.store import Store
 from pipeline.transforms import inverse_rigid, matrix, project
 from stages.masks import segment
 from stages.masks.extent import BUST, asked, share_beyond
+from stages.masks.judge import extent_finding
 from stages.masks.segment import Looked, Masked
 from stages.masks.stage import STAGE, Config
 from tests.masks.test_masks_stage import Scene, ball_alpha, scene  # noqa: F401
@@ -107,14 +108,25 @@ def test_the_stage_hands_on_face_and_extent(
     np.testing.assert_allclose(load_landmarks(found.path(found.artifact.landmarks)), points, atol=1e-6)
     if method == "object":
         assert found.artifact.extent is None and all(m.asked is None for m in found.artifact.masks)
+        assert "extent" not in [f.check for f in found.artifact.findings]
         return
     assert found.artifact.extent is not None
+    (told,) = [f for f in found.artifact.findings if f.check == "extent"]
+    assert told.level == "good" and "the beginning of the shoulders" in told.said
     cut = [m for m in found.artifact.masks if m.asked is not None]
     assert len(cut) > 0.8 * len(found.artifact.masks)
     for m in cut:
         assert m.asked is not None
         part, alpha = read_alpha(found.path(m.asked)), read_alpha(found.path(m.mask))
         assert (part[alpha == 0] == 1).all() and (part[alpha == 1] < 0.5).any()
+
+
+def test_photos_that_do_not_agree_on_a_head_are_told() -> None:
+    assert extent_finding(0, 0, False) is None  # nobody in the photos, or only from behind
+    lost = extent_finding(5, 0, False)
+    assert lost is not None and lost.level == "usable" and "5 photos" in lost.said and lost.remedy
+    whole = extent_finding(9, 8, False)
+    assert whole is not None and whole.level == "good" and "8 photos" in whole.said and "the whole" in whole.said
 
 
 def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:

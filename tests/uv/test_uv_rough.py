@@ -162,11 +162,20 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
         ("stretch", {"stretched": 0.025}, "usable"),
         ("stretch", {"stretched": 0.3}, "unusable"),
         ("stretch", {"stretched": float("nan")}, "unusable"),
+        ("face_share", {"face_share": 0.07}, "usable"),
     ],
 )
 def test_each_ruined_figure_has_its_level(check: str, ruin: dict[str, float], level: str) -> None:
     found = {f.check: f for f in judge(replace(GOOD, **ruin), NEAR, 0.3, 0.0, 0.0, 0.0)}  # type: ignore[arg-type]
     assert found[check].level == level and found[check].remedy
+
+
+def test_the_face_has_its_share_where_it_is_known() -> None:
+    def known(share: float | None) -> list[str]:
+        found = judge(replace(GOOD, face_share=share), NEAR, 0.3, 0.0, 0.0, 0.0)
+        return [f.level for f in found if f.check == "face_share"]
+
+    assert known(None) == [] and known(0.41) == ["good"] and known(0.39) == ["usable"]
 
 
 def test_distance_from_the_dense_mesh_is_judged() -> None:
