@@ -23,9 +23,7 @@ FIT_ERROR = Limits(27.0, 18.0)
 # 25 to 37 dB where the shape is right, 13 to 20 where it is not.
 LABELS = {"face": Limits(27.0, 20.0), "hair": Limits(22.0, 15.0), "eyes": Limits(22.0, 13.0)}
 LEAST_LABELLED = 100  # pixels over all photos, below which an error by label is chance
-# dB below the median of the photos: twice the error. A photo that is shown well counts for none of these, however well
-# the others are: a clean head at 38.4 dB in the median has three of 43 that the fit shows with 28 to 32 dB.
-BELOW = 6.0
+BELOW = 6.0  # dB below the median of the photos: twice the error. One that is shown well counts for none of these
 WORST_VIEWS = Limits(0.0, 0.1, lower=False)  # share of the photos
 # dB that the running PSNR may end below its best: rises to the end on sound captures, 1.6 on one with moving shadows.
 FELL = Limits(0.5, 3.0, lower=False)
@@ -111,7 +109,7 @@ def by_label(f: Fitted) -> list[Finding]:
 
 
 def views(f: Fitted) -> list[Finding]:
-    """Photos that the model explains much worse than the others."""
+    """Photos that the model explains much worse than the others, where it is at all."""
     if not f.errors:
         return []
     least = min(float(np.median([e.psnr for e in f.errors])) - BELOW, FIT_ERROR.good)

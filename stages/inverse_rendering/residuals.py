@@ -42,7 +42,8 @@ class LabelError:
 
 @dataclass(frozen=True, slots=True)
 class ViewError:
-    """One photo. square: mean squared error over its subject's pixels, sRGB. relative: root mean square of the linear
+    """One photo. square: mean squared error over its subject's pixels, sRGB; covered: over those of them where the field
+    is not empty, so that a mask with a piece too much is not taken for a wrong photo. relative: root mean square of the linear
     residual over the mean linear radiance. missing: share of the subject's pixels where the field is empty. beyond:
     share of the background's pixels, near the subject, where it is not. noise: standard deviation of the photo's own
     noise, sRGB, at the fit's size. labels: the same error by the label's name, where the photo has labels.
@@ -55,12 +56,13 @@ class ViewError:
     missing: float
     beyond: float
     noise: float
+    covered: float
     labels: Mapping[str, LabelError] = field(default_factory=dict)
 
     @property
     def psnr(self) -> float:
-        """dB, at most 100."""
-        return decibels(self.square)
+        """Of the covered pixels; dB, at most 100."""
+        return decibels(self.covered)
 
 
 def decibels(square: float) -> float:
@@ -99,15 +101,17 @@ def view_errors(
         first, behind = own.stop, beside.stop
         if not len(inside[n]):
             continue
+        full = opacity[own] >= HALF
         out.append(
             ViewError(
                 index=view.index,
                 pixels=len(inside[n]),
                 square=float(square[own].mean()),
                 relative=float(linear[own].mean().sqrt() / truth[own].mean().clamp(min=DARK)),
-                missing=float((opacity[own] < HALF).double().mean()),
+                missing=1 - float(full.double().mean()),
                 beyond=float(there[beside].double().mean()) if len(outside[n]) else 0.0,
                 noise=photo_noise(view, side),
+                covered=float(square[own][full if bool(full.any()) else slice(None)].mean()),
                 labels=_by_label(view, table.xy[inside[n]], square[own], labels[n], names) if labels else {},
             )
         )

@@ -33,7 +33,7 @@ RISING = (19.3, 25.2, 32.0, 34.3, 33.6, 34.5, 35.2, 36.4, 37.2, 37.5)
 def error(index: int, psnr: float = 37.5, **changes: Any) -> ViewError:
     square = 10 ** (-psnr / 10)
     labels = {"face": LabelError(200, square), "eyes": LabelError(30, square)}
-    return replace(ViewError(index, 1000, square, 0.05, 0.0, 0.0, 0.002, labels), **changes)
+    return replace(ViewError(index, 1000, square, 0.05, 0.0, 0.0, 0.002, square, labels), **changes)
 
 
 def sound(errors: list[ViewError] | None = None, facts: Any = None, faces: int = 12, **changes: Any) -> Fitted:
@@ -98,6 +98,15 @@ def test_photos_that_are_alike_or_shown_well_are_no_worst_ones() -> None:
     for median, one, level in ((30.0, 24.5, "good"), (37.5, 28.0, "good"), (30.0, 23.5, "usable")):
         found = only(sound([error(i, one if i == 3 else median) for i in range(20)]), "worst_views")
         assert found.level == level, (median, one)
+
+
+def test_a_mask_with_a_piece_too_much_makes_no_worst_photo() -> None:
+    """One hundredth of the pixels is background, which the model rightly does not show."""
+    errors = [error(i, 38.0) for i in range(20)]
+    errors[4] = replace(errors[4], square=errors[4].square * 0.99 + 0.25 * 0.01, missing=0.01)
+    assert only(sound(errors), "worst_views").level == "good"
+    errors[4] = replace(errors[4], covered=errors[4].square)
+    assert only(sound(errors), "worst_views").level == "usable"
 
 
 @pytest.mark.parametrize(("missing", "level"), [(0.0001, "good"), (0.05, "usable"), (0.6, "unusable")])
@@ -191,6 +200,7 @@ def test_errors_of_a_fitted_ball(ball: Trainer) -> None:
         assert e.square == pytest.approx(float((difference**2).mean()), rel=0.05)
         relative = np.sqrt(((shown - view.rgb)[view.alpha > 0.99] ** 2).mean()) / view.rgb[view.alpha > 0.99].mean()
         assert e.relative == pytest.approx(float(relative), rel=0.05)
+        assert e.covered == pytest.approx(e.square, rel=0.1)
     assert all(e.missing < 0.02 and e.beyond < 0.05 and e.pixels > 300 for e in errors)
 
 
@@ -217,6 +227,15 @@ def test_a_mask_that_lacks_half_of_the_subject_is_told_from_the_others(ball: Tra
     table = new_trainer(halved, ball_start(), SMALL, False, "cpu").pixels
     errors = view_errors(ball.model, table, halved, SMALL.image_side, SMALL.samples)
     assert all((e.beyond > 0.1) == (e.index == 4) for e in errors)
+
+
+def test_a_mask_with_a_bright_piece_too_much_is_no_wrong_photo(ball: Trainer) -> None:
+    strip = np.arange(64) < 6
+    more = [replace(v, alpha=np.maximum(v.alpha, strip), rgb=np.where(strip[:, None], 1, v.rgb)) if v.index == 4 else v
+            for v in ball.views]  # fmt: skip
+    table = new_trainer(more, ball_start(), SMALL, False, "cpu").pixels
+    for e in view_errors(ball.model, table, more, SMALL.image_side, SMALL.samples):
+        assert (e.square > 20 * e.covered) == (e.index == 4) and e.psnr > 25
 
 
 def test_own_colours_are_taken_off() -> None:
