@@ -93,7 +93,8 @@ def row_of(capture: Found, given: argparse.Namespace, out: Path, made: dict[str,
         ended = {"exit_code": None, "how": SKIPPED, "error": capture.skipped, "stage": "", "wall": 0.0}
         return row | {"ended": ended, "verdict": verdict_of(None), "seconds": {}, "figures": {}}
     folder = (out / capture.name).absolute()
-    arguments = ["run", str(capture.capture), "--out", str(folder), "--store", str((out / "store").absolute()),
+    photos = captures.gathered(capture, (out / "gathered" / capture.name).absolute())
+    arguments = ["run", str(photos), "--out", str(folder), "--store", str((out / "store").absolute()),
                  "--preset", given.preset, "--holdout", capture.holdout]  # fmt: skip
     before = _changed(folder / "run.json")
     try:

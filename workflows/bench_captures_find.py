@@ -5,6 +5,7 @@ A folder's own `truth/` is for scoring alone: it is never named to a run, and no
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,8 +15,9 @@ from workflows.batch_captures import natural
 
 DEFAULT_ROOT = Path(__file__).resolve().parents[2] / "shared" / "captures"  # beside the project
 PHOTOS = "images"
-LIGHT_STAGE = ("lights.json", "olat")  # photos with one light at a time
-NOT_A_FORMAT = "light stage: not a format of this version; its full-on photos can be run if put beside params.json"
+LIGHT_STAGE = ("lights.json", "olat")  # photos with one light at a time: not a format of this version
+ALL_ON, CAMERAS = "full_on", "params.json"  # of a light stage: the photos with all lights on, and their cameras
+NO_ALL_ON = f"light stage without photos in {ALL_ON}/ or without {CAMERAS}"
 NO_PHOTOS = "no photos and no cameras that are understood"
 
 # What a figure over held-out views was measured on must never change: the captures' own rule, by name.
@@ -30,13 +32,15 @@ HELD_OUT_ELSE = "every:8:3"
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A capture. folder: all of it, with its truth; capture: what a run is given; skipped: why it can't be run."""
+    """A capture. folder: all of it, with its truth; capture: what a run is given; skipped: why it can't be run;
+    beside: a file that a run needs beside its photos, which is elsewhere (see gathered)."""
 
     name: str
     folder: Path
     capture: Path
     holdout: str
     skipped: str = ""
+    beside: Path | None = None
 
 
 def root_of(given: str | None) -> Path:
@@ -72,11 +76,26 @@ def find(root: Path, only: Sequence[str] = (), holdout: str | None = None) -> li
 def _found(folder: Path, holdout: str | None) -> Found:
     rule = holdout or HELD_OUT.get(folder.name, HELD_OUT_ELSE)
     if all((folder / n).exists() for n in LIGHT_STAGE):
-        return Found(folder.name, folder, folder, rule, NOT_A_FORMAT)
+        photos, cameras = folder / ALL_ON, folder / CAMERAS
+        if not (cameras.is_file() and _readable(photos)):
+            return Found(folder.name, folder, folder, rule, NO_ALL_ON)
+        return Found(folder.name, folder, photos, rule, beside=cameras)
     for place in (folder, folder / PHOTOS):
         if _readable(place):
             return Found(folder.name, folder, place, rule)
     return Found(folder.name, folder, folder, rule, NO_PHOTOS)
+
+
+def gathered(capture: Found, place: Path) -> Path:
+    """What a run is given: the capture's own folder, or a new one at `place` with links to photos and cameras that lie
+    apart."""
+    if capture.beside is None:
+        return capture.capture
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    for file in (capture.beside, *sorted(p for p in capture.capture.iterdir() if p.is_file())):
+        (place / file.name).symlink_to(file.resolve())
+    return place
 
 
 def _readable(folder: Path) -> bool:

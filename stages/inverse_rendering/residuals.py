@@ -42,11 +42,11 @@ class LabelError:
 
 @dataclass(frozen=True, slots=True)
 class ViewError:
-    """One photo. square: mean squared error over its subject's pixels, sRGB; covered: over those of them where the field
-    is not empty, so that a mask with a piece too much is not taken for a wrong photo. relative: root mean square of the linear
-    residual over the mean linear radiance. missing: share of the subject's pixels where the field is empty. beyond:
-    share of the background's pixels, near the subject, where it is not. noise: standard deviation of the photo's own
-    noise, sRGB, at the fit's size. labels: the same error by the label's name, where the photo has labels.
+    """One photo. square: mean squared error over its subject's pixels, sRGB. covered: over those where the field
+    is not empty, so that a mask with a piece too much is not taken for a wrong photo. relative: root mean square of the
+    linear residual over the mean linear radiance. missing: share of the subject's pixels where the field is empty.
+    beyond: share of the background's pixels, near the subject, where it is not. noise: standard deviation of the
+    photo's own noise, sRGB, at the fit's size. labels: the same error by the label's name, where the photo has labels.
     """
 
     index: int

@@ -19,7 +19,7 @@ from stages.capture.scan import scan_capture
 from workflows import bench_captures as bench
 from workflows import bench_captures_child as child
 from workflows.bench_captures_against import compare
-from workflows.bench_captures_find import HELD_OUT, NO_PHOTOS, NOT_A_FORMAT, find, root_of
+from workflows.bench_captures_find import HELD_OUT, NO_ALL_ON, NO_PHOTOS, find, root_of
 from workflows.bench_captures_table import FIGURES, markdown
 from workflows.cli import parser
 from workflows.console import Console
@@ -66,10 +66,25 @@ def test_what_is_run_of_each_folder(root: Path) -> None:
     found = {c.name: c for c in find(root)}
     assert found["inner"].capture == root / "inner" / "images" and found["inner"].folder == root / "inner"
     assert found["good_2"].capture == root / "good_2"
-    assert found["stage"].skipped == NOT_A_FORMAT and found["empty"].skipped == NO_PHOTOS
+    assert found["stage"].skipped == NO_ALL_ON and found["empty"].skipped == NO_PHOTOS
     assert found["head_a"].holdout == HELD_OUT["head_a"] == "every:5:2" and found["good_2"].holdout == "every:8:3"
     assert {c.holdout for c in find(root, holdout="none")} == {"none"}
     assert [c.name for c in find(root, only=["good_2"])] == ["good_2"]
+
+
+def test_of_a_light_stage_the_photos_with_all_lights_on_are_run(root: Path) -> None:
+    photos(root / "stage" / "full_on", 4)
+    photos(root / "stage" / "olat" / "0")
+    row = run(root, "--only", "stage")["stage"]
+    assert row["ended"]["exit_code"] == 0 and "stage/full_on" in row["command"]
+    asked = json.loads((root.parent / "out" / "stage" / "asked.json").read_text())
+    given = Path(asked[1])
+    assert given == root.parent / "out" / "gathered" / "stage"
+    assert sorted(p.name for p in given.iterdir()) == ["0.jpg", "1.jpg", "2.jpg", "3.jpg", "params.json"]
+    assert (given / "3.jpg").read_bytes() == (root / "stage" / "full_on" / "3.jpg").read_bytes()
+    (root / "stage" / "full_on" / "3.jpg").unlink()
+    run(root, "--only", "stage")  # the links are made anew
+    assert not (given / "3.jpg").is_symlink()
 
 
 def test_what_is_not_there_is_told(root: Path, tmp_path: Path) -> None:
