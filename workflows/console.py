@@ -23,6 +23,7 @@ class Console:
         self.stream, self.bars = stream, stream.isatty()
         self.bar: tqdm[Any] | None = None
         self.label, self.last, self.began = "", 0.0, time.monotonic()
+        self.warned: set[str] = set()  # results whose warnings were shown: `neuface check` meets some twice
 
     def started(self, stage: str, number: int, of: int) -> None:
         """A stage begins; `of` is 0 for what is none of the run's stages."""
@@ -63,8 +64,9 @@ class Console:
         self.close()
         how = "reused" if done.reused else f"{done.run.get('seconds', 0):.1f} s"
         self.note(f"{self.label}: {how}")
-        for warning in getattr(done.located.artifact, "warnings", ()):
+        for warning in getattr(done.located.artifact, "warnings", ()) if done.key not in self.warned else ():
             self.note(f"    warning: {warning}")
+        self.warned.add(done.key)
 
     def note(self, text: str) -> None:
         """A line of its own."""

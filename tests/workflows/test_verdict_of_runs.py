@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.artifacts import Capture, Located
 from pipeline.contract import Done
 from pipeline.verdict import Level
 from stages import registry
 from tests.support.toy_stages import finding
 from workflows import estimate
 from workflows.cli import main
+from workflows.console import Console
 from workflows.plan import RunRequest, make_plan
 from workflows.publish import publish
 from workflows.runner import run_here, run_plan
@@ -216,6 +219,17 @@ def test_check_runs_on_when_cameras_were_given(photos: Path, monkeypatch: pytest
 
     monkeypatch.setattr(checking, "_has_cameras", lambda done: True)
     assert check(photos, "--set", "second.level=unusable") == 3
+
+
+def test_a_warning_is_shown_once_though_its_stage_is_met_twice() -> None:
+    """Check runs the first stage alone, then all that comes before the fit."""
+    artifact = Capture(kind="photos", views=(), warnings=("two photos are blurred",))
+    stream = io.StringIO()
+    console = Console(stream)
+    for key, reused in (("a", False), ("a", True), ("b", False)):
+        console.finished(Done("capture", key, Located(artifact, Path()), reused, {}))
+    assert stream.getvalue().count("two photos are blurred") == 2
+    assert stream.getvalue().count("reused") == 1
 
 
 def test_check_keeps_what_it_found_where_a_store_is_named(photos: Path) -> None:
