@@ -61,15 +61,17 @@ def checks() -> list[Check]:
 def checks_in(stage: str, source: str, known: dict[str, Any]) -> Iterator[Check]:
     """Of one module. known: its names and their values."""
     for function in (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)):
-        local = {
-            target.id: node.value
+        assigned = [
+            (node.lineno, target.id, node.value)
             for node in ast.walk(function)
             if isinstance(node, ast.Assign)
             for target in node.targets
             if isinstance(target, ast.Name)
-        }
+        ]
         for call in (n for n in ast.walk(function) if isinstance(n, ast.Call)):
             if isinstance(call.func, ast.Name) and call.func.id == "judged":
+                earlier = sorted((a for a in assigned if a[0] < call.lineno), key=lambda a: a[0])
+                local = {name: value for _, name, value in earlier}  # the last one before the call
                 given = dict(zip(NAMES, call.args, strict=False)) | {k.arg: k.value for k in call.keywords if k.arg}
                 for name in _texts(given["check"], local, known):
                     limits = tuple(x for x in _values(given["limits"], local, known) if isinstance(x, Limits))

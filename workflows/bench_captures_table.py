@@ -172,7 +172,7 @@ def _endings(rows: Mapping[str, Row]) -> str:
         why = "; ".join(verdict["reasons"]) or row["ended"]["error"] or row.get("fault") or NOTHING
         lines.append([name, ending(row), verdict["level"], of, NOTHING if held is None else str(held), _cell(why)])
     explained = {
-        "exit": "0: good or usable; 3: unusable, the asset is written unless the run ended before the fit; anything else failed",
+        "exit": "0: good or usable; 3: unusable, the asset is written but where the fit was not made; else: failed",
         "verdict": "the run's own, none where it has none",
         "placed": PLACED.means,
         "held out": "views that were kept from the fit and are scored",
