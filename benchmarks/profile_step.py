@@ -11,7 +11,7 @@ import pstats
 import sys
 
 import pipeline.threads  # noqa: F401  (before torch)
-from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.config import Config
 from workflows.ball import WHOLE, ball_trainer
 from workflows.machine import machine, told
 
@@ -20,7 +20,7 @@ SHOWN = 16
 
 def main(steps: int) -> None:
     """Print the table."""
-    settings = FitSettings(**WHOLE)
+    settings = Config(**WHOLE)
     trainer = ball_trainer(24, 256, settings.grid_cells, settings, "cpu")
     for _ in range(3):
         trainer.advance()

@@ -18,13 +18,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.artifacts import Artifact, FileRef, Located
 from pipeline.errors import Cancelled, stage_error_from_os_error
 from pipeline.store import Store
+from pipeline.units import FilledIn
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,24 @@ class StageConfig(BaseModel):
     """Base of every stage's settings. All of it is in the key: what can't change the result does not belong here."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    @classmethod
+    def setting_names(cls) -> tuple[str, ...]:
+        """What a user may set: every field but those that the stage fills in by itself."""
+        return tuple(
+            name for name, field in cls.model_fields.items() if not any(isinstance(m, FilledIn) for m in field.metadata)
+        )
+
+    def changed(self, **values: object) -> Self:
+        """A copy with other values, as dataclasses.replace makes one: what code sets is not held against the limits.
+
+        Raises:
+            TypeError: a name that is no setting.
+        """
+        unknown = values.keys() - type(self).model_fields.keys()
+        if unknown:
+            raise TypeError(f"no settings of {type(self).__module__}: {', '.join(sorted(unknown))}")
+        return self.model_copy(update=values)
 
 
 class Progress(Protocol):

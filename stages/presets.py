@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from pipeline.contract import Stage, StageConfig
 from pipeline.errors import UsageError
+from stages.old_names import without_old_names
 
 Settings = Mapping[str, Mapping[str, Any]]
 
@@ -86,14 +87,11 @@ def configs_for(
                     limit="key = value under the stage's name",
                     remedy=f"write [{stage}] above its keys",
                 )
-            for key in values:
-                known(
-                    key,
-                    stages[stage].config.model_fields,
-                    what=f"unknown setting of {stage}",
-                    where=f"{origin} {stage}.{key}",
-                )
-            merged[stage].update(values)
+            names = stages[stage].config.setting_names()
+            current = without_old_names(stage, values, names, origin)
+            for key in current:
+                known(key, names, what=f"unknown setting of {stage}", where=f"{origin} {stage}.{key}")
+            merged[stage].update(current)
     _tile_size(merged)
     return {name: _checked(stages[name], values) for name, values in merged.items()}
 

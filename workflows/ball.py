@@ -4,14 +4,13 @@ figures need no capture and compare between machines."""
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from stages.inverse_rendering.config import Config
     from stages.inverse_rendering.fit import Trainer
-    from stages.inverse_rendering.settings import FitSettings
     from stages.inverse_rendering.start import Start
     from stages.inverse_rendering.views import PhotoView
 
@@ -53,11 +52,11 @@ def ball_start(cells: int) -> Start:
     return Start(np.asarray(values, np.float32), np.full(3, -HALF, np.float32), 2 * HALF / cells)
 
 
-def ball_trainer(views: int, side: int, cells: int, settings: FitSettings, device: str) -> Trainer:
+def ball_trainer(views: int, side: int, cells: int, settings: Config, device: str) -> Trainer:
     """A fit of the ball on one grid, about to begin and far from its end."""
     from stages.inverse_rendering.begin import new_trainer
 
-    endless = replace(settings, steps=1_000_000, seconds=0.0, levels=1, image_side=side, shadows=False)
+    endless = settings.changed(steps=1_000_000, seconds=0.0, levels=1, image_side=side, shadows=False)
     photos = [ball_view(i, views, side) for i in range(views)]
     t = new_trainer(photos, ball_start(cells), endless, settings.calibration == "on", device)
     t.enter_level()

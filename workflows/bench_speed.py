@@ -96,9 +96,9 @@ def setups() -> list[dict[str, int]]:
 # ------------------------------------------------------------------ measuring
 def trainer(views: int, side: int, cells: int, batch: int, device: str, part: dict[str, Any] | None = None) -> Trainer:
     """A fit of the ball with the draft's model, whole or without a part."""
-    from stages.inverse_rendering.settings import FitSettings
+    from stages.inverse_rendering.config import Config
 
-    return ball_trainer(views, side, cells, FitSettings(batch=batch, **{**WHOLE, **(part or {})}), device)
+    return ball_trainer(views, side, cells, Config(batch=batch, **{**WHOLE, **(part or {})}), device)
 
 
 def measure(views: int, side: int, cells: int, batch: int, least: float, device: str) -> Point:

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.store import Store, write_synced
-from stages.inverse_rendering import settings as fits
-from stages.inverse_rendering.settings import FitSettings
+from stages.inverse_rendering.config import Config, Preset
 from stages.presets import PRESETS
 from stages.registry import FIT
 
@@ -49,9 +48,9 @@ class Rung:
 SIZES = ("image_side", "grid_cells", "levels", "batch", "samples", "hash_fine", "hash_log2_size")  # of a fit
 
 
-def _of(preset: str, **changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def _of(preset: Preset, **changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The sizes of a preset by stage, some of them changed."""
-    fit = FitSettings(**fits.PRESETS[preset])
+    fit = Config(preset=preset)
     sizes = {**PRESETS[preset], FIT: {name: getattr(fit, name) for name in SIZES}}
     return {stage: {**own, **changes.get(stage, {})} for stage, own in sizes.items()}
 
@@ -111,7 +110,7 @@ def calibrate(device: str) -> float:
     """Rays/s of this machine at the draft's settings, on the ball."""
     from workflows.ball import WHOLE, ball_trainer
 
-    settings = FitSettings(**WHOLE)
+    settings = Config(**WHOLE)
     trainer = ball_trainer(8, 256, settings.grid_cells, settings, device)
     trainer.advance()  # loads what the first step needs
     begun, steps = time.perf_counter(), 0

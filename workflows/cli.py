@@ -20,7 +20,7 @@ from contextlib import suppress
 
 from pipeline.errors import NeufaceError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
-from workflows import batch_commands, bench, check, commands, schedule, store_commands
+from workflows import batch_commands, bench, check, commands, schedule, settings_command, store_commands
 from workflows.console import Console
 from workflows.interrupt import Interrupted, as_exceptions, code_of
 
@@ -68,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     batch_commands.add_commands(commands_of)
     store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
     schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
+    settings_command.add_options(commands_of.add_parser("settings", help="every setting: meaning, limits, presets"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)

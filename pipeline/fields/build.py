@@ -38,7 +38,7 @@ def spatial(spec: FaceSpec) -> nn.Module:
         centre, radius = middle(spec)
         return SinusoidalField(centre, radius, columns, positive, spec.albedo_start, spec.width, spec.depth)
     lo, hi = torch.tensor(spec.lo), torch.tensor(spec.hi)
-    encoding = HashEncoding(lo, hi, spec.coarse, spec.fine, spec.levels, spec.log2_size)
+    encoding = HashEncoding(lo, hi, spec.coarse, spec.hash_fine, spec.hash_levels, spec.hash_log2_size)
     return SpatialField(encoding, columns, spec.width, spec.depth, spec.albedo_start, positive)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -109,7 +109,7 @@ class FaceModel(nn.Module):
 
     def save(self, path: Path) -> None:
         """Write the file that `load_model` reads."""
-        spec = {"format": FORMAT, "cell": self.geometry.cell, **asdict(self.spec)}
+        spec = {"format": FORMAT, "cell": self.geometry.cell, **self.spec.stored()}
         arrays = {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
         np.savez(path, spec=np.frombuffer(json.dumps(spec).encode(), np.uint8), **arrays)
 
@@ -128,10 +128,7 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
             remedy="run the fit again with this version",
         )
     cell = float(spec.pop("cell"))
-    for k in ("lo", "hi", "albedo_start", "prior_centre"):
-        if k in spec:
-            spec[k] = tuple(spec[k])
-    model = _unfilled(FaceSpec(**spec), arrays, cell)
+    model = _unfilled(FaceSpec.from_stored(spec), arrays, cell)
     model.load_state_dict(arrays)
     return model.to(device)
 

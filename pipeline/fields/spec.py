@@ -1,8 +1,17 @@
-"""What a fitted face is made of, as plain values: enough to build its modules before their parameters are read."""
+"""What a fitted face is made of, as plain values: enough to build its modules before their parameters are read.
+
+The names are those of the fit's settings (stages.inverse_rendering.config), which say what each means. Three have older
+names in the file, which stay, so that a field that was fitted can be read.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+IN_FILE = {"hash_levels": "levels", "hash_log2_size": "log2_size", "hash_fine": "fine"}
+TRIPLES = ("lo", "hi", "albedo_start", "prior_centre")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +32,10 @@ class FaceSpec:
     specular: bool = True
     shadows: bool = False
     calibrated: bool = False
-    levels: int = 10
-    log2_size: int = 17
+    hash_levels: int = 10
+    hash_log2_size: int = 17
     coarse: float = 0.03
-    fine: float = 0.0006
+    hash_fine: float = 0.0006
     width: int = 64
     depth: int = 2
     # which of the paper's systems; see pipeline.fields.build
@@ -42,3 +51,14 @@ class FaceSpec:
     prior_scale: float = 0.1
     prior_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     displacement_width: int = 256
+
+    def stored(self) -> dict[str, Any]:
+        """Its values by their names in the file."""
+        return {IN_FILE.get(name, name): value for name, value in asdict(self).items()}
+
+    @classmethod
+    def from_stored(cls, values: Mapping[str, Any]) -> FaceSpec:
+        """The inverse of `stored`; JSON has lists where tuples were."""
+        names = {old: new for new, old in IN_FILE.items()}
+        given: dict[str, Any] = {names.get(k, k): tuple(v) if k in TRIPLES else v for k, v in values.items()}
+        return cls(**given)

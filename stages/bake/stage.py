@@ -12,6 +12,7 @@ from pydantic import Field
 
 from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
 
@@ -31,7 +32,7 @@ class Inputs:
 class Config(StageConfig):
     """Size of the maps and what goes into them."""
 
-    size: int = Field(1024, ge=256, le=16384, description="width and height of the maps in texels")
+    size: Texels = Field(1024, ge=256, le=16384, description="width and height of the maps in texels")
     detail: bool = Field(True, description="add the fine detail of the fitted photos to the albedo")
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
 from pipeline.artifacts import Capture, CaptureSource, FileRef, Located
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError
+from pipeline.units import Unit, Views
 from stages.capture.holdout import check_rule, held_out
 
 
@@ -24,8 +25,10 @@ class Config(StageConfig):
     """Settings of the capture stage."""
 
     holdout: str = Field("none", description="views kept from the fit: none | every:N:K | names:a.jpg,b.jpg")
-    min_views: int = Field(3, ge=3, description="fewest views that must remain for the fit")
-    frames: int = Field(60, ge=8, le=500, description="frames to take from a film, spread over the camera's way")
+    min_views: Views = Field(3, ge=3, description="fewest views that must remain for the fit")
+    frames: Annotated[int, Unit("frames")] = Field(
+        60, ge=8, le=500, description="frames to take from a film, spread over the camera's way"
+    )
     drop_blurred: bool = Field(True, description="leave out photos with far less detail than the others")
     chart: Literal["auto", "on", "off"] = Field(
         "auto",

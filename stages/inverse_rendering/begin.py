@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -9,18 +11,20 @@ import torch
 from pipeline.fields.face import FaceModel
 from pipeline.fields.spec import FaceSpec
 from stages.inverse_rendering.choices import teach
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, PixelTable
 
+DERIVED = {"rank", "light_order", "specular", "hash_fine"}  # of a FaceSpec: what the settings say in part
+SAME = ({f.name for f in fields(FaceSpec)} & Config.model_fields.keys()) - DERIVED  # what they say by the same name
 ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'
 
 
 def new_trainer(
     views: list[PhotoView],
     start: Start,
-    settings: FitSettings,
+    settings: Config,
     calibrated: bool,
     device: str,
     prior: Start | None = None,
@@ -38,42 +42,26 @@ def new_trainer(
     return Trainer(views, settings, device, model, prior or start)
 
 
-def spec_for(views: list[PhotoView], start: Start, settings: FitSettings, calibrated: bool, device: str) -> FaceSpec:
+def spec_for(views: list[PhotoView], start: Start, config: Config, calibrated: bool, device: str) -> FaceSpec:
     """What the settings make of these photos and this start."""
     colour = PixelTable(views, 256, device).mean_colour()
     grey = float(colour.mean().clamp(min=1e-4))
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
     coarse = float((hi - lo).max()) / 16
+    same = {name: getattr(config, name) for name in SAME}
     return FaceSpec(
+        **same,
         lo=_triple(lo),
         hi=_triple(hi),
         views=len(views),
-        rank=settings.first_rank,
-        light_order=settings.first_order,
+        rank=config.first_rank,
+        light_order=config.first_order,
         light_start=grey / ALBEDO_START,
         albedo_start=_triple((colour / grey * ALBEDO_START).clamp(0.02, 0.95).cpu().numpy()),
-        attenuation=settings.attenuation,
-        basis_inputs=settings.basis_inputs,
-        density=settings.density,
-        volumetric=settings.volumetric,
-        specular=settings.specular != "off",
-        shadows=settings.shadows,
+        specular=config.specular != "off",
         calibrated=calibrated,
-        levels=settings.hash_levels,
-        log2_size=settings.hash_log2_size,
         coarse=coarse,
-        fine=settings.hash_fine if coarse / 1024 < settings.hash_fine < coarse / 2 else coarse / 20,
-        width=settings.width,
-        depth=settings.depth,
-        appearance=settings.appearance,
-        shading=settings.shading,
-        light=settings.light,
-        integral=settings.integral,
-        basis_width=settings.basis_width,
-        basis_depth=settings.basis_depth,
-        prior=settings.prior,
-        prior_scale=settings.prior_scale,
-        prior_centre=settings.prior_centre,
+        hash_fine=config.hash_fine if coarse / 1024 < config.hash_fine < coarse / 2 else coarse / 20,
     )
 
 

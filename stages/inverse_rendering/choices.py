@@ -21,9 +21,9 @@ from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths import sh
 from stages.inverse_rendering import evidence
+from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.evidence import NEGLIGIBLE, Trial, more
 from stages.inverse_rendering.lamp import Lamp, light_from_lobe, reflectance
-from stages.inverse_rendering.settings import AUTO, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, PixelTable
@@ -47,7 +47,7 @@ class Fit(Protocol):
     """What is read of a fit under way. waiting: positions of the views that it has not seen."""
 
     views: list[PhotoView]
-    settings: FitSettings
+    settings: Config
     device: str
     model: FaceModel
     prior: Start | None
@@ -84,12 +84,12 @@ def restored(plain: dict[str, Any]) -> Choices:
     return Choices(**{**plain, "columns": tuple(plain["columns"])})
 
 
-def open_questions(s: FitSettings) -> bool:
+def open_questions(s: Config) -> bool:
     """Whether anything is left to the evidence."""
     return s.judges and AUTO in (s.specular, s.rank, s.light_order, s.calibration, s.relief)
 
 
-def waiting_views(count: int, settings: FitSettings) -> tuple[int, ...]:
+def waiting_views(count: int, settings: Config) -> tuple[int, ...]:
     """Positions of the views that the fit does not see until the evidence is in: about one in eight, spread evenly."""
     if count < LEAST_VIEWS or not open_questions(settings):
         return ()
@@ -166,7 +166,7 @@ def _table(fit: Fit) -> PixelTable:
     return fit.table
 
 
-def _judge_colours(given: Choices, s: FitSettings, t: Trial, model: FaceModel) -> Choices:
+def _judge_colours(given: Choices, s: Config, t: Trial, model: FaceModel) -> Choices:
     """Lobe, calibration, order and rank, each given what the others need."""
     full, facts = model.spec.light_order, _facts(given, s, "not judged")
     most = _best_order(t, full) if given.specular else None
@@ -274,7 +274,7 @@ def strongest(model: FaceModel, t: Trial, k: int) -> tuple[int, ...]:
     return tuple(sorted(int(j) for j in np.argsort(-share, kind="stable")[:k]))
 
 
-def _facts(c: Choices, s: FitSettings, why: str) -> Facts:
+def _facts(c: Choices, s: Config, why: str) -> Facts:
     """Where nothing was tested."""
     return {
         "specular": {"modelled": c.specular, "why": "setting" if s.specular != AUTO else why},

@@ -10,9 +10,9 @@ import torch
 
 from pipeline.artifacts import Camera
 from pipeline.fields.face import FaceModel
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.gather import camera_only
 from stages.inverse_rendering.render import render_rays
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import Rays, factor_for, image_rays
 
 LEAST_TRAINING = 0.25  # share of the stage's seconds that training has in any case: a field must come out of it
@@ -31,7 +31,7 @@ class Clock:
         return time.monotonic() - self.begun
 
 
-def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: FitSettings, device: str) -> float:
+def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Config, device: str) -> float:
     """What rendering the held-out views (cameras of the photos) will take, by timing some of their rays."""
     if not held:
         return 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +28,18 @@ from stages.inverse_rendering.choices import (
     take_over,
     waiting_views,
 )
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
+EVEN_FROM = 0.3  # share of the fit after which only the light is found for a while
+OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are open at the start
+OPEN_UNTIL = 0.5  # share of the fit after which all of them are
 EVEN_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
 EVEN_LIGHT_RATE = 10.0  # times the light's rate
 LIT_RATE = 0.1  # times the light's rate once it is known from the lobe
@@ -62,7 +65,7 @@ class Trainer:
     """The state of a fit under way."""
 
     views: list[PhotoView]
-    settings: FitSettings
+    settings: Config
     device: str
     model: FaceModel
     prior: Start | None = None
@@ -166,7 +169,7 @@ class Trainer:
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
 
-        Between `even_from` and `even_until` a light that the lobe has told (lamp.py) rests with the surface while the
+        Between EVEN_FROM and `even_until` a light that the lobe has told (lamp.py) rests with the surface while the
         skin takes up what it leaves; then it moves slowly. Where no lobe tells it, everything rests but the light, and
         the skin is even: the light, which began as the same from everywhere, explains what it can of the shading that
         the albedo had taken up until then. Any earlier, and a surface that is still the hull bends to what is wrong.
@@ -174,7 +177,7 @@ class Trainer:
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
-        interlude, lit = s.even_from <= p < s.even_until, self.choices is not None and self.choices.lit
+        interlude, lit = EVEN_FROM <= p < s.even_until, self.choices is not None and self.choices.lit
         self.model.even = interlude and not lit
         for group in self.optimiser.param_groups:
             light = group["params"][0] is next(self.model.light.parameters())
@@ -186,9 +189,9 @@ class Trainer:
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
-        opened = s.open_from + (1 - s.open_from) * min(p / s.open_until, 1.0)
+        opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
         self.model.spatial.encoding.open_levels(opened)
-        still = s.even_from <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
+        still = EVEN_FROM <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
         return 0.0 if still or self.rests else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
@@ -252,10 +255,10 @@ class Trainer:
         with torch.autocast(kind, torch.bfloat16, enabled=short):
             return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
 
-    def weights(self) -> FitSettings:
+    def weights(self) -> Config:
         """The settings; once the light is known, skin need not be even: that would drive paint into the lobe."""
         lit = self.choices is not None and self.choices.lit
-        return replace(self.settings, parsimony=0.0) if lit else self.settings
+        return self.settings.changed(parsimony=0.0) if lit else self.settings
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients that the optimiser does not know of are finite."""
@@ -339,7 +342,7 @@ class Trainer:
         self.table = None
 
 
-def make_optimiser(model: FaceModel, settings: FitSettings, device: str) -> torch.optim.Optimizer:
+def make_optimiser(model: FaceModel, settings: Config, device: str) -> torch.optim.Optimizer:
     """Adam over everything but the SDF, which has its own in the band. The table has no momentum to spare: eps is
     small, because most of its entries see a gradient only now and then."""
     groups = [

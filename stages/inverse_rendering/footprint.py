@@ -5,14 +5,14 @@ The footprint of a pixel is that of pipeline.footprint, of the blocks of pixels 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.fields.face import FaceModel
 from pipeline.footprint import edges
-from stages.inverse_rendering.settings import AUTO, FitSettings
+from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, factor_for
 
@@ -36,12 +36,12 @@ class Footprint:
         side = float(np.sqrt(self.area / UTILISATION) / self.pixel)
         return int(2 ** np.ceil(np.log2(max(side, 16))))
 
-    def facts(self, settings: FitSettings, model: FaceModel) -> dict[str, str | float | bool]:
+    def facts(self, settings: Config, model: FaceModel) -> dict[str, str | float | bool]:
         """For the report."""
         return {
             "pixel_mm": round(self.pixel * 1e3, 4),
             "grid_cell_mm": round(model.geometry.cell * 1e3, 4),
-            "encoding_mm": round(model.spec.fine * 1e3, 4),
+            "encoding_mm": round(model.spec.hash_fine * 1e3, 4),
             "texture_supported": self.texture,
             "why": "no finer than the photos' pixels on the surface" if settings.resolution == AUTO else "setting",
         }
@@ -81,14 +81,13 @@ def _surface_of(start: Start) -> tuple[F64, F64, float]:
     return points, normals, faces * start.cell**2 * 2 / 3
 
 
-def supported(settings: FitSettings, looked: Footprint | None, start: Start) -> FitSettings:
+def supported(settings: Config, looked: Footprint | None, start: Start) -> Config:
     """The settings with a grid and an encoding that the photos can fill."""
     if looked is None:
         return settings
     finest = start.cell / 2 ** (settings.levels - 1)
     cells = int(settings.grid_cells * min(finest / (CELL_PIXELS * looked.pixel), 1.0))
-    return replace(
-        settings,
+    return settings.changed(
         grid_cells=max(cells, 16),
         hash_fine=max(settings.hash_fine, FINE_PIXELS * looked.pixel),
     )

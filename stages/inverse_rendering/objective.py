@@ -12,8 +12,8 @@ from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel
 from pipeline.maths import density, losses
 from pipeline.maths.sdf import unit
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.render import sample_shell, shade_shell, solid_behind
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.views import WHOLE, Batch
 
 
@@ -44,16 +44,14 @@ class Terms:
 
 
 def objective(
-    model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator, smooth_scale: float
+    model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float
 ) -> tuple[Tensor, float]:
     """Loss of a batch, the sum of [NeuFace eq. 20], and its mean squared error (sRGB)."""
     found = terms(model, batch, settings, generator, smooth_scale)
     return found.total, found.error
 
 
-def terms(
-    model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator, smooth_scale: float
-) -> Terms:
+def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float) -> Terms:
     """All parts of the loss. A batch without rays near the subject gives zeros."""
     device = batch.alpha.device
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)

@@ -23,10 +23,10 @@ from pipeline.fields.priors import HullPrior
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
 from stages.inverse_rendering.begin import spec_for
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.objective import Terms, calibrated_colours
 from stages.inverse_rendering.paper_render import geometry_of, render_samples
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable
 
@@ -39,7 +39,7 @@ def rate_factor(share: float) -> float:
     return float(0.5 ** int(min(share, HALVED_UNTIL) / HALVED_EVERY + 1e-9))
 
 
-def paper_terms(model: FaceModel, batch: Batch, settings: FitSettings, generator: torch.Generator) -> Terms:
+def paper_terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator) -> Terms:
     """All parts of [NeuFace eq. 20] with the paper's samples."""
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(batch.alpha.device)
     got = render_samples(model, batch.rays, settings.samples, jitter)
@@ -124,7 +124,7 @@ class PaperTrainer(Trainer):
         self.optimiser.load_state_dict(state["optimiser"])
 
 
-def paper_optimiser(model: FaceModel, settings: FitSettings) -> torch.optim.Optimizer:
+def paper_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
     """Adam; a prior's networks at its share of the rate, its codes and everything else at the full one."""
     prior = geometry_of(model).known
     codes = {id(p) for n, p in model.named_parameters() if n.startswith("geometry.prior.z_")}
@@ -144,7 +144,7 @@ def paper_optimiser(model: FaceModel, settings: FitSettings) -> torch.optim.Opti
 def new_paper_trainer(
     views: list[PhotoView],
     start: Start,
-    settings: FitSettings,
+    settings: Config,
     calibrated: bool,
     device: str,
     _prior: Start | None = None,
@@ -159,7 +159,7 @@ def new_paper_trainer(
     return PaperTrainer(views, settings, device, model)
 
 
-def prior_for(spec: FaceSpec, start: Start, settings: FitSettings) -> nn.Module:
+def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
     """The prior that the settings name."""
     if settings.prior == "sphere":
         return build.sphere_prior(spec)

@@ -21,6 +21,7 @@ from pipeline.faces.landmarks3d import HeadFrame, head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
 from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
+from stages.masks.config import Config
 from stages.masks.cut_out import cut
 from stages.masks.extent import BUST, asked, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
@@ -30,9 +31,12 @@ from stages.masks.redraw import redrawn
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
 from stages.masks.solid import Solid, distinct, find_solid
-from stages.masks.sources import Method, Plan, View, inverted, mask, plan, to_full_size
-from stages.masks.user_model import UserModel
+from stages.masks.sources import Plan, View, inverted, mask, plan, to_full_size
+from stages.masks.user_model import UserModel, hair_model, user_model
 
+WORKING_SIZE = 640  # longest edge at which people and objects are cut out
+MIN_AGREEMENT = 0.8  # least IoU of a mask and the hull of all masks, in the region of interest
+MAX_DEVIATION = 0.05  # IoU below the median from which a mask may be an outlier
 LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
 SMALL = 512  # longest edge of the masks that are held against each other
 CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
@@ -44,23 +48,6 @@ COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull ma
 Labelled = tuple[Path, tuple[str, ...]]
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """See stages.masks.stage.Config."""
-
-    method: Method
-    threshold: float
-    working_size: int
-    hull_cells: int
-    min_agreement: float
-    max_deviation: float
-    mend: bool
-    seed: int
-    model: UserModel | None = None
-    faces: bool = True
-    hair: UserModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,36 +76,37 @@ class Looked:
 
 
 def segment(
-    capture: Located[Capture], located: Located[CameraSet], settings: Settings, context: Context
+    capture: Located[Capture], located: Located[CameraSet], config: Config, context: Context
 ) -> MaskSet:  # fmt: skip
     """Masks of all registered views; see stages.masks.stage.run."""
     poses = located.artifact
     pairs = _views(capture, poses)
-    how = plan([v for v, _ in pairs], settings.method, settings.threshold, settings.working_size, settings.seed,
-               lambda: _solid(located, settings.seed), settings.model)  # fmt: skip
+    how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
+               lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
-    masked = _each(lambda p: _make(p[0], p[1], how, settings, context), pairs, context, "masking")
+    masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, context, "masking")
     warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the "
                 "other way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
     support = how.solid.support if how.solid is not None else None
-    found = _opinions(masked, voting, poses, settings, support)
+    found = _opinions(masked, voting, poses, config, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     first = _seen(masked, [])
-    if settings.mend:
-        bad = _outliers(masked, settings)
-        mended = _each(lambda t: _mend(t[0], t[1], t[2], settings, context),
+    if config.mend:
+        bad = _outliers(masked)
+        mended = _each(lambda t: _mend(t[0], t[1], t[2], config, context),
                        list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
         if any(a is not b for a, b in zip(mended, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in mended]
-            found = _opinions(mended, voting, poses, settings, support)
+            found = _opinions(mended, voting, poses, config, support)
             mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
         masked = mended
-    dropped = _dropped(masked, settings, warnings)
+    dropped = _dropped(masked, warnings)
     looked = [Looked()] * len(masked)
-    if settings.faces:
-        looked = _each(lambda m: _look(m, settings.hair, context), masked, context, "looking for a face")
+    if config.faces:
+        hair = hair_model(config)
+        looked = _each(lambda m: _look(m, hair, context), masked, context, "looking for a face")
     fitted = [(m.camera, x.face) for m, x in zip(masked, looked, strict=True)
               if x.face is not None and not m.view.holdout and m.view.index not in dropped]  # fmt: skip
     found_face = agreed(fitted)
@@ -228,10 +216,10 @@ def _each(work: Callable[[T], R], items: list[T], context: Context, message: str
     return out
 
 
-def _make(view: View, camera: Camera, how: Plan, settings: Settings, context: Context) -> Masked:
-    use = replace(view, given=view.given if settings.method in ("auto", "given") else None,
-                  plate=view.plate if settings.method in ("auto", "plate") else None)  # fmt: skip
-    alpha, source = mask(use, how, settings.threshold, settings.working_size, settings.seed)
+def _make(view: View, camera: Camera, how: Plan, config: Config, context: Context) -> Masked:
+    use = replace(view, given=view.given if config.method in ("auto", "given") else None,
+                  plate=view.plate if config.method in ("auto", "plate") else None)  # fmt: skip
+    alpha, source = mask(use, how, config.threshold, WORKING_SIZE, config.seed)
     if source == "given" and inverted(alpha, view.disc):
         alpha, source = 1 - alpha, INVERTED
     return _keep(use, camera, alpha, source, context)
@@ -258,20 +246,20 @@ def _solid(poses: Located[CameraSet], seed: int) -> Solid | None:
 
 
 def _opinions(
-    masked: list[Masked], voting: list[bool], poses: CameraSet, settings: Settings, support: Support | None
+    masked: list[Masked], voting: list[bool], poses: CameraSet, config: Config, support: Support | None
 ) -> list[Opinion]:
     return opinions([m.camera for m in masked], [m.small for m in masked], voting, poses.roi_radius,
-                    settings.hull_cells, support)  # fmt: skip
+                    config.hull_cells, support)  # fmt: skip
 
 
-def _outliers(masked: list[Masked], settings: Settings) -> list[bool]:
+def _outliers(masked: list[Masked]) -> list[bool]:
     """Of the fitted views; held-out ones are measured and left alone."""
     ious = [None if m.view.holdout or m.useless else m.iou for m in masked]
-    found = outliers(ious, settings.min_agreement, settings.max_deviation)
+    found = outliers(ious, MIN_AGREEMENT, MAX_DEVIATION)
     return [f or (m.useless and not m.view.holdout) for f, m in zip(found, masked, strict=True)]
 
 
-def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context: Context) -> Masked:
+def _mend(made: Masked, opinion: Opinion, bad: bool, config: Config, context: Context) -> Masked:
     """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
@@ -282,11 +270,11 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, settings: Settings, context
     if not (bad or doubtful):
         return made
     image = made.view.read()
-    w, h = working_size(image.shape[1], image.shape[0], settings.working_size)
+    w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
     opinion_here = _at_size(opinion, w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
     small = np.asarray(resized(image, w, h), np.uint8)
-    new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), settings.seed)
+    new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), config.seed)
     if made.source in LEARNED:
         new = redrawn(small, new)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
@@ -305,20 +293,20 @@ def _at_size(o: Opinion, width: int, height: int) -> Opinion:
     return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), max(1, round(o.margin * factor)), o.iou)
 
 
-def _dropped(masked: list[Masked], settings: Settings, warnings: list[str]) -> list[int]:
+def _dropped(masked: list[Masked], warnings: list[str]) -> list[int]:
     known = [m.iou for m in masked if m.iou is not None and not m.view.holdout]
     middle = float(np.median(known)) if known else 0.0
-    if middle < settings.min_agreement:
+    if middle < MIN_AGREEMENT:
         warnings.append(f"masks and cameras agree poorly: median IoU with the visual hull {middle:.2f}, expected at "
-                        f"least {settings.min_agreement:.2f}; look at the masks and the poses")  # fmt: skip
+                        f"least {MIN_AGREEMENT:.2f}; look at the masks and the poses")  # fmt: skip
     out = []
-    for m, bad in zip(masked, _outliers(masked, settings), strict=True):
+    for m, bad in zip(masked, _outliers(masked), strict=True):
         name = f"view {m.view.index} ({m.view.name})"
         if bad:
             out.append(m.view.index)
             why = "shows nothing or everything" if m.useless else f"has IoU {m.iou:.2f} with the other views' hull"
             warnings.append(f"{name} is not fitted: its mask {why} (median {middle:.2f})")
-        elif m.view.holdout and (m.useless or (m.iou is not None and m.iou < settings.min_agreement)):
+        elif m.view.holdout and (m.useless or (m.iou is not None and m.iou < MIN_AGREEMENT)):
             warnings.append(f"{name} is held out and its mask is doubtful: IoU {m.iou or 0:.2f} with the fitted views' "
                             f"hull (median {middle:.2f})")  # fmt: skip
     _enough(sum(not m.view.holdout for m in masked) - len(out), len(masked), warnings)

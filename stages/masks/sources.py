@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
+from stages.masks.config import Method
 from stages.masks.cut_out import INNER, OUTER, cut_by_region
 from stages.masks.key_out import Background, border_colours, find_background, key_out, key_out_plate
 from stages.masks.region import F32, U8, Bool, Disc, resized
@@ -18,7 +19,6 @@ from stages.masks.soften import soft_edge
 from stages.masks.solid import Solid, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
-Method = Literal["auto", "given", "plate", "key", "person", "object", "grabcut"]
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
 PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
 PERSON_VIEWS = 0.9  # share of the views in which it must: it takes a statue for a person from some sides, but not all

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.errors import UsageError
 from pipeline.networks import network
+from stages.masks.config import Config
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import refined
 
@@ -64,6 +65,22 @@ class UserModel:
                           limit=f"ONNX, input 1 x 3 x {self.side} x {self.side}, output 1 x {planes} x {self.side} x "
                           f"{self.side}", remedy=f"set {self.setting}_side to the network's input, or export it again "
                           "with a fixed size")  # fmt: skip
+
+
+def user_model(config: Config) -> UserModel | None:
+    """The network that the settings name for the subject, if any."""
+    if not config.model:
+        return None
+    return UserModel(Path(config.model), config.model_side, config.model_imagenet)
+
+
+def hair_model(config: Config) -> UserModel | None:
+    """The network that the settings name for hair, if any."""
+    if not config.hair_model:
+        return None
+    only = config.hair_model_class if config.hair_model_class >= 0 else None
+    path = Path(config.hair_model)
+    return UserModel(path, config.hair_model_side, config.hair_model_imagenet, only, "masks.hair_model")
 
 
 def mask_by_model(image: U8, disc: Disc, model: UserModel, threshold: float, longest: int, seed: int) -> Bool:

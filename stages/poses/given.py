@@ -12,6 +12,7 @@ from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid, matrix
 from pipeline.verdict import Finding
 from stages.poses.check import AGREE, FAR, IMPERFECT, check_cameras, features_of
+from stages.poses.config import Config
 from stages.poses.judge import CONTRADICTED, contradicted, mirrored
 from stages.poses.measure import find_faces, head_of, known_scale, some_of
 from stages.poses.mirrored import find_mirrored
@@ -19,7 +20,6 @@ from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
 from stages.poses.place import camera_of, camera_set
 from stages.poses.scale import by_world, eyes_of
-from stages.poses.settings import Config
 from stages.poses.ticks import progress_of
 
 if TYPE_CHECKING:
@@ -79,13 +79,13 @@ def _held_against_photos(
     from stages.poses.photogrammetry import (
         triangulate_given,
     )  # takes COLMAP, which cameras that stay as they are do not
-    from stages.poses.solved import settings_of
 
-    photos = photos_of(capture, config.use_masks)
+    photos = photos_of(capture)
     centres, axes = viewing_rays(cameras)
     distance = float(((centres - nearest_point(centres, axes)) ** 2).sum(1).mean() ** 0.5)
+    in_order = capture.artifact.kind == "video"
     found = triangulate_given(
-        [photos[i] for i in right], cameras, settings_of(capture, config), context.scratch, progress_of(context),
+        [photos[i] for i in right], cameras, config, in_order, context.scratch, progress_of(context),
         refine=config.given == "refine", deviation=config.given_deviation * distance,
     )  # fmt: skip
     if found is None:
@@ -106,7 +106,7 @@ def _contradicted(
 ) -> tuple[list[int], tuple[Finding, ...]]:  # fmt: skip
     """Places of the views whose photos contradict their cameras, none if most do; and what follows from it."""
     progress = progress_of(context)
-    photos = photos_of(capture, config.use_masks)
+    photos = photos_of(capture)
     features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
     far = IMPERFECT if config.given == "refine" else FAR
     verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)

@@ -35,16 +35,14 @@ SPREAD = Limits(60.0, 10.0)  # degrees: 174 and more all around, 27 an arc; belo
 MIRRORED = Limits(0.0, 0.5, lower=False)
 
 
-def judge(
-    found: CameraSet, capture: Capture, points: F64 | None, least_placed: float = PLACED.usable
-) -> tuple[Counts, tuple[Finding, ...]]:
+def judge(found: CameraSet, capture: Capture, points: F64 | None) -> tuple[Counts, tuple[Finding, ...]]:
     """Which directions the fitted views see, and all findings that cameras alone allow. points: (M, 3) sparse points in
-    asset coordinates, None where cameras were given. least_placed: share of the photos that a usable result places."""
+    asset coordinates, None where cameras were given."""
     views, stated = capture.views, found.source == "given" and capture.kind == "facescape"
     fitted = fitted_cameras(found.cameras, views)
     directions = view_directions(fitted)
     counts = count_seen(directions)
-    out = [_placed(found, least_placed), *_errors(found), *_focal(found, views), _scale(found, stated),
+    out = [_placed(found), *_errors(found), *_focal(found, views), _scale(found, stated),
            *_points(found, points), *_seen(counts), _spread(directions)]  # fmt: skip
     return counts, tuple(out)
 
@@ -87,10 +85,10 @@ def mirrored(names: Sequence[str], total: int) -> Finding:
                   views=names)  # fmt: skip
 
 
-def _placed(found: CameraSet, least: float) -> Finding:
+def _placed(found: CameraSet) -> Finding:
     total = len(found.cameras) + len(found.unregistered)
     return judged("photos_placed", len(found.cameras) / max(1, total),
-                  Limits(max(PLACED.good, least), least),
+                  PLACED,
                   f"{len(found.cameras)} of {total} photos have a camera that fits",
                   "take the photos around one still subject, sharp, each overlapping the next by two thirds; remove "
                   "those named if they show something else", views=found.unregistered)  # fmt: skip

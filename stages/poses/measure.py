@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from pipeline.errors import StageError
 from pipeline.faces.find import Face, find_face
 from pipeline.faces.landmarks3d import HeadFrame, head_frame, triangulate
 from pipeline.images import read_encoded
+from stages.poses.config import Config
 from stages.poses.features import U8, grey8
 from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, eyes_of, find_markers
 
@@ -23,23 +23,8 @@ NEEDS = {
 }
 
 
-class Wanted(Protocol):
-    """The stage's settings of the scale."""
-
-    @property
-    def scale(self) -> str: ...
-    @property
-    def distance(self) -> str: ...
-    @property
-    def marker_mm(self) -> float: ...
-    @property
-    def marker_kind(self) -> str: ...
-    @property
-    def pupils_mm(self) -> float: ...
-
-
 def known_scale(
-    capture: Located[Capture], cameras: list[Camera], config: Wanted, eyes: Eyes | None, warnings: list[str]
+    capture: Located[Capture], cameras: list[Camera], config: Config, eyes: Eyes | None, warnings: list[str]
 ) -> Scale | None:  # fmt: skip
     """Metres per unit of the cameras' world from what the user or the photos say of it, or None.
 

@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -21,6 +21,7 @@ from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.sharpness import detail
 from stages.poses.adjust import Refine
+from stages.poses.config import Config
 from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
 from stages.poses.known import triangulate
 from stages.poses.left_out import disjoint, linked, reasons
@@ -77,22 +78,6 @@ class Photo(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """See the stage's Config."""
-
-    seed: int
-    max_image_size: int
-    max_features: int
-    neighbours: int
-    shared: Literal["auto", "yes", "no"]
-    camera_model: str
-    refine: Refine
-    patience: int = 3
-    mapper: Literal["auto", "incremental", "global"] = "auto"
-    in_order: bool = False
-
-
 Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
 
 
@@ -107,31 +92,34 @@ class Solution:
     groups: tuple[tuple[int, ...], ...]
 
 
-def solve(photos: Sequence[Photo], settings: Settings, scratch: Path, progress: Progress) -> Solution:
-    """The solution with the highest score (`quality`) of all tries.
+def solve(
+    photos: Sequence[Photo], config: Config, in_order: bool, scratch: Path, progress: Progress
+) -> Solution:  # fmt: skip
+    """The solution with the highest score (`quality`) of all tries. Photos of equal size and EXIF share a lens, unless
+    the score doubts it and far more photos fit without. in_order: the photos follow each other, as a film's frames do.
 
     Raises:
         StageError: the photos were taken from one spot.
     """
     best: Model | None = None
-    shared, counts = settings.shared != "no", [0] * len(photos)
-    for effort in (PLAIN, PATIENT)[: settings.patience]:
-        features = detect_all(photos, settings, effort, progress)
+    counts = [0] * len(photos)
+    for effort in (PLAIN, PATIENT)[: config.patience]:
+        features = detect_all(photos, config, effort, progress)
         counts = counts if any(counts) else [len(f.uv) for f in features]
-        verified = match_all(photos, features, settings, effort, progress)
-        best = better(best, _place(photos, features, verified, settings, shared, scratch, progress), photos)
+        verified = match_all(photos, features, config, effort, progress, in_order)
+        best = better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
         if score(best, photos) >= GOOD_SCORE:
             break
-    if settings.patience >= 3 and score(best, photos) < GOOD_SCORE:
+    if config.patience >= 3 and score(best, photos) < GOOD_SCORE:
         lost = [i for i in range(len(photos)) if best is None or i not in best.poses]
-        features, verified = _askew(photos, features, verified, settings, progress, lost)
-        best = better(best, _place(photos, features, verified, settings, shared, scratch, progress), photos)
-    if settings.shared == "auto" and score(best, photos) < POOR_SCORE:
-        separate = _place(photos, features, verified, settings, False, scratch, progress)
+        features, verified = _askew(photos, features, verified, config, progress, lost)
+        best = better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
+    if score(best, photos) < POOR_SCORE:
+        separate = _place(photos, features, verified, config, False, scratch, progress)
         if best is None or score(separate, photos) >= BETTER_BY * score(best, photos):
             best = separate
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
-        _not_from_one_spot(photos, features, verified, settings.seed)
+        _not_from_one_spot(photos, features, verified, config.seed)
     return _explained(best, photos, counts, verified)
 
 
@@ -150,13 +138,13 @@ def _explained(
 
 
 def triangulate_given(
-    photos: Sequence[Photo], cameras: Sequence[Camera], settings: Settings, scratch: Path, progress: Progress,
-    *, refine: bool, deviation: float,
+    photos: Sequence[Photo], cameras: Sequence[Camera], config: Config, in_order: bool, scratch: Path,
+    progress: Progress, *, refine: bool, deviation: float,
 ) -> tuple[Model, list[int]] | None:  # fmt: skip
     """Sparse points from given cameras, and with `refine` better poses; None if no point is seen twice. Second: the
     views that were not mended. deviation: of the given centres, in the world's unit."""
-    features = detect_all(photos, settings, PLAIN, progress)
-    verified = match_all(photos, features, settings, PLAIN, progress)
+    features = detect_all(photos, config, PLAIN, progress)
+    verified = match_all(photos, features, config, PLAIN, progress, in_order)
     if not verified:
         return None
     progress(0, 1, "finding points")
@@ -164,19 +152,19 @@ def triangulate_given(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     try:
-        return triangulate(folder, cameras, features, verified, refine=refine, deviation=deviation, seed=settings.seed)
+        return triangulate(folder, cameras, features, verified, refine=refine, deviation=deviation, seed=config.seed)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def _askew(
-    photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], settings: Settings,
+    photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], config: Config,
     progress: Progress, lost: Sequence[int],
 ) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
     """The features and matches so far, and those of the `lost` photos and their likeliest neighbours seen as if from
     farther round; the others have found their place without."""
-    more = replace(settings, max_features=MORE_ASKEW * settings.max_features)
-    near = promising_pairs(features, ASKEW.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"))
+    more = config.changed(max_features=MORE_ASKEW * config.max_features)
+    near = promising_pairs(features, ASKEW.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
     pairs = [p for p in near if set(p) & set(lost)]
     wanted = sorted({i for p in pairs for i in p})
     nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
@@ -223,16 +211,16 @@ def _not_from_one_spot(
         )
 
 
-def detect_all(photos: Sequence[Photo], settings: Settings, effort: Effort, progress: Progress) -> list[Features]:
+def detect_all(photos: Sequence[Photo], config: Config, effort: Effort, progress: Progress) -> list[Features]:
     """Features of every photo."""
 
     def one(photo: Photo) -> Features:
-        grey = grey8(photo.pixels(), settings.max_image_size)
+        grey = grey8(photo.pixels(), config.max_image_size)
         alpha = photo.inside()
         inside = None
         if alpha is not None:
             inside = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5).astype(np.uint8)
-        return detect(grey, (photo.width, photo.height), settings.max_features, effort, inside)
+        return detect(grey, (photo.width, photo.height), config.max_features, effort, inside)
 
     found = []
     with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
@@ -248,16 +236,17 @@ def detect_all(photos: Sequence[Photo], settings: Settings, effort: Effort, prog
 
 
 def match_all(
-    photos: Sequence[Photo], features: Sequence[Features], settings: Settings, effort: Effort, progress: Progress
-) -> dict[Pair, Verified]:
-    """Verified matches by pair of photos."""
-    pairs = promising_pairs(features, effort.ratio, settings.neighbours, lambda: progress(0, 1, "comparing photos"),
-                            settings.in_order)  # fmt: skip
-    return match_pairs(photos, features, pairs, settings, effort, progress)
+    photos: Sequence[Photo], features: Sequence[Features], config: Config, effort: Effort, progress: Progress,
+    in_order: bool = False,
+) -> dict[Pair, Verified]:  # fmt: skip
+    """Verified matches by pair of photos. in_order: they follow each other, as a film's frames do."""
+    pairs = promising_pairs(features, effort.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"),
+                            in_order)  # fmt: skip
+    return match_pairs(photos, features, pairs, config, effort, progress)
 
 
 def match_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair], settings: Settings, effort: Effort,
+    photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair], config: Config, effort: Effort,
     progress: Progress,
 ) -> dict[Pair, Verified]:  # fmt: skip
     """Verified matches of the given pairs."""
@@ -266,7 +255,7 @@ def match_pairs(
         i, j = pair
         matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
         edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
-        return verify(features[i], features[j], matches, edge, settings.seed)
+        return verify(features[i], features[j], matches, edge, config.seed)
 
     found = {}
     with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
@@ -278,7 +267,7 @@ def match_pairs(
 
 
 def _place(
-    photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], settings: Settings,
+    photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], config: Config,
     shared: bool, scratch: Path, progress: Progress,
 ) -> Model | None:  # fmt: skip
     if not verified:
@@ -309,15 +298,15 @@ def _place(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         found = reconstruct(
-            folder, lenses, lens_of, features, verified, camera_model=settings.camera_model, mapper=mapper,
-            refine=settings.refine, seed=(settings.seed + seed) % 2**31, next_image=next_image, loose=loose,
+            folder, lenses, lens_of, features, verified, camera_model=config.camera_model, mapper=mapper,
+            refine=Refine(), seed=(config.seed + seed) % 2**31, next_image=next_image, loose=loose,
         )  # fmt: skip
         shutil.rmtree(folder, ignore_errors=True)
         if stopped:
             raise stopped[0]
         return found
 
-    return best_of(attempt, photos, together, mappers(len(photos), settings.mapper))
+    return best_of(attempt, photos, together, mappers(len(photos), config.mapper))
 
 
 def best_of(

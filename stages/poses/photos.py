@@ -32,12 +32,12 @@ class StoredPhoto:
         return None if self.mask is None else read_alpha(self.mask)
 
 
-def photos_of(capture: Located[Capture], use_masks: bool) -> list[StoredPhoto]:
+def photos_of(capture: Located[Capture]) -> list[StoredPhoto]:
     """One for each view, in the capture's order."""
     found = []
     for view in capture.artifact.views:
         focal, group = _lens(view)
-        mask = capture.path(view.mask) if use_masks and view.mask is not None else None
+        mask = capture.path(view.mask) if view.mask is not None else None
         found.append(StoredPhoto(view.width, view.height, focal, group, capture.path(view.image), mask))
     return found
 

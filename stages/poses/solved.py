@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from pipeline.artifacts import CameraSet, Capture, Located
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from stages.poses.adjust import Refine
+from stages.poses.config import Config
 from stages.poses.judge import groups, mirrored
 from stages.poses.measure import find_eyes, known_scale
 from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import normalise
-from stages.poses.photogrammetry import Settings, solve
+from stages.poses.photogrammetry import solve
 from stages.poses.photos import photos_of
 from stages.poses.place import camera_of, camera_set
-from stages.poses.settings import Config
 from stages.poses.ticks import progress_of
 
 MIN_FITTED = 3
@@ -29,9 +28,8 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
             `photos_placed` says that the result is unusable.
     """
     views = capture.artifact.views
-    solution = solve(
-        photos_of(capture, config.use_masks), settings_of(capture, config), context.scratch, progress_of(context)
-    )
+    in_order = capture.artifact.kind == "video"  # a film's frames follow each other
+    solution = solve(photos_of(capture), config, in_order, context.scratch, progress_of(context))
     model = solution.model
     placed = sorted(model.poses) if model is not None else []
     missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
@@ -56,7 +54,7 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
                         + "; if they show another subject, make a capture of their own")  # fmt: skip
     made = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
     lost = [i for i in range(len(views)) if i not in placed]
-    flipped = find_mirrored(photos_of(capture, config.use_masks), lost, placed, config.seed)
+    flipped = find_mirrored(photos_of(capture), lost, placed, config.seed)
     findings = (groups(len(placed), [[views[i].name for i in group] for group in others]),
                 mirrored([views[i].name for i in flipped], len(views)))  # fmt: skip
     sizes = tuple(len(g) for g in solution.groups)
@@ -69,15 +67,6 @@ def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
     for name, reason in why.items():
         out.setdefault(reason.split(":")[0], []).append(name)
     return out
-
-
-def settings_of(capture: Located[Capture], config: Config) -> Settings:
-    """What the solver is to do. A film's frames follow each other."""
-    refine = Refine(config.refine_focal, config.refine_distortion, config.refine_principal_point)
-    return Settings(
-        config.seed, config.max_image_size, config.max_features, config.neighbours, config.shared_intrinsics,
-        config.camera_model, refine, config.patience, config.mapper, capture.artifact.kind == "video",
-    )  # fmt: skip
 
 
 def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str]) -> StageError:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pipeline.artifacts import CameraSet, Capture, Located
 from pipeline.contract import Context, Stage
 from pipeline.errors import UsageError
-from stages.poses.settings import Config as Config
+from stages.poses.config import Config as Config
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
         )
     given = all_given and config.method != "colmap"
     found = (given_cameras if given else solved_cameras)(inputs.capture, config, context)
-    seen, findings = judge(found, inputs.capture.artifact, sparse_points(found, context.workdir), config.min_registered)
+    seen, findings = judge(found, inputs.capture.artifact, sparse_points(found, context.workdir))
     return found.model_copy(update={"seen_directions": seen, "findings": found.findings + findings})
 
 

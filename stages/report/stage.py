@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import Field
-
 from pipeline.artifacts import (
     CameraSet,
     Capture,
@@ -19,6 +17,10 @@ from pipeline.artifacts import (
     UvMesh,
 )
 from pipeline.contract import Context, Stage, StageConfig
+
+PICTURE_SIDE = 360  # pixels: the longer side of a picture on the page
+VIEWS_SHOWN = 8  # held-out views shown as pictures; the table lists all
+MASKS_SHOWN = 24  # photos shown with their mask's outline, the worst first
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +38,7 @@ class Inputs:
 
 
 class Config(StageConfig):
-    """Settings of the page; the metrics do not depend on them."""
-
-    picture_side: int = Field(360, ge=64, le=2048, description="largest side of a picture on the page, pixels")
-    views_shown: int = Field(8, ge=0, le=200, description="views shown as pictures; the table lists all")
-    masks_shown: int = Field(24, ge=0, le=1000, description="photos shown with their mask's outline, the worst first")
+    """The page has no settings."""
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Report:
@@ -56,14 +54,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     rows, total = [], max(1, len(inputs.usd.artifact.views), len(inputs.inverse_rendering.artifact.held_out))
     for number, view in enumerate(judged_views(inputs)):
         context.check()
-        rows.append(build_rows(view, config.picture_side))
+        rows.append(build_rows(view, PICTURE_SIDE))
         context.progress(number + 1, total + 1, f"view {view.index}")
     findings = judge(rows, {v.index: v.name for v in inputs.capture.artifact.views})
     verdict = verdict_of_inputs(inputs, report=findings)
     metrics = {"verdict": verdict.record(every=True), "holdout": summary(rows), "timing": {}, **figures(inputs)}
     metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
     (context.workdir / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-    page = build_page(metrics, verdict, rows[: config.views_shown], inputs, config.picture_side, config.masks_shown)
+    page = build_page(metrics, verdict, rows[:VIEWS_SHOWN], inputs, PICTURE_SIDE, MASKS_SHOWN)
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
     files = context.file("index.html"), context.file("metrics.json")

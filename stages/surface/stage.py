@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.units import Cells, Unit
 
 MESH = "surface.npz"
 
@@ -27,7 +28,7 @@ class Inputs:
 class Config(StageConfig):
     """How finely the zero set is sampled, and what becomes of surface that no photo saw."""
 
-    resolution: int = Field(
+    resolution: Cells = Field(
         256,
         ge=16,
         le=1024,
@@ -36,7 +37,7 @@ class Config(StageConfig):
     unseen: Literal["closed", "trimmed"] = Field(
         "closed", description="surface that no fitted photo saw: kept, so that the mesh is closed, or cut off"
     )
-    handle: float = Field(
+    handle: Annotated[float, Unit("share of the box's longest side")] = Field(
         0.1,
         ge=0,
         le=10,

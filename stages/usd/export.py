@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +15,7 @@ from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, Surface,
 from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd import component
+from stages.usd.config import Config
 from stages.usd.gltf import write_glb
 from stages.usd.light import environment, environment_figures, light_json, read_light
 from stages.usd.lookdev import lookdev_layer
@@ -28,24 +28,6 @@ from stages.usd.shading import Look
 F32 = npt.NDArray[np.float32]
 NEAR_HIGH = 4  # triangles looked at for each of the dense mesh, which is finer than what it lies on
 THUMBNAIL = "./thumbnails/default.png"  # made by the stage once there is something to render
-
-
-class Settings(Protocol):
-    """The part of the stage's config that matters here."""
-
-    name: str
-    asset_version: str
-    usdz: bool
-    glb: bool
-    obj: bool
-    proxy: bool
-    high: bool
-    environment_width: int
-    divide_shadows: bool
-    acescg: bool
-    author: str
-    license: str
-    subject_consent: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,21 +47,21 @@ def export(
     face: Located[FittedFace],
     poses: Located[CameraSet],
     capture: Located[Capture],
-    settings: Settings,
+    config: Config,
     folder: Path,
     check: Callable[[], None],
 ) -> Export:
     """Write all but the thumbnail, which has to be rendered from what is written here."""
-    name = settings.name
+    name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
-    proxy, notes = _proxy(uv, mesh) if settings.proxy else (None, [])
-    high, left_out = _high(surface, mesh) if settings.high else (None, [])
+    proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
+    high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
     check()
     light = read_light(face.path(face.artifact.light))
-    maps = write_maps(bake, mesh, light, name, folder, check, divide=settings.divide_shadows, acescg=settings.acescg)
+    maps = write_maps(bake, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
     written, look = maps.written, maps.look
-    who = component.Identity(name, settings.asset_version, settings.author, settings.license, settings.subject_consent)
+    who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
     hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
     holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
@@ -96,21 +78,21 @@ def export(
         layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
-    dome = environment(light, settings.environment_width)
+    dome = environment(light, config.environment_width)
     write_exr(folder / "environment.exr", dome)
     figures = maps.figures | environment_figures(light, dome)
     (folder / "light.json").write_text(light_json(light, attenuation_of(face.artifact)))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
-    if settings.usdz:
+    if config.usdz:
         # viewers on phones read no MaterialX, and some take any preview surface that they find
         plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
         single = component.package_layer(who, mesh, plain)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
-    if settings.glb:
+    if config.glb:
         written.append(folder / f"{name}.glb")
         write_glb(written[-1], name, mesh, look, folder, who.stated())
-    if settings.obj:
+    if config.obj:
         written += write_obj(folder, name, mesh, look)
     check()
     return Export(written, notes, figures, who.stated())

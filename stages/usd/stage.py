@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from pipeline.artifacts import (
     CameraSet,
@@ -23,7 +22,8 @@ from pipeline.artifacts import (
     UsdAsset,
     UvMesh,
 )
-from pipeline.contract import Context, Stage, StageConfig
+from pipeline.contract import Context, Stage
+from stages.usd.config import Config as Config
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,31 +37,6 @@ class Inputs:
     poses: Located[CameraSet]
     capture: Located[Capture]
     masks: Located[MaskSet]  # for its findings: the asset is marked with the verdict
-
-
-class Config(StageConfig):
-    """Settings of the export."""
-
-    name: str = Field("head", description="name of the asset: prim, file and prefix of the textures")
-    asset_version: str = Field("1.0.0", description="assetInfo:version of the component")
-    author: str = Field("", max_length=1000, description="who made the capture; recorded in the asset")
-    license: str = Field("", max_length=1000, description="licence of the capture; recorded in the asset")
-    subject_consent: str = Field("", max_length=1000, description="what the subject agreed to; recorded in the asset")
-    usdz: bool = Field(True, description="also write a preview package NAME.usdz")
-    glb: bool = Field(True, description="also write NAME.glb")
-    obj: bool = Field(True, description="also write NAME.obj and NAME.mtl")
-    divide_shadows: bool = Field(
-        True, description="take the captured light's shadows and interreflections out of the albedo"
-    )
-    acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
-    proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
-    high: bool = Field(True, description="write the dense mesh as high.usdc, for the variant lod=high")
-    environment_width: int = Field(512, ge=64, le=8192, multiple_of=2, description="columns of environment.exr")
-    render_views: bool = Field(True, description="render the held-out views from the exported files")
-    samples: int = Field(
-        0, ge=0, le=8, description="rays along each side of a pixel of these renders; 0: one, and 64 on silhouettes"
-    )
-    preview_size: int = Field(512, ge=64, le=4096, description="pixels of the preview pictures' side")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:

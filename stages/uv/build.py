@@ -13,12 +13,13 @@ from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.verdict import Finding
 from stages.uv import decimate
+from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import front_of
 from stages.uv.judge import judge
 from stages.uv.measure import Quality, measure
 from stages.uv.remesh import remeshed
-from stages.uv.unwrap import COARSER, Options, unwrap
+from stages.uv.unwrap import COARSER, most_tiles, unwrap
 
 MOST_OVERLAP, MOST_FLIPPED, MOST_EMPTY, MOST_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
 MANY_CRUMBS = 50
@@ -43,16 +44,13 @@ class Built:
 
 def build(
     dense: Mesh,
-    target_faces: int,
-    proxy_faces: int,
-    options: Options,
+    config: Config,
     step: Step,
     *,
-    even: bool = False,
+    texel: float | None = None,
     landmarks: F64 | None = None,
 ) -> Built:
-    """Decimate, unwrap and measure. even: triangles of one size and shape in the place of few where it is flat.
-    landmarks: (468, 3) of the face, which then has more texels.
+    """Decimate, unwrap and measure. texel: see `unwrap`. landmarks: (468, 3) of the face, which then has more texels.
 
     Raises:
         StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
@@ -67,13 +65,13 @@ def build(
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")
-    mesh = remeshed(dense, target_faces) if even else decimate.decimated(dense, target_faces)
-    proxy = decimate.decimated(mesh, proxy_faces)
+    mesh = (remeshed if config.remesh == "even" else decimate.decimated)(dense, config.target_faces)
+    proxy = decimate.decimated(mesh, config.proxy_faces)
     with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
         away = beside.submit(_away, dense, mesh, proxy)
         step(1, 4, "unwrapping")
         front = front_of(mesh, landmarks)
-        charts = unwrap(mesh, options, front)
+        charts = unwrap(mesh, config, front, texel)
         step(2, 4, "measuring charts")
         quality = measure(mesh, charts, None if front is None else front.face)
         step(3, 4, "measuring the decimation")
@@ -82,7 +80,7 @@ def build(
     step(4, 4, "done")
     rest = np.ones(len(mesh.faces), np.bool_) if front is None else ~front.region
     others = Mesh(mesh.vertices, mesh.normals, mesh.faces[rest]), Charts(charts.uvs, charts.faces[rest])
-    short = _too_few(options, tiles, footprint.texel(*others, options.size))
+    short = _too_few(config, texel, tiles, footprint.texel(*others, config.tile_size))
     span = float(np.ptp(mesh.vertices, axis=0).max())
     findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
@@ -120,13 +118,14 @@ def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _too_few(options: Options, tiles: int, texel: float) -> tuple[str, ...]:
+def _too_few(config: Config, wished: float | None, tiles: int, texel: float) -> tuple[str, ...]:
     """Where the texture became coarser than was asked, or fewer tiles than asked were of use."""
-    if options.texel is not None and texel > 1.001 * COARSER * options.texel:
+    if wished is not None and texel > 1.001 * COARSER * wished:
         return (
-            f"{tiles} tile(s) of {options.size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
-            f"pixels are {1e3 * options.texel:.3g} mm: a larger bake.size carries more",
+            f"{tiles} tile(s) of {config.tile_size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
+            f"pixels are {1e3 * wished:.3g} mm: a larger bake.size carries more",
         )
-    if options.texel is None and tiles < options.tiles:
-        return (f"the charts fill {tiles} of {options.tiles} tiles",)
+    most = most_tiles(config, wished)
+    if wished is None and tiles < most:
+        return (f"the charts fill {tiles} of {most} tiles",)
     return ()

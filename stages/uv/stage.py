@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
-
-from pydantic import Field
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, UvMesh
-from pipeline.contract import Context, Stage, StageConfig
+from pipeline.contract import Context, Stage
+from stages.uv.config import Config as Config
 
 MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 
@@ -24,36 +22,11 @@ class Inputs:
     masks: Located[MaskSet]
 
 
-class Config(StageConfig):
-    """Size of the meshes and how they are cut into charts."""
-
-    target_faces: int = Field(50_000, ge=200, le=2_000_000, description="triangles of the mesh that is textured")
-    remesh: Literal["adaptive", "even"] = Field(
-        "adaptive",
-        description="adaptive: few triangles where it is flat; even: one size and shape, for sculpting and quads",
-    )
-    proxy_faces: int = Field(5_000, ge=100, le=200_000, description="triangles of the coarse stand-in")
-    tiles: Annotated[int, Field(ge=1, le=10)] | Literal["auto"] = Field(
-        1, description="UDIM tiles to fill; auto: as many as it takes for texels no coarser than the photos' pixels"
-    )
-    tile_size: int = Field(
-        1024, ge=256, le=16384, description="texels along a tile's side that tiles=auto counts on; bake.size if not set"
-    )
-    texture_size: int = Field(1024, ge=256, le=8192, description="texture that the padding is measured in")
-    padding: int = Field(4, ge=1, le=64, description="texels of texture_size between two charts")
-    max_cost: float = Field(
-        12.0, gt=0, le=64, description="how bent a chart of xatlas may get; for meshes that our own charts do not suit"
-    )
-    face: bool = Field(True, description="give the face 40 % of the texels under charts, where its landmarks are known")
-    iterations: int = Field(1, ge=1, le=8, description="rounds in which xatlas grows charts from better seeds; slow")
-
-
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     """Decimate, cut, flatten, pack, measure. Raises StageError when the mesh can't be unwrapped."""
-    from pipeline import footprint, meshes, tiles
+    from pipeline import footprint, meshes
     from pipeline.faces.landmarks3d import load_landmarks
     from stages.uv.build import build
-    from stages.uv.unwrap import Options
 
     surface = inputs.surface
     dense = meshes.load(surface.path(surface.artifact.mesh))
@@ -62,19 +35,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.check()
         context.progress(done, total, message)
 
-    most, texel = config.tiles, None
-    if most == "auto":
+    texel = None
+    if config.tiles == "auto":
         fitted = set(inputs.inverse_rendering.artifact.fitted_views)
         texel = footprint.pixel(dense, (c for c in inputs.poses.artifact.cameras if c.index in fitted))
-        most = 1 if texel is None else tiles.MOST
-    options = Options(
-        config.texture_size, config.padding, config.max_cost, config.iterations, most, texel, config.tile_size
-    )
     ref = inputs.masks.artifact.landmarks
     landmarks = load_landmarks(inputs.masks.path(ref)) if ref is not None and config.face else None
-    built = build(
-        dense, config.target_faces, config.proxy_faces, options, step, even=config.remesh == "even", landmarks=landmarks
-    )
+    built = build(dense, config, step, texel=texel, landmarks=landmarks)
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
     return UvMesh(

@@ -8,14 +8,14 @@ would otherwise break its charts into hundreds of crumbs. Its mirrored charts ar
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline import meshes
+from pipeline import meshes, tiles
 from pipeline.errors import StageError
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.charts import unwrapped
+from stages.uv.config import Config
 from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
 from stages.uv.rough import in_pieces, short
@@ -30,28 +30,16 @@ COARSER = 1.05  # of the texel that is wished for: a few per cent are not worth 
 UNFOLDINGS = 6  # rounds in which what folds is taken apart; in the latter half face by face, which ends it
 FOLD_RASTER = 2048  # texels along a side on which folds are looked for
 WORTH_TEXELS = 1e-3  # of the surface without texels: with less, the charts stay as they are
+ITERATIONS = 1  # rounds in which xatlas grows charts from better seeds: more are slow
 MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
-    """texture_size and padding in texels; max_cost and iterations as in xatlas. tiles: that many are filled, or, with
-    `texel`, no more than it takes for texels that are no larger (mean edge on the surface, in the mesh's unit) but for
-    COARSER, `size` of them along a tile's side."""
-
-    texture_size: int = 1024
-    padding: int = 4
-    max_cost: float = 12.0
-    iterations: int = 1
-    tiles: int = 1
-    texel: float | None = None
-    size: int = 1024
-
-
-def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
+def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float | None = None) -> Charts:
     """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
 
-    A mesh that takes MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger.
+    A mesh that takes MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger. texel: mean edge
+    on the surface, in the mesh's unit, that texels should not exceed but for COARSER, config.tile_size of them along a
+    tile's side; no more tiles are filled than that takes. None: config.tiles are filled.
 
     Raises:
         StageError: xatlas gives up, or leaves faces without a chart.
@@ -59,11 +47,11 @@ def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
     span = float(np.ptp(mesh.vertices, axis=0).max())
     points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
-    padding = options.padding / options.texture_size
-    tiling = Tiling(options.tiles, None if options.texel is None else 1 / (COARSER * options.texel * options.size))
+    padding = config.padding / config.texture_size
+    tiling = Tiling(most_tiles(config, texel), None if texel is None else 1 / (COARSER * texel * config.tile_size))
     own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
     if own is not None:
-        return _with_texels(own, mesh, options, tiling, front)
+        return _with_texels(own, mesh, config, tiling, front)
     log.info("uv: a few discs do not lie flat; cutting further")
     found = in_pieces(scaled, points)
     if found is not None:
@@ -71,16 +59,21 @@ def unwrap(mesh: Mesh, options: Options, front: Front | None = None) -> Charts:
         even = evened(uvs, faces, meshes.areas(mesh.vertices, mesh.faces))
     else:
         log.info("uv: too many pieces do not lie flat; xatlas takes over")
-        even, faces = _flat(*_cut(points, mesh.faces, options), mesh, options)
-    return _with_texels(_placed(even, faces, mesh, options, tiling, front), mesh, options, tiling, front)
+        even, faces = _flat(*_cut(points, mesh.faces, config), mesh, config)
+    return _with_texels(_placed(even, faces, mesh, config, tiling, front), mesh, config, tiling, front)
 
 
-def _placed(
-    even: F64, faces: Faces, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None = None
-) -> Charts:
+def most_tiles(config: Config, texel: float | None) -> int:
+    """How many tiles may be filled. texel: the largest that is wished for; auto without one knows no need of more."""
+    if config.tiles == "auto":
+        return 1 if texel is None else tiles.MOST
+    return config.tiles
+
+
+def _placed(even: F64, faces: Faces, mesh: Mesh, config: Config, tiling: Tiling, front: Front | None = None) -> Charts:
     """Charts of one scale, but for the face's, in one square, or in tiles where that is asked for and they are not too
     many."""
-    padding, label = options.padding / options.texture_size, chart_of_face(faces, len(even))
+    padding, label = config.padding / config.texture_size, chart_of_face(faces, len(even))
     if front is not None:
         even = enlarged(even, faces, label, front, meshes.areas(mesh.vertices, mesh.faces))
     if label.max() < MANY_CHARTS:
@@ -91,10 +84,10 @@ def _placed(
             placed = packed(even, faces, label, total, padding, tiling)
         if placed is not None:
             return Charts(placed, faces)
-    return _packed(spread(even, faces), faces, options)
+    return _packed(spread(even, faces), faces, config)
 
 
-def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, front: Front | None = None) -> Charts:
+def _with_texels(charts: Charts, mesh: Mesh, config: Config, tiling: Tiling, front: Front | None = None) -> Charts:
     """The charts, those faces laid flat by themselves that have next to no texels, if they are worth it."""
     areas = meshes.areas(mesh.vertices, mesh.faces)
     out = short(mesh, charts)
@@ -103,15 +96,15 @@ def _with_texels(charts: Charts, mesh: Mesh, options: Options, tiling: Tiling, f
     log.info("uv: %d faces have no texels and are laid flat by themselves", int(out.sum()))
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     uvs, faces = one_by_one(charts.uvs.astype(np.float64), charts.faces, out, corners)
-    return _placed(evened(uvs, faces, areas), faces, mesh, options, tiling, front)
+    return _placed(evened(uvs, faces, areas), faces, mesh, config, tiling, front)
 
 
-def _flat(uvs: F64, faces: Faces, mesh: Mesh, options: Options) -> tuple[F64, Faces]:
+def _flat(uvs: F64, faces: Faces, mesh: Mesh, config: Config) -> tuple[F64, Faces]:
     """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.unfold)."""
     areas, corners = meshes.areas(mesh.vertices, mesh.faces), mesh.vertices.astype(np.float64)[mesh.faces]
     uvs = evened(turned_over(uvs, faces), faces, areas)
     for turn in range(UNFOLDINGS):
-        out = folded(_packed(spread(uvs, faces), faces, options), FOLD_RASTER)
+        out = folded(_packed(spread(uvs, faces), faces, config), FOLD_RASTER)
         if not out.any():
             break
         log.info("uv: %d faces lie on others", int(out.sum()))
@@ -135,13 +128,13 @@ def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
     return v
 
 
-def _cut(points: F64, triangles: Faces, options: Options) -> tuple[F64, Faces]:
+def _cut(points: F64, triangles: Faces, config: Config) -> tuple[F64, Faces]:
     """uvs (U, 2) in a common scale, one vertex for each place in each chart, and faces (F, 3)."""
     import xatlas
 
     atlas = xatlas.Atlas()
     charts, quick = xatlas.ChartOptions(), xatlas.PackOptions()
-    charts.max_cost, charts.max_iterations = options.max_cost, options.iterations
+    charts.max_cost, charts.max_iterations = config.max_cost, ITERATIONS
     quick.resolution, quick.padding, quick.bilinear = 256, 0, False  # thrown away: the charts are packed again
     normals = meshes.vertex_normals(points, triangles)
     try:
@@ -218,7 +211,7 @@ def spread(uvs: F64, faces: Faces) -> F64:
     return np.asarray(uvs - low[of_vertex] + np.stack([start[of_vertex], np.zeros(len(uvs))], 1), np.float64)
 
 
-def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
+def _packed(uvs: F64, faces: Faces, config: Config) -> Charts:
     """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight.
 
     xatlas leaves faces out that are smaller than 1e-7 in the given unit, and puts them anywhere: on a surface in metres
@@ -230,8 +223,8 @@ def _packed(uvs: F64, faces: Faces, options: Options) -> Charts:
 
     atlas = xatlas.Atlas()
     settings = xatlas.PackOptions()
-    settings.resolution = options.texture_size
-    settings.padding = int(np.ceil(options.padding * PACK_MARGIN))
+    settings.resolution = config.texture_size
+    settings.padding = int(np.ceil(config.padding * PACK_MARGIN))
     settings.bilinear, settings.bruteForce = True, False
     settings.rotate_charts = False  # xatlas turns a chart by swapping its axes, which mirrors it
     try:

@@ -13,6 +13,7 @@ from pipeline.meshes import Charts, Mesh
 from stages.bake.build import Baker
 from stages.bake.write import KINDS
 from stages.uv import measure, unwrap
+from stages.uv.config import Config
 from tests.support.analytic_fields import AnalyticField, Distance, sphere, union
 
 MAJOR, MINOR = 0.07, 0.025
@@ -78,7 +79,7 @@ def unwrapped(name: str) -> tuple[AnalyticField, Mesh, Charts]:
     distance, make = SHAPES[name]
     made = make()
     mesh = Mesh(*(np.asarray(a, np.float32) for a in (made.vertices, made.vertex_normals)), made.faces.astype(np.int32))
-    return EvenField(distance, cell=0.004), mesh, unwrap.unwrap(mesh, unwrap.Options(SIZE, 2))
+    return EvenField(distance, cell=0.004), mesh, unwrap.unwrap(mesh, Config(texture_size=SIZE, padding=2))
 
 
 @pytest.mark.slow

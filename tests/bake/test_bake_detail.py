@@ -21,6 +21,7 @@ from stages.bake import detail, detail_kernels, detail_views, smooth
 from stages.bake.build import Baker, Photos
 from stages.bake.texels import ALBEDO_RANGE
 from stages.uv import unwrap
+from stages.uv.config import Config
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.textured_ball import camera_on_orbit
 
@@ -120,7 +121,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     mesh = Mesh(*(np.asarray(a, np.float32) for a in (ball.vertices, ball.vertex_normals)), ball.faces.astype(np.int32))
     rng = np.random.default_rng(4)
     responses = np.eye(3) + 0.05 * rng.standard_normal((len(CAMERAS), 3, 3))
-    charts = unwrap.unwrap(mesh, unwrap.Options(SIZE, 2))
+    charts = unwrap.unwrap(mesh, Config(texture_size=SIZE, padding=2))
     field = SmoothField(sphere(RADIUS), half=(0.05, 0.05, 0.05), rank=1)
     return Scene(field, mesh, charts, tmp_path_factory.mktemp("photos"), responses)
 

@@ -22,6 +22,7 @@ from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
 from stages.surface.build import build as surface_build
 from stages.uv import unwrap
+from stages.uv.config import Config
 from stages.uv.decimate import decimated
 from tests.support import analytic_fields as analytic
 from tests.support.analytic_fields import AnalyticField, bumpy_head, ellipsoid, sphere
@@ -38,7 +39,7 @@ def quiet(done: int, total: int, message: str = "") -> None:
 def charted(field: AnalyticField, faces: int) -> tuple[Mesh, Charts]:
     dense = surface_build(field, 64, quiet).mesh
     mesh = decimated(dense, faces)
-    return mesh, unwrap.unwrap(mesh, unwrap.Options(SIZE, 4))
+    return mesh, unwrap.unwrap(mesh, Config(texture_size=SIZE, padding=4))
 
 
 @pytest.fixture(scope="module")

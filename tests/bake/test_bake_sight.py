@@ -17,8 +17,9 @@ from stages.bake.confidence import sighted
 from stages.bake.regions import Poll, Votes
 from stages.bake.write import write_maps
 from stages.surface.build import build as surface_build
+from stages.uv.config import Config
 from stages.uv.decimate import decimated
-from stages.uv.unwrap import Options, unwrap
+from stages.uv.unwrap import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.field_artifacts import camera
 
@@ -32,7 +33,7 @@ def quiet(done: int, total: int, message: str = "") -> None:
 @pytest.fixture(scope="module")
 def mesh_and_charts() -> tuple[Mesh, Charts]:
     mesh = decimated(surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh, 800)
-    return mesh, unwrap(mesh, Options(256, 4))
+    return mesh, unwrap(mesh, Config(texture_size=256, padding=4))
 
 
 def weight_of(view: View, points: np.ndarray, normals: np.ndarray, occluder: Occluder) -> np.ndarray:

@@ -52,7 +52,7 @@ def ball() -> Mesh:
 def charts(ball: Mesh) -> Charts:
     with pytest.MonkeyPatch.context() as patch:  # a coarser packing is quicker
         patch.setattr(pack, "G", 96)
-        found = unwrap.unwrap(ball, unwrap.Options(SIZE, 4, tiles=COUNT))
+        found = unwrap.unwrap(ball, Config(texture_size=SIZE, padding=4, tiles=COUNT))
     assert int(tiles.of_face(found).max()) + 1 == COUNT
     return found
 
@@ -176,7 +176,7 @@ def test_the_stage_bakes_every_tile_with_the_photos_detail(
 ) -> None:
     monkeypatch.setattr(pack, "G", 96)
     mesh = meshes.load(inputs.uv.path(inputs.uv.artifact.mesh))
-    charts = unwrap.unwrap(mesh, unwrap.Options(256, 2, tiles=2))
+    charts = unwrap.unwrap(mesh, Config(texture_size=256, padding=2, tiles=2))
     meshes.save(tmp_path / "uv.npz", mesh, charts)
     uv = UvMesh.model_validate(inputs.uv.artifact.model_dump() | {"mesh": FileRef.of(tmp_path, "uv.npz"), "tiles": 2})
     write_png(tmp_path / "labels.png", np.full((64, 64), 2 / 255))

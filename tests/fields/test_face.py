@@ -23,7 +23,7 @@ LO, CELL = torch.tensor([-0.2, -0.2, -0.2]), 0.02
 def ball_model(seed: int = 0, **changes: object) -> FaceModel:
     torch.manual_seed(seed)
     i = torch.stack(torch.meshgrid(*[torch.arange(21)] * 3, indexing="ij"), -1)
-    spec = FaceSpec(lo=(-0.2,) * 3, hi=(0.2,) * 3, views=4, levels=4, log2_size=10, fine=0.01, **changes)  # type: ignore[arg-type]
+    spec = FaceSpec(lo=(-0.2,) * 3, hi=(0.2,) * 3, views=4, hash_levels=4, hash_log2_size=10, hash_fine=0.01, **changes)  # type: ignore[arg-type]
     return FaceModel(spec, (LO + CELL * i).norm(dim=-1) - 0.1, LO, CELL)
 
 

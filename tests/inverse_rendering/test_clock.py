@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +31,7 @@ def ticking(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def by_clock() -> Trainer:
-    t = trainer(replace(SMALL, steps=7, seconds=99.0))  # neither is what counts: the stage sets the allowance
+    t = trainer(SMALL.changed(steps=7, seconds=99.0))  # neither is what counts: the stage sets the allowance
     t.allowance = STEPS * TICK
     return t
 
@@ -88,4 +87,4 @@ def test_rendering_the_held_out_views_is_kept_free(monkeypatch: pytest.MonkeyPat
 def test_the_papers_schedule_has_no_clock() -> None:
     with pytest.raises(ValueError, match="counts epochs"):
         Config(preset="paper", seconds=60.0)
-    assert np.isclose(Config(seconds=60.0).settings().seconds, 60.0)
+    assert np.isclose(Config(seconds=60.0).seconds, 60.0)

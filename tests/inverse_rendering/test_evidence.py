@@ -7,7 +7,6 @@ under test. tests/inverse_rendering/test_fit.py has it inside a fit.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,15 +18,14 @@ from pipeline.transforms import F64
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.choices import Choices, decide, restored, waiting_views
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import footprint, supported
-from stages.inverse_rendering.settings import PRESETS, FitSettings
 from stages.inverse_rendering.sightings import pictures, sight, surface_points
-from stages.inverse_rendering.stage import Config
 from stages.inverse_rendering.start import Start
 from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
-SMALL = FitSettings(
+SMALL = Config(
     image_side=96,
     steps=200,
     batch=512,
@@ -42,7 +40,7 @@ SMALL = FitSettings(
 
 def trainer(ball: Ball, radius: float = RADIUS, **settings: Any) -> Trainer:
     """A fit whose surface is right and whose prior had another radius."""
-    t = new_trainer(ball.photos(), start(), replace(SMALL, **settings), False, "cpu")
+    t = new_trainer(ball.photos(), start(), SMALL.changed(**settings), False, "cpu")
     t.prior = start(radius)
     t.enter_level()
     return t
@@ -180,9 +178,9 @@ def test_too_few_views_are_told() -> None:
 
 def test_waiting_views_are_few_and_spread() -> None:
     for count in (8, 11, 43, 200):
-        out = waiting_views(count, FitSettings())
+        out = waiting_views(count, Config())
         assert len(set(out)) == len(out) and 2 <= len(out) <= 6 and max(out) < count
-    assert waiting_views(43, replace(FitSettings(), **PRESETS["paper"])) == ()
+    assert waiting_views(43, Config(preset="paper")) == ()
     t = trainer(Ball())
     assert t.table is not None
     assert not np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.waiting).any()
@@ -314,11 +312,11 @@ def test_the_footprint_is_a_pixel_on_the_ball() -> None:
 def test_settings_no_finer_than_the_photos() -> None:
     looked = footprint(start(), Ball().photos(), 96)
     assert looked is not None
-    wish = replace(SMALL, grid_cells=1000, hash_fine=1e-5)
+    wish = SMALL.changed(grid_cells=1000, hash_fine=1e-5)
     cell = 0.2 / 1000
     got = supported(wish, looked, Start(start().values, start().lo, cell))
     assert got.grid_cells * looked.pixel == pytest.approx(1000 * cell, rel=0.02)
     assert got.hash_fine == pytest.approx(0.5 * looked.pixel)
-    modest = replace(SMALL, grid_cells=20, hash_fine=0.01)
+    modest = SMALL.changed(grid_cells=20, hash_fine=0.01)
     assert supported(modest, looked, Start(start().values, start().lo, 0.01)) == modest
     assert supported(wish, None, start()) == wish

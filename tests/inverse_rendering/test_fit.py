@@ -15,15 +15,15 @@ import torch
 from pipeline import transforms
 from pipeline.errors import Cancelled, StageError
 from stages.inverse_rendering.begin import new_trainer
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
 from stages.inverse_rendering.objective import objective
 from stages.inverse_rendering.predict import predict_view
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView, PixelTable, factor_for, image_rays
 
 RADIUS, SIDE = 0.1, 64
-SMALL = FitSettings(
+SMALL = Config(
     lr_sdf=0.2,  # few steps for 8 mm
     image_side=64,
     steps=200,
@@ -69,7 +69,7 @@ def ball_start(radius: float = 0.108) -> Start:
 
 
 def trainer(
-    settings: FitSettings = SMALL, calibrated: bool = False, gains: Callable[[int], float] = lambda i: 1.0
+    settings: Config = SMALL, calibrated: bool = False, gains: Callable[[int], float] = lambda i: 1.0
 ) -> Trainer:
     views = [ball_view(i, gains(i)) for i in range(12) if i != 5]
     return new_trainer(views, ball_start(), settings, calibrated, "cpu")
@@ -117,7 +117,7 @@ def test_shading_goes_to_the_light(fitted: Trainer) -> None:
 
     up, aside = slope(fitted)
     assert abs(up - 0.371) < 0.06 and aside < 0.05
-    free = trainer(replace(SMALL, parsimony=0.0, even_until=0.0))
+    free = trainer(SMALL.changed(parsimony=0.0, even_until=0.0))
     run_fit(free, hooks())
     assert slope(free)[0] < 0.28
 
@@ -131,7 +131,7 @@ def test_a_fit_repeats_bit_by_bit(fitted: Trainer) -> None:
 
 def test_a_calibrated_fit_repeats_bit_by_bit() -> None:
     """The colour matrices are shared by many rays: their gradient's sum must not depend on timing."""
-    short = replace(SMALL, steps=40, batch=4096)
+    short = SMALL.changed(steps=40, batch=4096)
     states = []
     for _ in range(2):
         t = trainer(short, calibrated=True)
@@ -169,7 +169,7 @@ def test_a_torn_or_foreign_checkpoint_is_not_used(tmp_path: Path) -> None:
     assert not trainer().load(path)
     trainer().save(path)
     assert trainer().load(path)
-    assert not trainer(FitSettings(**{**{f: getattr(SMALL, f) for f in SMALL.__slots__}, "seed": 7})).load(path)
+    assert not trainer(SMALL.changed(seed=7)).load(path)
 
 
 def test_objective_reaches_every_parameter() -> None:
@@ -191,7 +191,7 @@ def test_objective_reaches_every_parameter() -> None:
 
 def test_calibration_takes_the_cameras_gains() -> None:
     t = trainer(calibrated=True, gains=lambda i: 1.2 if i % 2 else 0.8)
-    t.settings = replace(SMALL, lr_appearance=0.03)
+    t.settings = SMALL.changed(lr_appearance=0.03)
     t = Trainer(t.views, t.settings, "cpu", t.model)
     run_fit(t, hooks())
     gains = torch.diagonal(t.model.calibration(), dim1=1, dim2=2).mean(-1)
@@ -261,7 +261,7 @@ def test_what_lies_behind_an_edge_shows() -> None:
         np.linalg.norm(p - [0, 0, -0.06], axis=-1) - 0.06, np.linalg.norm(p - [0, 0, 0.08], axis=-1) - 0.03
     )
     start = Start(values.astype(np.float32), np.full(3, lo, np.float32), cell)
-    t = new_trainer([ball_view(k) for k in range(3)], start, replace(SMALL, levels=1), False, "cpu")
+    t = new_trainer([ball_view(k) for k in range(3)], start, SMALL.changed(levels=1), False, "cpu")
     t.model.beta.fill_(0.002)
     x = torch.tensor([0.0292, 0.0292, 0.0, 0.065])
     o = torch.stack([x, torch.zeros(4), torch.full((4,), 0.5)], -1)
@@ -300,7 +300,7 @@ def test_shading_every_sample_is_the_mean_of_the_samples(fitted: Trainer) -> Non
 
 def test_short_products_find_the_same_ball() -> None:
     """bfloat16 for the networks alone: finite, and the surface where float32 has it."""
-    t = trainer(replace(SMALL, precision="bfloat16"))
+    t = trainer(SMALL.changed(precision="bfloat16"))
     run_fit(t, hooks())
     d = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     s = t.model.geometry(RADIUS * d[d[:, 1].abs() < 0.6])[0]

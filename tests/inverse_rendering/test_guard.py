@@ -12,17 +12,17 @@ import torch
 from pipeline.errors import StageError
 from stages.inverse_rendering import objective
 from stages.inverse_rendering.begin import new_trainer
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
 from stages.inverse_rendering.guard import Guard
-from stages.inverse_rendering.settings import FitSettings
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import PhotoView
 from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
 
-SHORT = replace(SMALL, steps=8, batch=256, levels=1, shadows=False, max_dropped=3)
+SHORT = SMALL.changed(steps=8, batch=256, levels=1, shadows=False, max_dropped=3)
 
 
-def trainer(settings: FitSettings = SHORT, views: list[PhotoView] | None = None, start: Start | None = None) -> Trainer:
+def trainer(settings: Config = SHORT, views: list[PhotoView] | None = None, start: Start | None = None) -> Trainer:
     photos = [ball_view(i) for i in range(0, 12, 3)] if views is None else views
     return new_trainer(photos, ball_start() if start is None else start, settings, True, "cpu")
 
@@ -183,7 +183,7 @@ def test_scenes_of_any_size(scale: float) -> None:
             v.world_from_cam[:3, 3] *= k
         b = ball_start()
         start = Start((b.values * k).astype(np.float32), (b.lo * k).astype(np.float32), b.cell * k)
-        t = trainer(replace(SHORT, steps=20, hash_fine=SHORT.hash_fine * k), views, start)
+        t = trainer(SHORT.changed(steps=20, hash_fine=SHORT.hash_fine * k), views, start)
         run_fit(t, Hooks(lambda *a, **k: None, lambda: False))
         finite(t)
         assert t.guard.dropped == 0

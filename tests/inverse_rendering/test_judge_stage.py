@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from stages.inverse_rendering.stage import Config, Inputs, run
 from tests.inverse_rendering.test_fit import SMALL, ball_view
 
 COUNT = 12
-SETTINGS = {k: v for k, v in asdict(SMALL).items() if k in Config.model_fields and k != "stereo"}
+SETTINGS = {k: v for k, v in SMALL.model_dump().items() if k in Config.model_fields and k != "stereo"}
 
 
 def inputs(folder: Path, wrong: int | None = None) -> Inputs:

@@ -12,7 +12,7 @@ from pipeline.errors import UsageError
 from stages.masks.region import Disc
 from stages.masks.sources import to_full_size
 from stages.masks.stage import Config
-from stages.masks.user_model import UserModel, mask_by_model
+from stages.masks.user_model import UserModel, hair_model, mask_by_model, user_model
 
 
 def _field(number: int, value: bytes | int | str) -> bytes:
@@ -109,3 +109,15 @@ def test_one_class_of_several(tmp_path: Path) -> None:
     assert "masks.hair_model" in caught.value.where and "at least 4" in caught.value.limit
     with pytest.raises(UsageError, match="can't be used"):
         UserModel(path, 32, False).probability(square)  # three classes, and none chosen
+
+
+def test_the_settings_name_the_networks(tmp_path: Path) -> None:
+    """Each setting reaches its own network; nothing is made where none is named."""
+    path = write_red_detector(tmp_path / "net.onnx", 64)
+    assert user_model(Config()) is None and hair_model(Config()) is None
+    own = Config(model=str(path), model_side=64, model_imagenet=True, hair_model_imagenet=False)
+    assert user_model(own) == UserModel(path, 64, True) and hair_model(own) is None
+    hair = Config(hair_model=str(path), hair_model_side=96, hair_model_imagenet=True, hair_model_class=2)
+    assert hair_model(hair) == UserModel(path, 96, True, 2, "masks.hair_model") and user_model(hair) is None
+    only = hair_model(Config(hair_model=str(path)))
+    assert only is not None and only.of_class is None

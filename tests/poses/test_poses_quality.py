@@ -12,11 +12,12 @@ import pytest
 
 from pipeline.transforms import inverse_rigid, project
 from stages.poses import matching, photogrammetry
+from stages.poses.config import Config
 from stages.poses.features import PLAIN, Features
 from stages.poses.held import HELD, firmly_held
 from stages.poses.left_out import disjoint, linked, reasons
 from stages.poses.matching import Verified, verify
-from stages.poses.photogrammetry import GLOBAL_FROM, SEEDS, Settings, best_of, match_pairs
+from stages.poses.photogrammetry import GLOBAL_FROM, SEEDS, best_of, match_pairs
 from stages.poses.quality import GOOD_SCORE, better, quality, score
 from stages.poses.solve import Lens, Model, Pose, Refine, reconstruct
 from tests.support.textured_ball import camera_on_orbit
@@ -143,8 +144,8 @@ def test_the_stage_takes_the_better_seed(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(photogrammetry, "reconstruct", mapper)
     pair = {(0, 1): Verified(np.eye(3), np.zeros((20, 2), np.uint32))}
-    settings = Settings(7, 200, 100, 4, "yes", "SIMPLE_RADIAL", Refine())
-    found = photogrammetry._place(PHOTOS, [], pair, settings, True, tmp_path, lambda *_: None)
+    config = Config(seed=7, max_image_size=200, max_features=200, neighbours=4)
+    found = photogrammetry._place(PHOTOS, [], pair, config, True, tmp_path, lambda *_: None)
     assert found is right and asked == [7, 9]  # the two photos that match have places: nothing to ask for loosely
 
 
@@ -208,9 +209,9 @@ def test_a_pair_on_which_opencv_gives_up_is_not_matched(monkeypatch: pytest.Monk
     codes = rng.random((320, 128)).astype(np.float32)
     codes /= np.linalg.norm(codes, axis=1, keepdims=True)
     features = [Features(f.uv, codes) for f in features[:3]]
-    settings = Settings(0, 200, 100, 4, "yes", "SIMPLE_RADIAL", Refine())
+    config = Config(seed=0, max_image_size=200, max_features=200, neighbours=4)
     pairs, photos = [(0, 1), (0, 2), (1, 2)], [Photo(width=320, height=280)] * 3
-    all_right = match_pairs(photos, features, pairs, settings, PLAIN, lambda *_: None)
+    all_right = match_pairs(photos, features, pairs, config, PLAIN, lambda *_: None)
     assert list(all_right) == pairs
     real = cv2.findFundamentalMat
 
@@ -222,7 +223,7 @@ def test_a_pair_on_which_opencv_gives_up_is_not_matched(monkeypatch: pytest.Monk
     monkeypatch.setattr(matching.cv2, "findFundamentalMat", fails_on_the_second)
     every = np.stack([np.arange(320)] * 2, 1).astype(np.uint32)
     assert verify(features[0], features[2], every, 320, 0) is None
-    found = match_pairs(photos, features, pairs, settings, PLAIN, lambda *_: None)
+    found = match_pairs(photos, features, pairs, config, PLAIN, lambda *_: None)
     assert list(found) == [(0, 1), (1, 2)]
     for p in found:
         np.testing.assert_array_equal(found[p].matches, all_right[p].matches)

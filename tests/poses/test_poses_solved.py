@@ -11,11 +11,12 @@ import pytest
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
+from stages.poses.config import Config
 from stages.poses.features import ASKEW, PATIENT, PLAIN, detect, grey8
 from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
-from stages.poses.photogrammetry import Settings, _askew, detect_all, match_all
+from stages.poses.photogrammetry import _askew, detect_all, match_all
 from stages.poses.photos import photos_of
-from stages.poses.solve import Refine, opencv_distortion
+from stages.poses.solve import opencv_distortion
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -212,11 +213,11 @@ def test_photos_far_apart_match_when_looked_at_askew() -> None:
 
 
 def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -> None:
-    photos = photos_of(capture_of(ball), False)[:2]
-    settings = Settings(0, 200, 150, 4, "yes", "SIMPLE_RADIAL", Refine())
-    plain = detect_all(photos, settings, PLAIN, lambda *_: None)
-    verified = match_all(photos, plain, settings, PLAIN, lambda *_: None)
-    both, joint = _askew(photos, plain, verified, settings, lambda *_: None, [0])
+    photos = photos_of(capture_of(ball))[:2]
+    config = Config(max_image_size=200, neighbours=4).changed(max_features=150)  # fewer than a user may set
+    plain = detect_all(photos, config, PLAIN, lambda *_: None)
+    verified = match_all(photos, plain, config, PLAIN, lambda *_: None)
+    both, joint = _askew(photos, plain, verified, config, lambda *_: None, [0])
     first, second = joint[0, 1].matches.T
     assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
     new = joint[0, 1].matches[first >= len(plain[0].uv)]

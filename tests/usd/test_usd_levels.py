@@ -78,11 +78,12 @@ def test_only_what_the_user_said_is_recorded(exported, inputs: SyntheticInputs, 
     assert "capture" not in plain.GetDefaultPrim().GetAssetInfo()
     assert exported[1].stated == {}
     said = {"author": "Anna", "license": "CC BY 4.0", "subject_consent": "research, until 2030"}
-    made = run_stage(inputs, tmp_path / "work", render_views=False, **said)
+    made = run_stage(inputs, tmp_path / "work", render_views=False, asset_version="2.1.0", **said)
     wanted = {"author": "Anna", "license": "CC BY 4.0", "subjectConsent": "research, until 2030"}
     for file in ("head.usd", "head.usdz"):
         stage = Usd.Stage.Open(str(tmp_path / "work/asset" / file))
         assert dict(stage.GetDefaultPrim().GetAssetInfo()["capture"]) == wanted
+        assert stage.GetDefaultPrim().GetAssetInfo()["version"] == "2.1.0"
         assert dict(stage.GetRootLayer().customLayerData["capture"]) == wanted
     assert made.stated == wanted
 

@@ -15,6 +15,7 @@ from stages.surface.trim import cut
 from stages.uv import decimate, unwrap
 from stages.uv import pack as packing
 from stages.uv.build import Built, build
+from stages.uv.config import Config
 from stages.uv.measure import measure, stretch
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
 
@@ -30,7 +31,7 @@ def dense() -> Mesh:
 
 @pytest.fixture(scope="module")
 def built(dense: Mesh) -> Built:
-    return build(dense, 5000, 1000, unwrap.Options(512, 4), quiet)
+    return build(dense, Config(target_faces=5000, proxy_faces=1000, texture_size=512, padding=4), quiet)
 
 
 def painted(charts: Charts, size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +104,7 @@ def test_few_charts_and_little_stretch(built: Built) -> None:
 
 @pytest.mark.slow
 def test_twice_gives_the_same(dense: Mesh, built: Built) -> None:
-    again = build(dense, 5000, 1000, unwrap.Options(512, 4), quiet)
+    again = build(dense, Config(target_faces=5000, proxy_faces=1000, texture_size=512, padding=4), quiet)
     assert again.charts.uvs.tobytes() == built.charts.uvs.tobytes()
     assert again.mesh.vertices.tobytes() == built.mesh.vertices.tobytes() and again.quality == built.quality
 
@@ -121,7 +122,7 @@ def test_a_mesh_with_a_border_keeps_it(dense: Mesh) -> None:
     vertices, faces, source = meshes.compact(points, faces)
     normals = np.concatenate([dense.normals, dense.normals[ends[:, 0]]])[source]
     opened = Mesh(vertices.astype(np.float32), normals, faces)
-    made = build(opened, 1200, 300, unwrap.Options(512, 4), quiet)
+    made = build(opened, Config(target_faces=1200, proxy_faces=300, texture_size=512, padding=4), quiet)
     for mesh in (made.mesh, made.proxy):
         found = meshes.topology(mesh.faces, len(mesh.vertices))
         assert found.sound and found.components == 1 and found.euler == 1
@@ -133,7 +134,11 @@ def test_a_mesh_with_a_border_keeps_it(dense: Mesh) -> None:
 def test_a_mesh_that_is_no_manifold_is_refused(dense: Mesh) -> None:
     tips = np.array([[0, 1, 2], [0, 3, 4]], np.int32)
     with pytest.raises(StageError, match="not a manifold"):
-        build(Mesh(dense.vertices, dense.normals, tips), 1000, 300, unwrap.Options(512, 4), quiet)
+        build(
+            Mesh(dense.vertices, dense.normals, tips),
+            Config(target_faces=1000, proxy_faces=300, texture_size=512, padding=4),
+            quiet,
+        )
 
 
 def test_bubble_is_cut_off() -> None:
@@ -281,7 +286,7 @@ def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.Mon
     monkeypatch.setattr(unwrap, "MANY_CHARTS", 0)
     for ours in ("unwrapped", "in_pieces"):
         monkeypatch.setattr(unwrap, ours, lambda *_: None)
-    charts = unwrap.unwrap(decimate.decimated(dense, 2000), unwrap.Options(512, 4))
+    charts = unwrap.unwrap(decimate.decimated(dense, 2000), Config(texture_size=512, padding=4))
     assert painted(charts, 500)[0].max() == 1
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).mean() > 0.99
 

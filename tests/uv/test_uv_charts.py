@@ -12,6 +12,7 @@ from stages.surface.build import build as surface_build
 from stages.usd.render import _square, _triangle
 from stages.uv import flatten, segment, unwrap
 from stages.uv.charts import unwrapped
+from stages.uv.config import Config
 from stages.uv.measure import measure
 from tests.support.analytic_fields import AnalyticField, bumpy_head
 
@@ -61,13 +62,13 @@ ZOO = {
 def test_charts_of_awkward_shapes_are_valid(name: str) -> None:
     mesh = ZOO[name]()
     assert meshes.topology(mesh.faces, len(mesh.vertices)).manifold
-    charts = unwrap.unwrap(mesh, unwrap.Options(512, 3))
+    charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=3))
     found = measure(mesh, charts)
     assert found.charts <= 40 and found.utilisation > 0.45
     assert found.overlap < 1e-3 and found.flipped < 1e-3 and found.empty < 1e-3
     assert found.stretch < 1.3
     if name == "noisy":
-        again = unwrap.unwrap(mesh, unwrap.Options(512, 3))
+        again = unwrap.unwrap(mesh, Config(texture_size=512, padding=3))
         assert again.uvs.tobytes() == charts.uvs.tobytes()
 
 
@@ -193,7 +194,7 @@ def test_least_cut_parts_a_dumbbell_at_its_waist() -> None:
 
 def test_charts_hold_their_faces() -> None:
     mesh = mesh_of(trimesh.creation.icosphere(2, 0.1))
-    charts: Charts = unwrap.unwrap(mesh, unwrap.Options(512, 3))
+    charts: Charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=3))
     position: dict[int, int] = {}
     for uv, vertex in zip(charts.faces.ravel().tolist(), mesh.faces.ravel().tolist(), strict=True):
         assert position.setdefault(uv, vertex) == vertex

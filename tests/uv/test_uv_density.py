@@ -11,8 +11,9 @@ from pipeline.faces.oval import on_face
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
 from stages.uv.build import build
+from stages.uv.config import Config
 from stages.uv.density import MOST, SHARE, Front, dense_charts, enlarged, face_share, front_of, scale_for
-from stages.uv.unwrap import Options, chart_of_face, signed_areas
+from stages.uv.unwrap import chart_of_face, signed_areas
 from tests.support.analytic_fields import AnalyticField, bumpy_head
 from tests.support.faces import face
 
@@ -33,8 +34,10 @@ def landmarks(share: float = 0.7) -> np.ndarray:
 
 @pytest.mark.slow
 def test_the_face_is_a_chart_with_two_fifths_of_the_texels(head: Mesh) -> None:
-    plain = build(head, 4000, 400, Options(512, 3), quiet)
-    made = build(head, 4000, 400, Options(512, 3), quiet, landmarks=landmarks())
+    plain = build(head, Config(target_faces=4000, proxy_faces=400, texture_size=512, padding=3), quiet)
+    made = build(
+        head, Config(target_faces=4000, proxy_faces=400, texture_size=512, padding=3), quiet, landmarks=landmarks()
+    )
     assert plain.quality.face_share is None
     assert made.quality.face_share is not None and made.quality.face_share == pytest.approx(SHARE, abs=0.01)
     assert made.quality.overlap == 0 and made.quality.flipped == 0 and made.warnings == ()

@@ -15,8 +15,8 @@ from stages.surface.build import build as surface_build
 from stages.surface.trim import cut
 from stages.uv import decimate
 from stages.uv.build import build
+from stages.uv.config import Config
 from stages.uv.remesh import remeshed
-from stages.uv.unwrap import Options
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
 
 pytest.importorskip("pymeshlab")
@@ -80,7 +80,9 @@ def test_few_triangles_are_kept_and_twice_is_the_same(dense: Mesh) -> None:
 
 
 def test_charts_on_even_triangles(dense: Mesh) -> None:
-    made = build(dense, 5000, 1000, Options(512, 4), lambda *_: None, even=True)
+    made = build(
+        dense, Config(target_faces=5000, proxy_faces=1000, texture_size=512, padding=4, remesh="even"), lambda *_: None
+    )
     assert unevenness(made.mesh) < 0.2 and made.quality.overlap == 0 and made.warnings == ()
     assert len(made.proxy.faces) <= 1200
 

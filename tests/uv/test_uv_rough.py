@@ -21,7 +21,6 @@ from stages.uv.decimate import Deviation
 from stages.uv.judge import judge
 from stages.uv.measure import Quality, measure
 from stages.uv.stage import Config, Inputs, run
-from stages.uv.unwrap import Options
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
 
 GOOD = Quality(
@@ -49,14 +48,14 @@ def sound(mesh: Mesh, charts: Charts) -> Quality:
 @pytest.mark.parametrize("noise, most", [(0.5, 40), pytest.param(1.5, 200, marks=pytest.mark.slow)])
 def test_a_surface_in_shreds_gets_few_charts_that_all_have_texels(noise: float, most: int) -> None:
     mesh = shredded(3, noise)
-    q = sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
+    q = sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
     assert q.charts < most and q.crumbs < 0.3 * most
 
 
 @pytest.mark.slow
 def test_thousands_of_loose_faces_stay_whole_and_are_judged() -> None:
     mesh = shredded(4, 2.0)
-    q = sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
+    q = sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
     (charts,) = (f for f in judge(q, NEAR, 0.2, 0.0, 0.0, 0.0) if f.check == "charts")
     assert charts.level != "good" and charts.value == q.charts
 
@@ -66,13 +65,13 @@ def test_faces_without_area_do_not_break_the_charts() -> None:
     mesh = with_worthless_faces(shredded(3, 0.2))
     area = meshes.areas(mesh.vertices, mesh.faces)
     assert (area == 0).sum() >= 10
-    sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
+    sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
 
 
 def test_a_chart_that_collapsed_to_a_line_is_laid_flat_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a real run died of: st without area on a part of the surface."""
     mesh = surface_build(AnalyticField(sphere()), 16, quiet).mesh
-    charts = unwrap.unwrap(mesh, Options(512, 4))
+    charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=4))
     fallen = charts.uvs.copy()
     where = fallen[charts.faces[::40]].reshape(-1, 2)
     loose = np.concatenate([fallen, np.stack([where[:, 0], np.full(len(where), 0.5)], 1)])
@@ -81,7 +80,7 @@ def test_a_chart_that_collapsed_to_a_line_is_laid_flat_anew(monkeypatch: pytest.
     broken = Charts(loose.astype(np.float32), faces)
     assert measure(mesh, broken).empty > 0.01
     monkeypatch.setattr(unwrap, "unwrapped", lambda *_: broken)
-    sound(mesh, unwrap.unwrap(mesh, Options(512, 4)))
+    sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
 
 
 def test_faces_smaller_than_a_tenth_of_a_square_millimetre_are_packed_too() -> None:
@@ -92,15 +91,15 @@ def test_faces_smaller_than_a_tenth_of_a_square_millimetre_are_packed_too() -> N
     faces = np.arange(1200, dtype=np.int32).reshape(-1, 3)
     uvs = unwrap.turned_over(corners.reshape(-1, 2), faces)
     assert np.abs(unwrap.signed_areas(uvs, faces)).max() < 1e-7
-    charts = unwrap._packed(unwrap.spread(uvs, faces), faces, Options(1024, 1))
+    charts = unwrap._packed(unwrap.spread(uvs, faces), faces, Config(texture_size=1024, padding=1))
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).all()
     assert (raster.layers(raster.texel_corners(charts, 2048), 2048) > 1).sum() == 0
 
 
 def test_good_charts_are_left_as_they_are() -> None:
     mesh = decimate.decimated(surface_build(AnalyticField(bumpy_head()), 48, quiet).mesh, 3000)
-    charts = unwrap.unwrap(mesh, Options(512, 4))
-    assert unwrap._with_texels(charts, mesh, Options(512, 4), unwrap.Tiling()) is charts
+    charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=4))
+    assert unwrap._with_texels(charts, mesh, Config(texture_size=512, padding=4), unwrap.Tiling()) is charts
 
 
 def test_fragments_are_given_to_a_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +124,7 @@ def test_a_decimation_that_opens_the_mesh_is_handed_on(monkeypatch: pytest.Monke
         return v, np.delete(f, far[:60], axis=0)  # a hole that is too wide to be filled
 
     monkeypatch.setattr(decimate, "_simplified", torn)
-    made = build(dense, 800, 200, Options(256, 2), quiet)
+    made = build(dense, Config(target_faces=800, proxy_faces=200, texture_size=256, padding=2), quiet)
     (opened,) = (f for f in made.findings if f.check == "opened")
     assert (
         opened.level != "good" and opened.value > 0 and meshes.topology(made.mesh.faces, len(made.mesh.vertices)).sound

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -102,9 +101,9 @@ def test_as_few_tiles_as_reach_the_scale() -> None:
 
 
 def test_a_mesh_is_laid_out_for_its_tiles(ball: Mesh) -> None:
-    plain = unwrap.Options(512, 4)
+    plain = Config(texture_size=512, padding=4)
     one = unwrap.unwrap(ball, plain)
-    three = unwrap.unwrap(ball, replace(plain, tiles=3))
+    three = unwrap.unwrap(ball, plain.changed(tiles=3))
     density = checked(ball, three, 4 / 512)
     assert len(density) == 3 and np.ptp(density) < 1e-3 * density.mean()
     texel = footprint.texel(ball, one, 512)
@@ -113,9 +112,9 @@ def test_a_mesh_is_laid_out_for_its_tiles(ball: Mesh) -> None:
     assert len(quality.tile_utilisation) == 3 and quality.overlap == 0
     assert np.mean(quality.tile_utilisation) == pytest.approx(quality.utilisation)
     # texels that one tile has already: the same charts, to the last bit
-    content = unwrap.unwrap(ball, replace(plain, tiles=10, texel=1.01 * texel, size=512))
+    content = unwrap.unwrap(ball, plain.changed(tiles="auto", tile_size=512), texel=1.01 * texel)
     assert content.uvs.tobytes() == one.uvs.tobytes() and content.faces.tobytes() == one.faces.tobytes()
-    finer = unwrap.unwrap(ball, replace(plain, tiles=10, texel=0.7 * texel, size=512))
+    finer = unwrap.unwrap(ball, plain.changed(tiles="auto", tile_size=512), texel=0.7 * texel)
     assert footprint.texel(ball, finer, 512) <= unwrap.COARSER * 0.7 * texel * (1 + 1e-4)
     assert 2 <= tiles.of_face(finer).max() + 1 <= 4
 

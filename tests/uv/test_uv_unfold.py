@@ -8,9 +8,10 @@ import pytest
 from pipeline import meshes, raster
 from pipeline.meshes import Charts, Mesh
 from stages.uv import unwrap as unwrapping
+from stages.uv.config import Config
 from stages.uv.measure import measure
 from stages.uv.unfold import folded, one_by_one, taken_apart
-from stages.uv.unwrap import Options, signed_areas, unwrap
+from stages.uv.unwrap import signed_areas, unwrap
 
 
 def strip(count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -115,7 +116,7 @@ def test_charts_that_fold_are_mended_before_they_are_packed(uvs: np.ndarray, mon
     for ours in ("unwrapped", "in_pieces"):  # as where our own charts do not lie flat
         monkeypatch.setattr(unwrapping, ours, lambda *_: None)
     monkeypatch.setattr(unwrapping, "_cut", lambda *_: (uvs * 1000, mesh.faces))  # as if xatlas had made these
-    charts = unwrap(mesh, Options())
+    charts = unwrap(mesh, Config())
     quality = measure(mesh, charts)
     assert quality.overlap < 1e-3 and quality.flipped == 0 and quality.empty == 0
     assert charts.faces.shape == mesh.faces.shape and charts.uvs.min() >= 0 and charts.uvs.max() <= 1

@@ -1,0 +1,57 @@
+"""The tables of docs/settings.md, from the stages' configs: the same source as `neuface settings`.
+
+    python -m benchmarks.settings_page            # prints them
+    python -m benchmarks.settings_page --write    # puts them into docs/settings.md
+
+tests/docs holds the page to it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from stages.registry import REGISTRY
+from stages.settings import Setting, all_settings, value_in_words
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
+BEGIN, END = "<!-- settings -->", "<!-- /settings -->"
+HEAD = "| setting | default | may be | presets | meaning |\n|---|---|---|---|---|"
+
+
+def tables() -> str:
+    """A table for each stage, between the page's marks."""
+    return "\n".join([BEGIN, *_lines(), END])
+
+
+def row(s: Setting) -> str:
+    """A line of a table."""
+    unit = f" {s.unit}" if s.unit else ""
+    presets = ", ".join(f"{name} {value_in_words(v)}" for name, v in s.differing().items())
+    cells = (f"`{s.name}`", f"{value_in_words(s.default)}{unit}", s.allowed, presets, s.meaning)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+
+def _lines() -> Iterator[str]:
+    settings = all_settings()
+    for stage in REGISTRY:
+        own = [s for s in settings if s.stage == stage.name]
+        yield f"\n## {stage.name}\n{(stage.config.__doc__ or '').strip()}\n"
+        if own:
+            yield "\n".join([HEAD, *map(row, own)])
+
+
+def main(arguments: list[str]) -> int:
+    """Print the tables, or write them into the page."""
+    if "--write" not in arguments:
+        print(tables())
+        return 0
+    text = PAGE.read_text()
+    before, rest = text.split(BEGIN)
+    PAGE.write_text(before + tables() + rest.split(END)[1])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

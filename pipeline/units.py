@@ -1,0 +1,33 @@
+"""Types of settings that carry a unit: `neuface settings` and docs/settings.md read it from the field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """The unit of a setting's number, as it is shown."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class FilledIn:
+    """Marks a field that the stage fills in by itself, so that it enters the key: the hash of a named file, say. It is
+    no setting: it is listed nowhere, and --set refuses it."""
+
+
+Pixels = Annotated[int, Unit("pixels")]
+Texels = Annotated[int, Unit("texels")]
+Triangles = Annotated[int, Unit("triangles")]
+Cells = Annotated[int, Unit("grid cells")]
+Rays = Annotated[int, Unit("rays")]
+Steps = Annotated[int, Unit("steps")]
+Views = Annotated[int, Unit("photos")]
+Seconds = Annotated[float, Unit("seconds")]
+Metres = Annotated[float, Unit("metres")]
+Millimetres = Annotated[float, Unit("millimetres")]
+Share = Annotated[float, Unit("share")]
+ContentHash = Annotated[str, FilledIn()]

@@ -1,0 +1,135 @@
+"""Every setting of every stage: meaning, unit, what it may be, default, and its value in each preset.
+
+Read from the stages' configs alone; `neuface settings` and docs/settings.md show the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from pydantic.fields import FieldInfo
+
+from pipeline.contract import Stage, StageConfig
+from pipeline.units import Unit
+from stages.presets import PRESETS, configs_for, known
+
+WHERE = "neuface settings"
+BOUNDS = (
+    ("minimum", "at least"),
+    ("exclusiveMinimum", "more than"),
+    ("maximum", "at most"),
+    ("exclusiveMaximum", "less than"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting. allowed: its type and limits in words. presets: its value in each preset, by the preset's name."""
+
+    stage: str
+    name: str
+    meaning: str
+    unit: str
+    allowed: str
+    default: Any
+    presets: Mapping[str, Any]
+
+    @property
+    def key(self) -> str:
+        """What stands before the = of --set."""
+        return f"{self.stage}.{self.name}"
+
+    def differing(self) -> dict[str, Any]:
+        """The presets whose value is not the default."""
+        return {preset: value for preset, value in self.presets.items() if value != self.default}
+
+    def record(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"key": self.key, **asdict(self)}
+
+
+def all_settings(registry: Iterable[Stage[Any, Any, Any]] | None = None) -> tuple[Setting, ...]:
+    """Of all stages, in the order in which they run."""
+    stages = _registry() if registry is None else tuple(registry)
+    filled = {preset: configs_for(preset, {}, registry=stages) for preset in PRESETS}
+    return tuple(
+        setting
+        for stage in stages
+        for setting in _settings_of(stage, {preset: configs[stage.name] for preset, configs in filled.items()})
+    )
+
+
+def found(word: str, registry: Iterable[Stage[Any, Any, Any]] | None = None) -> tuple[Setting, ...]:
+    """Those of a stage (masks), one (masks.method), or those of a name in all stages (method).
+
+    Raises:
+        UsageError: there is no such stage or setting; says what there is, and what may have been meant.
+    """
+    stages = _registry() if registry is None else tuple(registry)
+    settings = all_settings(stages)
+    stage, dot, name = word.partition(".")
+    same = tuple(s for s in settings if s.name == word)
+    if same:
+        return same
+    known(stage, [s.name for s in stages], what="unknown stage", where=WHERE)
+    of_stage = tuple(s for s in settings if s.stage == stage)
+    if not dot:
+        return of_stage
+    known(name, [s.name for s in of_stage], what=f"unknown setting of {stage}", where=WHERE)
+    return tuple(s for s in of_stage if s.name == name)
+
+
+def value_in_words(value: Any) -> str:
+    """A value as --set takes it; a text without letters as quotes, which would not be seen."""
+    if isinstance(value, str):
+        return value or '""'
+    return json.dumps(value)
+
+
+def _registry() -> tuple[Stage[Any, Any, Any], ...]:
+    from stages.registry import REGISTRY
+
+    return REGISTRY
+
+
+def _settings_of(stage: Stage[Any, Any, Any], presets: Mapping[str, StageConfig]) -> Iterator[Setting]:
+    schemas: dict[str, Any] = stage.config.model_json_schema()["properties"] if stage.config.model_fields else {}
+    for name in stage.config.setting_names():
+        field: FieldInfo = stage.config.model_fields[name]
+        values = {preset: getattr(config, name) for preset, config in presets.items()}
+        unit = next((m.name for m in field.metadata if isinstance(m, Unit)), "")
+        yield Setting(stage.name, name, field.description or "", unit, _allowed(schemas[name]), field.default, values)
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """Type and limits of a JSON schema in words."""
+    if "anyOf" in schema:
+        return ", or ".join(_allowed(part) for part in schema["anyOf"])
+    if "enum" in schema or "const" in schema:
+        return _either([value_in_words(v) for v in schema.get("enum", [schema.get("const")])])
+    kind = schema["type"]
+    if kind == "array":
+        return f"{len(schema['prefixItems'])} numbers in brackets"
+    if kind == "string":
+        return f"text of up to {schema['maxLength']} letters" if "maxLength" in schema else "text"
+    return {"boolean": "true or false", "integer": "whole number", "number": "number"}[kind] + _limits(schema)
+
+
+def _either(words: list[str]) -> str:
+    return ", ".join(words[:-1]) + " or " + words[-1] if len(words) > 1 else words[0]
+
+
+def _limits(schema: Mapping[str, Any]) -> str:
+    """Of a number, as what follows its type."""
+    if "minimum" in schema and "maximum" in schema:
+        text = f", {_number(schema['minimum'])} to {_number(schema['maximum'])}"
+    else:
+        text = "".join(f", {words} {_number(schema[bound])}" for bound, words in BOUNDS if bound in schema)
+    return text + (f", a multiple of {_number(schema['multipleOf'])}" if "multipleOf" in schema else "")
+
+
+def _number(value: float) -> str:
+    return str(int(value)) if float(value).is_integer() else str(value)
