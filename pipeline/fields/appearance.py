@@ -102,6 +102,13 @@ class IntegratedBasis(nn.Module):
             assert isinstance(last, nn.Linear)
             last.bias.add_(math.log(math.expm1(1.0 / rank)))
 
+    @property
+    def rank(self) -> int:
+        """k."""
+        last = self.net[-1]
+        assert isinstance(last, nn.Linear)
+        return last.out_features
+
     def forward(self, wo: Tensor, n: Tensor) -> Tensor:
         """B at unit directions, (N, 3) each; wo . n is taken as >= 0, which visible points have."""
         cosine = (wo * n).sum(-1, keepdim=True).clamp(min=0)

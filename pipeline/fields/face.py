@@ -9,7 +9,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,20 +17,17 @@ from torch import Tensor, nn
 
 from pipeline.errors import StageError
 from pipeline.fields import build
-from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis, SpatialField
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.displaced import DisplacedSdf
-from pipeline.fields.geometry import GridSdf
-from pipeline.fields.light import ShLight
+from pipeline.fields.parts import Geometry, Skin
 from pipeline.fields.protocol import F32, Material
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.fields.spec import FaceSpec
-from pipeline.maths import brdf, split_sum
+from pipeline.maths import brdf
 from pipeline.maths.sdf import unit
 
 FORMAT = 1
 CHUNK = 131_072
-DIELECTRIC = 0.04  # F0 of what is no metal
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,55 +46,43 @@ class FaceModel(nn.Module):
     """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width.
 
     `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and bounces only where `shadowing` is on.
+    The order in which the parts are made is the order of the random draws that they start from, and of the file.
     """
 
     beta: Tensor
 
-    def __init__(
-        self, spec: FaceSpec, values: Tensor, lo: Tensor, cell: float, geometry: DisplacedSdf | None = None
-    ) -> None:
+    def __init__(self, spec: FaceSpec, geometry: Geometry) -> None:
         super().__init__()
+        system = build.system_of(spec)
         self.spec = spec
-        # DisplacedSdf answers what is asked after the fit; what a grid alone can do is asked by the grid's own trainer
-        self.geometry = GridSdf(values, lo, cell) if geometry is None else cast(GridSdf, geometry)
-        self.spatial = cast(SpatialField, build.spatial(spec))
-        self.basis = cast(IntegratedBasis, build.material_integral(spec))
-        self.light = cast(ShLight, build.light(spec))
+        self.geometry = geometry
+        self.spatial = system.spatial(spec)
+        self.basis = system.integral(spec)
+        self.light = system.light(spec)
+        self.shading = system.shading(spec, self.basis, self.light)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
         self.even = False  # one albedo for all, while the light is found
-        self.register_buffer("beta", torch.tensor(cell))
+        self.register_buffer("beta", torch.tensor(geometry.cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
         albedo, rho, c, inv_kappa = self.spatial(x)
         if self.even:
             albedo = albedo.detach().median(0).values.expand_as(albedo)
-        if self.spec.shading == "disney" and self.spec.specular:
-            return self._disney(x, n, wo, albedo, rho, inv_kappa)
-        diffuse = self._diffuse(albedo, x, n)
         if not self.spec.specular:
+            diffuse = self._diffuse(albedo, x, n)
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
-        incident = self.light.reflected(brdf.reflect(wo, n), inv_kappa, self.spec.attenuation)
-        bound = torch.ones_like(rho) if self.spec.shading == "phong" else self.basis.integral(x, c, wo, n)
-        specular = brdf.specular(rho, bound, incident)
-        return Shaded(diffuse + specular, diffuse, specular, albedo, inv_kappa)
+        skin = Skin(albedo, rho, c, inv_kappa)
+        base = self.shading.diffuse_albedo(skin)
+        diffuse = self._diffuse(base, x, n)
+        specular = self.shading.specular(skin, x, n, wo)
+        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
 
     def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
         """L_d under what arrives of the light, (N, 3)."""
         open_light = brdf.lambertian(albedo, self.light.irradiance(n))
         return open_light if self.shadowing is None else open_light * self.shadowing(x)
-
-    def _disney(self, x: Tensor, n: Tensor, wo: Tensor, albedo: Tensor, metallic: Tensor, inv_kappa: Tensor) -> Shaded:
-        """Split-sum GGX with a metallic parameter, which rho's output stands for. [NeuFace section 5.2]"""
-        m, alpha = metallic[:, None], split_sum.alpha_from_inv_kappa(inv_kappa)
-        base = albedo * (1 - m)
-        diffuse = self._diffuse(base, x, n)
-        f0 = DIELECTRIC * (1 - m) + albedo * m
-        width = alpha if self.spec.light == "cubemap" else inv_kappa
-        incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)
-        specular = split_sum.environment_brdf(f0, (n * wo).sum(-1), alpha) * incident
-        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
 
     def solve_shadows(self) -> None:
         """Bring the shadows up to date with the surface, the albedo and the light found so far."""
@@ -128,17 +113,10 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
             remedy="run the fit again with this version",
         )
     cell = float(spec.pop("cell"))
-    model = _unfilled(FaceSpec.from_stored(spec), arrays, cell)
+    known = FaceSpec.from_stored(spec)
+    model = FaceModel(known, build.system_of(known).geometry(known, arrays, cell))
     model.load_state_dict(arrays)
     return model.to(device)
-
-
-def _unfilled(spec: FaceSpec, arrays: dict[str, Tensor], cell: float) -> FaceModel:
-    """The modules whose parameters are in `arrays`."""
-    if spec.geometry == "grid":
-        return FaceModel(spec, arrays["geometry.values"], arrays["geometry.lo"], cell)
-    none = torch.zeros(0)
-    return FaceModel(spec, none, none, cell, build.stored_displaced(spec, arrays))
 
 
 class FittedField:
@@ -162,7 +140,7 @@ class FittedField:
     @property
     def rank(self) -> int:
         """Number of specular bases."""
-        return 1 if self.model.spec.shading == "phong" else self.model.spec.rank
+        return self.model.shading.rank
 
     @property
     def light(self) -> F32:
@@ -197,9 +175,7 @@ class FittedField:
         albedo, rho, c, inv_kappa = self._map(self.model.spatial, points)
         if not self.model.spec.specular:
             rho, c, inv_kappa = np.zeros_like(rho), np.ones_like(c), np.full_like(inv_kappa, TYPICAL_INV_KAPPA)
-        if self.model.spec.shading == "phong":
-            c = np.ones((len(rho), 1), np.float32)
-        return Material(albedo, rho, c, inv_kappa)
+        return Material(albedo, rho, self.model.shading.coefficients(c), inv_kappa)
 
     def irradiance_ratio(self, points: F32) -> F32:
         """(N, 3)."""
@@ -211,17 +187,7 @@ class FittedField:
 
     def basis(self, wo: F32, normal: F32) -> F32:
         """(N, k). Raises StageError for a model without bases."""
-        if self.model.spec.integral != "low_rank" or self.model.spec.shading == "disney":
-            raise StageError(
-                "this model has no specular bases to bake",
-                where="inverse_rendering.shading, inverse_rendering.integral",
-                value=f"{self.model.spec.shading}, {self.model.spec.integral}",
-                limit="shading neural or phong, and integral low_rank",
-                remedy="such models are for comparisons (neuface bench ablations); fit one with bases for an asset",
-            )
-        if self.model.spec.shading == "phong":
-            return np.ones((len(wo), 1), np.float32)
-        (b,) = self._map(lambda w, n: (self.model.basis(w, n),), wo, normal)
+        (b,) = self._map(lambda w, n: (self.model.shading.bases(w, n),), wo, normal)
         return b
 
     def normals(self, points: F32) -> F32:

@@ -17,6 +17,7 @@ from scipy import ndimage
 from torch import Tensor, nn
 
 from pipeline.fields import kernels
+from pipeline.fields.parts import Geometry
 from pipeline.maths import sdf as spline
 from pipeline.pieces import filled, subject_pieces
 
@@ -159,6 +160,12 @@ class GridSdf(nn.Module):
         self.v.view(-1)[active] = torch.as_tensor(state["v"]).to(self.v)
         self.steps = int(state["steps"])
         self.typical = float(state["typical"])
+
+
+def grid_of(geometry: Geometry) -> GridSdf:
+    """A geometry as the grid that the fast fit refines and moves."""
+    assert isinstance(geometry, GridSdf)
+    return geometry
 
 
 def coarse_distance(free: np.ndarray) -> np.ndarray:

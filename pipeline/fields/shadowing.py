@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.fields.geometry import GridSdf
+from pipeline.fields.parts import Geometry
 from pipeline.maths import sh
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
@@ -97,7 +97,7 @@ class Arrivals:
 
 
 def solve(
-    shadowing: Shadowing, geometry: GridSdf, surface: Surface, light: Tensor, directions: int = 256, bounces: int = 2
+    shadowing: Shadowing, geometry: Geometry, surface: Surface, light: Tensor, directions: int = 256, bounces: int = 2
 ) -> None:
     """Fill the grid from the present surface, albedo and light ((L + 1)^2, 3), in place."""
     with torch.no_grad():
@@ -118,7 +118,7 @@ def solve(
         shadowing.solved.fill_(True)
 
 
-def near_surface(shadowing: Shadowing, geometry: GridSdf) -> tuple[Tensor, Tensor, Tensor]:
+def near_surface(shadowing: Shadowing, geometry: Geometry) -> tuple[Tensor, Tensor, Tensor]:
     """Flat index (M,) of the nodes beside the surface, the surface point of each (M, 3) and its normal (M, 3)."""
     with torch.no_grad():
         nodes = shadowing.nodes()
@@ -133,7 +133,7 @@ def near_surface(shadowing: Shadowing, geometry: GridSdf) -> tuple[Tensor, Tenso
         return index[good], x[good], unit(g[good])
 
 
-def arrivals(geometry: GridSdf, surface: Surface, light: Tensor, directions: int) -> Arrivals:
+def arrivals(geometry: Geometry, surface: Surface, light: Tensor, directions: int) -> Arrivals:
     """Trace every direction of each point's hemisphere."""
     d = fibonacci(directions).to(surface.x)
     radiance = sh.radiance(light.detach(), d).clamp(min=0)

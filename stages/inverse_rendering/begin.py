@@ -9,8 +9,9 @@ import numpy.typing as npt
 import torch
 
 from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import GridSdf
 from pipeline.fields.spec import FaceSpec
-from stages.inverse_rendering.choices import teach
+from stages.inverse_rendering.choices import own_parts, teach
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.start import Start
@@ -34,11 +35,12 @@ def new_trainer(
     torch.manual_seed(settings.seed)
     spec = spec_for(views, start, settings, calibrated, device)
     values = torch.from_numpy(start.values.copy())  # a start that is the prior stays what it was
-    model = FaceModel(spec, values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    grid = GridSdf(values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
+    model = FaceModel(spec, grid)
     if settings.judges and settings.basis_inputs == "cosine":
-        teach(model.basis)
+        teach(own_parts(model)[1])
     model.to(device)
-    model.geometry.to_device(device)
+    grid.to_device(device)
     return Trainer(views, settings, device, model, prior or start)
 
 

@@ -19,6 +19,8 @@ from torch import Tensor, nn
 from pipeline.fields.appearance import START_RHO, IntegratedBasis, SpatialField, restart_lobe
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf
+from pipeline.fields.light import ShLight
+from pipeline.fields.parts import Geometry
 from pipeline.maths import sh
 from stages.inverse_rendering import evidence
 from stages.inverse_rendering.config import AUTO, Config
@@ -144,16 +146,22 @@ def _told(c: Choices, lamp: Lamp | None) -> Choices:
 
 def light_up(model: FaceModel, lamp: Lamp) -> list[nn.Parameter]:
     """Put the light into the model, and a lobe that is skin's usual one everywhere. Hands back what was overwritten."""
-    spatial, last = model.spatial, model.spatial.net[-1]
-    assert isinstance(last, nn.Linear) and isinstance(spatial, SpatialField)
+    spatial, basis, light = own_parts(model)
+    last = spatial.net[-1]
+    assert isinstance(last, nn.Linear)
     with torch.no_grad():
-        model.light.coefficients.zero_()
-        model.light.coefficients[: len(lamp.coefficients)] = torch.from_numpy(lamp.coefficients).to(last.weight)[
-            :, None
-        ]
+        light.coefficients.zero_()
+        light.coefficients[: len(lamp.coefficients)] = torch.from_numpy(lamp.coefficients).to(last.weight)[:, None]
     restart_lobe(last, START_RHO)
-    teach(model.basis)
-    return [*last.parameters(), *model.basis.parameters(), model.light.coefficients]
+    teach(basis)
+    return [*last.parameters(), *basis.parameters(), light.coefficients]
+
+
+def own_parts(model: FaceModel) -> tuple[SpatialField, IntegratedBasis, ShLight]:
+    """Our own parts of a model. Others are never judged, and keep all that they began with."""
+    spatial, basis, light = model.spatial, model.basis, model.light
+    assert isinstance(spatial, SpatialField) and isinstance(basis, IntegratedBasis) and isinstance(light, ShLight)
+    return spatial, basis, light
 
 
 def teach(basis: IntegratedBasis) -> None:
@@ -238,14 +246,14 @@ def _consistency(t: Trial, calibrated: bool) -> float:
     return evidence.held_out(t, None, response)
 
 
-def silhouette_error(fit: Fit, geometry: GridSdf) -> float:
+def silhouette_error(fit: Fit, geometry: Geometry) -> float:
     """Share of the waiting views' rays that hit where the mask shows nothing, or pass where it shows the subject."""
     batch = _table(fit).only(fit.waiting).draw(RAYS, 0.5, SEED + 2)
     hit = _hits(geometry, batch.rays.o, batch.rays.d)
     return float((hit != (batch.alpha > 0.5)).double().mean())
 
 
-def _hits(geometry: GridSdf, o: Tensor, d: Tensor) -> Tensor:
+def _hits(geometry: Geometry, o: Tensor, d: Tensor) -> Tensor:
     from pipeline.maths.tracing import box_interval
 
     near, far = box_interval(o, d, *geometry.box())
@@ -270,7 +278,7 @@ def strongest(model: FaceModel, t: Trial, k: int) -> tuple[int, ...]:
         x = torch.from_numpy(t.x[:: max(len(t.x) // 4096, 1)]).float().to(model.beta.device)
         c = model.spatial(x)[2]
         up = torch.tensor([[0.0, 0.0, 1.0]], device=x.device)
-        share = (c.mean(0) * model.basis(up, up)[0]).cpu().numpy()
+        share = (c.mean(0) * model.shading.bases(up, up)[0]).cpu().numpy()
     return tuple(sorted(int(j) for j in np.argsort(-share, kind="stable")[:k]))
 
 
@@ -306,7 +314,8 @@ def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Param
     spec = model.spec
     if c.rank < spec.rank:
         heads = [*range(5), *(5 + j for j in c.columns)]
-        for net, rows in ((model.spatial.net, heads), (model.basis.net, list(c.columns))):
+        spatial, basis, _ = own_parts(model)
+        for net, rows in ((spatial.net, heads), (basis.net, list(c.columns))):
             last = net[-1]
             assert isinstance(last, nn.Linear)
             for name in ("weight", "bias"):
@@ -315,12 +324,13 @@ def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Param
                 setattr(last, name, new)
                 swaps[new] = (old, rows)
             last.out_features = len(rows)
-        model.spatial.rank = c.rank
+        spatial.rank = c.rank
     if c.light_order < spec.light_order:
         kept = slice(0, sh.count(c.light_order))
-        old = model.light.coefficients
-        model.light.coefficients = nn.Parameter(old.detach()[kept].clone())
-        swaps[model.light.coefficients] = (old, kept)
+        _, _, light = own_parts(model)
+        old = light.coefficients
+        light.coefficients = nn.Parameter(old.detach()[kept].clone())
+        swaps[light.coefficients] = (old, kept)
     if not c.calibrated:
         _still(model)
     model.spec = replace(spec, rank=c.rank, light_order=c.light_order, specular=c.specular, calibrated=c.calibrated)

@@ -184,9 +184,9 @@ class Config(StageConfig):
         given = dict(data) if isinstance(data, dict) else {}
         filled = {**PRESETS.get(str(given.get("preset", "draft")), {}), **given}
         if filled.get("prior_file"):
-            from pipeline.fields.imface_layout import digest
+            from stages.inverse_rendering.systems import prior_digest
 
-            filled["prior_digest"] = digest(str(filled["prior_file"]))
+            filled["prior_digest"] = prior_digest(str(filled["prior_file"]))
         return filled
 
     @field_validator("specular", "relief", mode="before")

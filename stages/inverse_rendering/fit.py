@@ -17,7 +17,9 @@ from typing import Any
 import torch
 
 from pipeline.errors import Cancelled, StageError
+from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import GridSdf, grid_of
 from stages.inverse_rendering.choices import (
     EVIDENCE_AT,
     Choices,
@@ -98,6 +100,11 @@ class Trainer:
         return -10 * math.log10(max(self.error, 1e-10)) if math.isfinite(self.error) else float("nan")
 
     @property
+    def grid(self) -> GridSdf:
+        """The surface, which has an optimiser of its own."""
+        return grid_of(self.model.geometry)
+
+    @property
     def pixels(self) -> PixelTable:
         """The photos' pixels at the present level."""
         self.enter_level()
@@ -121,7 +128,7 @@ class Trainer:
         starts = LEVEL_STARTS[self.settings.levels]
         due = sum(self.share() >= s for s in starts) - 1
         while self.level < due:
-            self.model.geometry.refine()
+            self.grid.refine()
             self.level += 1
             self.table = None
         if self.table is None:
@@ -130,7 +137,7 @@ class Trainer:
             self.table = PixelTable(self.views, side, self.device)
             self.table.wait(() if self.choices else self.waiting)
         if self.rests:
-            self.model.geometry.values.requires_grad_(False)
+            self.grid.values.requires_grad_(False)
 
     @property
     def rests(self) -> bool:
@@ -160,8 +167,8 @@ class Trainer:
                         k: v[rows].clone() if v.shape == old.shape else v for k, v in known[old].items()
                     }
         if self.rests and self.prior is not None:
-            self.model.geometry.restore(prior_surface(self).values.detach())
-            self.model.geometry.values.requires_grad_(False)
+            self.grid.restore(prior_surface(self).values.detach())
+            self.grid.values.requires_grad_(False)
 
     def set_rates(self) -> float:
         """Learning rates, beta and open encoding levels of this step; returns the SDF's rate in asset units.
@@ -190,7 +197,7 @@ class Trainer:
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
         opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
-        self.model.spatial.encoding.open_levels(opened)
+        _hashed(self.model).encoding.open_levels(opened)
         still = EVEN_FROM <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
         return 0.0 if still or self.rests else s.lr_sdf * self.model.geometry.cell * decay * warm
 
@@ -235,15 +242,15 @@ class Trainer:
     def move(self, rate: float) -> None:
         """Take the step."""
         self.optimiser.step()
-        self.model.geometry.step(rate)
+        self.grid.step(rate)
 
     def tend(self) -> None:
         """What is due every BAND_EVERY steps."""
-        self.model.geometry.find_band()
+        self.grid.find_band()
 
     def finish(self) -> None:
         """What is due after the last step."""
-        self.model.geometry.redistance()
+        self.grid.redistance()
 
     def _terms(self, batch: Batch, seed: int) -> Terms:
         generator = torch.Generator().manual_seed(seed + 1)
@@ -262,7 +269,7 @@ class Trainer:
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients that the optimiser does not know of are finite."""
-        return self.model.geometry.gradient_is_finite()
+        return self.grid.gradient_is_finite()
 
     def _is_finite(self, loss: torch.Tensor) -> bool:
         finite = math.isfinite(float(loss.detach())) and self.geometry_is_finite()
@@ -281,7 +288,7 @@ class Trainer:
 
     def forget(self) -> None:
         """Drop gradients that the optimiser does not know of."""
-        self.model.geometry.drop_gradient()
+        self.grid.drop_gradient()
 
     def _note(self, loss: float, error: float) -> None:
         self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
@@ -318,7 +325,7 @@ class Trainer:
 
     def parts(self) -> dict[str, Any]:
         """Model, choices and optimisers, as a checkpoint holds them."""
-        g = self.model.geometry
+        g = self.grid
         return {
             "level": self.level,
             "choices": self.choices.plain() if self.choices else None,
@@ -330,7 +337,7 @@ class Trainer:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Inverse of `parts`."""
-        g = self.model.geometry
+        g = self.grid
         g.cell = float(state["cell"])
         self.level = state["level"]
         if state["choices"] is not None:
@@ -345,13 +352,20 @@ class Trainer:
 def make_optimiser(model: FaceModel, settings: Config, device: str) -> torch.optim.Optimizer:
     """Adam over everything but the SDF, which has its own in the band. The table has no momentum to spare: eps is
     small, because most of its entries see a gradient only now and then."""
+    spatial = _hashed(model)
     groups = [
-        {"params": [model.spatial.encoding.table], "start": settings.lr_appearance},
-        {"params": [*model.spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
+        {"params": [spatial.encoding.table], "start": settings.lr_appearance},
+        {"params": [*spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
         {"params": list(model.light.parameters()), "start": settings.lr_light},
         {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
     ]
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+
+def _hashed(model: FaceModel) -> SpatialField:
+    """The Spatial MLP, whose table and levels are handled apart."""
+    assert isinstance(model.spatial, SpatialField)
+    return model.spatial
 
 
 def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:

@@ -10,6 +10,7 @@ from torch import Tensor
 from pipeline.colour import srgb_from_linear
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import grid_of
 from pipeline.maths import density, losses
 from pipeline.maths.sdf import unit
 from stages.inverse_rendering.config import Config
@@ -84,7 +85,7 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     if model.spec.specular:
         gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
-    if model.geometry.values.requires_grad:  # a surface that rests is as smooth as it is
+    if grid_of(model.geometry).values.requires_grad:  # a surface that rests is as smooth as it is
         out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
         out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.fields.face import FaceModel
-from stages.inverse_rendering.render import render_rays
+from stages.inverse_rendering.systems import render_any
 from stages.inverse_rendering.views import PhotoView, image_rays
 
 F32 = npt.NDArray[np.float32]
@@ -18,6 +18,6 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
     No calibration is applied: the colours are those of the mean response, A = I.
     """
     w, h = view.size[0] // factor, view.size[1] // factor
-    colour, opacity = render_rays(model, image_rays(view, factor, device), samples)
+    colour, opacity = render_any(model, image_rays(view, factor, device), samples)
     rgba = np.concatenate([colour.cpu().numpy(), opacity.cpu().numpy()[:, None]], 1)
     return rgba.reshape(h, w, 4).astype(np.float32)

@@ -130,10 +130,6 @@ def _covered(model: FaceModel, o: Tensor, d: Tensor, near: Tensor, far: Tensor) 
 
 def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536) -> tuple[Tensor, Tensor]:
     """Premultiplied linear colour (N, 3) and opacity (N,) of any number of rays, without gradients."""
-    if model.spec.geometry == "displaced":
-        from stages.inverse_rendering.paper_render import render_all
-
-        return render_all(model, rays, samples)
     parts = [
         _render_chunk(model, Rays(rays.o[i : i + chunk], rays.d[i : i + chunk]), samples)
         for i in range(0, len(rays.d), chunk)

@@ -20,8 +20,8 @@ from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.fields.face import FaceModel
 from pipeline.images import shrink_whole
 from stages.inverse_rendering.objective import calibrated_colours
-from stages.inverse_rendering.render import render_rays
 from stages.inverse_rendering.stereo import noise_of
+from stages.inverse_rendering.systems import render_any
 from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable, factor_for
 
 U8 = npt.NDArray[np.uint8]
@@ -128,7 +128,7 @@ def photo_noise(view: PhotoView, side: int) -> float:
 def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Tensor]:
     """Linear colour (N, 3) as the photos' own cameras answer to it, and opacity (N,)."""
     with torch.no_grad():
-        colour, opacity = render_rays(model, batch.rays, samples)
+        colour, opacity = render_any(model, batch.rays, samples)
         if model.spec.calibrated:
             colour = calibrated_colours(model.calibration(), batch.view, colour)
     return colour, opacity

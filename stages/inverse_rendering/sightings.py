@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from pipeline import transforms
-from pipeline.fields.geometry import GridSdf
+from pipeline.fields.parts import Geometry
 from pipeline.images import shrink_whole
 from pipeline.maths import sh
 from pipeline.maths.sdf import unit
@@ -90,7 +90,7 @@ def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
     return out
 
 
-def surface_points(geometry: GridSdf, rays: Rays) -> tuple[Tensor, Tensor]:
+def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
     """x and unit n (P, 3) where rays meet the surface; rays that meet nothing are left out."""
     with torch.no_grad():
         near, far = box_interval(rays.o, rays.d, *geometry.box())
@@ -99,7 +99,7 @@ def surface_points(geometry: GridSdf, rays: Rays) -> tuple[Tensor, Tensor]:
         return x, unit(geometry(x)[1])
 
 
-def sight(geometry: GridSdf, shots: list[Picture], x: Tensor, n: Tensor) -> Sightings:
+def sight(geometry: Geometry, shots: list[Picture], x: Tensor, n: Tensor) -> Sightings:
     """Every photo's look at the points: inside the frame and the mask, not too flat, nothing before it."""
     points, normals = (a.detach().cpu().double().numpy() for a in (x, n))
     parts = [_seen_by(geometry, shot, points, normals, x) for shot in shots]
@@ -108,7 +108,7 @@ def sight(geometry: GridSdf, shots: list[Picture], x: Tensor, n: Tensor) -> Sigh
     return Sightings(x, n, point.astype(np.int64), view, colour, wo)
 
 
-def _seen_by(geometry: GridSdf, shot: Picture, points: F64, normals: F64, x: Tensor) -> tuple[I64, F64, F64]:
+def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Tensor) -> tuple[I64, F64, F64]:
     """Indices of the points that one photo sees, their colours there and the directions to the camera."""
     view = shot.view
     centre = view.world_from_cam[:3, 3]
@@ -140,7 +140,7 @@ def _look_up(shot: Picture, at: F64) -> tuple[F64, F64]:
     return value, least
 
 
-def _free(geometry: GridSdf, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
+def _free(geometry: Geometry, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
     """Whether rays from the camera reach the points."""
     d = torch.from_numpy(-wo).to(x)
     o = torch.from_numpy(centre).to(x).expand_as(d).contiguous()

@@ -25,7 +25,6 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
-    from stages.inverse_rendering.begin import new_trainer
     from stages.inverse_rendering.clock import LEAST_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.exposure import exposures_differ
@@ -33,10 +32,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.gather import read_labels, read_views
     from stages.inverse_rendering.judge import Fitted, findings
-    from stages.inverse_rendering.paper import new_paper_trainer
     from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.start import agreed, hull_start, sphere_start
     from stages.inverse_rendering.stereo import start_from_photos
+    from stages.inverse_rendering.systems import trainer_for
 
     clock, settings = Clock(), config
     dropped = set(inputs.masks.artifact.dropped)
@@ -70,9 +69,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     if settings.stereo and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")
         start = start_from_photos(start, views, context.device, context.check)
-    make = new_paper_trainer if settings.method == "paper" else new_trainer
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
-    trainer = make(views, start, settings, own_colours, context.device, prior)
+    trainer = trainer_for(views, start, settings, own_colours, context.device, prior)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)

@@ -13,7 +13,7 @@ from pipeline.errors import StageError
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis
 from pipeline.fields.calibration import Calibration
 from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
-from pipeline.fields.geometry import coarse_distance
+from pipeline.fields.geometry import GridSdf, coarse_distance
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf
 
@@ -24,7 +24,7 @@ def ball_model(seed: int = 0, **changes: object) -> FaceModel:
     torch.manual_seed(seed)
     i = torch.stack(torch.meshgrid(*[torch.arange(21)] * 3, indexing="ij"), -1)
     spec = FaceSpec(lo=(-0.2,) * 3, hi=(0.2,) * 3, views=4, hash_levels=4, hash_log2_size=10, hash_fine=0.01, **changes)  # type: ignore[arg-type]
-    return FaceModel(spec, (LO + CELL * i).norm(dim=-1) - 0.1, LO, CELL)
+    return FaceModel(spec, GridSdf((LO + CELL * i).norm(dim=-1) - 0.1, LO, CELL))
 
 
 def sphere_points(n: int) -> torch.Tensor:

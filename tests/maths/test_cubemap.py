@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.fields.cubemap import CubemapLight
+from pipeline.fields.paper.cubemap import CubemapLight
 from pipeline.maths import cubemap, microfacet, sh, split_sum, vmf
 from tests.maths.test_microfacet import ggx_energy
 from tests.maths.test_sh import directions

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from pipeline.fields.appearance import mlp
-from pipeline.fields.sinusoidal import positional_encoding
+from pipeline.fields.paper.sinusoidal import positional_encoding
 
 OCTAVES, FEATURES = 6, 256
 

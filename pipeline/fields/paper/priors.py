@@ -113,7 +113,7 @@ class SpherePrior(nn.Module):
 
     def sdf(self, x: Tensor) -> Tensor:
         """Network value, in asset units."""
-        from pipeline.fields.sinusoidal import positional_encoding
+        from pipeline.fields.paper.sinusoidal import positional_encoding
 
         u = (x - self.centre) / self.radius
         h = torch.cat([u, positional_encoding(u, self.octaves)], -1)

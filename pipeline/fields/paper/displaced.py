@@ -1,7 +1,6 @@
 """SDF(x) = I(x) + D(x): a prior and a learnt displacement. [NeuFace eq. 17]
 
-Answers what `pipeline.fields.geometry.GridSdf` answers to the stages after the fit. Values and normals come from one
-pass and automatic differentiation.
+Values and normals come from one pass and automatic differentiation.
 """
 
 from __future__ import annotations
@@ -10,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.fields.appearance import mlp
-from pipeline.fields.priors import Prior
-from pipeline.fields.sinusoidal import positional_encoding
+from pipeline.fields.paper.priors import Prior
+from pipeline.fields.paper.sinusoidal import positional_encoding
 from pipeline.maths.tracing import aggressive_trace
 
 OCTAVES = 6  # L of [NeuFace section B]

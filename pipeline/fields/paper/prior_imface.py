@@ -150,7 +150,7 @@ class LandmarkNet(nn.ModuleDict):
 
 
 class ImFacePrior(nn.Module):
-    """`pipeline.fields.priors.Prior` over ImFace, built from a state in our names (`imface_layout.our_names`).
+    """`pipeline.fields.paper.priors.Prior` over ImFace, built from a state in our names (`imface_layout.our_names`).
 
     scale: asset units per unit of the prior; centre: its origin in asset coordinates. Its axes are the asset's.
     The codes start at the mean of the state's, and are learnt at the full rate; the networks at a hundredth of it.

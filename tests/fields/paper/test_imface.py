@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from pipeline.errors import StageError
-from pipeline.fields.imface_layout import digest, load_imface_state, our_names
-from pipeline.fields.prior_imface import ImFacePrior, warp
+from pipeline.fields.paper.imface_layout import digest, load_imface_state, our_names
+from pipeline.fields.paper.prior_imface import ImFacePrior, warp
 from tests.support.imface_checkpoint import ours, published, reference_sdf
 
 CENTRE, SCALE = torch.tensor([0.01, -0.02, 0.03]), 0.1

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.fields.displaced import DisplacedSdf
-from pipeline.fields.priors import HullPrior, SpherePrior
+from pipeline.fields.paper.displaced import DisplacedSdf
+from pipeline.fields.paper.priors import HullPrior, SpherePrior
 
 
 def hull(scale: float = 1.0) -> HullPrior:

@@ -11,13 +11,12 @@ interval without end, as in the authors' code, paints empty rays. Samples are st
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import torch
 from torch import Tensor
 
-from pipeline.fields.displaced import DisplacedSdf
 from pipeline.fields.face import FaceModel
+from pipeline.fields.paper.displaced import DisplacedSdf
 from pipeline.maths.density import laplace_density, ray_weights
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import sphere_interval
@@ -42,7 +41,8 @@ class Rendered:
 
 def geometry_of(model: FaceModel) -> DisplacedSdf:
     """The geometry of a model of the paper's kind."""
-    return cast(DisplacedSdf, model.geometry)
+    assert isinstance(model.geometry, DisplacedSdf)
+    return model.geometry
 
 
 def render_samples(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None) -> Rendered:

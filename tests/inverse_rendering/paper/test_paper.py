@@ -11,14 +11,14 @@ import torch
 
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel, FittedField, load_model
-from pipeline.fields.sinusoidal import SinusoidalField, positional_encoding
+from pipeline.fields.paper.sinusoidal import SinusoidalField, positional_encoding
 from pipeline.maths.density import laplace_density, ray_weights
-from stages.inverse_rendering import paper
 from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import run_fit
 from stages.inverse_rendering.objective import Terms
-from stages.inverse_rendering.paper_render import geometry_of, render_samples
+from stages.inverse_rendering.paper import trainer as paper
+from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.predict import predict_view
 from stages.inverse_rendering.start import sphere_start
 from stages.inverse_rendering.views import Rays

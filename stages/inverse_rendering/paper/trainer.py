@@ -16,17 +16,17 @@ from torch import nn
 
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
-from pipeline.fields import build
 from pipeline.fields.face import FaceModel
-from pipeline.fields.prior_imface import ImFacePrior
-from pipeline.fields.priors import HullPrior
+from pipeline.fields.paper import build
+from pipeline.fields.paper.prior_imface import ImFacePrior
+from pipeline.fields.paper.priors import HullPrior
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
 from stages.inverse_rendering.begin import spec_for
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.objective import Terms, calibrated_colours
-from stages.inverse_rendering.paper_render import geometry_of, render_samples
+from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.start import Start
 from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable
 
@@ -147,14 +147,12 @@ def new_paper_trainer(
     settings: Config,
     calibrated: bool,
     device: str,
-    _prior: Start | None = None,
 ) -> PaperTrainer:
     """A fit of the paper's kind that has not begun. Raises StageError if ImFace is asked for and can't be read."""
     torch.manual_seed(settings.seed)
     spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced")
     prior = prior_for(spec, start, settings)
-    none = torch.zeros(0)
-    model = FaceModel(spec, none, none, start.cell, build.displaced(spec, prior))
+    model = FaceModel(spec, build.displaced(spec, prior))
     model.to(device)
     return PaperTrainer(views, settings, device, model)
 
@@ -173,7 +171,7 @@ def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
             limit="the path of a published checkpoint",
             remedy="see docs/imface.md for how to get one, or take the prior hull",
         )
-    from pipeline.fields.imface_layout import load_imface_state
+    from pipeline.fields.paper.imface_layout import load_imface_state
 
     state = load_imface_state(Path(settings.prior_file))
     return ImFacePrior(state, torch.tensor(spec.prior_centre), spec.prior_scale)

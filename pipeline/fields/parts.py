@@ -1,0 +1,128 @@
+"""What the parts of a model answer, whatever they are made of, and how a system makes them.
+
+Production has one implementation of each (geometry.GridSdf, appearance.SpatialField and IntegratedBasis, light.ShLight,
+shading.BasisShading). Those that the paper compares are in pipeline.fields.paper. build.system_of chooses, once, when a
+model is made. Every part is a network module: its parameters are the model's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor, nn
+
+from pipeline.fields.protocol import F32
+from pipeline.fields.spec import FaceSpec
+
+
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """Material at N places: albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], inv_kappa (N,)."""
+
+    albedo: Tensor
+    rho: Tensor
+    c: Tensor
+    inv_kappa: Tensor
+
+
+class Part(Protocol):
+    """A network module."""
+
+    def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
+        """What is learnt of it."""
+        ...
+
+
+class Geometry(Part, Protocol):
+    """A surface: the zero set of a signed distance, negative inside, asset units."""
+
+    @property
+    def cell(self) -> float:
+        """Edge of the finest cell."""
+        ...
+
+    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3) -> SDF (N,) and its gradient (N, 3)."""
+        ...
+
+    def box(self) -> tuple[Tensor, Tensor]:
+        """(3,) corners of the volume in which the SDF is defined."""
+        ...
+
+    def trace(self, o: Tensor, d: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """N rays -> t, hit and SDF of the first hit or the closest approach, (N,) each. [NeuFace section 4.4]"""
+        ...
+
+
+class Spatial(Part, Protocol):
+    """The Spatial MLP. [NeuFace section 4.1]"""
+
+    def __call__(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(N, 3) -> the fields of Skin."""
+        ...
+
+
+class Integral(Part, Protocol):
+    """The material integral: the factor between rho and the light. [NeuFace eq. 6]"""
+
+    def integral(self, x: Tensor, c: Tensor, wo: Tensor, n: Tensor) -> Tensor:
+        """(N, 3), (N, k), (N, 3), (N, 3) -> (N,), at least 0."""
+        ...
+
+
+class Light(Part, Protocol):
+    """The captured light."""
+
+    def __call__(self) -> Tensor:
+        """((L + 1)^2, 3) coefficients of the real orthonormal harmonics."""
+        ...
+
+    def even_gradient(self, order: int) -> None:
+        """Make the gradient that of a white light of this order."""
+        ...
+
+    def irradiance(self, n: Tensor) -> Tensor:
+        """E(n): (N, 3) -> (N, 3)."""
+        ...
+
+    def reflected(self, w_r: Tensor, width: Tensor, attenuation: str) -> Tensor:
+        """Radiance averaged over a lobe of `width` (N,) around w_r (N, 3): (N, 3). [NeuFace eq. 11]"""
+        ...
+
+
+class Shading(Protocol):
+    """How skin reflects the light, and what of that a texture can hold."""
+
+    @property
+    def rank(self) -> int:
+        """k, the number of specular bases."""
+        ...
+
+    def diffuse_albedo(self, skin: Skin) -> Tensor:
+        """(N, 3): the a of [NeuFace eq. 16]."""
+        ...
+
+    def specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor) -> Tensor:
+        """L_s (N, 3) at x with unit n and wo, (N, 3) each. [NeuFace eq. 5]"""
+        ...
+
+    def coefficients(self, c: F32) -> F32:
+        """(N, columns) of the Spatial MLP -> (N, k), those of the bases."""
+        ...
+
+    def bases(self, wo: Tensor, n: Tensor) -> Tensor:
+        """(N, k) at unit directions, (N, 3) each. Raises StageError for a model without bases."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """How a model's parts are made. geometry: from a saved model's arrays, by their names there, and its cell."""
+
+    geometry: Callable[[FaceSpec, Mapping[str, Tensor], float], Geometry]
+    spatial: Callable[[FaceSpec], Spatial]
+    integral: Callable[[FaceSpec], Integral]
+    light: Callable[[FaceSpec], Light]
+    shading: Callable[[FaceSpec, Integral, Light], Shading]
