@@ -147,7 +147,6 @@ def new_paper_trainer(
     settings: FitSettings,
     calibrated: bool,
     device: str,
-    _prior: Start | None = None,
 ) -> PaperTrainer:
     """A fit of the paper's kind that has not begun. Raises StageError if ImFace is asked for and can't be read."""
     torch.manual_seed(settings.seed)

@@ -156,7 +156,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.clock import LEAST_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.exposure import exposures_differ
-    from stages.inverse_rendering.fit import Hooks, run_fit
+    from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.gather import read_labels, read_views
     from stages.inverse_rendering.judge import Fitted, findings
@@ -197,9 +197,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     if settings.stereo and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")
         start = start_from_photos(start, views, context.device, context.check)
-    make = new_paper_trainer if settings.method == "paper" else new_trainer
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
-    trainer = make(views, start, settings, own_colours, context.device, prior)
+    if settings.method == "paper":
+        trainer: Trainer = new_paper_trainer(views, start, settings, own_colours, context.device)
+    else:
+        trainer = new_trainer(views, start, settings, own_colours, context.device, prior)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
