@@ -169,8 +169,8 @@ def test_an_empty_batch_costs_nothing() -> None:
     t = trainer()
     none = torch.zeros(0, 3)
     batch = Batch(Rays(none, none), none, none[:, 0], torch.zeros(0, dtype=torch.int64), none[:, 0])
-    loss, error = objective.objective(t.model, batch, t.settings, torch.Generator(), 1.0)
-    assert float(loss.detach()) == 0 and np.isnan(error)
+    found = objective.terms(t.model, batch, t.settings, torch.Generator(), 1.0)
+    assert float(found.total.detach()) == 0 and np.isnan(found.error)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e5])
