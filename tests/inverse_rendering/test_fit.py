@@ -339,6 +339,21 @@ def test_a_draw_depends_on_its_seed_alone() -> None:
     assert int((a.alpha <= 0.5).sum()) == 16
 
 
+@pytest.mark.parametrize("outside_share", [0.0, 0.25, 0.9])
+def test_a_ray_stands_for_as_many_as_it_was_drawn_from(outside_share: float) -> None:
+    """However many rays are drawn on either side, the weighted mean of alpha is that of all pixels in question."""
+    table = PixelTable([ball_view(i) for i in range(3)], 64, "cpu")
+    batch = table.draw(4000, outside_share, 0)
+    out = batch.alpha <= 0.5
+    pools = len(table.inside), len(table.outside)
+    assert int(out.sum()) == int(4000 * outside_share) and float(batch.share.mean()) == pytest.approx(1, rel=1e-4)
+    if outside_share:
+        ratio = float(batch.share[out][0] / batch.share[~out][0])
+        assert ratio == pytest.approx(pools[1] / pools[0] * (1 - outside_share) / outside_share, rel=1e-4)
+        everyone = torch.cat([table.alpha[table.inside], table.alpha[table.outside]]).mean()
+        assert float((batch.share * batch.alpha).mean()) == pytest.approx(float(everyone), rel=0.02)
+
+
 @pytest.mark.parametrize(
     ("size", "side", "loose", "exact"),
     [
@@ -358,7 +373,9 @@ def test_odd_sizes_lose_only_the_blocks_that_do_not_fill() -> None:
     v = ball_view(0)
     v = replace(v, rgb=v.rgb[:63, :61], alpha=v.alpha[:63, :61])
     table = PixelTable([v], 32, "cpu")
-    assert len(table.alpha) <= 31 * 30
+    blocks = v.alpha[:62, :60].reshape(31, 2, 30, 2).mean((1, 3))
+    assert len(table.alpha) <= 31 * 30 and len(table.inside) == (blocks > 0.5).sum() > 100
+    assert float(table.alpha[table.inside].sum()) == pytest.approx(float(blocks[blocks > 0.5].sum()), rel=1e-5)
 
 
 def test_rays_undo_the_lens() -> None:
