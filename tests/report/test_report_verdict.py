@@ -111,6 +111,7 @@ def test_a_photo_without_a_mask_is_shown_as_it_is(results: SyntheticResults) -> 
     )
     assert picture.caption == "3.png"
     with_mask, without = (decoded(p.uri) for p in (outlined.troubles[0].pictures[0], picture))
-    photo = cv2.imread(str(results.capture.folder / "images" / "3.png"))
+    (view,) = (v for v in results.capture.artifact.views if v.name == "3.png")
+    photo = cv2.imread(str(results.capture.path(view.image)))
     small = cv2.resize(photo, without.shape[1::-1], interpolation=cv2.INTER_AREA)
     assert np.abs(without.astype(float) - small).mean() < 6 < np.abs(with_mask.astype(float) - small).max()
