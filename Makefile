@@ -15,11 +15,13 @@ help: ## this list
 demo: $(VENV)/.ready ## sets up what is missing, then photos of a made-up head -> asset + report, checked against the truth
 	$(BIN)/neuface demo --out $(OUT)
 
+# `make test WORKERS=2`: in so many processes, each file in one of them, so that what a file's tests share is made once.
+SPREAD = $(if $(WORKERS),-n $(WORKERS) --dist loadfile)
 test: $(VENV)/.ready-dev ## sets up what is missing, then every test
-	$(BIN)/python -m pytest -q --durations=10
+	$(BIN)/python -m pytest -q --durations=10 $(SPREAD)
 
 check: lint ## format, lint, types, import rules, and the tests that are quick
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(BIN)/python -m pytest -q -m "not slow" $(SPREAD)
 
 lint: $(VENV)/.ready-dev ## format, lint, types and import rules
 	$(BIN)/ruff format --check .

@@ -14,12 +14,9 @@ import json
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline import transforms
 from pipeline.artifacts import CameraSet
-
-F64 = npt.NDArray[np.float64]
 
 
 def solved_cameras(run: Path) -> CameraSet:

@@ -21,7 +21,6 @@ from pipeline.faces.landmarks3d import HeadFrame
 from pipeline.hull import BAND_CELLS, Hull
 
 F64 = npt.NDArray[np.float64]
-F32 = npt.NDArray[np.float32]
 
 BELOW = 0.95  # h from the chin down to the cut: a neck is 0.5 h long; skin that an open collar shows goes on
 MIDDLE = (0.0, 0.0, -0.55)  # h from between the eyes to the middle of the extent: left, up, to the front

@@ -7,6 +7,7 @@ import signal
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -17,6 +18,8 @@ OFFLINE = {
 }
 for _name, _value in OFFLINE.items():
     os.environ.setdefault(_name, _value)
+hypothesis.settings.register_profile("no_clock", deadline=None)  # a busy machine is no fault
+hypothesis.settings.load_profile("no_clock")
 # A shell's background jobs ignore SIGINT, nohup's SIGHUP; the programs that tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -39,7 +39,7 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
             raise Cancelled("stopped by the user; finished stages are kept")
         watch.observer.started(stage.name, number, len(plan.stages))
         if stage.name == FIT and plan.request.budget is not None:
-            plan = within_budget(plan, finished, done)
+            plan = within_budget(plan, done)
         inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
@@ -52,7 +52,7 @@ def run_plan(plan: Plan, run_stage: RunStage) -> list[Done[Any]]:
     return done
 
 
-def within_budget(plan: Plan, finished: dict[str, Located[Artifact]], done: list[Done[Any]]) -> Plan:
+def within_budget(plan: Plan, done: list[Done[Any]]) -> Plan:
     """The plan with settings, from the fit on, that the rest of its budget pays for."""
     assert plan.request.budget is not None
     watch = current()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 import shutil
 import time
@@ -209,8 +208,3 @@ def _made_from(photos: set[Path], store: Store) -> Iterator[Path]:
         stage, _, key = path.stem.rpartition("-")
         yield path
         yield from (store.root / stage).glob(f"{key}*")
-
-
-def as_json(found: Iterable[Piece]) -> str:
-    """For a script."""
-    return json.dumps([{"path": str(p.path), "why": p.why, "bytes": p.size} for p in found], indent=1)

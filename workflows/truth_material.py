@@ -97,7 +97,7 @@ def compare(field: Path, capture_folder: Path, capture: Capture, capture_from_as
     held = [v for v in capture.views if v.holdout]
     for number, view in enumerate(held):
         seen = _seen_points(view, capture_folder)
-        mine = fitted_looks(model, seen.points, seen.normals, seen.to_eye, capture_from_asset)
+        mine = fitted_looks(model, seen.points, seen.to_eye, capture_from_asset)
         really = true_looks(capture_folder, seen.points, seen.normals, seen.to_eye)
         found.append(mine)
         true.append(really)
@@ -163,7 +163,7 @@ def true_looks(folder: Path, points: F64, normals: F64, to_eye: F64) -> Looks:
     return Looks(look.albedo, look.f0, look.roughness, both - specular, specular)
 
 
-def fitted_looks(model: Any, points: F64, normals: F64, to_eye: F64, capture_from_asset: F64) -> Looks:
+def fitted_looks(model: Any, points: F64, to_eye: F64, capture_from_asset: F64) -> Looks:
     """The model at the nearest points of its own surface, towards the same camera."""
     import torch
 

@@ -128,6 +128,6 @@ class IntegratedBasis(nn.Module):
         self.zero_grad(set_to_none=True)
 
     def integral(self, x: Tensor, c: Tensor, wo: Tensor, n: Tensor) -> Tensor:
-        """c(x) . B(wo, n): the material integral under the low-rank prior, (N,). [NeuFace eq. 8]"""
+        """c(x) . B(wo, n): the integral of [NeuFace eq. 7], the low-rank prior, (N,). [NeuFace eq. 8]"""
         out: Tensor = (c * self(wo, n)).sum(-1)
         return out

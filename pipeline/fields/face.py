@@ -6,7 +6,6 @@ File: npz with `spec` (JSON, utf-8 bytes) and one array a parameter or buffer, b
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -199,8 +198,3 @@ class FittedField:
 def load_face(path: Path, device: str = "cpu") -> FittedField:
     """The fitted face in a file, as plain arrays."""
     return FittedField(load_model(path, device))
-
-
-def mean_radiance(light: Tensor) -> float:
-    """Mean of L over the sphere and the channels: c_00 Y_00."""
-    return float(light[0].mean() / math.sqrt(4 * math.pi))

@@ -1,6 +1,6 @@
 """Differentiable gathers with two back ends: compiled CPU kernels where numba is installed, plain torch elsewhere.
 
-The torch path is the reference, and the only one on a GPU. `use_numba(False)` forces it everywhere (tests).
+The torch path is the reference, and the only one on a GPU. Tests force it by taking `nb` away.
 """
 
 from __future__ import annotations
@@ -22,18 +22,10 @@ try:
 except ImportError:  # a bare GPU machine has torch, numpy and scipy alone
     nb = None
 
-_enabled = True
-
-
-def use_numba(enabled: bool) -> None:
-    """Allow or forbid the compiled kernels."""
-    global _enabled
-    _enabled = enabled
-
 
 def compiled(x: Tensor) -> bool:
     """Whether the compiled kernels serve this tensor: float32 on the CPU, numba at hand."""
-    return _enabled and nb is not None and x.device.type == "cpu" and x.dtype == torch.float32
+    return nb is not None and x.device.type == "cpu" and x.dtype == torch.float32
 
 
 def _np(x: Tensor) -> Any:

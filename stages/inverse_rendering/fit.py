@@ -92,7 +92,7 @@ class Trainer:
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Of everything that has not its own."""
-        return make_optimiser(self.model, self.settings, self.device)
+        return make_optimiser(self.model, self.settings)
 
     @property
     def psnr(self) -> float:
@@ -349,7 +349,7 @@ class Trainer:
         self.table = None
 
 
-def make_optimiser(model: FaceModel, settings: Config, device: str) -> torch.optim.Optimizer:
+def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
     """Adam over everything but the SDF, which has its own in the band. The table has no momentum to spare: eps is
     small, because most of its entries see a gradient only now and then."""
     spatial = _hashed(model)

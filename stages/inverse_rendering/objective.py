@@ -44,16 +44,8 @@ class Terms:
         return total
 
 
-def objective(
-    model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float
-) -> tuple[Tensor, float]:
-    """Loss of a batch, the sum of [NeuFace eq. 20], and its mean squared error (sRGB)."""
-    found = terms(model, batch, settings, generator, smooth_scale)
-    return found.total, found.error
-
-
 def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float) -> Terms:
-    """All parts of the loss. A batch without rays near the subject gives zeros."""
+    """All parts of [NeuFace eq. 20]. A batch without rays near the subject gives zeros."""
     device = batch.alpha.device
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)

@@ -30,15 +30,11 @@ def subjects_face(image: U8, alpha: F32, disc: Disc) -> Face | None:
     return face if face is not None and on_subject(face, alpha) >= INSIDE else None
 
 
-def face_labels(image: U8, alpha: F32, disc: Disc, hair: UserModel | None = None) -> U8 | None:
+def labels_with(face: Face | None, image: U8, alpha: F32, disc: Disc, hair: UserModel | None) -> U8 | None:
     """(H, W) labels of a photo (H, W, 3) 8-bit sRGB with its mask (H, W), or None without face and hair.
 
-    hair: the user's network, if there is one; it has the last word, but for the eyes."""
-    return labels_with(subjects_face(image, alpha, disc), image, alpha, disc, hair)
-
-
-def labels_with(face: Face | None, image: U8, alpha: F32, disc: Disc, hair: UserModel | None) -> U8 | None:
-    """`face_labels` where the face was looked for before."""
+    face: what `subjects_face` found. hair: the user's network, if there is one; it has the last word, but for the eyes.
+    """
     out = (alpha >= 0.5).astype(np.uint8) * SUBJECT
     if face is not None:
         # the hull and not the oval around the face, which runs through the nose where it is seen from the side

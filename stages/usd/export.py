@@ -25,7 +25,6 @@ from stages.usd.obj import write_obj
 from stages.usd.package import bounded_png, write_package
 from stages.usd.shading import Look
 
-F32 = npt.NDArray[np.float32]
 NEAR_HIGH = 4  # triangles looked at for each of the dense mesh, which is finer than what it lies on
 THUMBNAIL = "./thumbnails/default.png"  # made by the stage once there is something to render
 

@@ -23,8 +23,3 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.level}: {self.check}: {self.message}" + (f" ({self.where})" if self.where else "")
-
-
-def errors(findings: list[Finding]) -> list[Finding]:
-    """Only those that make an asset unfit."""
-    return [f for f in findings if f.level == "error"]

@@ -20,7 +20,7 @@ from stages.usd.shading import Look, T, connect, shader
 
 SURFACE = "ND_open_pbr_surface_surfaceshader"
 CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
-SRGB, LINEAR, DATA = "srgb_texture", "lin_rec709", "raw"
+SRGB, DATA = "srgb_texture", "raw"
 LARGEST_F0 = 0.16  # of `specular_weight` = 4: a fit gone wrong must not become a mirror
 
 

@@ -169,3 +169,17 @@ def test_borders_of_regions_are_smooth_at_sizes_beyond_the_votes() -> None:
     assert np.array_equal(codes[sure], np.where(away > 0, 2, 1)[sure])
     tied = Votes(np.array([4, 9], np.uint8), np.ones((2, 2, 2), np.float32))
     assert (tied.winners(np.arange(16), 4) == 4).all()
+
+
+def test_distances_to_a_mesh_by_hand() -> None:
+    """Two triangles, at 2 and 5 units: the first in the list is as good as any, a slanting ray is as much longer, and
+    what points past both, or away, meets nothing."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    vertices = np.concatenate([corners, corners - np.array([0, 0, 3], np.float32)])
+    mesh = Mesh(vertices, np.full_like(vertices, [0, 0, 1]), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
+    ways = np.array([[0, 0, -1.0], [0.1, 0, -1], [5, 0, -1], [0, 0, 1]])
+    length = np.linalg.norm(ways, axis=1)
+    found = Occluder(mesh).distance(np.array([0.0, 0, 2]), ways / length[:, None])
+    assert np.allclose(found[:2], 2 * length[:2], rtol=1e-5) and np.isinf(found[2:]).all()
+    from_between = Occluder(mesh).distances(np.array([[0, 0, -1.0], [0, 0, -1]]), np.array([[0, 0, -1.0], [0, 0, 1]]))
+    assert np.allclose(from_between, [2, 1], rtol=1e-5)

@@ -50,10 +50,14 @@ def test_read_linear_decodes_integers_and_leaves_floats(tmp_path: Path) -> None:
 
 
 def test_read_linear_of_grey_and_alpha(tmp_path: Path) -> None:
-    images.write_png(tmp_path / "g.png", codes(8, 1))
-    assert images.read_linear(tmp_path / "g.png").shape == (7, 5, 3)
-    images.write_png(tmp_path / "a.png", codes(8, 4))
-    assert images.read_linear(tmp_path / "a.png").shape == (7, 5, 3)
+    """Grey is the same in all channels, alpha is left out and multiplies nothing."""
+    grey, four = codes(8, 1), codes(8, 4)
+    images.write_png(tmp_path / "g.png", grey)
+    found = images.read_linear(tmp_path / "g.png")
+    assert found.shape == (7, 5, 3) and np.abs(found - linear_from_srgb(grey.reshape(7, 5, 1))).max() < 1e-7
+    images.write_png(tmp_path / "a.png", four)
+    found = images.read_linear(tmp_path / "a.png")
+    assert found.shape == (7, 5, 3) and np.abs(found - linear_from_srgb(four[..., :3])).max() < 1e-7
 
 
 def test_write_png_from_linear_is_srgb(tmp_path: Path) -> None:

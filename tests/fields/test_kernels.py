@@ -17,12 +17,20 @@ from pipeline.maths.tracing import sphere_trace
 LO, CELL, SHAPE = torch.tensor([-1.0, -1.1, -0.9]), 0.08, (26, 28, 24)
 
 
+COMPILED = kernels.nb
+
+
 @pytest.fixture(autouse=True)
 def _compiled() -> Iterator[None]:
-    if kernels.nb is None:
+    if COMPILED is None:
         pytest.skip("numba is not installed: there are no compiled kernels")
     yield
-    kernels.use_numba(True)
+    use_numba(True)
+
+
+def use_numba(enabled: bool) -> None:
+    """Without the kernels' module all goes the plain way, as it does where numba is not installed."""
+    kernels.nb = COMPILED if enabled else None
 
 
 def ball_grid(radius: float = 0.6) -> torch.Tensor:
@@ -46,7 +54,7 @@ def grid_gradients(values: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor,
 def test_spline_matches_the_reference_both_ways() -> None:
     v, x = torch.randn(SHAPE, generator=torch.Generator().manual_seed(3)), points(5000)
     fast = grid_gradients(v, x)
-    kernels.use_numba(False)
+    use_numba(False)
     slow = grid_gradients(v, x)
     for a, b in zip(fast, slow, strict=True):
         assert (a - b).abs().max() < 3e-5 * b.abs().max()
@@ -100,7 +108,7 @@ def test_hash_matches_the_reference_both_ways() -> None:
     upstream = torch.randn(3000, e.width, generator=torch.Generator().manual_seed(2))
     results = []
     for enabled in (True, False):
-        kernels.use_numba(enabled)
+        use_numba(enabled)
         xx = x.clone().requires_grad_()
         e.table.grad = None
         out = e(xx)
@@ -134,7 +142,7 @@ def test_band_optimiser_is_adam_where_rays_touch() -> None:
     reference = torch.nn.Parameter(start.view(-1)[active].clone())
     adam = torch.optim.Adam([reference], lr=0.01, betas=(0.9, 0.99), eps=1e-12)
     for enabled in (True, False):
-        kernels.use_numba(enabled)
+        use_numba(enabled)
         v, g, m, w = start.clone(), torch.zeros(SHAPE), torch.zeros(SHAPE), torch.zeros(SHAPE)
         torch.manual_seed(9)
         for step in range(1, 6):
@@ -158,7 +166,7 @@ def test_band_optimiser_leaves_untouched_coefficients_alone() -> None:
 @pytest.mark.parametrize("fast", [True, False])
 def test_patches_against_scipy(fast: bool) -> None:
     """Two photos of other sizes, positions inside, at the border and beyond it, scaled as projections are."""
-    kernels.use_numba(fast)
+    use_numba(fast)
     rng = np.random.default_rng(2)
     photos = [rng.random(size, np.float32) for size in ((13, 9), (7, 21))]
     sizes = torch.tensor([p.shape for p in photos])

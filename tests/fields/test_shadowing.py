@@ -81,7 +81,8 @@ def test_an_empty_volume_is_left_alone() -> None:
     body = geometry(None)
     with torch.no_grad():
         body.values.fill_(1.0)
-    assert not bool(solved(body, 0.5).solved)
+    left = solved(body, 0.5)
+    assert not bool(left.solved) and torch.allclose(left(on_sphere(OUTER, 1.0)), torch.ones(1))
 
 
 def test_trilinear_is_exact_for_a_plane_and_constant_outside() -> None:

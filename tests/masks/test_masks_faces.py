@@ -9,7 +9,7 @@ import pytest
 from skimage import data
 
 from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face
-from stages.masks.face_labels import EYES, FACE, HAIR, LABELS, SUBJECT, face_labels, on_subject
+from stages.masks.face_labels import EYES, FACE, HAIR, LABELS, SUBJECT, labels_with, on_subject, subjects_face
 from stages.masks.region import Disc
 from stages.masks.user_model import UserModel
 from tests.masks.test_masks_user_model import write_network, write_red_detector
@@ -17,6 +17,10 @@ from tests.masks.test_masks_user_model import write_network, write_red_detector
 ASTRONAUT = data.astronaut()
 SUBJECT_ALPHA = np.zeros((512, 512), np.float32)
 SUBJECT_ALPHA[20:, 40:300] = 1
+
+
+def face_labels(image: np.ndarray, alpha: np.ndarray, disc: Disc, hair: UserModel | None = None) -> np.ndarray | None:
+    return labels_with(subjects_face(image, alpha, disc), image, alpha, disc, hair)
 
 
 def test_labels_of_a_real_face() -> None:

@@ -60,12 +60,20 @@ def test_lookup_at_centres_and_without_seams(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_extremes_of_a_lookup() -> None:
-    values = torch.rand(3, 24, 3, requires_grad=True)
+    """Levels beyond the last are the last, in between is in between, lengths do not count, and at 1e-20, 1e4 and at the
+    cube's corners the value is a mean of texels."""
+    values = torch.rand(3, 24, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
     d = torch.tensor([[1.0, 0, 0], [1, 1, 1], [-1, 1, -1], [1e-20, 0, 1e-20], [0, 0, -1e4]], requires_grad=True)
     level = torch.tensor([0.0, 1, 2, 5, 0.5], requires_grad=True)
     out = cubemap.lookup(values, d, level)
     out.sum().backward()
-    assert all(bool(torch.isfinite(x).all()) for x in (out, values.grad, d.grad, level.grad) if x is not None)
+    assert all(x is not None and bool(torch.isfinite(x).all()) for x in (values.grad, d.grad, level.grad))
+    exact, unit = values.detach().double(), torch.nn.functional.normalize(d.detach().double(), dim=-1)
+    each = [cubemap.lookup(exact[k : k + 1], unit, torch.zeros(5).double()) for k in range(3)]
+    expected = [each[0][0], each[1][1], each[2][2], each[2][3], (each[0][4] + each[1][4]) / 2]
+    assert torch.allclose(out.detach().double(), torch.stack(expected), atol=1e-5)
+    assert all(m.min() >= exact[k].min() and m.max() <= exact[k].max() for k, m in enumerate(each))
+    assert float(values.grad.sum()) == pytest.approx(15, rel=1e-5), "weights of each of 5 lookups add up to 1"
 
 
 def lit(c: torch.Tensor, lobe: str = "vmf", size: int = 16) -> CubemapLight:
@@ -102,9 +110,13 @@ def test_an_even_map_is_a_furnace(lobe: str) -> None:
 
 
 def test_every_texel_can_learn() -> None:
+    """Under an even light each texel's gradient is in proportion to its solid angle, seen from all directions."""
     light = CubemapLight(4, 1.0, "vmf")
-    light.reflected(directions(4000).float(), torch.full((4000,), 0.02)).square().sum().backward()
-    assert light.raw.grad is not None and (light.raw.grad != 0).all()
+    light.reflected(directions(40_000).float(), torch.full((40_000,), 0.02)).square().mean().backward()
+    assert light.raw.grad is not None
+    share = cubemap.solid_angles(4) / (4 * math.pi) * 2 / 3 * (1 - math.exp(-1.0))  # softplus' slope where it is 1
+    assert torch.allclose(light.raw.grad.double(), share[:, None].expand(-1, 3), rtol=0.25)
+    assert float(light.raw.grad.sum()) == pytest.approx(2 * (1 - math.exp(-1.0)), rel=1e-3)
 
 
 # ------------------------------------------------------------------ GGX's table

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pipeline.maths
-from pipeline.maths import brdf, correlation, cubemap, density, losses, relight, sdf, sh, split_sum, vmf
+from pipeline.maths import brdf, correlation, cubemap, density, losses, sdf, sh, split_sum, vmf
 
 
 def draw(*shape: int, seed: int = 0, low: float = 0.1, high: float = 0.9) -> torch.Tensor:
@@ -66,16 +66,6 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "losses.displacement": (losses.displacement, (draw(4),)),
     "losses.embedding": (losses.embedding, (draw(2, 8),)),
     "losses.normal_consistency": (losses.normal_consistency, (unit(4), unit(4, 1))),
-    "relight.project_lat_long": (lambda p: relight.project_lat_long(p, 2, "hanning"), (draw(4, 8, 3),)),
-    "relight.rotate": (lambda c: relight.rotate(c, torch.eye(3).roll(1, 0)), (lit(3),)),
-    "relight.directional": (
-        lambda d, e: relight.directional(torch.nn.functional.normalize(d, dim=0), e, 3),
-        (draw(3), draw(3, seed=1)),
-    ),
-    "relight.point": (
-        lambda p, i: relight.point(p, i, torch.zeros(3, dtype=torch.float64), 3),
-        (draw(3), draw(3, seed=1)),
-    ),
     "sdf.axis_weights": (sdf.axis_weights, (draw(4, low=-0.4, high=0.4),)),
     "sdf.spline_sdf": (lambda v, x: sdf.spline_sdf(v, x, LO, 0.25), (draw(6, 6, 6), draw(4, 3, low=0.4, high=0.8))),
     "sdf.spline_stencil": (
@@ -107,10 +97,6 @@ WITHOUT = {
     "tracing": {"box_interval", "sphere_interval", "sphere_trace", "aggressive_trace"},  # searches, without gradients
     "cubemap": {"texel_directions", "solid_angles", "padded"},
     "split_sum": {"table"},
-    "relight": {
-        *("lat_long_directions", "lat_long_solid_angles", "window_of", "product_rule", "order_for"),  # constants
-        "energy_of",  # a report
-    },
     "precision": {"full_precision", "raise_half"},
     "sh_recurrence": {"recurrence"},
     "sh_compiled": {"tables"},  # float32 alone; held to its twin in test_sh

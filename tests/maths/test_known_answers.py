@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from pipeline.maths import brdf, density, relight, sh, tracing, vmf
+from pipeline.maths import brdf, density, sh, tracing, vmf
 from tests.maths.test_sh import directions, sphere_quadrature
 
 F64 = torch.float64
@@ -161,9 +161,3 @@ def test_sphere_interval_is_exact_from_far_away() -> None:
     near, far = tracing.sphere_interval(o, d, torch.zeros(3), 0.2)
     half = math.sqrt(0.04 - 0.01)
     assert float(far - near) == pytest.approx(2 * half, rel=1e-3)
-
-
-def test_light_of_a_lamp_adds_up() -> None:
-    """Flux through all directions is what the lamp sends to the place: c_00 sqrt(4 pi) = I / r^2."""
-    c = relight.point(torch.tensor([0.0, 2, 0]), torch.ones(3), torch.zeros(3), 4)
-    assert float(c[0, 0]) * math.sqrt(4 * math.pi) == pytest.approx(0.25)

@@ -59,8 +59,12 @@ def test_refinement_keeps_the_function() -> None:
 
 
 def test_far_outside_is_finite() -> None:
-    s, g = sdf.spline_sdf(grid(), torch.tensor([[1e6, -1e6, 0.0]], dtype=torch.float64), LO, CELL)
+    """Beyond the grid the border's cell goes on as it is: the value and slope of the nearest place that it covers."""
+    v = grid()
+    far = torch.tensor([[1e6, -1e6, 0.0], [-9.0, 3.0, 1e9]], dtype=torch.float64)
+    s, g = sdf.spline_sdf(v, far, LO, CELL)
     assert torch.isfinite(s).all() and torch.isfinite(g).all()
+    assert s.abs().max() <= v.abs().max() and torch.equal(s, sdf.spline_sdf(v, 2 * far, LO, CELL)[0])
 
 
 def test_unit_is_safe_at_zero() -> None:

@@ -8,7 +8,8 @@ import torch
 from numpy.polynomial.legendre import leggauss
 from scipy.special import ive
 
-from pipeline.maths import vmf
+from pipeline.maths import brdf, sh, vmf
+from tests.maths.test_sh import directions
 
 ORDER = 10
 KAPPAS = [1e-6, 1e-3, 0.1, 0.5, 1.44, 2.0, 5.0, 20.0, 100.0, 1e4, 1e8]
@@ -65,3 +66,17 @@ def test_error_of_the_papers_form_is_as_stated() -> None:
     large = torch.tensor([1e-4], dtype=torch.float64)
     found = (vmf.attenuation_exact(large, 1) - vmf.attenuation_exponential(large, 1)).abs()[0, 1] / large[0] ** 2
     assert float(found) == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("inv_kappa", [0.02, 0.1, 0.5, 1e3])
+def test_a_distant_light_through_a_lobe_is_the_lobes_density(inv_kappa: float) -> None:
+    """[NeuFace eq. 10]: light E from one direction alone has c_lm = E Y_lm there; through the lobe it is E D(w_r), the
+    vMF density in closed form. At 1/kappa = 1,000 nothing of the direction is left: E / (4 pi) from everywhere."""
+    order = 40 if inv_kappa < 0.05 else 20
+    to, e = directions(1)[0], torch.tensor([2.0, 1.0, 0.5], dtype=torch.float64)
+    c = sh.sh_basis(to[None], order).T * e
+    w_r = torch.nn.functional.normalize(to + 0.4 * min(inv_kappa, 1) ** 0.5 * directions(30, 3), dim=-1)
+    kappa = 1 / inv_kappa
+    density = kappa / (2 * np.pi * -np.expm1(-2 * kappa)) * torch.exp(kappa * (w_r @ to - 1))
+    found = brdf.light_integral(w_r, torch.full((30,), inv_kappa, dtype=torch.float64), c, "exact")
+    assert torch.allclose(found, density[:, None] * e, rtol=0.005, atol=5e-4 * float(density.max()))

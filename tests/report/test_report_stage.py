@@ -78,9 +78,18 @@ def test_page_parses_and_refers_to_nothing_outside(made: tuple[dict, str]) -> No
 
 
 def test_every_picture_decodes(made: tuple[dict, str]) -> None:
-    for uri in Page(made[1]).links:
-        content = base64.b64decode(uri.partition("base64,")[2], validate=True)
-        assert cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) is not None
+    """As the kind that its address names; most of them show more than one colour."""
+    links, seen = Page(made[1]).links, []
+    assert len(links) > 8
+    for uri in links:
+        head, _, code = uri.partition("base64,")
+        content = base64.b64decode(code, validate=True)
+        start = {"data:image/png;": b"\x89PNG", "data:image/jpeg;": b"\xff\xd8\xff", "data:image/webp;": b"RIFF"}[head]
+        assert content.startswith(start)
+        shown = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert shown is not None and min(shown.shape[:2]) > 4
+        seen.append(np.ptp(shown) > 0)
+    assert sum(seen) > len(seen) / 2
 
 
 def test_metrics_have_the_keys_that_others_read(made: tuple[dict, str]) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
@@ -21,6 +24,10 @@ LIMITS = Limits(0.9, 0.5)
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SyntheticResults:
     return write_results(tmp_path_factory.mktemp("results"))
+
+
+def decoded(uri: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.partition("base64,")[2]), np.uint8), cv2.IMREAD_COLOR)
 
 
 def found(results: SyntheticResults, **findings: tuple[Finding, ...]) -> SyntheticResults:
@@ -98,4 +105,13 @@ def test_a_photo_without_a_mask_is_shown_as_it_is(results: SyntheticResults) -> 
         replace(results, masks=Located(masks, results.masks.folder)),
         60,
     )
-    assert len(shown.troubles[0].pictures) == 1
+    (picture,) = shown.troubles[0].pictures
+    outlined = verdict_shown(
+        Verdict({"poses": (judged("a", 0.1, LIMITS, "Lost.", "x", views=["3.png"]),)}), results, 60
+    )
+    assert picture.caption == "3.png"
+    with_mask, without = (decoded(p.uri) for p in (outlined.troubles[0].pictures[0], picture))
+    (view,) = (v for v in results.capture.artifact.views if v.name == "3.png")
+    photo = cv2.imread(str(results.capture.path(view.image)))
+    small = cv2.resize(photo, without.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(without.astype(float) - small).mean() < 6 < np.abs(with_mask.astype(float) - small).max()

@@ -60,7 +60,11 @@ def test_unusable_lights_are_refused(image: np.ndarray) -> None:
 def test_infinite_suns_are_bounded() -> None:
     image = np.ones((8, 16, 3), np.float32)
     image[2, 3] = np.inf
-    assert np.isfinite(lamps(checked_environment(image, "x.hdr"), 20).flux).all()
+    found, bounded = lamps(checked_environment(image, "x.hdr"), 20), np.ones((8, 16, 3), np.float32)
+    bounded[2, 3] = 65504  # what 16 bits hold
+    whole = (bounded * latlong_weights(16, 8)[..., None]).sum((0, 1))
+    np.testing.assert_allclose(found.flux.sum(0), whole, rtol=1e-4)
+    assert found.directions[found.flux[:, 0].argmax()] @ latlong_directions(16, 8)[2, 3] > 0.999
 
 
 def test_nothing_is_in_the_way_on_a_convex_body() -> None:

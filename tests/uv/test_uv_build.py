@@ -279,7 +279,14 @@ def test_packing_a_line_and_a_point() -> None:
     uvs = np.array([[0, 0], [1, 0], [0, 1], [0, 0], [0.2, 0.2], [0.4, 0.4], [3, 3], [3, 3], [3, 3]], float)
     faces = np.arange(9, dtype=np.int32).reshape(3, 3)
     placed = packing.pack(uvs, faces, np.arange(3), 0.01)
-    assert placed is not None and np.isfinite(placed).all()
+    assert placed is not None and placed.min() >= 0 and placed.max() <= 1
+    triangle, line, point = placed.reshape(3, 3, 2).astype(float)
+    scale = np.linalg.norm(triangle[1] - triangle[2]) / np.sqrt(2)
+    assert scale > 0.3, "the triangle fills most of the square"
+    for k, length in ((1, 0.2), (2, 0.4)):
+        assert np.linalg.norm(line[k] - line[0]) == pytest.approx(scale * length * np.sqrt(2), rel=1e-3)
+    assert np.ptp(point, 0).max() < 1e-6
+    assert np.linalg.norm(line[:, None] - point[None], axis=2).min() >= 0.01 - 1e-6
 
 
 def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:

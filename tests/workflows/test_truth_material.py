@@ -60,9 +60,7 @@ def test_the_models_parts() -> None:
     n = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     wo = torch.nn.functional.normalize(n + 0.4 * n.flip(0), dim=-1)
     off = 0.103 * n.double().numpy()  # 3 mm outside
-    found = tm.fitted_looks(
-        model, off @ place[:3, :3].T + place[:3, 3], n.double().numpy() @ turn.T, wo.double().numpy() @ turn.T, place
-    )
+    found = tm.fitted_looks(model, off @ place[:3, :3].T + place[:3, 3], wo.double().numpy() @ turn.T, place)
     with torch.no_grad():
         own = model.shade(0.1 * n, n, wo)
         _, rho, c, s = model.spatial(0.1 * n)

@@ -28,7 +28,7 @@ class CubemapLight(nn.Module):
 
     def __init__(self, size: int, start: float, lobe: str) -> None:
         super().__init__()
-        self.size, self.lobe_kind = size, lobe
+        self.size = size
         self.widths = INV_KAPPAS if lobe == "vmf" else ALPHAS
         d = cubemap.texel_directions(size)
         between = (d @ d.T).clamp(-1, 1)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 SPARSE = (36, 45, 30, 48, 54)  # outer eye corners, tip of the nose, corners of the mouth, of 68 landmarks
-NETS = ("deform", "reference", "template")
 RENAMES = {
     "2022": [
         (r"^id_embedding\.weight$", "codes_id"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
@@ -57,11 +56,13 @@ def test_lengths_follow_the_scene(scale: float) -> None:
 
 
 def test_beta_stays_positive() -> None:
+    """(|raw| + 1e-4) times Omega's radius, as in VolSDF: the same for either sign, and never below the least."""
     g = DisplacedSdf(hull())
+    radius = float(hull().sphere()[1])
     for raw in (-1.0, 0.0, 1e-9, 5.0):
         with torch.no_grad():
             g.beta_raw.fill_(raw)
-        assert float(g.beta()) > 0
+        assert float(g.beta()) == pytest.approx((abs(raw) + 1e-4) * radius, rel=1e-5)
 
 
 def test_the_hull_goes_on_beyond_its_grid() -> None:
@@ -75,17 +76,38 @@ def test_the_hull_goes_on_beyond_its_grid() -> None:
 
 
 def test_an_empty_hull_has_a_sphere() -> None:
+    """It holds the whole grid, and not much more."""
     p = HullPrior(torch.ones(5, 5, 5), torch.zeros(3), 0.1)
     centre, radius = p.sphere()
-    assert np.isfinite(radius) and radius > 0 and bool(torch.isfinite(centre).all())
+    corners = 0.4 * torch.tensor([[i, j, k] for i in (0.0, 1) for j in (0.0, 1) for k in (0.0, 1)])
+    assert (centre - 0.2).abs().max() <= 0.05 + 1e-6
+    assert float((corners - centre).norm(dim=-1).max()) <= radius < 0.5
 
 
 def test_normals_can_be_learnt_through() -> None:
-    """The Eikonal term needs the derivative of the gradient by the parameters."""
+    """The Eikonal term needs the derivative of the gradient by the parameters: against differences, in float64."""
     torch.manual_seed(0)
-    g = DisplacedSdf(SpherePrior(torch.zeros(3), 0.2, 16, 2), 16, 2)
-    _, n = g(torch.randn(10, 3) * 0.1)
-    ((n.norm(dim=-1) - 1).abs()).mean().backward()
-    assert all(p.grad is not None for name, p in g.named_parameters() if name.endswith("weight"))
+    g = DisplacedSdf(SpherePrior(torch.zeros(3), 0.2, 16, 2), 16, 2).double()
+    x = torch.randn(10, 3, dtype=torch.float64) * 0.1
+
+    def uneven() -> torch.Tensor:
+        return ((g(x)[1].norm(dim=-1) - 1) ** 2).mean()
+
+    with torch.no_grad():
+        g.displacement.net[-1].weight.normal_(std=0.02)  # type: ignore[operator,union-attr]
+    uneven().backward()
+    weights = {name: p for name, p in g.named_parameters() if name.endswith("weight")}
+    for name, p in weights.items():
+        way, values = torch.randn(p.shape, dtype=torch.float64), []
+        assert p.grad is not None, name
+        for sign in (1, -1):
+            with torch.no_grad():
+                p.add_(sign * 1e-5 * way)
+            values.append(float(uneven().detach()))
+            with torch.no_grad():
+                p.sub_(sign * 1e-5 * way)
+        slope = (values[0] - values[1]) / 2e-5
+        assert float((p.grad * way).sum()) == pytest.approx(slope, rel=1e-3, abs=1e-6), name
+    assert len(weights) > 4
     with torch.no_grad():
         assert not g(torch.zeros(1, 3))[0].requires_grad

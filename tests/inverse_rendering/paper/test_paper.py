@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,17 +130,70 @@ def test_what_is_rendered_is_eq_18_by_hand() -> None:
     assert got.opacity[0] > 0.99 and got.opacity[2] < 0.3 and got.opacity[3] == 0
 
 
-def test_the_terms_are_the_papers() -> None:
-    """Each of eq. 20 to 24 is there with its weight; a prior without codes has no embedding term."""
+@pytest.mark.parametrize("prior", ["hull", "imface"])
+def test_the_terms_are_eq_20_by_hand(prior: str, tmp_path: Path) -> None:
+    """[NeuFace eq. 20] in float64 from what was rendered, each part with a weight of its own; a prior without codes has
+    no embedding term, and a pixel that shows the subject in part has no colour term."""
+    torch.save({"decoder": published(ours(True), "2022")}, tmp_path / "envs_last.pth")
+    weights = {
+        "rgb": 2.0,
+        "white": 3.0,
+        "specular_energy": 5.0,
+        "embedding": 7.0,
+        "eikonal": 11.0,
+        "displacement": 13.0,
+    }
+    file = str(tmp_path / "envs_last.pth")
+    t = trainer(prior=prior, prior_file=file, prior_scale=0.12, **weights)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        t.model.light.coefficients[:4] += 0.3 * torch.rand(4, 3)
+        t.model.calibration.net[-1].weight.normal_(std=0.1)
+        for name, p in t.model.named_parameters():
+            if name.startswith("geometry.") and not name.startswith("geometry.prior.") or ".z_" in name:
+                p.add_(0.01 * torch.randn(p.shape))
+    batch = t.pixels.draw(64, 0.25, 0)
+    batch.alpha[:3] = torch.tensor([0.3, 0.6, 0.98])
+    found: Terms = paper.paper_terms(t.model, batch, t.settings, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        jitter = torch.rand(64, t.settings.samples, generator=torch.Generator().manual_seed(0))
+        got = render_samples(t.model, batch.rays, t.settings.samples, jitter)
+        A, light = t.model.calibration().double().numpy(), t.model.light().double().numpy()
+        geometry = geometry_of(t.model)
+        z = geometry.known.embeddings()
+        radius = float(geometry.known.sphere()[1])
+    radiance = np.einsum("nij,nj->ni", A[batch.view.numpy()], got.colour.double().numpy())
+    srgb = np.where(radiance <= 0.0031308, 12.92 * radiance, 1.055 * np.maximum(radiance, 1e-9) ** (1 / 2.4) - 0.055)
+    alpha = batch.alpha.numpy()
+    target = np.where(alpha[:, None] > 0.99, batch.target.double().numpy(), 0)
+    sure = (alpha > 0.99) | (alpha < 0.01)
+    assert not sure[:3].any() and sure.sum() > 20
+    parts = {
+        "rgb": np.abs(srgb - target).mean(1)[sure].sum() / 64,
+        "white": np.abs(light - light.mean(1)[:, None]).mean(1).sum(),
+        "specular_energy": got.specular.double().numpy().mean(1).sum() / 64,
+        "eikonal": np.abs(np.linalg.norm(got.gradient.double().numpy(), axis=1) - 1).mean(),
+        "displacement": np.abs(got.moved.double().numpy()).mean() / radius,
+    }
+    if prior == "imface":
+        assert z is not None
+        parts["embedding"] = (z.double().numpy() ** 2).sum()
+    assert set(found.scalars) == set(parts)
+    for name, value in parts.items():
+        got_ = float(found.scalars[name].detach())
+        assert got_ == pytest.approx(weights[name] * value, rel=2e-3) and value > 1e-7, name
+    total = sum(weights[name] * value for name, value in parts.items())
+    assert float(found.total.detach()) == pytest.approx(total, rel=1e-3)
+
+
+def test_rays_past_the_head_have_no_shape_terms() -> None:
+    """The extreme of [NeuFace eq. 20]: nothing is met, so that the colour is black, which is what the mask says."""
     t = trainer()
-    t.enter_level()
-    assert t.table is not None
-    found: Terms = paper.paper_terms(t.model, t.table.draw(64, 0.25, 0), t.settings, torch.Generator().manual_seed(0))
-    assert list(found.scalars) == ["rgb", "white", "specular_energy", "eikonal", "displacement"]
-    assert float(found.scalars["displacement"].detach()) == 0, "the displacement starts at zero"
-    doubled = t.settings.changed(eikonal=2 * t.settings.eikonal)
-    again = paper.paper_terms(t.model, t.table.draw(64, 0.25, 0), doubled, torch.Generator().manual_seed(0))
-    assert float(again.scalars["eikonal"].detach()) == pytest.approx(2 * float(found.scalars["eikonal"].detach()))
+    batch = t.pixels.at(t.pixels.outside[:16])
+    away = replace(batch, rays=Rays(batch.rays.o, -batch.rays.d))
+    found = paper.paper_terms(t.model, away, t.settings, torch.Generator().manual_seed(0))
+    assert list(found.scalars) == ["rgb", "white", "specular_energy"]
+    assert float(found.scalars["rgb"].detach()) == 0 and float(found.scalars["specular_energy"].detach()) == 0
 
 
 def test_interruptions_change_nothing(tmp_path: Path) -> None:

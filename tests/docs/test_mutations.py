@@ -1,0 +1,47 @@
+"""The list of wrong changes fits the code; whether they are noticed is for `python -m benchmarks.mutations` to say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.mutations import MUTATIONS, PARTS, Mutation, fate
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("mutation", MUTATIONS, ids=lambda m: m.change)
+def test_each_change_can_be_made_and_has_its_tests(mutation: Mutation) -> None:
+    text = (ROOT / mutation.file).read_text()
+    assert text.count(mutation.before) == 1 and mutation.before != mutation.after
+    compile(text.replace(mutation.before, mutation.after), mutation.file, "exec")
+    file, _, name = mutation.tests.partition("::")
+    assert f"def {name or 'test_'}" in (ROOT / file).read_text()
+
+
+def test_the_list_spans_the_product() -> None:
+    assert len(MUTATIONS) >= 30 and len({m.change for m in MUTATIONS}) == len(MUTATIONS)
+    assert {m.file.split("/")[0] for m in MUTATIONS} == {"pipeline", "stages", "workflows"} <= set(PARTS)
+
+
+@pytest.mark.parametrize(
+    ("test", "expected"),
+    [
+        ("assert f() == 2", "killed"),
+        ("assert f() > 0", "survived"),
+        ("import nothing_of_that_name", "unclear"),
+    ],
+)
+def test_a_change_is_killed_only_by_a_test_that_fails_and_is_taken_back(
+    tmp_path: Path, test: str, expected: str
+) -> None:
+    (tmp_path / "pyproject.toml").write_text("[tool.pytest.ini_options]\nmarkers = ['slow: slow']\n")
+    code = tmp_path / "code_to_change.py"
+    code.write_text("def f():\n    return 1 + 1\n")
+    before = code.stat().st_mtime_ns
+    body = test if test.startswith("import") else f"from code_to_change import f\n\n\ndef test_f():\n    {test}"
+    (tmp_path / "test_it.py").write_text(body + "\n")
+    assert fate(tmp_path, Mutation("code_to_change.py", "1 + 1", "1 + 2", "test_it.py"))[0] == expected
+    assert code.read_text() == "def f():\n    return 1 + 1\n" and code.stat().st_mtime_ns == before
+    assert fate(tmp_path, Mutation("code_to_change.py", "1 + 7", "1", "test_it.py"))[0] == "unclear"
