@@ -18,6 +18,7 @@ from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.visibility import seen_by
 from stages.bake.stage import Config, Inputs, run
 from stages.surface.build import build as surface_build
+from stages.uv.config import Config as UvConfig
 from stages.uv.decimate import decimated
 from stages.uv.unwrap import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
@@ -41,7 +42,7 @@ ALL = PNG | {"specular_coefficients", "lobe_coefficients", "shininess", "inv_kap
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
     field = AnalyticField(sphere(0.08))
     mesh = decimated(surface_build(field, 32, lambda done, total: None).mesh, 800)
-    charts = unwrap(mesh, Config(texture_size=256, padding=2))
+    charts = unwrap(mesh, UvConfig(texture_size=256, padding=2))
     meshes.save(tmp_path / "uv.npz", mesh, charts)
     uv = UvMesh(
         mesh=FileRef.of(tmp_path, "uv.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), charts=1,

@@ -22,6 +22,7 @@ from stages.bake.confidence import sighted
 from stages.bake.stage import Config, Inputs, region_shares, run
 from stages.bake.write import KINDS, joined, write_maps
 from stages.uv import pack, unwrap
+from stages.uv.config import Config as UvConfig
 from tests.bake.test_bake_sight import VIEWS, labelled
 from tests.bake.test_bake_stage import inputs  # noqa: F401  (a fixture)
 from tests.support.analytic_fields import AnalyticField, linear_albedo, sphere
@@ -52,7 +53,7 @@ def ball() -> Mesh:
 def charts(ball: Mesh) -> Charts:
     with pytest.MonkeyPatch.context() as patch:  # a coarser packing is quicker
         patch.setattr(pack, "G", 96)
-        found = unwrap.unwrap(ball, Config(texture_size=SIZE, padding=4, tiles=COUNT))
+        found = unwrap.unwrap(ball, UvConfig(texture_size=SIZE, padding=4, tiles=COUNT))
     assert int(tiles.of_face(found).max()) + 1 == COUNT
     return found
 
@@ -176,7 +177,7 @@ def test_the_stage_bakes_every_tile_with_the_photos_detail(
 ) -> None:
     monkeypatch.setattr(pack, "G", 96)
     mesh = meshes.load(inputs.uv.path(inputs.uv.artifact.mesh))
-    charts = unwrap.unwrap(mesh, Config(texture_size=256, padding=2, tiles=2))
+    charts = unwrap.unwrap(mesh, UvConfig(texture_size=256, padding=2, tiles=2))
     meshes.save(tmp_path / "uv.npz", mesh, charts)
     uv = UvMesh.model_validate(inputs.uv.artifact.model_dump() | {"mesh": FileRef.of(tmp_path, "uv.npz"), "tiles": 2})
     write_png(tmp_path / "labels.png", np.full((64, 64), 2 / 255))

@@ -7,10 +7,10 @@ import numpy.typing as npt
 import pytest
 import torch
 from numpy.polynomial.legendre import leggauss
-from pipeline.fields.paper.material import DirectIntegral
 
 from pipeline.fields.appearance import IntegratedBasis, SpatialField
 from pipeline.fields.encodings import HashEncoding
+from pipeline.fields.paper.material import DirectIntegral
 from pipeline.maths import brdf
 from tests.fields.test_face import ball_model, sphere_points
 

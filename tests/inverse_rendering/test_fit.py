@@ -197,7 +197,7 @@ WEIGHTS = {
 def weighed_ball() -> Trainer:
     """A fit whose terms all differ and all have another weight: its skin is patchy, its light not white, and its
     matrices are not the identity."""
-    t = trainer(replace(SMALL, **WEIGHTS), calibrated=True)
+    t = trainer(SMALL.changed(**WEIGHTS), calibrated=True)
     t.enter_level()
     t.set_rates()
     torch.manual_seed(0)
@@ -281,7 +281,7 @@ def test_the_objectives_gradient_is_that_of_differences(name: str) -> None:
     """Along a random direction of one part of the model. The median that parsimony holds fixed is left out, and so is
     what depends on the shape alone."""
     t = weighed_ball()
-    settings = replace(t.settings, parsimony=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
+    settings = t.settings.changed(parsimony=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
     batch = t.pixels.draw(512, 0.25, 0)
     p = dict(t.model.named_parameters())[name]
     way = torch.randn(p.shape, generator=torch.Generator().manual_seed(1))
