@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.transforms import F64
+from stages.capture.readers.cameras import given_camera
 from stages.capture.readers.described import (
     Declared,
     Described,
-    fault,
     find_photo,
     five_terms,
-    given_camera,
     indices_of,
     natural_key,
 )
+from stages.capture.readers.values import fault, printable
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", "")
 NAMES = ("cameras", "images", "points3D")
@@ -52,14 +52,15 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
     for index, image in zip(indices_of([i.name for i in images]), images, strict=True):
         photo = find_photo(folder, image.name)
         if photo is None:
-            left_out.append(f"{PurePosixPath(image.name).name}: its photo is missing")
-            warnings.append(f"the COLMAP model has {image.name}, which is not in the capture; put the photo into "
-                            "images/ or into the folder itself")  # fmt: skip
+            left_out.append(f"{printable(PurePosixPath(image.name).name)}: its photo is missing")
+            warnings.append(f"the COLMAP model has {printable(image.name)}, which is not in the capture; put the "
+                            "photo into images/ or into the folder itself")  # fmt: skip
             continue
         (K, d, _), camera = lenses[image.camera_id], model.cameras[image.camera_id]
         pose = np.asarray(image.cam_from_world().matrix(), np.float64)
-        given = given_camera(K, pose, d, f"{files[1].name}, {image.name}")
-        views.append(Declared(index, photo.name, photo, given, (camera.width, camera.height), f"{image.camera_id}"))
+        size = (int(camera.width), int(camera.height))
+        given = given_camera(K, pose, d, f"{files[1].name}, {printable(image.name)}", size)
+        views.append(Declared(index, photo.name, photo, given, size, f"{image.camera_id}"))
     warnings += [f"COLMAP camera {k} ({model.cameras[k].model_name}) is replaced by the nearest k1 k2 p1 p2 k3, "
                  f"{error:.2f} pixels off at most" for k, (_, _, error) in lenses.items() if error > NOTED]  # fmt: skip
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
