@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.transforms import F64
-from stages.capture.readers.cameras import given_camera
+from stages.capture.readers.cameras import checked_frame, checked_K, given_camera
+from stages.capture.readers.colmap_files import miscounted
 from stages.capture.readers.described import (
     Declared,
     Described,
@@ -22,11 +23,13 @@ from stages.capture.readers.described import (
     indices_of,
     natural_key,
 )
-from stages.capture.readers.values import fault, printable
+from stages.capture.readers.values import fault, finite, pixels, printable
 
 FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", "")
 NAMES = ("cameras", "images", "points3D")
 MORE = ("rigs", "frames")  # newer versions write these too
+WHOLE = "a complete model as COLMAP writes it"
+AGAIN = "export the model again, or remove it to have the cameras solved"
 NOTED = 0.02  # pixels: a lens replaced with less error than this needs no note
 
 
@@ -42,6 +45,9 @@ def find(folder: Path) -> list[Path]:
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
     """Registered images with their photos; those whose photo is missing are left out and named."""
+    wrong = miscounted(files)
+    if wrong is not None:
+        raise fault("the COLMAP model can't be read", files[0].parent.name, wrong, WHOLE, AGAIN)
     model = _model(files[0].parent, files[0].suffix)
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: natural_key(i.name))
     if not images:
@@ -72,26 +78,29 @@ def _model(folder: Path, suffix: str) -> Any:
     model = pycolmap.Reconstruction()
     try:
         (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
-    except (RuntimeError, ValueError, IndexError) as e:
-        raise fault("the COLMAP model can't be read", folder.name, str(e).strip().splitlines()[-1][:200],
-                    "a complete model as COLMAP writes it",
-                    "export the model again, or remove it to have the cameras solved") from e  # fmt: skip
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError, KeyError, TypeError) as e:
+        said = printable((str(e).strip().splitlines() or [type(e).__name__])[-1])
+        raise fault("the COLMAP model can't be read", folder.name, said, WHOLE, AGAIN) from e
     return model
 
 
 def _lens(camera: Any, where: str) -> tuple[F64, F64, float]:
     """K (3, 3), k1 k2 p1 p2 k3, greatest error in pixels. COLMAP has the first pixel's centre at (0.5, 0.5)."""
-    p, model = [float(x) for x in camera.params], camera.model_name
+    size = (pixels(int(camera.width), where, AGAIN), pixels(int(camera.height), where, AGAIN))
+    p, model = [float(x) for x in finite(np.array(camera.params, np.float64), where, AGAIN)], camera.model_name
     exact = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
     if model in exact and not (model == "FULL_OPENCV" and any(p[9:])):
         terms = p[exact[model] :]
         d = {0: [0.0] * 5, 1: [*terms, 0, 0, 0, 0], 2: [*terms, 0, 0, 0], 4: [*terms, 0.0], 8: terms[:5]}[len(terms)]
-        return np.asarray(camera.calibration_matrix(), np.float64), np.array(d, np.float64), 0.0
+        K = checked_K(np.asarray(camera.calibration_matrix(), np.float64), where)
+        return checked_frame(K, size, where), np.array(d, np.float64), 0.0
     if camera.is_spherical():
         raise fault("a panorama has no pinhole camera", where, model, "a perspective or fisheye lens",
                     "cut perspective photos out of the panoramas")  # fmt: skip
     focal = camera.mean_focal_length()
     K = np.array([[focal, 0, camera.principal_point_x], [0, focal, camera.principal_point_y], [0, 0, 1.0]])
+
+    checked_frame(checked_K(K, where), size, where)
 
     def image_from_plane(xy: F64) -> F64:
         return np.asarray(camera.img_from_cam(np.concatenate([xy, np.ones((len(xy), 1))], 1)), np.float64)
