@@ -7,6 +7,7 @@ the nearest lens of that kind over the frame, if it is near enough.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -48,12 +49,11 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
     wrong = miscounted(files)
     if wrong is not None:
         raise fault("the COLMAP model can't be read", files[0].parent.name, wrong, WHOLE, AGAIN)
-    model = _model(files[0].parent, files[0].suffix)
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: natural_key(i.name))
+    cameras, images = _model(files[0].parent, files[0].suffix)
     if not images:
         raise fault("the COLMAP model has no registered images", files[1].name, 0, "at least 3",
                     "run the mapper again, or remove the model to have the cameras solved")  # fmt: skip
-    lenses = {k: _lens(c, f"{files[0].name}, camera {k}") for k, c in model.cameras.items()}
+    lenses = {k: _lens(c, f"{files[0].name}, camera {k}") for k, c in cameras.items()}
     views, left_out, warnings = [], [], []
     for index, image in zip(indices_of([i.name for i in images]), images, strict=True):
         photo = find_photo(folder, image.name)
@@ -62,26 +62,38 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             warnings.append(f"the COLMAP model has {printable(image.name)}, which is not in the capture; put the "
                             "photo into images/ or into the folder itself")  # fmt: skip
             continue
-        (K, d, _), camera = lenses[image.camera_id], model.cameras[image.camera_id]
-        pose = np.asarray(image.cam_from_world().matrix(), np.float64)
+        (K, d, _), camera = lenses[image.camera_id], cameras[image.camera_id]
         size = (int(camera.width), int(camera.height))
-        given = given_camera(K, pose, d, f"{files[1].name}, {printable(image.name)}", size)
+        given = given_camera(K, image.pose, d, f"{files[1].name}, {printable(image.name)}", size)
         views.append(Declared(index, photo.name, photo, given, size, f"{image.camera_id}"))
-    warnings += [f"COLMAP camera {k} ({model.cameras[k].model_name}) is replaced by the nearest k1 k2 p1 p2 k3, "
+    warnings += [f"COLMAP camera {k} ({cameras[k].model_name}) is replaced by the nearest k1 k2 p1 p2 k3, "
                  f"{error:.2f} pixels off at most" for k, (_, _, error) in lenses.items() if error > NOTED]  # fmt: skip
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
 
 
-def _model(folder: Path, suffix: str) -> Any:
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """A registered image. pose: (3, 4) cam_from_world."""
+
+    name: str
+    camera_id: int
+    pose: F64
+
+
+def _model(folder: Path, suffix: str) -> tuple[dict[int, Any], list[_Image]]:
+    """COLMAP's cameras by their numbers, and the registered images in natural order. Raises StageError."""
     from pipeline.colmap import pycolmap
 
     model = pycolmap.Reconstruction()
     try:
         (model.read_binary if suffix == ".bin" else model.read_text)(str(folder))
+        images = [_Image(i.name, i.camera_id, np.asarray(i.cam_from_world().matrix(), np.float64))
+                  for i in model.images.values() if i.has_pose]  # fmt: skip
+        cameras = {i.camera_id: model.cameras[i.camera_id] for i in images} | dict(model.cameras.items())
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError, KeyError, TypeError) as e:
         said = printable((str(e).strip().splitlines() or [type(e).__name__])[-1])
         raise fault("the COLMAP model can't be read", folder.name, said, WHOLE, AGAIN) from e
-    return model
+    return cameras, sorted(images, key=lambda i: natural_key(i.name))
 
 
 def _lens(camera: Any, where: str) -> tuple[F64, F64, float]:

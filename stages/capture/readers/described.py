@@ -22,6 +22,7 @@ PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
 LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
 MOST_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
 MOST_DIGITS = 300  # of a number in a file's name that is compared as one
+MOST_STEPS = 100  # of the search: a lens that can be described takes about ten
 GRID = 17  # half the positions along each edge of the frame at which a lens is compared
 
 
@@ -142,7 +143,7 @@ def five_terms(
     p, worst = start, np.inf
     if len(xy) >= 9:
         with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):  # it ran off to infinity
-            p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1)).x
+            p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1), max_nfev=MOST_STEPS).x
             worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max())
     if not worst <= LENS_LIMIT:
         raise fault(

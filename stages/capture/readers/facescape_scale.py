@@ -41,7 +41,7 @@ def metres_from_world(folder: Path) -> F64 | None:
     if not isinstance(found, list) or len(found) < 2:
         raise fault("an entry of the scale dictionary is not understood", where, shown(found),
                     "a number, and a 3 x 4 matrix", REMEDY)  # fmt: skip
-    scale, pose = number(found[0], where, REMEDY), checked_pose(table(found[1], where, REMEDY), where)
+    scale, pose = number(found[0], where, REMEDY), checked_pose(numbers(found[1], where, REMEDY), where)
     if not LEAST_SCALE <= scale <= 1 / LEAST_SCALE:
         raise fault("an entry of the scale dictionary has no scale", where, scale,
                     f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)  # fmt: skip

@@ -56,7 +56,8 @@ def find(folder: Path) -> list[Path]:
 def read(folder: Path, files: Sequence[Path]) -> Described:
     """Aligned and enabled cameras with their photos; others are left out and named."""
     chunk = _chunk(files[0])
-    lenses = {s.get("id", ""): s for s in chunk.iter("sensor")}
+    sensors = {s.get("id", ""): s for s in chunk.iter("sensor")}
+    lenses: dict[str, Lens] = {}
     world_from_chunk = _world_from_chunk(chunk, files[0].name)
     cameras = [c for c in chunk.iter("camera") if c.get("label")]
     labels = [c.get("label", "") for c in cameras]
@@ -72,7 +73,10 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
                 f"{files[0].name} names {printable(label)}, which is not in the capture; put the photo beside it"
             )
         else:
-            K, d, size = _lens(lenses.get(camera.get("sensor_id", "")), where)
+            sensor = camera.get("sensor_id", "")
+            if sensor not in lenses:
+                lenses[sensor] = _lens(sensors.get(sensor), where)
+            K, d, size = lenses[sensor]
             chunk_from_cam = checked_pose(words(pose.text, 16, where, REMEDY).reshape(4, 4), where)
             moved = _rigid_part(world_from_chunk, chunk_from_cam)
             given = given_camera(K, inverse_rigid(moved), d, where, size)

@@ -29,6 +29,7 @@ from stages.capture.readers.sizes import picture_size
 from stages.capture.readers.values import fault, flag, label, number, pixels, printable, table
 
 NAMES = ("transforms.json", "transforms_train.json")
+Lenses = dict[object, tuple[F64, F64]]  # stand-ins of other models by all their figures: most frames share one
 REMEDY = "copy the file again, or remove it to have the cameras solved from the photos"
 
 
@@ -43,6 +44,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
     frames = data["frames"]
     names = [label(f.get("file_path", ""), f"{files[0].name}, frame {i}, file_path") for i, f in enumerate(frames)]
     views, left_out, warnings = [], [], []
+    bent: Lenses = {}
     for index, name, frame in zip(indices_of(names), names, frames, strict=True):
         photo = find_photo(folder, name) if name else None
         if photo is None:
@@ -53,7 +55,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
         where = f"{files[0].name}, {printable(name)}"
         size = _size(data | frame, photo, where)
         mask = find_photo(folder, label(frame["mask_path"], where)) if frame.get("mask_path") else None
-        camera = _camera(data | frame, size, where)
+        camera = _camera(data | frame, size, where, bent)
         views.append(Declared(index, photo.name, photo, camera, size, mask=mask))
     absent = tuple(note.split(":")[0] for note in left_out)
     return Described(tuple(views), tuple(left_out), absent, tuple(warnings))
@@ -75,7 +77,7 @@ def _size(values: Mapping[str, Any], photo: Path, where: str) -> tuple[int, int]
     return pixels(w, f"{where}, w"), pixels(h, f"{where}, h")
 
 
-def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str) -> GivenCamera:
+def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, bent: Lenses) -> GivenCamera:
     width, height = size
     if "transform_matrix" not in values:
         raise fault("a frame has no pose", where, "no transform_matrix", "a 4 x 4 matrix", "write the pose, or take "
@@ -90,12 +92,27 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str) -> Giv
     model = label(values.get("camera_model", ""), f"{where}, camera_model")
     checked_lens(K, d, size, where)
     checked_lens(K, np.array([*higher[:2], 0, 0, higher[2]]), size, where)
-    if flag(values.get("is_fisheye", False), f"{where}, is_fisheye") or model == "OPENCV_FISHEYE":
-        radial = np.array([d[0], d[1], d[4], higher[0]])
-        K, d, _ = five_terms(lambda xy: _fisheye(xy, radial) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
-    elif np.any(higher) and model != "OPENCV":  # k4 is 0 in OPENCV, and some writers leave a stray value there
-        K, d, _ = five_terms(lambda xy: _rational(xy, d, higher) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
+    fisheye = flag(values.get("is_fisheye", False), f"{where}, is_fisheye") or model == "OPENCV_FISHEYE"
+    rational = bool(np.any(higher)) and model != "OPENCV"  # k4 is 0 in OPENCV, and some writers leave a stray value
+    if fisheye or rational:
+        key = (fisheye, size, *K.ravel(), *d, *higher)
+        if key not in bent:
+            bent[key] = _stand_in(fisheye, K, d, higher, size, where)
+        K, d = bent[key]
     return given_camera(K, inverse_rigid(world_from_cam), d, where, size)
+
+
+def _stand_in(
+    fisheye: bool, K: F64, d: F64, higher: F64, size: tuple[int, int], where: str
+) -> tuple[F64, F64]:  # fmt: skip
+    """K and k1 k2 p1 p2 k3 nearest to a fisheye or a rational lens. Raises StageError if none is near enough."""
+    radial = np.array([d[0], d[1], d[4], higher[0]])
+
+    def image_from_plane(xy: F64) -> F64:
+        return (_fisheye(xy, radial) if fisheye else _rational(xy, d, higher)) @ K[:2, :2].T + K[:2, 2]
+
+    found, five, _ = five_terms(image_from_plane, K, size[0], size[1], where)
+    return found, five
 
 
 def _fisheye(xy: F64, k: F64) -> F64:
