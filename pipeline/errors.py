@@ -10,6 +10,8 @@ import errno
 import os
 from pathlib import Path
 
+MOST_LETTERS = 1000  # of one line of a message
+
 
 class NeufaceError(Exception):
     """Base of every error that is reported without a traceback."""
@@ -30,11 +32,17 @@ class StageError(NeufaceError):
 
     def __init__(self, what: str, *, where: object, value: object, limit: object, remedy: str) -> None:
         self.what, self.where, self.value, self.limit, self.remedy = what, where, value, limit, remedy
-        super().__init__(f"{what}\n  where: {where}\n  found: {value}\n  limit: {limit}\n  what to do: {remedy}")
+        place, found = (_cut(str(x)) for x in (where, value))
+        super().__init__(f"{what}\n  where: {place}\n  found: {found}\n  limit: {limit}\n  what to do: {remedy}")
 
     def __reduce__(self) -> tuple[object, ...]:
         fields = {k: str(getattr(self, k)) for k in ("where", "value", "limit", "remedy")}
         return _rebuild, (type(self), self.what, fields)
+
+
+def _cut(text: str) -> str:
+    """What came from a file may have any length."""
+    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS // 2]} ... {text[-MOST_LETTERS // 4 :]}"
 
 
 class UsageError(StageError):

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.artifacts import GivenCamera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, distort
-from stages.capture.readers.values import DIGITS, LONGEST_NAME, fault, printable
+from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fault, printable
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
@@ -108,7 +108,8 @@ def find_photo(folder: Path, written: str) -> Path | None:
     Paths that lead out of the capture are not followed. A name that is longer than any file's is no file.
     """
     plain = written.replace("\\", "/").removeprefix("./")
-    if any(len(part.encode("utf-8", "backslashreplace")) > LONGEST_NAME for part in plain.split("/")):
+    lengths = [len(part.encode("utf-8", "backslashreplace")) for part in plain.split("/")]
+    if max(lengths) > LONGEST_NAME or sum(lengths) > LONGEST_PATH:
         return None
     inside = not PurePosixPath(plain).is_absolute() and ".." not in PurePosixPath(plain).parts
     candidates = [folder / root / plain for root in PHOTO_FOLDERS] if inside else []

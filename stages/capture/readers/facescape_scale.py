@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.transforms import F64, rigid, similarity
 from stages.capture.readers.cameras import checked_pose
 from stages.capture.readers.described import read_json
-from stages.capture.readers.values import fault, number, shown
+from stages.capture.readers.values import fault, number, shown, table
 
 NAME = "Rt_scale_dict.json"
 LEAST_SCALE = 1e-9  # millimetres in a unit of the capture's world, or the other way round
@@ -32,8 +32,8 @@ def metres_from_world(folder: Path) -> F64 | None:
     expression = re.match(r"\d+", folder.name)
     if path is None or expression is None:
         return None
-    table = read_json(path, "FaceScape's scale dictionary can't be read", REMEDY)
-    person = table.get(folder.parent.name, {}) if isinstance(table, dict) else {}
+    dictionary = read_json(path, "FaceScape's scale dictionary can't be read", REMEDY)
+    person = dictionary.get(folder.parent.name, {}) if isinstance(dictionary, dict) else {}
     found = person.get(expression[0]) if isinstance(person, dict) else None
     if found is None:
         return None
@@ -41,7 +41,7 @@ def metres_from_world(folder: Path) -> F64 | None:
     if not isinstance(found, list) or len(found) < 2:
         raise fault("an entry of the scale dictionary is not understood", where, shown(found),
                     "a number, and a 3 x 4 matrix", REMEDY)  # fmt: skip
-    scale, pose = number(found[0], where, REMEDY), checked_pose(numbers(found[1], where, REMEDY), where)
+    scale, pose = number(found[0], where, REMEDY), checked_pose(table(found[1], where, REMEDY), where)
     if not LEAST_SCALE <= scale <= 1 / LEAST_SCALE:
         raise fault("an entry of the scale dictionary has no scale", where, scale,
                     f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)  # fmt: skip

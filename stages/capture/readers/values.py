@@ -19,6 +19,7 @@ LONGEST_EDGE = 1_000_000  # pixels
 MOST_NUMBERS, MOST_LETTERS = 64, 10_000  # of one table, of one text
 DIGITS = 9  # of a view's number
 LONGEST_NAME = 240  # bytes: file systems take 255, and a suffix is tried behind it
+LONGEST_PATH = 1000  # bytes, below the capture's folder
 PLAIN = "write it as a plain JSON number"
 ROWS = "write it as plain JSON numbers in rows of equal length"
 _SHORT = reprlib.Repr()
