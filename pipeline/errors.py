@@ -41,7 +41,8 @@ class StageError(NeufaceError):
 
 
 def _cut(text: str) -> str:
-    """What came from a file may have any length."""
+    """What came from a file may have any length, and letters that can't be written."""
+    text = text.encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS // 2]} ... {text[-MOST_LETTERS // 4 :]}"
 
 

@@ -43,6 +43,7 @@ def test_a_name_too_long(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_messages_have_an_end() -> None:
+    str(StageError("w", where="\ud800", value="\udcff", limit="l", remedy="r")).encode()
     assert len(str(StageError("w", where="x" * 10**6, value="y" * 10**6, limit="l", remedy="r"))) < 3000
 
 

@@ -126,6 +126,7 @@ def test_nonsense_in_text(folders: Folders, kind: str, how: list) -> None:
 
 @given(how=nonsense)
 @halved
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_nonsense_in_an_npz(folders: Folders, how: list) -> None:
     folder, files = folders["idr"]
     arrays: dict[str, object] = dict(np.load(io.BytesIO(files["cameras_sphere.npz"])))

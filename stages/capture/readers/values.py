@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from typing import Any
 
 import numpy as np
 
@@ -53,13 +54,14 @@ def number(value: object, where: str, remedy: str = PLAIN) -> float:
 
 def table(value: object, where: str, remedy: str = ROWS) -> F64:
     """A number, a row of numbers or rows of equal length, of at most MOST_NUMBERS. Raises StageError."""
-    rows = value if isinstance(value, list) else [value]
+    rows: list[Any] = value if isinstance(value, list) else [value]
     nested = bool(rows) and all(isinstance(r, list) for r in rows)
+    width = len(rows[0]) if nested else 1
     flat = [x for r in rows[:MOST_NUMBERS] for x in r[:MOST_NUMBERS]] if nested else rows[: MOST_NUMBERS + 1]
-    even = not nested or len({len(r) for r in rows}) == 1
+    even = not nested or all(len(r) == width for r in rows)
     if not even or any(isinstance(x, bool) or not isinstance(x, int | float) for x in flat):
         raise fault("a camera parameter is not a table of numbers", where, shown(value), "numbers only", remedy)
-    if len(rows) * (len(rows[0]) if nested else 1) > MOST_NUMBERS:
+    if len(rows) * width > MOST_NUMBERS:
         raise fault("a camera parameter has the wrong shape", where, f"more than {MOST_NUMBERS} numbers",
                     f"at most {MOST_NUMBERS} numbers", remedy)  # fmt: skip
     for x in flat:
