@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 class StageConfig(BaseModel):
     """Base of every stage's settings. All of it is in the key: what can't change the result does not belong here."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
     def setting_names(cls) -> tuple[str, ...]:

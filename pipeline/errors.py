@@ -7,7 +7,10 @@ Programming errors stay ordinary Python exceptions; only what a user can meet an
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
+
+MOST_LETTERS = 1000  # of one line of a message
 
 
 class NeufaceError(Exception):
@@ -29,11 +32,18 @@ class StageError(NeufaceError):
 
     def __init__(self, what: str, *, where: object, value: object, limit: object, remedy: str) -> None:
         self.what, self.where, self.value, self.limit, self.remedy = what, where, value, limit, remedy
-        super().__init__(f"{what}\n  where: {where}\n  found: {value}\n  limit: {limit}\n  what to do: {remedy}")
+        place, found = (_cut(str(x)) for x in (where, value))
+        super().__init__(f"{what}\n  where: {place}\n  found: {found}\n  limit: {limit}\n  what to do: {remedy}")
 
     def __reduce__(self) -> tuple[object, ...]:
         fields = {k: str(getattr(self, k)) for k in ("where", "value", "limit", "remedy")}
         return _rebuild, (type(self), self.what, fields)
+
+
+def _cut(text: str) -> str:
+    """What came from a file may have any length, and letters that can't be written."""
+    text = text.encode("utf-8", "backslashreplace").decode()
+    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS // 2]} ... {text[-MOST_LETTERS // 4 :]}"
 
 
 class UsageError(StageError):
@@ -72,16 +82,56 @@ _DISK_REMEDIES = {
 }
 
 
-def stage_error_from_os_error(error: OSError, where: Path | str) -> DiskError | None:
+_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of a copy, the target is at fault
+
+
+def stage_error_from_os_error(error: OSError, where: Path | str) -> StageError | None:
     """The user's message for a disk fault, or None when it is not one that a user can mend."""
+    if error.errno == errno.ENAMETOOLONG:
+        return _name_too_long(os.fsdecode(error.filename or where))
+    closed = _unreadable(error)
+    if closed is not None:
+        return _can_not_be_read(closed)
     found = _DISK_REMEDIES.get(error.errno or 0)
     if found is None:
         return None
     what, remedy = found
     return DiskError(
         what,
-        where=error.filename or where,
+        where=(error.errno in _WRITING and error.filename2) or error.filename or where,
         value=error.strerror or error,
         limit="a writable folder with enough free space",
         remedy=remedy,
+    )
+
+
+def _unreadable(error: OSError) -> Path | None:
+    """The file or folder that this user may not read, if that is the fault; None if it is one of writing."""
+    if error.errno not in (errno.EACCES, errno.EPERM) or not isinstance(error.filename, str | bytes | Path):
+        return None
+    path = Path(os.fsdecode(error.filename))
+    for place, right in ((path.parent, os.X_OK), (path, os.R_OK | (os.X_OK if os.path.isdir(path) else 0))):  # noqa: PTH112
+        if os.path.exists(place) and not os.access(place, right):  # noqa: PTH110  (a Path's own raises here)
+            return place
+    return None
+
+
+def _can_not_be_read(place: Path) -> StageError:
+    return StageError(
+        "this user may not read a file or folder",
+        where=place,
+        value="permission denied",
+        limit="read permission (of a folder: read and search)",
+        remedy=f"give it with: chmod u+rX '{place}', as its owner; or copy the photos to a folder of your own",
+    )
+
+
+def _name_too_long(path: str) -> StageError:
+    name = max(path.split("/"), key=len)
+    return StageError(
+        "a file's name is too long for the file system",
+        where=f"{name[:60]}...",
+        value=f"{len(os.fsencode(name))} bytes in a name, {len(os.fsencode(path))} in the whole path",
+        limit="255 bytes in a name, 4096 in a path",
+        remedy="use shorter names, or folders that are nested less deeply",
     )

@@ -20,6 +20,9 @@ SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal map
 ROWS_TEXELS = 1 << 20  # converted at once
 WRITERS = 8  # threads that compress an EXR, at most; its bytes do not depend on them
 MAX_BYTES = 1 << 32  # that many pixels of RGBA in 32-bit floats, uncompressed
+SMALL, DENSEST = 1 << 22, 10_000  # pixels; per byte: a white PNG of one bit a pixel has 8,000
+KINDS = (np.uint8, np.uint16, np.float32, np.float64)
+MARKS = (b"\x89PNG", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"RIFF", b"#?")  # RIFF: WebP is 16383 wide
 MAX_PIXELS = 1 << 28  # the largest map, larger than any camera's frame: beyond it a file is a mistake or a bomb
 
 
@@ -40,7 +43,15 @@ def read_encoded(path: Path) -> npt.NDArray[Any]:
         raise _too_large(path, f"{image.shape[1]} x {image.shape[0]}")
     if image.ndim == 2:
         image = image[..., None]
-    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(image.shape[2])
+    if order is None or image.dtype not in KINDS:
+        raise StageError(
+            "the image's pixels are of a kind that is not read",
+            where=path.name,
+            value=f"{image.shape[2]} channels of {image.dtype}",
+            limit="1, 3 or 4 channels of 8 or 16 bits without sign, or of floats",
+            remedy="export the image again as 8- or 16-bit RGB",
+        )
     return np.ascontiguousarray(image[..., order])
 
 
@@ -52,6 +63,14 @@ def refuse_bombs(path: Path, size: int) -> None:
         declared = declared_size_of(path)
         if declared is not None and abs(declared[0] * declared[1]) > MAX_PIXELS:
             raise _too_large(path, f"{declared[0]} x {declared[1]}")
+        if declared is not None and declared[0] * declared[1] > max(SMALL, DENSEST * size):
+            raise StageError(
+                "the image declares more pixels than its file can hold",
+                where=path.name,
+                value=f"{declared[0]} x {declared[1]} in {size} bytes",
+                limit=f"{DENSEST} pixels in a byte",
+                remedy="copy the file again from the camera, or take it out of the folder",
+            )
 
 
 def _too_large(path: Path, value: str) -> StageError:
@@ -67,10 +86,16 @@ def _too_large(path: Path, value: str) -> StageError:
 def _decoded(path: Path) -> npt.NDArray[Any] | None:
     """(H, W) or (H, W, C) in OpenCV's order, or None. Its wheel is built without OpenEXR: those are read here."""
     if path.suffix.lower() != ".exr":
-        return cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+        data = np.fromfile(path, np.uint8)
+        if not bytes(data[:4]).startswith(MARKS):  # OpenCV knows more formats, whose sizes nobody checked
+            return None
+        try:
+            return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            return None
     try:
         planes, names = read_exr(path)
-    except (RuntimeError, OSError, ValueError):  # what OpenEXR raises for damaged files
+    except (RuntimeError, OSError, ValueError, TypeError, KeyError, MemoryError):  # what OpenEXR raises when damaged
         return None
     colour = [n for n in "BGRA" if n in names]
     wanted = colour if len(colour) >= 3 else list(names[:1])

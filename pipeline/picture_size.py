@@ -6,6 +6,7 @@ them is trusted beyond the bytes that are there. Sources: PNG (ISO 15948), JPEG 
 
 from __future__ import annotations
 
+import re
 import struct
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -14,10 +15,11 @@ Data = bytes | mmap
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others in that range are tables
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_MAX_TAGS, _HEAD = 1000, 65_536
 
 
 def declared_size(data: Data) -> tuple[int, int] | None:
-    """(width, height) as the header of a PNG, JPEG, TIFF or EXR file has it; None if there is none to be found."""
+    """(width, height) as the header of a PNG, JPEG, TIFF, EXR or Radiance file has it; None if none is found."""
     try:
         if data[:8] == b"\x89PNG\r\n\x1a\n":
             return struct.unpack_from(">II", data, 16)
@@ -25,8 +27,12 @@ def declared_size(data: Data) -> tuple[int, int] | None:
             return _jpeg(data)
         if data[:4] in (b"II*\0", b"MM\0*"):
             return _tiff(data, "<" if data[:1] == b"I" else ">")
+        if data[:4] in (b"II+\0", b"MM\0+"):
+            return _big_tiff(data, "<" if data[:1] == b"I" else ">")
         if data[:4] == b"\x76\x2f\x31\x01":
             return _exr(data)
+        if data[:2] == b"#?":
+            return _radiance(data)
     except (struct.error, ValueError, IndexError):  # the header ends before it should: the decoder will say so
         return None
     return None
@@ -67,6 +73,25 @@ def _tiff(data: Data, order: str) -> tuple[int, int] | None:
             form = {3: "H", 4: "I"}[kind] if kind in (3, 4) else "I"
             (found[tag],) = struct.unpack_from(f"{order}{form}", data, first + 10 + 12 * entry)
     return (found[_TIFF_WIDTH], found[_TIFF_HEIGHT]) if len(found) == 2 else None
+
+
+def _big_tiff(data: Data, order: str) -> tuple[int, int] | None:
+    """TIFF with offsets of eight bytes."""
+    (first,) = struct.unpack_from(f"{order}Q", data, 8)
+    (count,) = struct.unpack_from(f"{order}Q", data, first)
+    found = {}
+    for entry in range(min(count, _MAX_TAGS)):
+        tag, kind = struct.unpack_from(f"{order}HH", data, first + 8 + 20 * entry)
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT):
+            form = {3: "H", 4: "I"}.get(kind, "Q")
+            (found[tag],) = struct.unpack_from(f"{order}{form}", data, first + 20 + 20 * entry)
+    return (found[_TIFF_WIDTH], found[_TIFF_HEIGHT]) if len(found) == 2 else None
+
+
+def _radiance(data: Data) -> tuple[int, int] | None:
+    """Lines of text up to an empty one, then the size."""
+    size = re.search(rb"\n\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n", data[:_HEAD])
+    return (int(size[2]), int(size[1])) if size else None
 
 
 def _exr(data: Data) -> tuple[int, int] | None:

@@ -10,6 +10,7 @@ one, so that a process killed at any moment leaves nothing that could be taken f
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import logging
@@ -19,7 +20,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -30,6 +31,9 @@ log = logging.getLogger(__name__)
 A = TypeVar("A", bound=Artifact)
 LINEAGE = ".lineage"
 MANIFEST, RUN = "manifest.json", "run.json"
+MOST_BYTES = 1 << 28  # of a manifest: beyond it the file is something else
+MOST_SECONDS = 1e9
+LONGEST_PATH = 250  # bytes: the stages write names of a few dozen
 
 
 class Store:
@@ -54,7 +58,7 @@ class Store:
         if not folder.is_dir():
             return None
         try:
-            artifact = kind.model_validate_json((folder / MANIFEST).read_bytes())
+            artifact = self.manifest(stage, key, kind)
         except (OSError, ValidationError) as e:
             self._discard(folder, f"manifest unreadable: {e}")
             return None
@@ -67,11 +71,21 @@ class Store:
             os.utime(folder)
         return Located(artifact, folder)
 
+    def manifest(self, stage: str, key: str, kind: type[A]) -> A:
+        """What the manifest says; its files are not looked at. Raises OSError or ValidationError."""
+        path = self.folder(stage, key) / MANIFEST
+        if path.stat().st_size > MOST_BYTES:
+            raise OSError(errno.EFBIG, f"more than {MOST_BYTES} bytes")
+        return kind.model_validate_json(path.read_bytes())
+
     def load_run(self, stage: str, key: str) -> dict[str, object]:
-        """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is not there."""
-        path = self.folder(stage, key) / RUN
-        found: dict[str, object] = json.loads(path.read_text()) if path.is_file() else {}
-        return found
+        """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is not there, or damaged."""
+        found = _json(self.folder(stage, key) / RUN)
+        seconds = found.get("seconds", 0.0)
+        if isinstance(seconds, int | float) and 0 <= seconds < MOST_SECONDS:
+            return found
+        log.warning("%s/%s: run.json is damaged; the times of this stage are not known", stage, key)
+        return {}
 
     def _discard(self, folder: Path, fault: str) -> None:
         log.warning("stored artifact %s/%s is damaged (%s); it is made anew", folder.parent.name, folder.name, fault)
@@ -145,11 +159,17 @@ class Store:
 
 def lineage(path: Path) -> dict[str, list[str]]:
     """What a key was made from; empty where it is not known."""
+    found = _json(path)
+    return {k: v for k, v in found.items() if isinstance(v, list) and all(isinstance(x, str) for x in v)}
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file; empty where there is none."""
     try:
-        found: dict[str, list[str]] = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        found = json.loads(path.read_bytes()) if path.stat().st_size <= MOST_BYTES else {}
+    except (OSError, ValueError, RecursionError):
         return {}
-    return found
+    return found if isinstance(found, dict) else {}
 
 
 def file_refs(model: BaseModel) -> Iterator[FileRef]:
@@ -174,8 +194,8 @@ def _refs_in(value: object) -> Iterator[FileRef]:
 
 def _fault(folder: Path, ref: FileRef) -> str | None:
     path = folder / ref.path
-    if not path.is_file():
-        return f"{ref.path} is missing"
+    if len(os.fsencode(ref.path)) > LONGEST_PATH or not path.is_file():
+        return f"{ref.path[:200]} is missing"
     size = path.stat().st_size
     if size != ref.size:
         return f"{ref.path} has {size} bytes, not {ref.size}"

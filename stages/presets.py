@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import reprlib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -51,6 +52,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 DEFAULT_PRESET = "draft"
+MOST_BYTES = 1_000_000  # of a settings file
 
 
 def configs_for(
@@ -133,7 +135,7 @@ def _checked(stage: Stage[Any, Any, Any], values: Mapping[str, Any]) -> StageCon
         raise UsageError(
             "a setting is outside its limits",
             where=key,
-            value=repr(first["input"]),
+            value=reprlib.repr(first["input"]),
             limit=first["msg"],
             remedy=f"change {key}{about}",
         ) from e
@@ -173,7 +175,7 @@ def _value(text: str) -> Any:
     if text == "null" or text[:1] in ("[", "{"):
         try:
             return json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             return text
     return text
 
@@ -186,15 +188,20 @@ def read_config_file(path: Path) -> dict[str, dict[str, Any]]:
     """
     kinds = {".toml": tomllib.loads, ".json": json.loads}
     try:
+        if path.stat().st_size > MOST_BYTES:
+            raise ValueError(f"more than {MOST_BYTES // 1000} kB")
         read: Any = kinds[path.suffix.lower()](path.read_text(encoding="utf-8"))
     except KeyError:
         fault = f"a {path.suffix or 'nameless'} file"
+    except RecursionError:
+        fault = "tables too deep in each other"
     except (OSError, ValueError) as e:
-        fault = str(e)
+        fault = str(e)[:200]
     else:
-        if isinstance(read, dict):
+        stray = [k for k, v in read.items() if not isinstance(v, dict)] if isinstance(read, dict) else []
+        if isinstance(read, dict) and not stray:
             return read
-        fault = f"a {type(read).__name__} at the top"
+        fault = f"{reprlib.repr(stray[0])} outside of any table" if stray else f"a {type(read).__name__} at the top"
     raise UsageError(
         "the settings file can't be read",
         where=f"--config {path}",

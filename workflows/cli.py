@@ -18,7 +18,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from pipeline.errors import NeufaceError, stage_error_from_os_error
+from pipeline.errors import NeufaceError, UsageError, stage_error_from_os_error
 from stages.presets import DEFAULT_PRESET
 from workflows import batch_commands, bench, check, commands, schedule, settings_command, store_commands
 from workflows.console import Console
@@ -133,6 +133,20 @@ def _where(sub: argparse.ArgumentParser) -> None:
     )
 
 
+def _unicode(options: argparse.Namespace) -> None:
+    """Raises UsageError where a path or a text is not UTF-8: no manifest, USD file or page could name it."""
+    for option, value in vars(options).items():
+        for text in value if isinstance(value, list) else [value]:
+            if isinstance(text, str) and text != text.encode("utf-8", "replace").decode():
+                raise UsageError(
+                    "a name is not UTF-8",
+                    where=f"--{option}" if option in ("out", "store", "name", "set", "config") else option,
+                    value=ascii(text),
+                    limit="text and paths in UTF-8",
+                    remedy="rename the file or folder, or write the text in UTF-8",
+                )
+
+
 class _at_least:  # noqa: N801  (used like a function)
     """An integer with a lower limit, as argparse wants it."""
 
@@ -152,6 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
     console = Console()
     try:
+        _unicode(options)
         with as_exceptions():
             code: int = options.run(options, console)
     except Interrupted as e:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
@@ -202,9 +202,18 @@ def preview(plan: Plan) -> list[Step]:
             continue
         k = key(stage, inputs_from(stage, finished), plan.configs[stage.name])
         manifest = plan.store.folder(stage.name, k) / MANIFEST
-        if stage.name in plan.anew or not manifest.is_file():
+        found = _stored(plan.store, stage, k) if stage.name not in plan.anew else None
+        if found is None:
             steps.append(Step(stage.name, k, "made anew" if manifest.is_file() else "made"))
             continue
-        finished[stage.name] = Located(stage.output.model_validate_json(manifest.read_bytes()), manifest.parent)
+        finished[stage.name] = found
         steps.append(Step(stage.name, k, "reused"))
     return steps
+
+
+def _stored(store: Store, stage: Stage[Any, Any, Any], k: str) -> Located[Artifact] | None:
+    """What the store has of a key; None if it has nothing, or its manifest is damaged."""
+    try:
+        return Located(store.manifest(stage.name, k, stage.output), store.folder(stage.name, k))
+    except (OSError, ValidationError):
+        return None

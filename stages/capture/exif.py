@@ -22,9 +22,37 @@ EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE = 0x829A, 0x829D, 0x8827, 0xA403
 WHITE_BALANCES: dict[tuple[float, ...], str] = {(0,): "auto", (1,): "manual"}
 EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
+FOCAL = (0.05, 100.0)  # of the longest edge: what is beyond is no lens, but damaged metadata
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8)}
 _MAX_TAGS, _MAX_VALUES = 1000, 1_000_000
+_WANTED = {
+    MAKE,
+    MODEL,
+    ORIENTATION,
+    EXIF_IFD,
+    FOCAL_MM,
+    FOCAL_35MM,
+    PIXEL_X,
+    LENS,
+    PLANE_X_RESOLUTION,
+    PLANE_UNIT,
+    GPS_IFD,
+    LAT_REF,
+    LAT,
+    LON_REF,
+    LON,
+    ALT_REF,
+    ALT,
+    EXPOSURE_S,
+    F_NUMBER,
+    ISO,
+    WHITE_BALANCE,
+    273,
+    279,
+    324,
+    325,
+}  # fmt: skip  (the last four: where a TIFF's strips and tiles lie)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +75,14 @@ class Exif:
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Focal length in pixels of an image of width x height, or None."""
+        found = None
         if self.focal_35mm:
-            return self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
-        if self.focal_mm and self.pixels_per_mm and self.recorded_width:
+            found = self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+        elif self.focal_mm and self.pixels_per_mm and self.recorded_width:
             # the resolution is that of the frame as recorded; a copy scaled down since has fewer pixels a millimetre
-            return self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_width
-        return None
+            found = self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_width
+        low, high = FOCAL
+        return found if found is not None and low <= found / max(width, height) <= high else None
 
 
 def read_exif(data: bytes) -> Exif:
@@ -170,7 +200,7 @@ def _ifd(block: bytes, offset: int) -> Tags:
             break
         tag, kind, count = struct.unpack_from(order + "HHI", block, entry)
         code, size = _TYPES.get(kind, ("", 0))
-        if not size or count > _MAX_VALUES:
+        if not size or count > _MAX_VALUES or tag in tags or tag not in _WANTED:
             continue
         at = entry + 8 if size * count <= 4 else struct.unpack_from(order + "I", block, entry + 8)[0]
         if at + size * count <= len(block):
@@ -181,7 +211,7 @@ def _ifd(block: bytes, offset: int) -> Tags:
 def _values(block: bytes, order: str, code: str, at: int, count: int) -> tuple[float, ...] | str:
     if code == "s":
         return block[at : at + count].split(b"\0")[0].decode("latin-1").strip()
-    raw = struct.unpack_from(order + code * count, block, at)
+    raw = struct.unpack_from(f"{order}{count * len(code)}{code[0]}", block, at)
     if len(code) == 1:
         return raw
     return tuple(n / d if d else math.nan for n, d in zip(raw[::2], raw[1::2], strict=True))

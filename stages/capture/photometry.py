@@ -18,6 +18,7 @@ CLIPPED = 0.99  # of an integer file's largest value: JPEG leaves clipped areas 
 PLATEAU = 64  # pixels of a float file that share its largest value exactly: that is where the sensor ended
 EVEN = 1.02  # exposures that differ by less are equal: cameras round what they write
 MIDDLE = 0.5
+FARTHEST = 1e4  # times the middle exposure, 13 stops: beyond it the metadata are damaged
 
 Bool = npt.NDArray[np.bool_]
 
@@ -48,5 +49,7 @@ def exposures(written: Sequence[float | None], light: Sequence[float]) -> list[f
     if len(known) < len(written) or not known or max(known) <= EVEN * min(known):
         return None
     found = np.array(known) / float(np.quantile(known, MIDDLE, method="nearest"))
+    if not 1 / FARTHEST <= found.min() <= found.max() <= FARTHEST:
+        return None
     b = np.log(np.maximum(light, 1e-6))
     return [float(e) for e in found] if np.std(b - np.log(found)) < np.std(b) else None

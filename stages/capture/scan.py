@@ -16,9 +16,11 @@ from pipeline.transforms import rows
 from stages.capture.readers import describe, find_reader
 from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key
 from stages.capture.readers.facescape_scale import metres_from_world
+from stages.capture.readers.values import printable
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp")
+FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp",
+                    ".jxl", ".jp2", ".jfif", ".rw2", ".orf", ".pef", ".srw")  # fmt: skip
 MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
 MIN_PHOTOS = 3  # two views leave depth along their common line open, and nothing to check it against
 
@@ -77,6 +79,8 @@ def _source(
     masks: Sequence[Path],
     plates: Sequence[Path],
 ) -> CaptureSource:
+    for path in (*photos, *cameras, *masks, *plates):
+        _can_be_written(path)
     refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
     world = metres_from_world(folder) if kind == "facescape" else None
     return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
@@ -89,8 +93,20 @@ def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
     is that photo's original, and needs no word."""
     read = {(p.parent, p.stem) for p in photos}
     beside = sorted({f for p in {q.parent for q in photos} for f in p.iterdir()}, key=lambda f: natural_key(f.name))
-    return tuple(f.name for f in beside if f.suffix.lower() in FOREIGN_SUFFIXES and not f.name.startswith(".")
-                 and (f.parent, f.stem) not in read)  # fmt: skip
+    foreign = (f for f in beside if f.suffix.lower() in FOREIGN_SUFFIXES and not f.name.startswith("."))
+    return tuple(printable(f.name) for f in foreign if (f.parent, f.stem) not in read)
+
+
+def _can_be_written(path: Path) -> None:
+    """Raises StageError where a file's name is not UTF-8: no manifest could hold it."""
+    if path.name != path.name.encode("utf-8", "replace").decode():
+        raise StageError(
+            "a file's name is not UTF-8",
+            where=ascii(path.name),
+            value="bytes that are no letters",
+            limit="names in UTF-8",
+            remedy="rename the file; letters, digits, _ and - are safe everywhere",
+        )
 
 
 def _film(path: Path) -> Located[CaptureSource]:

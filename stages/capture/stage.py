@@ -77,7 +77,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     masked = sum(v.mask is not None for v in views)
     findings = (*judge(seen, [n for n in found.absent if n not in described], source.artifact.passed_over),
                 *given_masks(masked, useless))  # fmt: skip
-    warnings = found.warnings + made.foreign_colours(candidates, photos) + made.partly_masked(views)
+    warnings = found.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
+    warnings += made.partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world,
                    left_out=tuple(found.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path, PurePath
 
 from pipeline.artifacts import CaptureSource, CaptureView, ColourChart, FileRef, Located
@@ -12,6 +13,8 @@ from stages.capture.exif import metres_from
 from stages.capture.gather import Gathered, gather_mask, gather_photo
 from stages.capture.photometry import exposures
 from stages.capture.profile import is_srgb
+
+NAMED = 20  # files in one note
 
 
 def photo_of(
@@ -122,6 +125,15 @@ def foreign_colours(candidates: list[Candidate], photos: list[Gathered]) -> list
             named.setdefault(photo.profile, []).append(candidate.name)
     return [f"{len(names)} photos have the colour profile {profile!r}, such as {names[0]}; their colours are taken as "
             "sRGB: export them as sRGB for true ones" for profile, names in sorted(named.items())]  # fmt: skip
+
+
+def not_read(names: Sequence[str]) -> list[str]:
+    """A note on pictures in the folder whose format is not read."""
+    if not names:
+        return []
+    some = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    return [f"{len(names)} pictures are not used, because their format is not read: {some}; convert them to JPEG, PNG, "
+            "TIFF or EXR, or move them out of the folder"]  # fmt: skip
 
 
 def partly_masked(views: list[CaptureView]) -> list[str]:

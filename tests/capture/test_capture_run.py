@@ -303,7 +303,7 @@ def mirrored(params: dict) -> dict:
     (lambda p: {"2_K": [1, 2, 3]}, "2_K", "shape"),
     (lambda p: {"2_K": [[1, 2], [3]]}, "2_K", "numbers"),
     (lambda p: {"2_K": "abc"}, "2_K", "numbers"),
-    (lambda p: {"2_K": None}, "2_K", "not finite"),
+    (lambda p: {"2_K": None}, "2_K", "numbers"),
     (mirrored, "2_Rt", "left-handed"),
     (lambda p: {"2_Rt": (np.array(p["2_Rt"]) * 1.01).tolist()}, "2_Rt", "no rotation"),
     (lambda p: {"2_Rt": np.array(p["2_Rt"])[:, :3].tolist()}, "2_Rt", "shape"),

@@ -1,10 +1,11 @@
-"""What a description of cameras says, whatever its format; and the checks that all formats share."""
+"""What a description of cameras says, whatever its format; its files, its photos, and lenses of other models."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
@@ -13,13 +14,15 @@ import numpy as np
 
 from pipeline.artifacts import GivenCamera
 from pipeline.errors import StageError
-from pipeline.transforms import F64, distort, rigid, rows
+from pipeline.transforms import F64, distort
+from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fault, printable
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
-ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
 LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
 MOST_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
+MOST_DIGITS = 300  # of a number in a file's name that is compared as one
+MOST_STEPS = 100  # of the search: a lens that can be described takes about ten
 GRID = 17  # half the positions along each edge of the frame at which a lens is compared
 
 
@@ -42,7 +45,7 @@ def read_json(path: Path, what: str, remedy: str) -> Any:
     try:
         return json.loads(description(path))
     except (ValueError, RecursionError) as e:
-        raise fault(what, path.name, str(e)[:200], "a JSON object", remedy) from e
+        raise fault(what, path.name, printable(str(e)), "a JSON object", remedy) from e
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,13 +91,13 @@ class Reader(Protocol):
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts 2.jpg before 10.jpg."""
     parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(p), p) if p.isdecimal() else (1, 0, p.lower()) for p in parts)
+    return tuple((0, int(p), p) if p.isdecimal() and len(p) < MOST_DIGITS else (1, 0, p.lower()) for p in parts)
 
 
 def indices_of(names: Sequence[str]) -> list[int]:
     """View numbers: the files' stems if all are different numbers, else the order."""
     stems = [PurePosixPath(n).stem for n in names]
-    if all(s.isdecimal() and len(s) < 10 for s in stems) and len({int(s) for s in stems}) == len(stems):
+    if all(s.isdecimal() and len(s) <= DIGITS for s in stems) and len({int(s) for s in stems}) == len(stems):
         return [int(s) for s in stems]
     return list(range(len(stems)))
 
@@ -102,9 +105,12 @@ def indices_of(names: Sequence[str]) -> list[int]:
 def find_photo(folder: Path, written: str) -> Path | None:
     """The file that a description means: as written, without its suffix, or by its name in one of the usual folders.
 
-    Paths that lead out of the capture are not followed.
+    Paths that lead out of the capture are not followed. A name that is longer than any file's is no file.
     """
     plain = written.replace("\\", "/").removeprefix("./")
+    lengths = [len(part.encode("utf-8", "backslashreplace")) for part in plain.split("/")]
+    if max(lengths) > LONGEST_NAME or sum(lengths) > LONGEST_PATH:
+        return None
     inside = not PurePosixPath(plain).is_absolute() and ".." not in PurePosixPath(plain).parts
     candidates = [folder / root / plain for root in PHOTO_FOLDERS] if inside else []
     candidates += [folder / root / PurePosixPath(plain).name for root in PHOTO_FOLDERS]
@@ -116,88 +122,6 @@ def find_photo(folder: Path, written: str) -> Path | None:
             if with_suffix.is_file():
                 return with_suffix
     return None
-
-
-def given_camera(K: F64, cam_from_world: F64, distortion: F64, where: str) -> GivenCamera:
-    """A camera, checked. K (3, 3): the first pixel's centre at (0.5, 0.5). Pose (3, 4) or (4, 4). k1 k2 p1 p2 k3."""
-    K, pose = checked_K(K, where), checked_pose(cam_from_world, where)
-    return GivenCamera(K=rows(K), cam_from_world=rows(pose), distortion=tuple(float(x) for x in distortion))
-
-
-def checked_K(K: F64, where: str) -> F64:
-    """K itself. Raises StageError if it is not finite, not 3 x 3, singular or not upper triangular."""
-    if K.shape != (3, 3):
-        raise fault("camera matrix has the wrong shape", where, f"shape {K.shape}", "3 x 3", "write K as three rows")
-    finite(K, where)
-    scale = max(float(np.abs(K).max()), 1e-300)
-    if abs(float(np.linalg.det(K / scale))) * scale**2 < 1e-9 or min(K[0, 0], K[1, 1]) <= 0:
-        raise fault(
-            "camera matrix K is singular",
-            where,
-            f"fx = {K[0, 0]:g}, fy = {K[1, 1]:g}, determinant {float(np.linalg.det(K)):.3g}",
-            "fx and fy above 0",
-            "write the focal lengths in pixels",
-        )
-    if np.abs(K[2] - [0, 0, 1]).max() > 1e-6 or abs(K[1, 0]) > 1e-6 * K[0, 0]:
-        raise fault(
-            "camera matrix K is not upper triangular",
-            where,
-            K.tolist(),
-            "rows (fx, s, cx), (0, fy, cy), (0, 0, 1)",
-            "check that the matrix is not transposed",
-        )
-    return K
-
-
-def checked_pose(m: F64, where: str) -> F64:
-    """4x4 cam_from_world, its rotation made exact. Raises StageError if it is none, or left-handed."""
-    if m.shape not in ((3, 4), (4, 4)) or (m.shape == (4, 4) and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-6):
-        raise fault(
-            "camera pose has the wrong shape",
-            where,
-            f"shape {m.shape}",
-            "3 x 4: rotation, then translation",
-            "write the pose as three rows of four",
-        )
-    finite(m, where)
-    R = m[:3, :3]
-    error = float(np.abs(R @ R.T - np.eye(3)).max())
-    if error > ORTHONORMAL_LIMIT:
-        raise fault(
-            "camera pose has no rotation matrix",
-            where,
-            f"|R R^T - 1| = {error:.3g}",
-            f"at most {ORTHONORMAL_LIMIT:g}",
-            "write a pure rotation, without scale or shear",
-        )
-    if np.linalg.det(R) < 0:
-        raise fault(
-            "camera pose is left-handed",
-            where,
-            "det R = -1 (mirrored)",
-            "det R = +1",
-            "use right-handed axes; flip one axis where the pose is written",
-        )
-    u, _, vt = np.linalg.svd(R)
-    return rigid(u @ vt, m[:3, 3])
-
-
-def finite(values: F64, where: str) -> F64:
-    """The values themselves. Raises StageError if any is NaN or infinite."""
-    if not np.isfinite(values).all():
-        raise fault(
-            "a camera parameter is not finite",
-            where,
-            values.tolist(),
-            "finite numbers only (no NaN, no Infinity)",
-            "write it again from the calibration, or take the view out",
-        )
-    return values
-
-
-def fault(what: str, where: str, value: object, limit: object, remedy: str) -> StageError:
-    """The user's message."""
-    return StageError(what, where=where, value=value, limit=limit, remedy=remedy)
 
 
 def five_terms(
@@ -217,9 +141,12 @@ def five_terms(
     def error(p: F64) -> F64:
         return np.asarray((distort(xy, p[4:]) * p[:2] + p[2:4] - uv).ravel(), np.float64)
 
-    p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1)).x if len(xy) >= 9 else start
-    worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max()) if len(xy) >= 9 else np.inf
-    if worst > LENS_LIMIT:
+    p, worst = start, np.inf
+    if len(xy) >= 9:
+        with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):  # it ran off to infinity
+            p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1), max_nfev=MOST_STEPS).x
+            worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max())
+    if not worst <= LENS_LIMIT:
         raise fault(
             "the lens can't be described by k1 k2 p1 p2 k3",
             where,
@@ -237,6 +164,7 @@ def _over_the_frame(image_from_plane: Callable[[F64], F64], K: F64, width: int, 
     reach = np.array([max(K[0, 2], width - K[0, 2]) / K[0, 0], max(K[1, 2], height - K[1, 2]) / K[1, 1]])
     side = np.linspace(-1, 1, 2 * GRID)
     xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2) * reach * 1.5
-    uv = image_from_plane(xy)
+    with np.errstate(all="ignore"):
+        uv = image_from_plane(xy)
     inside = np.isfinite(uv).all(1) & (uv > -1).all(1) & (uv < np.array([width, height]) + 1).all(1)
     return xy[inside], uv[inside]

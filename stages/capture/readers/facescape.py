@@ -17,16 +17,15 @@ import numpy as np
 from pipeline.artifacts import GivenCamera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, corner_K_from_centre_K
+from stages.capture.readers.cameras import checked_frame, checked_K, checked_lens, given_camera
 from stages.capture.readers.described import (
     PHOTO_SUFFIXES,
     Declared,
     Described,
-    checked_K,
-    fault,
-    given_camera,
     natural_key,
     read_json,
 )
+from stages.capture.readers.values import DIGITS, fault, flag, label, pixels, table, view_number
 
 PARAMS = "params.json"
 _KEY = re.compile(r"(\d+)_(K|Rt|distortion|width|height|valid|ori|sn|matches)")
@@ -56,7 +55,8 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             warnings.append(f"params.json names view {index}, but its photo is missing")
         else:
             camera, size = given_view(params, index)
-            views.append(Declared(index, photo.name, photo, camera, size, str(params.get(f"{index}_sn", ""))))
+            serial = label(params.get(f"{index}_sn", ""), _where(f"{index}_sn"))
+            views.append(Declared(index, photo.name, photo, camera, size, serial))
     return Described(tuple(views), tuple(left_out), tuple(absent), tuple(warnings))
 
 
@@ -65,7 +65,7 @@ def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
     named: dict[int, Path] = {}
     for photo in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
         usable = photo.suffix.lower() in PHOTO_SUFFIXES and not photo.name.startswith(".") and photo.is_file()
-        if not usable or not photo.stem.isdecimal() or int(photo.stem) not in indices:
+        if not usable or not photo.stem.isdecimal() or len(photo.stem) > DIGITS or int(photo.stem) not in indices:
             continue
         index = int(photo.stem)
         if index in named:
@@ -98,12 +98,12 @@ def read_params(path: Path) -> dict[str, Any]:
 
 def view_indices(params: Mapping[str, Any]) -> list[int]:
     """Indices of all views that params.json speaks of, ascending."""
-    return sorted({int(m[1]) for m in map(_KEY.fullmatch, params) if m})
+    return sorted({view_number(m[1], PARAMS) for m in map(_KEY.fullmatch, params) if m})
 
 
 def is_valid(params: Mapping[str, Any], index: int) -> bool:
-    """`{i}_valid`; a view without it is taken as valid."""
-    return bool(params.get(f"{index}_valid", True))
+    """`{i}_valid`; a view without it is taken as valid. Raises StageError if it is neither true nor false."""
+    return flag(params.get(f"{index}_valid", True), _where(f"{index}_valid"))
 
 
 def given_view(params: Mapping[str, Any], index: int) -> tuple[GivenCamera, tuple[int, int]]:
@@ -125,28 +125,17 @@ def given_view(params: Mapping[str, Any], index: int) -> tuple[GivenCamera, tupl
             "list five numbers; zeros for a lens without distortion",
         )
     d = np.concatenate([d, np.zeros(5 - d.size)])
-    camera = given_camera(corner_K_from_centre_K(K), pose, d, _where(f"{index}_Rt"))
-    return camera, (_pixels(params, f"{index}_width"), _pixels(params, f"{index}_height"))
+    width, height = (pixels(_said(params, k), _where(k)) for k in (f"{index}_width", f"{index}_height"))
+    K = checked_frame(corner_K_from_centre_K(K), (width, height), _where(f"{index}_K"))
+    camera = given_camera(K, pose, checked_lens(K, d, (width, height), _where(key)), _where(f"{index}_Rt"))
+    return camera, (width, height)
 
 
 def _where(key: str) -> str:
     return f"params.json, key {key}"
 
 
-def _pixels(params: Mapping[str, Any], key: str) -> int:
-    value = _numbers(params, key)
-    if value.ndim != 0 or value != np.round(value) or value < 1:
-        raise fault(
-            "image size is not a whole number of pixels",
-            _where(key),
-            params[key],
-            "a whole number above 0",
-            "write the photo's size in pixels",
-        )
-    return int(value)
-
-
-def _numbers(params: Mapping[str, Any], key: str) -> F64:
+def _said(params: Mapping[str, Any], key: str) -> Any:
     if key not in params:
         raise fault(
             "a camera parameter is missing",
@@ -155,22 +144,9 @@ def _numbers(params: Mapping[str, Any], key: str) -> F64:
             "every valid view has K, Rt, distortion, width and height",
             f"add {key}, or set {key.split('_')[0]}_valid to false",
         )
-    try:
-        found = np.array(params[key], np.float64)
-    except (TypeError, ValueError) as e:
-        raise fault(
-            "a camera parameter is not a table of numbers",
-            _where(key),
-            str(params[key])[:80],
-            "numbers only",
-            "write it as plain JSON numbers in rows of equal length",
-        ) from e
-    if not np.isfinite(found).all():
-        raise fault(
-            "a camera parameter is not finite",
-            _where(key),
-            params[key],
-            "finite numbers only (no NaN, no Infinity)",
-            f"write it again from the calibration, or set {key.split('_')[0]}_valid to false",
-        )
-    return found
+    return params[key]
+
+
+def _numbers(params: Mapping[str, Any], key: str) -> F64:
+    remedy = f"write it again from the calibration, or set {key.split('_')[0]}_valid to false"
+    return table(_said(params, key), _where(key), remedy)

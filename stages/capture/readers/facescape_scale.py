@@ -14,9 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.transforms import F64, rigid, similarity
-from stages.capture.readers.described import checked_pose, fault, read_json
+from stages.capture.readers.cameras import checked_pose
+from stages.capture.readers.described import read_json
+from stages.capture.readers.values import fault, number, shown, table
 
 NAME = "Rt_scale_dict.json"
+LEAST_SCALE = 1e-9  # millimetres in a unit of the capture's world, or the other way round
 REMEDY = "copy the file again, or take it out of the tree to have the unit recognised"
 
 
@@ -29,20 +32,19 @@ def metres_from_world(folder: Path) -> F64 | None:
     expression = re.match(r"\d+", folder.name)
     if path is None or expression is None:
         return None
-    table = read_json(path, "FaceScape's scale dictionary can't be read", REMEDY)
-    person = table.get(folder.parent.name, {}) if isinstance(table, dict) else {}
+    dictionary = read_json(path, "FaceScape's scale dictionary can't be read", REMEDY)
+    person = dictionary.get(folder.parent.name, {}) if isinstance(dictionary, dict) else {}
     found = person.get(expression[0]) if isinstance(person, dict) else None
     if found is None:
         return None
     where = f"{NAME}, {folder.parent.name}, {expression[0]}"
-    try:
-        scale, pose = float(found[0]), np.array(found[1], np.float64)
-    except (TypeError, ValueError, IndexError, KeyError) as e:
-        raise fault("an entry of the scale dictionary is not understood", where, str(found)[:80],
-                    "a number, and a 3 x 4 matrix", REMEDY) from e  # fmt: skip
-    if not (np.isfinite(scale) and scale > 0):
-        raise fault("an entry of the scale dictionary has no scale", where, scale, "above 0", REMEDY)
-    pose = checked_pose(pose, where)
+    if not isinstance(found, list) or len(found) < 2:
+        raise fault("an entry of the scale dictionary is not understood", where, shown(found),
+                    "a number, and a 3 x 4 matrix", REMEDY)  # fmt: skip
+    scale, pose = number(found[0], where, REMEDY), checked_pose(table(found[1], where, REMEDY), where)
+    if not LEAST_SCALE <= scale <= 1 / LEAST_SCALE:
+        raise fault("an entry of the scale dictionary has no scale", where, scale,
+                    f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)  # fmt: skip
     return (
         similarity(1e-3, np.eye(3), np.zeros(3))
         @ rigid(pose[:3, :3], pose[:3, 3])

@@ -12,17 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.picture_size import declared_size_of
 from pipeline.transforms import F64, corner_K_from_centre_K
+from stages.capture.readers.cameras import given_camera
 from stages.capture.readers.described import (
     PHOTO_SUFFIXES,
     Declared,
     Described,
-    fault,
-    finite,
-    given_camera,
     indices_of,
     natural_key,
 )
+from stages.capture.readers.npz import arrays_of
+from stages.capture.readers.values import DIGITS, fault, finite
 
 NAMES = ("cameras_sphere.npz", "cameras.npz")
 PHOTOS, MASKS = ("image", "images", "rgb"), ("mask", "masks")
@@ -49,7 +50,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             continue
         where = f"{files[0].name}, world_mat_{place}"
         K, pose = camera_of_projection(finite(matrices[place], where)[:3, :4], where)
-        camera = given_camera(corner_K_from_centre_K(K), pose, np.zeros(5), where)
+        camera = given_camera(corner_K_from_centre_K(K), pose, np.zeros(5), where, declared_size_of(photo))
         mask = masks[place] if len(masks) == len(photos) else None
         views.append(Declared(index, photo.name, photo, camera, None, mask=mask))
     for place in sorted(set(matrices) - set(range(len(photos)))):
@@ -64,7 +65,8 @@ def camera_of_projection(P: F64, where: str) -> tuple[F64, F64]:
     Raises StageError if P has no camera.
     """
     M = P[:, :3]
-    scale = float(np.cbrt(np.linalg.det(M)))
+    with np.errstate(all="ignore"):
+        scale = float(np.cbrt(np.linalg.det(M)))
     if not np.isfinite(P).all() or abs(np.linalg.det(M / max(np.abs(M).max(), 1e-300))) < 1e-12:
         raise fault("a projection matrix has no camera", where, "its left 3 x 3 part is singular",
                     "K [R | t]", REMEDY)  # fmt: skip
@@ -78,12 +80,8 @@ def camera_of_projection(P: F64, where: str) -> tuple[F64, F64]:
 
 
 def _matrices(path: Path) -> dict[int, F64]:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            found = {int(m[1]): np.array(data[k], np.float64)
-                     for k in data.files if (m := re.fullmatch(r"world_mat_(\d+)", k))}  # fmt: skip
-    except (ValueError, OSError, KeyError, EOFError) as e:
-        raise fault("the cameras' file can't be read", path.name, str(e)[:200], "an npz of arrays", REMEDY) from e
+    wanted = re.compile(rf"world_mat_(\d{{1,{DIGITS}}})")
+    found = {int(m[1]): array for name, array in arrays_of(path, wanted, REMEDY) if (m := wanted.fullmatch(name))}
     if not found or any(m.shape not in ((3, 4), (4, 4)) for m in found.values()):
         raise fault("the cameras' file holds no cameras", path.name, f"{len(found)} arrays world_mat_0, ...",
                     "a 4 x 4 world_mat_i for every photo", REMEDY)  # fmt: skip
@@ -94,5 +92,7 @@ def _pictures(folder: Path, names: Sequence[str]) -> list[Path]:
     root = next((folder / n for n in names if (folder / n).is_dir()), None)
     if root is None:
         return []
-    found = (p for p in root.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith("."))
+    found = (
+        p for p in root.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".") and p.is_file()
+    )
     return sorted(found, key=lambda p: natural_key(p.name))

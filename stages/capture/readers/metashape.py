@@ -17,19 +17,26 @@ from xml.etree import ElementTree
 import numpy as np
 
 from pipeline.transforms import F64, apply, inverse_rigid, rigid, similarity
+from stages.capture.readers.cameras import (
+    checked_frame,
+    checked_K,
+    checked_lens,
+    checked_pose,
+    checked_rotation,
+    given_camera,
+)
 from stages.capture.readers.described import (
     Declared,
     Described,
-    checked_pose,
     description,
-    fault,
     find_photo,
     five_terms,
-    given_camera,
     indices_of,
 )
+from stages.capture.readers.values import fault, pixels, printable, words
 
 HEAD = 4096  # bytes in which the format shows
+LEAST_SCALE = 1e-9  # of the chunk: from its own units to the world's, or the other way round
 REMEDY = "export the cameras again (File > Export > Export Cameras, Agisoft XML), or remove the file"
 Lens = tuple[F64, F64, tuple[int, int]]
 
@@ -37,6 +44,8 @@ Lens = tuple[F64, F64, tuple[int, int]]
 def find(folder: Path) -> list[Path]:
     """The first XML file (by name) that Metashape wrote."""
     for path in sorted(folder.glob("*.xml")):
+        if not path.is_file():
+            continue
         with path.open("rb") as f:
             head = f.read(HEAD)
         if b"<document" in head and b"<chunk" in head:
@@ -47,24 +56,30 @@ def find(folder: Path) -> list[Path]:
 def read(folder: Path, files: Sequence[Path]) -> Described:
     """Aligned and enabled cameras with their photos; others are left out and named."""
     chunk = _chunk(files[0])
-    lenses = {s.get("id", ""): s for s in chunk.iter("sensor")}
+    sensors = {s.get("id", ""): s for s in chunk.iter("sensor")}
+    lenses: dict[str, Lens] = {}
     world_from_chunk = _world_from_chunk(chunk, files[0].name)
     cameras = [c for c in chunk.iter("camera") if c.get("label")]
     labels = [c.get("label", "") for c in cameras]
     views, left_out, warnings = [], [], []
     for index, label, camera in zip(indices_of(labels), labels, cameras, strict=True):
-        photo, where = find_photo(folder, label), f"{files[0].name}, camera {label}"
+        photo, where = find_photo(folder, label), f"{files[0].name}, camera {printable(label)}"
         pose = camera.find("transform")
         if camera.get("enabled", "true") in ("false", "0") or pose is None:
-            left_out.append(f"{label}: {'not aligned' if pose is None else 'disabled'} in {files[0].name}")
+            left_out.append(f"{printable(label)}: {'not aligned' if pose is None else 'disabled'} in {files[0].name}")
         elif photo is None:
-            left_out.append(f"{label}: its photo is missing")
-            warnings.append(f"{files[0].name} names {label}, which is not in the capture; put the photo beside it")
+            left_out.append(f"{printable(label)}: its photo is missing")
+            warnings.append(
+                f"{files[0].name} names {printable(label)}, which is not in the capture; put the photo beside it"
+            )
         else:
-            K, d, size = _lens(lenses.get(camera.get("sensor_id", "")), where)
-            chunk_from_cam = checked_pose(_numbers(pose.text, 16, where).reshape(4, 4), where)
+            sensor = camera.get("sensor_id", "")
+            if sensor not in lenses:
+                lenses[sensor] = _lens(sensors.get(sensor), where)
+            K, d, size = lenses[sensor]
+            chunk_from_cam = checked_pose(words(pose.text, 16, where, REMEDY).reshape(4, 4), where)
             moved = _rigid_part(world_from_chunk, chunk_from_cam)
-            given = given_camera(K, inverse_rigid(moved), d, where)
+            given = given_camera(K, inverse_rigid(moved), d, where, size)
             views.append(Declared(index, photo.name, photo, given, size, f"sensor {camera.get('sensor_id')}"))
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
 
@@ -72,8 +87,8 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 def _chunk(path: Path) -> ElementTree.Element:
     try:
         root = ElementTree.fromstring(description(path))
-    except ElementTree.ParseError as e:
-        raise fault("the cameras' file can't be read", path.name, str(e), "Agisoft XML", REMEDY) from e
+    except (ElementTree.ParseError, ValueError, LookupError) as e:
+        raise fault("the cameras' file can't be read", path.name, printable(str(e)), "Agisoft XML", REMEDY) from e
     chunk = root.find("chunk")
     if chunk is None or next(chunk.iter("camera"), None) is None:
         raise fault("the cameras' file names no cameras", path.name, "no <camera>", "at least 3 cameras", REMEDY)
@@ -87,11 +102,12 @@ def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
         return np.eye(4)
     where = f"{name}, the chunk's transform"
     rotation, translation, scale = (found.findtext(k) for k in ("rotation", "translation", "scale"))
-    R = _numbers(rotation, 9, where).reshape(3, 3) if rotation else np.eye(3)
-    t = _numbers(translation, 3, where) if translation else np.zeros(3)
-    s = float(_numbers(scale, 1, where)[0]) if scale else 1.0
-    if s <= 0:
-        raise fault("the chunk has no scale", where, s, "above 0", REMEDY)
+    R = words(rotation, 9, where, REMEDY).reshape(3, 3) if rotation else np.eye(3)
+    t = words(translation, 3, where, REMEDY) if translation else np.zeros(3)
+    s = float(words(scale, 1, where, REMEDY)[0]) if scale else 1.0
+    if not LEAST_SCALE <= s <= 1 / LEAST_SCALE:
+        raise fault("the chunk has no scale", where, s, f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)
+    checked_rotation(R, where)
     return similarity(s, R, t)
 
 
@@ -114,16 +130,17 @@ def _lens(sensor: ElementTree.Element | None, where: str) -> Lens:
     resolution = c.find("resolution")
     if resolution is None:
         raise fault("a calibration has no size", where, "no <resolution>", "width and height", REMEDY)
-    width, height = int(resolution.get("width", 0)), int(resolution.get("height", 0))
+    width, height = (_pixels(resolution.get(k, ""), f"{where}, {k}") for k in ("width", "height"))
 
     def value(name: str) -> float:
         text = c.findtext(name)
-        return float(_numbers(text, 1, f"{where}, {name}")[0]) if text else 0.0
+        return float(words(text, 1, f"{where}, {name}", REMEDY)[0]) if text else 0.0
 
     f, skew = value("f"), value("b2")
     K = np.array([[f + value("b1"), skew, width / 2 + value("cx")], [0, f, height / 2 + value("cy")], [0, 0, 1.0]])
     radial, p = np.array([value(f"k{i}") for i in (1, 2, 3, 4)]), (value("p1"), value("p2"))
-    d = np.array([radial[0], radial[1], p[1], p[0], radial[2]])
+    K = checked_frame(checked_K(K, where), (width, height), where)
+    d = checked_lens(K, np.array([radial[0], radial[1], p[1], p[0], radial[2]]), (width, height), where)
     if radial[3] == 0:
         return K, d, (width, height)
 
@@ -138,11 +155,5 @@ def _lens(sensor: ElementTree.Element | None, where: str) -> Lens:
     return K5, d5, (width, height)
 
 
-def _numbers(text: str | None, count: int, where: str) -> F64:
-    try:
-        found = np.array((text or "").split(), np.float64)
-    except ValueError as e:
-        raise fault("a camera parameter is not a table of numbers", where, (text or "")[:80], "numbers", REMEDY) from e
-    if found.size != count:
-        raise fault("a camera parameter has the wrong length", where, found.size, f"{count} numbers", REMEDY)
-    return found
+def _pixels(text: str, where: str) -> int:
+    return pixels(float(words(text, 1, where, REMEDY)[0]), where, REMEDY)

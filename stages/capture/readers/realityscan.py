@@ -15,19 +15,18 @@ from xml.etree import ElementTree
 import numpy as np
 
 from pipeline.transforms import F64
+from stages.capture.readers.cameras import checked_frame, checked_lens, given_camera
 from stages.capture.readers.described import (
     PHOTO_SUFFIXES,
     Declared,
     Described,
     description,
-    fault,
-    finite,
     five_terms,
-    given_camera,
     indices_of,
     natural_key,
 )
 from stages.capture.readers.sizes import picture_size
+from stages.capture.readers.values import fault, label, printable, words
 
 SPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 MARK = b"capturingreality.com/ns/xcr"
@@ -43,7 +42,9 @@ def find(folder: Path) -> list[Path]:
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
     """Photos that have a sidecar; the others are left out, because their place is not known."""
-    photos = [p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".")]
+    photos = [
+        p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".") and p.is_file()
+    ]
     by_stem = {p.stem: p for p in sorted(photos)}
     views, left_out, warnings = [], [], []
     for index, sidecar in zip(indices_of([f.name for f in files]), files, strict=True):
@@ -54,7 +55,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             continue
         size = picture_size(photo)
         K, pose, d = _camera(_fields(sidecar), size, sidecar.name)
-        views.append(Declared(index, photo.name, photo, given_camera(K, pose, d, sidecar.name), size))
+        views.append(Declared(index, photo.name, photo, given_camera(K, pose, d, sidecar.name, size), size))
     left_out += [f"{p.name}: it was not registered (no .xmp with a pose)" for _, p in sorted(by_stem.items())]
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
 
@@ -62,8 +63,8 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 def _fields(path: Path) -> dict[str, str]:
     try:
         root = ElementTree.fromstring(description(path))
-    except ElementTree.ParseError as e:
-        raise fault("a camera's file can't be read", path.name, str(e), "XMP of RealityScan", REMEDY) from e
+    except (ElementTree.ParseError, ValueError, LookupError) as e:
+        raise fault("a camera's file can't be read", path.name, printable(str(e)), "XMP of RealityScan", REMEDY) from e
     found: dict[str, str] = {}
     for element in root.iter():
         found |= {k.removeprefix(SPACE): v for k, v in element.attrib.items() if k.startswith(SPACE)}
@@ -81,12 +82,12 @@ def _camera(fields: Mapping[str, str], size: tuple[int, int], where: str) -> tup
     u, v = (float(_numbers(fields, k, 1, where, "0")[0]) for k in ("PrincipalPointU", "PrincipalPointV"))
     K = np.array([[focal, 0, size[0] / 2 + u * edge], [0, focal, size[1] / 2 + v * edge], [0, 0, 1.0]])
     pose = np.concatenate([R, (-R @ centre)[:, None]], 1)
-    model = fields.get("DistortionModel", "perspective").lower()
+    model = label(fields.get("DistortionModel", "perspective"), where, REMEDY).lower()
     if not (model == "perspective" or model.startswith("brown")):
-        raise fault("the lens is of a kind that is not understood", where, model, "perspective or Brown",
+        raise fault("the lens is of a kind that is not understood", where, printable(model), "perspective or Brown",
                     "choose a Brown model in the alignment settings and export again")  # fmt: skip
     k1, k2, k3, k4, t1, t2 = _numbers(fields, "DistortionCoeficients", 6, where, "0 0 0 0 0 0")
-    d = np.array([k1, k2, t1, t2, k3])
+    d = checked_lens(checked_frame(K, size, where), np.array([k1, k2, t1, t2, k3]), size, where)
     if model == "perspective" or k4 == 0:
         return K, pose, d * (model != "perspective")
 
@@ -105,12 +106,4 @@ def _numbers(fields: Mapping[str, str], key: str, count: int, where: str, defaul
     text = fields.get(key, default)
     if text is None:
         raise fault("a camera parameter is missing", f"{where}, xcr:{key}", "not there", "a registered photo", REMEDY)
-    try:
-        found = np.array(text.split(), np.float64)
-    except ValueError as e:
-        raise fault("a camera parameter is not a table of numbers", f"{where}, xcr:{key}", text[:80], "numbers",
-                    REMEDY) from e  # fmt: skip
-    if found.size != count:
-        raise fault("a camera parameter has the wrong length", f"{where}, xcr:{key}", found.size, f"{count} numbers",
-                    REMEDY)  # fmt: skip
-    return finite(found, f"{where}, xcr:{key}")
+    return words(text, count, f"{where}, xcr:{key}", REMEDY)

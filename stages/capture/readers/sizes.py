@@ -13,7 +13,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     Raises StageError if the file is no picture.
     """
     declared = declared_size_of(path)
-    if declared is not None:
+    if declared is not None and min(declared) > 0:
         return declared
     from pipeline.images import read_encoded
 

@@ -16,20 +16,20 @@ import numpy as np
 
 from pipeline.artifacts import GivenCamera
 from pipeline.transforms import F64, OPENCV_CAM_FROM_OPENGL_CAM, inverse_rigid
+from stages.capture.readers.cameras import checked_frame, checked_K, checked_lens, checked_pose, given_camera
 from stages.capture.readers.described import (
     Declared,
     Described,
-    checked_pose,
-    fault,
     find_photo,
     five_terms,
-    given_camera,
     indices_of,
     read_json,
 )
 from stages.capture.readers.sizes import picture_size
+from stages.capture.readers.values import fault, flag, label, number, pixels, printable, table
 
 NAMES = ("transforms.json", "transforms_train.json")
+Lenses = dict[object, tuple[F64, F64]]  # stand-ins of other models by all their figures: most frames share one
 REMEDY = "copy the file again, or remove it to have the cameras solved from the photos"
 
 
@@ -42,18 +42,20 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
     """Frames with their photos; those whose photo is missing are left out and named."""
     data = _object(files[0])
     frames = data["frames"]
-    names = [str(f.get("file_path", "")) for f in frames]
+    names = [label(f.get("file_path", ""), f"{files[0].name}, frame {i}, file_path") for i, f in enumerate(frames)]
     views, left_out, warnings = [], [], []
+    bent: Lenses = {}
     for index, name, frame in zip(indices_of(names), names, frames, strict=True):
         photo = find_photo(folder, name) if name else None
         if photo is None:
-            left_out.append(f"{PurePosixPath(name).name or f'frame {index}'}: its photo is missing")
-            warnings.append(f"{files[0].name} lists {name or '(no file_path)'}, which is not there; put the photo back "
-                            "or take the frame out of the file")  # fmt: skip
+            left_out.append(f"{printable(PurePosixPath(name).name) or f'frame {index}'}: its photo is missing")
+            warnings.append(f"{files[0].name} lists {printable(name) or '(no file_path)'}, which is not there; put the "
+                            "photo back or take the frame out of the file")  # fmt: skip
             continue
-        size = _size(data | frame, photo)
-        mask = find_photo(folder, str(frame["mask_path"])) if frame.get("mask_path") else None
-        camera = _camera(data | frame, size, f"{files[0].name}, {name}")
+        where = f"{files[0].name}, {printable(name)}"
+        size = _size(data | frame, photo, where)
+        mask = find_photo(folder, label(frame["mask_path"], where)) if frame.get("mask_path") else None
+        camera = _camera(data | frame, size, where, bent)
         views.append(Declared(index, photo.name, photo, camera, size, mask=mask))
     absent = tuple(note.split(":")[0] for note in left_out)
     return Described(tuple(views), tuple(left_out), absent, tuple(warnings))
@@ -68,29 +70,49 @@ def _object(path: Path) -> dict[str, Any]:
     return dict(found)
 
 
-def _size(values: Mapping[str, Any], photo: Path) -> tuple[int, int]:
-    w, h = values.get("w"), values.get("h")
-    return (int(w), int(h)) if w and h else picture_size(photo)
+def _size(values: Mapping[str, Any], photo: Path, where: str) -> tuple[int, int]:
+    w, h = (values.get(k) for k in ("w", "h"))
+    if w is None or h is None:
+        return picture_size(photo)
+    return pixels(w, f"{where}, w"), pixels(h, f"{where}, h")
 
 
-def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str) -> GivenCamera:
+def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, bent: Lenses) -> GivenCamera:
     width, height = size
     if "transform_matrix" not in values:
         raise fault("a frame has no pose", where, "no transform_matrix", "a 4 x 4 matrix", "write the pose, or take "
                     "the frame out of the file")  # fmt: skip
-    world_from_cam = checked_pose(_numbers(values, "transform_matrix", where), where) @ OPENCV_CAM_FROM_OPENGL_CAM
+    world_from_cam = checked_pose(_matrix(values, where), where) @ OPENCV_CAM_FROM_OPENGL_CAM
     K = np.array([[_focal(values, size, "x", where), 0, _number(values, "cx", width / 2, where)],
                   [0, _focal(values, size, "y", where), _number(values, "cy", height / 2, where)],
                   [0, 0, 1.0]])  # fmt: skip
+    K = checked_frame(checked_K(K, where), size, where)
     d = np.array([_number(values, k, 0.0, where) for k in ("k1", "k2", "p1", "p2", "k3")])
     higher = np.array([_number(values, k, 0.0, where) for k in ("k4", "k5", "k6")])
-    model = str(values.get("camera_model", ""))
-    if values.get("is_fisheye") or model == "OPENCV_FISHEYE":
-        radial = np.array([d[0], d[1], d[4], higher[0]])
-        K, d, _ = five_terms(lambda xy: _fisheye(xy, radial) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
-    elif np.any(higher) and model != "OPENCV":  # k4 is 0 in OPENCV, and some writers leave a stray value there
-        K, d, _ = five_terms(lambda xy: _rational(xy, d, higher) @ K[:2, :2].T + K[:2, 2], K, width, height, where)
-    return given_camera(K, inverse_rigid(world_from_cam), d, where)
+    model = label(values.get("camera_model", ""), f"{where}, camera_model")
+    checked_lens(K, d, size, where)
+    checked_lens(K, np.array([*higher[:2], 0, 0, higher[2]]), size, where)
+    fisheye = flag(values.get("is_fisheye", False), f"{where}, is_fisheye") or model == "OPENCV_FISHEYE"
+    rational = bool(np.any(higher)) and model != "OPENCV"  # k4 is 0 in OPENCV, and some writers leave a stray value
+    if fisheye or rational:
+        key = (fisheye, size, *K.ravel(), *d, *higher)
+        if key not in bent:
+            bent[key] = _stand_in(fisheye, K, d, higher, size, where)
+        K, d = bent[key]
+    return given_camera(K, inverse_rigid(world_from_cam), d, where, size)
+
+
+def _stand_in(
+    fisheye: bool, K: F64, d: F64, higher: F64, size: tuple[int, int], where: str
+) -> tuple[F64, F64]:  # fmt: skip
+    """K and k1 k2 p1 p2 k3 nearest to a fisheye or a rational lens. Raises StageError if none is near enough."""
+    radial = np.array([d[0], d[1], d[4], higher[0]])
+
+    def image_from_plane(xy: F64) -> F64:
+        return (_fisheye(xy, radial) if fisheye else _rational(xy, d, higher)) @ K[:2, :2].T + K[:2, 2]
+
+    found, five, _ = five_terms(image_from_plane, K, size[0], size[1], where)
+    return found, five
 
 
 def _fisheye(xy: F64, k: F64) -> F64:
@@ -114,27 +136,27 @@ def _rational(xy: F64, d: F64, higher: F64) -> F64:
 def _focal(values: Mapping[str, Any], size: tuple[int, int], axis: str, where: str) -> float:
     """Pixels, from fl_x / fl_y or the angle of view; one for both axes where only one is given."""
     for a in (axis, "x", "y"):
-        if values.get(f"fl_{a}"):
+        if values.get(f"fl_{a}") is not None:
             return _number(values, f"fl_{a}", 0.0, where)
     for a, edge in ((axis, size["xy".index(axis)]), ("x", size[0]), ("y", size[1])):
-        if values.get(f"camera_angle_{a}"):
-            return edge / 2 / float(np.tan(_number(values, f"camera_angle_{a}", 0.0, where) / 2))
+        if values.get(f"camera_angle_{a}") is not None:
+            return edge / 2 / float(np.tan(_angle(values, f"camera_angle_{a}", where) / 2))
     raise fault("a camera has no focal length", where, "neither fl_x nor camera_angle_x", "fl_x in pixels",
                 "write fl_x and fl_y, or remove the file to have the cameras solved")  # fmt: skip
 
 
-def _number(values: Mapping[str, Any], key: str, default: float, where: str) -> float:
-    try:
-        found = float(values.get(key, default))
-    except (TypeError, ValueError) as e:
-        raise fault("a camera parameter is not a number", f"{where}, {key}", str(values[key])[:80], "a number",
-                    "write it as a plain JSON number") from e  # fmt: skip
+def _angle(values: Mapping[str, Any], key: str, where: str) -> float:
+    """An angle of view in radians. Raises StageError where no lens has it."""
+    found = _number(values, key, 0.0, where)
+    if not 0 < found < np.pi:
+        raise fault("an angle of view is not that of a camera", f"{where}, {key}", found, "above 0, below pi (radians)",
+                    "write it in radians, or write fl_x and fl_y in pixels")  # fmt: skip
     return found
 
 
-def _numbers(values: Mapping[str, Any], key: str, where: str) -> F64:
-    try:
-        return np.array(values[key], np.float64)
-    except (TypeError, ValueError) as e:
-        raise fault("a camera parameter is not a table of numbers", f"{where}, {key}", str(values[key])[:80],
-                    "numbers only", "write it as plain JSON numbers in rows of equal length") from e  # fmt: skip
+def _number(values: Mapping[str, Any], key: str, default: float, where: str) -> float:
+    return number(values.get(key, default), f"{where}, {key}")
+
+
+def _matrix(values: Mapping[str, Any], where: str) -> F64:
+    return table(values["transform_matrix"], f"{where}, transform_matrix")

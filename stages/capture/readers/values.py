@@ -1,0 +1,132 @@
+"""Strict reading of single values: the one place where a description's numbers, flags, sizes and names are checked.
+
+Whatever a file holds instead of a value, the answer is a `StageError` that names the place and the remedy. Nothing is
+allocated for a value before it is known to be small.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import StageError
+from pipeline.transforms import F64
+
+MOST = 1e15  # magnitude of any number: far beyond every unit, and its square is still a number
+LONGEST_EDGE = 1_000_000  # pixels
+MOST_NUMBERS, MOST_LETTERS = 64, 10_000  # of one table, of one text
+DIGITS = 9  # of a view's number
+LONGEST_NAME = 240  # bytes: file systems take 255, and a suffix is tried behind it
+LONGEST_PATH = 1000  # bytes, below the capture's folder
+PLAIN = "write it as a plain JSON number"
+ROWS = "write it as plain JSON numbers in rows of equal length"
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlist = 2, 80, 80, 12
+
+
+def fault(what: str, where: str, value: object, limit: object, remedy: str) -> StageError:
+    """The user's message."""
+    return StageError(what, where=where, value=value, limit=limit, remedy=remedy)
+
+
+def shown(value: object) -> str:
+    """A value in a message, however large or deep it is."""
+    return _SHORT.repr(value)[:120]
+
+
+def printable(name: str) -> str:
+    """A name from a file that can be written everywhere: what is no Unicode is escaped, what is long is cut."""
+    clean = name[:MOST_LETTERS].encode("utf-8", "backslashreplace").decode()
+    return clean if len(clean) <= 120 else f"{clean[:80]}...{clean[-20:]}"
+
+
+def number(value: object, where: str, remedy: str = PLAIN) -> float:
+    """A finite number. Raises StageError for text, flags, lists and what is not finite or beyond MOST."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise fault("a camera parameter is not a number", where, shown(value), "a number", remedy)
+    if isinstance(value, int) and abs(value) > MOST:
+        raise _too_large(where, value, remedy)
+    return float(finite(np.array(float(value)), where, remedy))
+
+
+def table(value: object, where: str, remedy: str = ROWS) -> F64:
+    """A number, a row of numbers or rows of equal length, of at most MOST_NUMBERS. Raises StageError."""
+    rows: list[Any] = value if isinstance(value, list) else [value]
+    nested = bool(rows) and all(isinstance(r, list) for r in rows)
+    width = len(rows[0]) if nested else 1
+    flat = [x for r in rows[:MOST_NUMBERS] for x in r[:MOST_NUMBERS]] if nested else rows[: MOST_NUMBERS + 1]
+    even = not nested or all(len(r) == width for r in rows)
+    if not even or any(isinstance(x, bool) or not isinstance(x, int | float) for x in flat):
+        raise fault("a camera parameter is not a table of numbers", where, shown(value), "numbers only", remedy)
+    if len(rows) * width > MOST_NUMBERS:
+        raise fault("a camera parameter has the wrong shape", where, f"more than {MOST_NUMBERS} numbers",
+                    f"at most {MOST_NUMBERS} numbers", remedy)  # fmt: skip
+    for x in flat:
+        if isinstance(x, int) and abs(x) > MOST:
+            raise _too_large(where, x, remedy)
+    return finite(np.array(value, np.float64), where, remedy)
+
+
+def words(text: str | None, count: int, where: str, remedy: str) -> F64:
+    """(count,) numbers that are written with spaces between them. Raises StageError."""
+    text = text or ""
+    try:
+        if len(text) > MOST_LETTERS:
+            raise ValueError
+        found = np.array([float(w) for w in text.split()], np.float64)
+    except ValueError as e:
+        raise fault("a camera parameter is not a table of numbers", where, shown(text), "numbers", remedy) from e
+    if found.size != count:
+        raise fault("a camera parameter has the wrong length", where, found.size, f"{count} numbers", remedy)
+    return finite(found, where, remedy)
+
+
+def finite(values: F64, where: str, remedy: str = "write it again from the calibration, or take the view out") -> F64:
+    """The values themselves. Raises StageError if any is NaN, infinite or beyond MOST."""
+    if not np.isfinite(values).all():
+        raise fault("a camera parameter is not finite", where, shown(values.tolist()),
+                    "finite numbers only (no NaN, no Infinity)", remedy)  # fmt: skip
+    if np.abs(values).max(initial=0.0) > MOST:
+        raise _too_large(where, float(np.abs(values).max()), remedy)
+    return values
+
+
+def pixels(value: object, where: str, remedy: str = "write the photo's size in pixels") -> int:
+    """A width or height. Raises StageError if it is no whole number from 1 to LONGEST_EDGE."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and 1 <= value <= LONGEST_EDGE:
+        whole = math.floor(value)
+        if whole == value:
+            return whole
+    raise fault("image size is not a whole number of pixels", where, shown(value),
+                f"a whole number from 1 to {LONGEST_EDGE}", remedy)  # fmt: skip
+
+
+def flag(value: object, where: str, remedy: str = "write true or false, without quotation marks") -> bool:
+    """A JSON boolean, or 0 or 1. Raises StageError for all else: the text "false" is not false."""
+    if isinstance(value, int) and value in (0, 1):  # a bool is an int
+        return bool(value)
+    raise fault("a flag is neither true nor false", where, shown(value), "true, false, 0 or 1", remedy)
+
+
+def label(value: object, where: str, remedy: str = "write it as text between quotation marks") -> str:
+    """A name: text, or a whole number that stands for one. Raises StageError."""
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MOST:
+        return str(value)
+    if not isinstance(value, str) or len(value) > MOST_LETTERS or "\0" in value:
+        raise fault("a name is not text", where, shown(value), f"text of at most {MOST_LETTERS} letters", remedy)
+    return value.encode("utf-8", "backslashreplace").decode()  # half a pair of surrogates is no letter
+
+
+def view_number(digits: str, where: str) -> int:
+    """A view's number from its digits. Raises StageError if there are more than DIGITS."""
+    if len(digits) > DIGITS:
+        raise fault("a view's number is too long", where, shown(digits), f"at most {DIGITS} digits",
+                    "number the views from 0")  # fmt: skip
+    return int(digits)
+
+
+def _too_large(where: str, value: float, remedy: str) -> StageError:
+    return fault("a camera parameter is too large", where, shown(value), f"at most {MOST:g}", remedy)
