@@ -59,7 +59,7 @@ class Tally:
         )
         if lost > MANY_LOST:
             out.append(
-                f"{lost:.1%} of the texels have no zero set of the field near them (the flat cut of the neck, or a "
+                f"{lost:.1%} of the texels lie where the fitted surface does not reach (the flat cut of the neck, or a "
                 "mesh that does not belong to this field)"
             )
         if residual > RESIDUAL:

@@ -131,7 +131,7 @@ def hull_start(
     hull = kept(visual_hull(cameras, alphas, lo, hi, cell))
     if not hull.occupied.any():
         raise StageError(
-            "the masks have no common body",
+            "the visual hull of the masks is empty",
             where="inverse_rendering",
             value="an empty visual hull",
             limit="at least one voxel inside every view's silhouette",

@@ -136,5 +136,5 @@ def _warnings(kept: Kept, repairs: Topology | None, handles: int) -> tuple[str, 
             f"{repairs.pinched_vertices} pinched vertices"
         )
     if handles:
-        out.append(f"{handles} handles are wider than surface.handle and were left: charts may be many")
+        out.append(f"handles wider than surface.handle, which were left: {handles}; charts may be many")
     return tuple(out)

@@ -72,7 +72,7 @@ def judge(found: Measured) -> tuple[Finding, ...]:
             "handles_left",
             left,
             LEFT_HANDLES,
-            f"{left} handles are wider than surface.handle and were left",
+            f"handles wider than surface.handle, which were left: {left}",
             "raise surface.handle, or look at the masks: an arm or a strap that touches the head makes one",
         ),
         judged(

@@ -114,7 +114,7 @@ def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
     )
     out = [f"{value:.2%} {what}" for value, limit, what in checks if value > limit]
     if quality.crumbs > MANY_CRUMBS:
-        out.append(f"{quality.crumbs} of {quality.charts} charts are crumbs: the surface is rough")
+        out.append(f"{quality.crumbs} of {quality.charts} charts are fragments: the surface is rough")
     return tuple(out)
 
 
