@@ -25,6 +25,7 @@ from tests.support.mutations import damaged, damages
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (70, 80, 3), np.uint8)
 SUFFIXES = (".png", ".jpg", ".tif", ".exr")
+MEGABYTES = 4000  # 10,000 pixels in each of 17 kB, as colours in floats: what a file of that size may hold
 HEAD = 400  # bytes: half the damage goes to the header
 
 
