@@ -24,7 +24,7 @@ settings = {**SETTINGS, "stereo": False, "steps": 4, "batch": 64}
 run(inputs(folder), Config(**settings), Context(folder, folder))
 load_face(folder / "field.npz")
 print(len(loaded()), *loaded())
-run(inputs(folder), Config(**settings, shading="phong"), Context(folder, folder))
+run(inputs(folder), Config(**{**settings, "shading": "phong"}), Context(folder, folder))
 print(len(loaded()))
 """
 
