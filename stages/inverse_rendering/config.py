@@ -200,6 +200,8 @@ class Config(StageConfig):
             raise ValueError("relief = off is for method fast; the paper's displacement is what its method fits")
         if self.seconds > 0 and self.method != "fast":
             raise ValueError("seconds is for method fast; the paper's schedule counts epochs")
+        if self.method == "fast" and self.appearance != "hash":
+            raise ValueError("appearance = sinusoidal is for method paper; the fast fit moves a hash table")
         return self
 
     @property

@@ -261,8 +261,12 @@ def vote(points: F64, normals: F64, scores: F32, offsets: F64, voters: int) -> t
     """Offset (N,) on which a point and its neighbours that face the same way agree, and the confidence in it, >= 0.
 
     A peak is refined by a parabola. One at either end of the sweep says only that the truth lies beyond: confidence 0.
+    So does a sweep of one or two offsets, which has ends alone: that of photos as coarse as the sweep is deep.
     """
-    distance, near = cKDTree(points).query(points, voters, workers=-1)
+    if len(offsets) < 3:
+        return np.zeros(len(points)), np.zeros(len(points))
+    voters = min(voters, len(points))
+    distance, near = (a.reshape(-1, voters) for a in cKDTree(points).query(points, voters, workers=-1))
     facing = np.clip((normals[near] * normals[:, None]).sum(2), 0, None) ** 2
     weight = facing * np.exp(-((distance / np.maximum(distance[:, -1:], 1e-12)) ** 2))
     score = np.einsum("nk,nkj->nj", weight, scores[near]) / weight.sum(1, keepdims=True)

@@ -184,3 +184,16 @@ def test_normals_of_a_ball() -> None:
     p, n = stereo.surface_points(*[getattr(too_large(0.0), k) for k in ("values", "lo", "cell")])
     assert np.abs(np.linalg.norm(p, axis=1) - RADIUS).max() < 1e-3
     assert ((p / np.linalg.norm(p, axis=1, keepdims=True) * n).sum(1) > 0.999).all()
+
+
+def test_a_sweep_that_has_only_ends_moves_nothing() -> None:
+    """Coarse photos: one offset, two; then fewer points than there are voters."""
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    for count in (1, 2):
+        scores = np.ones((40, count), np.float32)
+        offset, confidence = stereo.vote(points, normals, scores, np.linspace(0.1, 0, count), 8)
+        assert not offset.any() and not confidence.any()
+    peaked = np.array([[0, 1, 0]], np.float32)
+    offset, confidence = stereo.vote(points[:1], normals[:1], peaked, np.array([0.1, 0.0, -0.1]), 8)
+    assert offset == pytest.approx(0.0) and confidence[0] == pytest.approx(1.0)

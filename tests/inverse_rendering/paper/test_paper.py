@@ -334,3 +334,16 @@ def test_without_a_prior_the_grid_starts_as_a_sphere() -> None:
     x = start.lo + start.cell * i
     assert np.allclose(start.values, np.linalg.norm(x, axis=-1) - 0.12, atol=1e-6)
     assert start.lo.max() < -0.2 and start.cell == pytest.approx(0.4 / 48 * 2)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"preset": "paper", "relief": "off"}, "relief = off"),
+        ({"preset": "paper", "seconds": 10.0}, "seconds is for"),
+        ({"appearance": "sinusoidal"}, "for method paper"),
+    ],
+)
+def test_settings_that_only_one_method_knows_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Config(**values)
