@@ -7,12 +7,10 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 from pipeline.artifacts import CaptureSource, FileRef, GivenCamera, Located
-from pipeline.errors import StageError
 from stages.capture.readers import describe
 from stages.capture.readers.described import indices_of
 from stages.capture.suspects import blurred
 
-MIN_PHOTOS = 3  # that differ, where cameras are given
 
 if TYPE_CHECKING:
     from stages.capture.gather import Gathered
@@ -90,11 +88,6 @@ def without_doubles(found: Found, given: bool) -> list[Candidate]:
             found.warnings.append(f"{c.name} is the same file as {other}, with another camera; take one of them out")
         else:
             found.leave_out(c, f"it is the same file as {other}; put the photo there that was meant, or remove it")
-    if given and len(first) < MIN_PHOTOS <= len(kept):
-        raise StageError("the photos are copies of one another", where=", ".join(c.name for c in kept[:3]) + ", ...",
-                         value=f"{len(first)} different files for {len(kept)} cameras",
-                         limit=f"at least {MIN_PHOTOS} different photos",
-                         remedy="copy the photos again, each under its own name")  # fmt: skip
     return kept
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import shutil
 import struct
 import zipfile
 from collections.abc import Callable
@@ -91,14 +90,6 @@ def test_a_camera_at_the_end_of_the_world(facescape, gather) -> None:
     far[2, 3] = 1e12
     rewrite(folder, params, **{"3_Rt": far.tolist()})
     assert "too far away" in refused(gather, folder).what
-
-
-def test_one_photo_copied_under_all_names(facescape, gather) -> None:
-    folder, _ = facescape
-    for i in range(1, 6):
-        shutil.copy(folder / "0.jpg", folder / f"{i}.jpg")
-    error = refused(gather, folder)
-    assert "copies of one another" in error.what and "1 different files for 6 cameras" in error.value
 
 
 # ------------------------------------------------------------------ transforms.json
