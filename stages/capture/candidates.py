@@ -11,7 +11,6 @@ from stages.capture.readers import describe
 from stages.capture.readers.described import indices_of
 from stages.capture.suspects import blurred
 
-
 if TYPE_CHECKING:
     from stages.capture.gather import Gathered
 
