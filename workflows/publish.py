@@ -16,11 +16,11 @@ from pipeline.errors import stage_error_from_os_error
 from workflows.plan import Plan
 from workflows.published import note_published, published, write_whole
 from workflows.replace import drop, prepare, put, tidy
+from workflows.report_timing import TIMED, with_seconds
 from workflows.store_roots import note_root
 from workflows.verdict import verdict_of_done
 
 Copies = dict[str, Path]  # path below the published folder -> file in the store
-TIMED = ("index.html", "metrics.json")  # of the report: they get the seconds of the run
 
 
 def publish(plan: Plan, done: Iterable[Done[Any]], said: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
@@ -75,15 +75,9 @@ def _fill(name: str, copies: Copies, timing: Mapping[str, float], folder: Path) 
         target = folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         if name == "report" and path in TIMED:
-            target.write_bytes(_with_timing(path, source.read_bytes(), timing))
+            target.write_bytes(with_seconds(path, source.read_bytes(), timing))
         else:
             shutil.copyfile(source, target)
-
-
-def report_hash(folder: Path, path: str, timing: Mapping[str, float]) -> str:
-    """sha256 of a report's file as a run with these seconds published it."""
-    content = (folder / path).read_bytes()
-    return hashlib.sha256(_with_timing(path, content, timing) if path in TIMED else content).hexdigest()
 
 
 def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
@@ -146,12 +140,3 @@ def asset_hash(files: Iterable[FileRef]) -> str:
     """sha256 over the sorted (path, sha256) of the asset's files: equal hashes mean equal bytes."""
     pairs = sorted((f.path, f.sha256) for f in files)
     return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
-
-
-def _with_timing(path: str, content: bytes, timing: Mapping[str, float]) -> bytes:
-    """The report with the seconds of this run: manifests are the same on every machine, times are not."""
-    if path == "metrics.json":
-        return json.dumps({**json.loads(content), "timing": dict(timing)}, indent=1).encode()
-    from stages.report.page import with_timing
-
-    return with_timing(content.decode(), timing).encode()

@@ -15,6 +15,7 @@ from typing import Any
 
 from pipeline.artifacts import sha256_of
 from pipeline.store import MANIFEST, write_synced
+from workflows.report_timing import report_hash
 
 LIST = ".published.json"
 FOLDERS = ("asset", "report")
@@ -104,8 +105,6 @@ def _published_of(stage: str, folder: Path, timing: Mapping[str, float]) -> Iter
         inside = f"{top}/" if top else ""
         yield from ((f"asset/{f['path'].removeprefix(inside)}", f["sha256"]) for f in files)
     if stage == "report":
-        from workflows.publish import report_hash
-
         for f in files:
             if (folder / f["path"]).is_file():
                 yield f"report/{f['path']}", report_hash(folder, f["path"], timing)

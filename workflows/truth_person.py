@@ -29,7 +29,7 @@ import numpy.typing as npt
 from pipeline.transforms import apply, corner_K_from_centre_K, inverse_rigid, matrix, rigid, umeyama
 from workflows import truth_geometry as geometry
 from workflows.bench_captures_figures import Figures, Run
-from workflows.truth_capture import Labels, albedo_figures
+from workflows.truth_albedo import Labels, albedo_figures
 from workflows.truth_geometry import F64, SEEN_BY, Camera, Mask
 
 SKIN = 1

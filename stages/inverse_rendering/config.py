@@ -184,7 +184,7 @@ class Config(StageConfig):
         given = dict(data) if isinstance(data, dict) else {}
         filled = {**PRESETS.get(str(given.get("preset", "draft")), {}), **given}
         if filled.get("prior_file"):
-            from stages.inverse_rendering.systems import prior_digest
+            from stages.inverse_rendering.prior_file import prior_digest
 
             filled["prior_digest"] = prior_digest(str(filled["prior_file"]))
         return filled

@@ -37,10 +37,3 @@ def render_any(model: FaceModel, rays: Rays, samples: int) -> tuple[Tensor, Tens
     from stages.inverse_rendering.paper.render import render_all
 
     return render_all(model, rays, samples)
-
-
-def prior_digest(path: str) -> str:
-    """sha256 of a prior's checkpoint, or "" where there is no such file (the loader then says so)."""
-    from pipeline.fields.paper.imface_layout import digest
-
-    return digest(path)

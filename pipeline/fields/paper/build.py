@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from pipeline.fields import build
+from pipeline.fields import makers
 from pipeline.fields.paper.cubemap import CubemapLight
 from pipeline.fields.paper.displaced import DisplacedSdf
 from pipeline.fields.paper.material import FEATURES, DirectIntegral, FeatureIntegral
@@ -43,7 +43,7 @@ def columns(spec: FaceSpec) -> tuple[int, bool]:
 
 def hashed(spec: FaceSpec) -> Spatial:
     """Ours."""
-    return build.hashed(spec, *columns(spec))
+    return makers.hashed(spec, *columns(spec))
 
 
 def sinusoidal(spec: FaceSpec) -> Spatial:
@@ -69,7 +69,7 @@ def cubemap(spec: FaceSpec) -> Light:
 def shading_of(spec: FaceSpec) -> Callable[[FaceSpec, Integral, Light], Shading]:
     """Neural bases where there are any, else one of the others."""
     if spec.shading == "neural":
-        return build.shading if spec.integral == "low_rank" else IntegralShading
+        return makers.shading if spec.integral == "low_rank" else IntegralShading
     return {"phong": PhongShading, "disney": DisneyShading}[spec.shading]
 
 
@@ -95,9 +95,9 @@ def stored_displaced(spec: FaceSpec, arrays: Mapping[str, Tensor], cell: float) 
 
 
 GEOMETRIES: dict[str, Callable[[FaceSpec, Mapping[str, Tensor], float], Geometry]] = {
-    "grid": build.geometry,
+    "grid": makers.geometry,
     "displaced": stored_displaced,
 }
 SPATIALS: dict[str, Callable[[FaceSpec], Spatial]] = {"hash": hashed, "sinusoidal": sinusoidal}
-INTEGRALS: dict[str, Callable[[FaceSpec], Integral]] = {"low_rank": build.basis, "direct": direct, "feature": feature}
-LIGHTS: dict[str, Callable[[FaceSpec], Light]] = {"sh": build.light, "cubemap": cubemap}
+INTEGRALS: dict[str, Callable[[FaceSpec], Integral]] = {"low_rank": makers.basis, "direct": direct, "feature": feature}
+LIGHTS: dict[str, Callable[[FaceSpec], Light]] = {"sh": makers.light, "cubemap": cubemap}
