@@ -63,7 +63,7 @@ MUTATIONS = (
     Mutation("stages/inverse_rendering/paper/trainer.py", "settings.displacement * moved.mean()",
              "settings.eikonal * moved.mean()",
              "tests/inverse_rendering/paper/test_paper.py::test_the_terms_are_eq_20_by_hand"),
-    Mutation("stages/inverse_rendering/views.py", "self.at(i, share / share.mean())", "self.at(i)",
+    Mutation("stages/inverse_rendering/ray_sampling.py", "self.at(i, share / share.mean())", "self.at(i)",
              "tests/inverse_rendering/test_fit.py::test_a_ray_stands_for_as_many_as_it_was_drawn_from"),
     Mutation("pipeline/colour.py", "v <= 0.04045, v / 12.92", "v <= 0.04045, v / 12.0", "tests/core/test_colour.py"),
     # ---------------------------------------------------------------- cameras and poses
@@ -76,7 +76,7 @@ MUTATIONS = (
              "weights = 1.0 + 0 * np.maximum(distance,", "tests/poses/test_poses_normalise.py"),
     Mutation("stages/poses/scale.py", "<= MET * max(", "<= 100 * MET * max(", "tests/poses/test_poses_scale.py"),
     # ---------------------------------------------------------------- masks and hull
-    Mutation("stages/masks/redraw.py", "UNIT * (behind - own)", "UNIT * (own - behind)",
+    Mutation("stages/masks/refine_contour.py", "UNIT * (behind - own)", "UNIT * (own - behind)",
              "tests/masks/test_masks_redraw.py::test_a_contour_that_is_nearly_right_becomes_right"),
     Mutation("stages/masks/face_labels.py", "(out > 0) & (out != EYES)", "(out > 0)",
              "tests/masks/test_masks_faces.py"),
@@ -92,10 +92,12 @@ MUTATIONS = (
     Mutation("pipeline/visibility.py", 'found["primID"] >= 0', 'found["primID"] > 0',
              "tests/bake/test_bake_sight.py::test_distances_to_a_mesh_by_hand"),
     # ---------------------------------------------------------------- USD and report
-    Mutation("stages/usd/light.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
+    Mutation("stages/usd/write/light.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
              "np.pi * (2 * (np.arange(width) + 0.5) / width - 1)", "tests/usd/test_usd_light.py"),
-    Mutation("stages/usd/lobe.py", "REFERENCE_F0 * a + b", "REFERENCE_F0 * a", "tests/usd/test_usd_lobe.py"),
-    Mutation("stages/usd/lamps.py", "np.minimum(image[..., :3], HALF_MAX)", "np.minimum(image[..., :3], 1e3)",
+    Mutation("stages/usd/write/ggx_conversion.py", "REFERENCE_F0 * a + b", "REFERENCE_F0 * a",
+             "tests/usd/test_usd_lobe.py"),
+    Mutation("stages/usd/render/median_cut.py", "np.minimum(image[..., :3], HALF_MAX)",
+             "np.minimum(image[..., :3], 1e3)",
              "tests/usd/test_usd_relight.py::test_infinite_suns_are_bounded"),
     Mutation("stages/report/metrics.py", "-10 * float(np.log10(", "-20 * float(np.log10(",
              "tests/report/test_report_metrics.py"),
@@ -109,11 +111,11 @@ MUTATIONS = (
              "tests/core/test_contract.py::test_a_damaged_artifact_is_found_and_made_anew"),
     Mutation("pipeline/contract.py", '"version": stage.version', '"version": 0',
              "tests/core/test_contract.py::test_key_is_the_digest_of_what_it_names"),
-    Mutation("workflows/store_care.py", "elif (stage, key) not in needed:", "else:",
+    Mutation("workflows/store/gc.py", "elif (stage, key) not in needed:", "else:",
              "tests/workflows/test_store_care.py::test_what_a_published_folder_names_stays_and_the_rest_goes"),
-    Mutation("workflows/schedule.py", "if resource.free == 0:", "if resource.free < -1000:",
+    Mutation("workflows/batch/schedule.py", "if resource.free == 0:", "if resource.free < -1000:",
              "tests/workflows/test_schedule.py"),
-    Mutation("workflows/budget.py", "stage = left - slower * rung.after", "stage = left",
+    Mutation("workflows/run/budget.py", "stage = left - slower * rung.after", "stage = left",
              "tests/workflows/test_budget.py"),
 )  # fmt: skip
 

@@ -12,8 +12,8 @@ import sys
 
 import pipeline.threads  # noqa: F401  (before torch)
 from stages.inverse_rendering.config import Config
-from workflows.ball import WHOLE, ball_trainer
-from workflows.machine import machine, told
+from workflows.run.calibration_scene import WHOLE, ball_trainer
+from workflows.run.host_info import machine, told
 
 SHOWN = 16
 

@@ -21,11 +21,11 @@ import mitsuba as mi
 import numpy as np
 
 from pipeline.images import read_exr, write_exr
-from stages.usd.exported import read_cameras, read_usd_mesh
-from stages.usd.lobe import INV_KAPPA_SCALE, REFERENCE_F0
-from stages.usd.maps import vertex_image
-from stages.usd.render import bilinear
-from stages.usd.shading import ior_from_f0
+from stages.usd.render.exported import read_cameras, read_usd_mesh
+from stages.usd.render.render import bilinear
+from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0
+from stages.usd.write.maps import vertex_image
+from stages.usd.write.shading import ior_from_f0
 
 TOP = 0.16
 

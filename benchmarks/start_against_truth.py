@@ -21,8 +21,8 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts import Located
 from pipeline.store import Store
-from stages.inverse_rendering.gather import read_views
-from stages.inverse_rendering.start import Start, hull_start
+from stages.inverse_rendering.initial_geometry import Start, hull_start
+from stages.inverse_rendering.load_views import read_views
 from stages.inverse_rendering.stereo import start_from_photos, surface_points
 from stages.registry import REGISTRY
 

@@ -10,7 +10,7 @@ import errno
 import os
 from pathlib import Path
 
-MOST_LETTERS = 1000  # of one line of a message
+MAX_LETTERS = 1000  # of one line of a message
 
 
 class NeufaceError(Exception):
@@ -43,7 +43,7 @@ class StageError(NeufaceError):
 def _cut(text: str) -> str:
     """What came from a file may have any length, and letters that can't be written."""
     text = text.encode("utf-8", "backslashreplace").decode()
-    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS // 2]} ... {text[-MOST_LETTERS // 4 :]}"
+    return text if len(text) <= MAX_LETTERS else f"{text[: MAX_LETTERS // 2]} ... {text[-MAX_LETTERS // 4 :]}"
 
 
 class UsageError(StageError):

@@ -17,8 +17,8 @@ from pipeline.artifacts import Camera
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, project
 
-LEAST_COSINE = 0.35  # flatter views smear a pixel over too much surface
-MOST_POINTS = 10_000
+MIN_COSINE = 0.35  # flatter views smear a pixel over too much surface
+MAX_POINTS = 10_000
 
 
 def edges(
@@ -31,12 +31,12 @@ def edges(
     uv, depth = project(K, inverse_rigid(world_from_cam), distortion, points)
     inside = (depth > 0) & (np.nan_to_num(uv, nan=-1) >= 0).all(1) & (np.nan_to_num(uv, nan=np.inf) < size).all(1)
     pixel = depth * block / float(np.sqrt(abs(np.linalg.det(K[:2, :2]))))
-    return np.where(inside & (cosine > LEAST_COSINE), pixel / cosine.clip(min=LEAST_COSINE), np.inf)
+    return np.where(inside & (cosine > MIN_COSINE), pixel / cosine.clip(min=MIN_COSINE), np.inf)
 
 
 def pixel(mesh: Mesh, cameras: Iterable[Camera]) -> float | None:
     """Median over the surface of the edge of the finest pixel that faces it, in the mesh's unit; None if none does."""
-    step = max(1, -(-len(mesh.faces) // MOST_POINTS))
+    step = max(1, -(-len(mesh.faces) // MAX_POINTS))
     faces = mesh.faces[::step]
     area = meshes.area_vectors(mesh.vertices, faces)
     weight = np.linalg.norm(area, axis=1)

@@ -12,11 +12,11 @@ import numpy.typing as npt
 from scipy import ndimage
 
 Bool = npt.NDArray[np.bool_]
-LEAST = 0.3  # of the weight of the chief piece: lighter pieces are dropped
+MIN_WEIGHT = 0.3  # of the weight of the chief piece: lighter pieces are dropped
 SPREAD = 0.25  # of the volume's longest side: the distance from the origin at which a voxel counts an eighth
 
 
-def subject_pieces(inside: Bool, lo: npt.ArrayLike, cell: float, least: float = LEAST) -> Bool:
+def subject_pieces(inside: Bool, lo: npt.ArrayLike, cell: float, least: float = MIN_WEIGHT) -> Bool:
     """(X, Y, Z) the 6-connected pieces of a volume that belong to the subject; an empty volume stays empty.
 
     Args:

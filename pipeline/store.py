@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 A = TypeVar("A", bound=Artifact)
 LINEAGE = ".lineage"
 MANIFEST, RUN = "manifest.json", "run.json"
-MOST_BYTES = 1 << 28  # of a manifest: beyond it the file is something else
-MOST_SECONDS = 1e9
+MAX_BYTES = 1 << 28  # of a manifest: beyond it the file is something else
+MAX_SECONDS = 1e9
 LONGEST_PATH = 250  # bytes: the stages write names of a few dozen
 
 
@@ -74,15 +74,15 @@ class Store:
     def manifest(self, stage: str, key: str, kind: type[A]) -> A:
         """What the manifest says; its files are not looked at. Raises OSError or ValidationError."""
         path = self.folder(stage, key) / MANIFEST
-        if path.stat().st_size > MOST_BYTES:
-            raise OSError(errno.EFBIG, f"more than {MOST_BYTES} bytes")
+        if path.stat().st_size > MAX_BYTES:
+            raise OSError(errno.EFBIG, f"more than {MAX_BYTES} bytes")
         return kind.model_validate_json(path.read_bytes())
 
     def load_run(self, stage: str, key: str) -> dict[str, object]:
         """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is not there, or damaged."""
         found = _json(self.folder(stage, key) / RUN)
         seconds = found.get("seconds", 0.0)
-        if isinstance(seconds, int | float) and 0 <= seconds < MOST_SECONDS:
+        if isinstance(seconds, int | float) and 0 <= seconds < MAX_SECONDS:
             return found
         log.warning("%s/%s: run.json is damaged; the times of this stage are not known", stage, key)
         return {}
@@ -166,7 +166,7 @@ def lineage(path: Path) -> dict[str, list[str]]:
 def _json(path: Path) -> dict[str, Any]:
     """A JSON object from a file; empty where there is none."""
     try:
-        found = json.loads(path.read_bytes()) if path.stat().st_size <= MOST_BYTES else {}
+        found = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES else {}
     except (OSError, ValueError, RecursionError):
         return {}
     return found if isinstance(found, dict) else {}

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.meshes import Charts, Indices, Mesh
 
-FIRST, MOST = 1001, 10
+FIRST, MAX_TILES = 1001, 10
 TOKEN = "<UDIM>"
 
 
@@ -31,7 +31,7 @@ def count(charts: Charts) -> int:
     return int(of_face(charts).max()) + 1
 
 
-def alone(mesh: Mesh, charts: Charts, tile: int) -> tuple[Mesh, Charts]:
+def single_tile(mesh: Mesh, charts: Charts, tile: int) -> tuple[Mesh, Charts]:
     """The faces of one tile, their texture coordinates moved to the unit square. Vertices and uvs keep their rows."""
     mine = of_face(charts) == tile
     if tile == 0 and mine.all():

@@ -85,11 +85,11 @@ def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occl
     """(N,) the cosines towards all views that see each point, summed."""
     total = np.zeros(len(points))
     for view in views:
-        total += sight(view, points, normals, occluder)[0]
+        total += view_cosines(view, points, normals, occluder)[0]
     return total
 
 
-def sight(view: View, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
+def view_cosines(view: View, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
     """(N,) cosine towards the camera where the view sees the point, else 0; (N, 2) where in the photo, in pixels."""
     camera = view.camera
     world_from_cam = matrix(camera.world_from_cam)

@@ -52,7 +52,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 DEFAULT_PRESET = "draft"
-MOST_BYTES = 1_000_000  # of a settings file
+MAX_BYTES = 1_000_000  # of a settings file
 
 
 def configs_for(
@@ -188,8 +188,8 @@ def read_config_file(path: Path) -> dict[str, dict[str, Any]]:
     """
     kinds = {".toml": tomllib.loads, ".json": json.loads}
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ValueError(f"more than {MOST_BYTES // 1000} kB")
+        if path.stat().st_size > MAX_BYTES:
+            raise ValueError(f"more than {MAX_BYTES // 1000} kB")
         read: Any = kinds[path.suffix.lower()](path.read_text(encoding="utf-8"))
     except KeyError:
         fault = f"a {path.suffix or 'nameless'} file"

@@ -14,15 +14,15 @@ from prefect.exceptions import TerminationSignal
 from prefect.states import Completed
 
 from pipeline.errors import Cancelled
-from workflows.access import check_folders
-from workflows.adapter import as_tasks, publish_result, report_batch
-from workflows.batch_request import BatchRequest
-from workflows.complete import complete
-from workflows.forms import takes
-from workflows.interrupt import PARENT, end_with, interruptible
-from workflows.plan import RunRequest, make_plan
-from workflows.session import Session, given, session
-from workflows.verdict import last_lines, level_in, state_name
+from workflows.batch.request import BatchRequest
+from workflows.run.complete import complete
+from workflows.run.interrupt import PARENT, end_with, interruptible
+from workflows.run.plan import RunRequest, make_plan
+from workflows.run.session import Session, given, session
+from workflows.run.verdict import last_lines, level_in, state_name
+from workflows.server.access import check_folders
+from workflows.server.adapter import as_tasks, publish_result, report_batch
+from workflows.server.flow_signature import takes
 
 
 @flow(name="capture-to-asset", flow_run_name="{capture} -> {out}", retries=0, persist_result=False)
@@ -49,20 +49,20 @@ def facescape_batch(**asked: Any) -> Any:
 
     Run it in a pool of its own: it waits for the captures' runs and would hold the slot that they need.
     """
-    from workflows.batch import run_batch
-    from workflows.batch_prefect import Pool
+    from workflows.batch.loop import run_batch
+    from workflows.batch.pool import Pool
 
     request = BatchRequest(**asked)
     with _watched(asked) as watch:
-        summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, said=watch.observer.note)
+        summary = run_batch(request, Pool(request), stopped=watch.stop.is_set, notify=watch.observer.note)
     report_batch(Path(request.out), summary.counts())
     if summary.failed:
         raise RuntimeError(
             f"{summary.failed} of {summary.total} captures have no asset: {request.out}/batch/index.html"
         )
     refused, counts = summary.refused(request.strict), summary.counts()
-    told = f"{refused} of {summary.total} results are not good enough"
-    return Completed(name="Unusable", message=told, data=counts) if refused else counts
+    message = f"{refused} of {summary.total} results are not good enough"
+    return Completed(name="Unusable", message=message, data=counts) if refused else counts
 
 
 @contextmanager

@@ -30,7 +30,7 @@ MIN_PHOTOS = 3  # fewer can agree by chance
 MET = 0.06  # of the face's size in a photo: median residual from which it shows another face, or none
 SOFT = 0.02  # s: the network's own scatter on sharp frontal photos is about 1 % of the face
 ROUNDS = 10
-MOST_PAIRS = 150
+MAX_PAIRS = 150
 SPREAD = 2.8  # of a face's landmarks: its whole size over the median distance from their middle
 WIDE = np.radians(4.0)  # rays of two photos must part by so much to say how far away the face is
 TOP, CHIN = 10, 152  # upper end of the forehead and lower end of the chin, in the middle
@@ -115,7 +115,7 @@ def residuals(cameras: Sequence[Camera], uv: F64, xyz: F64) -> F64:
 def _best_pair(seen: _Sights) -> Bool | None:
     """(N,) photos that agree with the face of the pair of photos that most agree with, the closest of equals."""
     pairs = [p for p in combinations(range(len(seen.cameras)), 2) if _parted(seen, np.array(p))]
-    pairs = pairs[:: -(-len(pairs) // MOST_PAIRS)] if pairs else []
+    pairs = pairs[:: -(-len(pairs) // MAX_PAIRS)] if pairs else []
     few = np.linspace(0, seen.uv.shape[1] - 1, min(seen.uv.shape[1], 32)).astype(int)
     some = _Sights(seen.cameras, seen.uv[:, few], seen.centre, seen.direction[:, few])
     best: tuple[float, Bool] | None = None

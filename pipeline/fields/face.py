@@ -61,13 +61,13 @@ class FaceModel(nn.Module):
         self.shading = system.shading(spec, self.basis, self.light)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
-        self.even = False  # one albedo for all, while the light is found
+        self.uniform_albedo = False  # one albedo for all, while the light is found
         self.register_buffer("beta", torch.tensor(geometry.cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
         albedo, rho, c, inv_kappa = self.spatial(x)
-        if self.even:
+        if self.uniform_albedo:
             albedo = albedo.detach().median(0).values.expand_as(albedo)
         if not self.spec.specular:
             diffuse = self._diffuse(albedo, x, n)

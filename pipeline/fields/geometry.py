@@ -93,7 +93,7 @@ class GridSdf(nn.Module):
         self.steps += 1
         if self.steps <= 2 or self.steps % TYPICAL_EVERY == 0:
             self.typical = self._typical_gradient()
-        eps = max(DAMPING * self.typical, kernels.LEAST_EPS)
+        eps = max(DAMPING * self.typical, kernels.MIN_EPS)
         kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS, eps)
 
     def _typical_gradient(self) -> float:

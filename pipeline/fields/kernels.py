@@ -14,7 +14,7 @@ from torch import Tensor
 from pipeline.maths.sdf import spline_sdf, spline_stencil
 from pipeline.maths.tracing import MAX_STEPS, REFINE_STEPS, sphere_trace
 
-LEAST_EPS = 1e-12  # of the optimiser: distances are in metres, so that gradients can be as small as 1e-8
+MIN_EPS = 1e-12  # of the optimiser: distances are in metres, so that gradients can be as small as 1e-8
 
 nb: Any
 try:
@@ -114,7 +114,7 @@ def adam_on_band(
     step: int,
     lr: float,
     betas: tuple[float, float],
-    eps: float = LEAST_EPS,
+    eps: float = MIN_EPS,
 ) -> None:
     """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
 

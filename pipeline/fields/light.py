@@ -24,7 +24,7 @@ class ShLight(nn.Module):
         """The coefficients."""
         return self.coefficients
 
-    def even_gradient(self, order: int) -> None:
+    def uniform_gradient(self, order: int) -> None:
         """While nothing but the light moves: the same for all colours, and no more of it than skin can show."""
         grad = self.coefficients.grad
         if grad is not None:

@@ -79,7 +79,7 @@ class Light(Part, Protocol):
         """((L + 1)^2, 3) coefficients of the real orthonormal harmonics."""
         ...
 
-    def even_gradient(self, order: int) -> None:
+    def uniform_gradient(self, order: int) -> None:
         """Make the gradient that of a white light of this order."""
         ...
 

@@ -35,7 +35,7 @@ def specular_energy(specular: Tensor) -> Tensor:
 
 
 @full_precision
-def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
+def shininess_prior(inv_kappa: Tensor, typical: float) -> Tensor:
     """ln^2(s / s_0): (N,) -> (N,), s = 1 / kappa. Not in the paper.
 
     Differs: the photos fix only the product of the light's band l and exp(-l (l + 1) s / 2), so that a duller skin
@@ -46,7 +46,7 @@ def shininess_gauge(inv_kappa: Tensor, typical: float) -> Tensor:
 
 
 @full_precision
-def albedo_parsimony(albedo: Tensor) -> Tensor:
+def albedo_sparsity(albedo: Tensor) -> Tensor:
     """|ln a - median of ln a|, mean over channels: (N, 3) in [0, 1] -> (N,). Not in the paper.
 
     Differs: the photos fix only the product a E(n), and on a still head under still light any shading can hide in the

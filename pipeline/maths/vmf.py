@@ -12,7 +12,7 @@ from torch import Tensor
 from pipeline.maths.precision import full_precision
 
 EXTRA_ORDERS = 8  # error below 4e-8 over all s in float64, 1e-6 in float32
-LEAST_ORDER = 10  # lower ones start as high as this: 8 orders above order 1 the start's own error is 1.4e-6
+MIN_ORDER = 10  # lower ones start as high as this: 8 orders above order 1 the start's own error is 1.4e-6
 
 
 @full_precision
@@ -42,7 +42,7 @@ def attenuation_exact(inv_kappa: Tensor, order: int) -> Tensor:
     derivative.
     """
     s = inv_kappa
-    top = max(order, LEAST_ORDER) + EXTRA_ORDERS
+    top = max(order, MIN_ORDER) + EXTRA_ORDERS
     t = s.clamp(max=1e9)  # its square must not overflow; what is beyond is forgotten after one step
     r = 1 / ((top + 1) * s + torch.sqrt(1 + (top + 1) * (top + 2) * t * t * (1 + t / (1 + t))))
     ratios = []

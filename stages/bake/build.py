@@ -19,12 +19,12 @@ from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
-from stages.bake.gutter import HALO, nearest_rows
+from stages.bake.dilate import HALO, nearest_rows
 from stages.bake.lut import basis_lut
+from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.regions import Votes, areas
 from stages.bake.smooth import continued
-from stages.bake.spool import Spool, blank
-from stages.bake.tally import Tally, tally
+from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
 
 log = logging.getLogger("neuface.bake")
@@ -53,7 +53,7 @@ class Baked:
     samples: Samples
     confidence: F32
     lut: F32
-    tally: Tally
+    statistics: Statistics
     votes: Votes | None
     regions: dict[int, float]
 
@@ -105,7 +105,7 @@ class Baker:
             StageError: no chart has area, or the field is not finite on the mesh.
         """
         size, step = self._size, self._step
-        mesh, charts = tiles.alone(*self._whole, number)
+        mesh, charts = tiles.single_tile(*self._whole, number)
 
         def ahead(done: int, total: int, message: str) -> None:
             step(number * total + done, self.tiles * total, message)
@@ -125,7 +125,7 @@ class Baker:
             mesh, charts, self._views, side, lambda done, total: ahead(done, total, "visibility"), self._occluder
         )
         nearest = _nearest(texel, size, self._scratch)
-        found = tally(samples, size)
+        found = statistics_of(samples, size)
         log.info(
             "bake: tile %d, %.1f %% covered, basis residual %.3f",
             tiles.FIRST + number,
@@ -156,7 +156,7 @@ def _detail(
 ) -> detail.Detail:
     count = tiles.count(charts)
     sparse = min(size, _per_tile(SPARSE, count))
-    some = detail.joined([_spread(field, *tiles.alone(mesh, charts, t), sparse) for t in range(count)])
+    some = detail.joined([_spread(field, *tiles.single_tile(mesh, charts, t), sparse) for t in range(count)])
     area = float(meshes.areas(mesh.vertices, mesh.faces).sum())
     texel = float(np.sqrt(area / max(len(some.x), 1))) * sparse / size
     fine = footprint.fine_texel(mesh, charts, size)
@@ -189,13 +189,13 @@ def _bands(
 ) -> tuple[Indices, Samples]:
     corners = raster.texel_corners(charts, size)
     frame = tangents.frames(mesh, charts)
-    spool = Spool(scratch)
+    buffer = MemmapBuffer(scratch)
     for first, last in bands(size):
         step(first, size, "baking")
         hits = raster.rasterise(corners, size, first, last)
         part = sample(field, mesh, frame, hits, known, found)
-        spool.append({"texel": hits.texel} | {f.name: getattr(part, f.name) for f in fields(Samples)})
-    arrays = spool.arrays()
+        buffer.append({"texel": hits.texel} | {f.name: getattr(part, f.name) for f in fields(Samples)})
+    arrays = buffer.arrays()
     return arrays.pop("texel"), Samples(**arrays)
 
 

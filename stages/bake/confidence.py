@@ -20,7 +20,7 @@ import numpy as np
 from pipeline import raster
 from pipeline.meshes import F32, F64, Charts, Mesh
 from pipeline.nearest import filled
-from pipeline.visibility import Occluder, View, picked, sight
+from pipeline.visibility import Occluder, View, picked, view_cosines
 from stages.bake.regions import Poll, Votes
 
 SIZE = 512  # texels: visibility has no finer detail than the photos' geometry, and rays cost
@@ -54,7 +54,7 @@ def sighted(
     total = np.zeros(len(points))
     for i, view in enumerate(views):
         step(i, len(views))
-        cosine, uv = sight(view, points, normals, occluder)
+        cosine, uv = view_cosines(view, points, normals, occluder)
         poll.ask(view, cosine, uv)
         total += unclipped(view, cosine, uv)
     covered = np.zeros(small * small, np.bool_)

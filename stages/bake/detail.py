@@ -36,7 +36,7 @@ WIDTH = 0.004  # metres: what the field itself resolves
 EDGES = 1.5  # mean edges of the mesh: the low band lives on its vertices, so that WIDTH is at least that
 DISAGREEMENT = 0.015  # of albedo
 HALF_WEIGHT = 0.1  # of one sharp photo from straight ahead
-LEAST_LIGHT = 0.1  # of the mean of S over all directions: darker places tell nothing of the albedo
+MIN_LIGHT = 0.1  # of the mean of S over all directions: darker places tell nothing of the albedo
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ def shade(light: F32, normals: F64, ratio: F32) -> F32:
     coefficients = torch.from_numpy(np.asarray(light, np.float32))
     e = sh.irradiance(coefficients, torch.from_numpy(np.ascontiguousarray(normals, np.float32))).numpy()
     # the mean of E over all normals is pi times that of the radiance, c_00 Y_00
-    floor = LEAST_LIGHT * float(light[0].mean()) / np.sqrt(4 * np.pi)
+    floor = MIN_LIGHT * float(light[0].mean()) / np.sqrt(4 * np.pi)
     return np.asarray(np.maximum(e * ratio / np.pi, max(floor, 1e-6)), np.float32)
 
 

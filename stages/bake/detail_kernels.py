@@ -21,10 +21,10 @@ import numpy as np
 from numba import njit, prange
 
 ROW = 43
-MOST = 8  # photos that have a say in one texel: those of the largest weight
-LEAST_COSINE = 0.2  # photos that look along the surface further than that have no say
+MAX_PHOTOS = 8  # photos that have a say in one texel: those of the largest weight
+MIN_COSINE = 0.2  # photos that look along the surface further than that have no say
 DEPTH_SLACK = 0.0015  # of the distance: how far behind the depth picture still counts as the same place
-LEAST_SPREAD = 0.004  # of albedo: differences below it are noise of the photos
+MIN_SPREAD = 0.004  # of albedo: differences below it are noise of the photos
 OUTLIER = 0.25  # of albedo: no detail of a skin differs more from its surroundings
 HUBER = 1.5  # spreads beyond which a photo counts as an outlier
 ROUNDS = 3
@@ -41,7 +41,7 @@ def _look(camera, depth, clipped, x, n):
         return 0.0, 0.0, 0.0, 0.0
     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
     cosine = height / distance
-    if cosine < LEAST_COSINE:
+    if cosine < MIN_COSINE:
         return 0.0, distance, 0.0, 0.0
     a = camera[0] * x[0] + camera[1] * x[1] + camera[2] * x[2] + camera[3]
     b = camera[4] * x[0] + camera[5] * x[1] + camera[6] * x[2] + camera[7]
@@ -129,8 +129,8 @@ def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, alb
 @njit(error_model="numpy", cache=True)
 def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
     """A block of `fine`: a function of its own, because the compiler takes long over bodies of parallel loops."""
-    values, chosen, found = np.empty((MOST, 3)), np.empty(MOST), np.empty(3)
-    views, places = np.empty(MOST, np.int64), np.empty((MOST, 2))
+    values, chosen, found = np.empty((MAX_PHOTOS, 3)), np.empty(MAX_PHOTOS), np.empty(3)
+    views, places = np.empty(MAX_PHOTOS, np.int64), np.empty((MAX_PHOTOS, 2))
     for i in range(len(x)):
         count = 0
         for v in range(len(cameras)):
@@ -142,11 +142,11 @@ def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, al
             w = cosine * camera[40] / distance
             w = w * w * w * w
             slot = count
-            if count < MOST:
+            if count < MAX_PHOTOS:
                 count += 1
             else:
                 slot = 0
-                for j in range(1, MOST):
+                for j in range(1, MAX_PHOTOS):
                     if chosen[j] < chosen[slot]:
                         slot = j
                 if chosen[slot] >= w:
@@ -201,7 +201,7 @@ def _robust_mean(values, weights, count, out):
         for j in range(count):
             spread += weights[j] * abs(values[j, k] - centre)
             total += weights[j]
-        limit = HUBER * max(1.2533 * spread / total, LEAST_SPREAD)  # of a normal distribution: sigma / mean |x|
+        limit = HUBER * max(1.2533 * spread / total, MIN_SPREAD)  # of a normal distribution: sigma / mean |x|
         for _ in range(ROUNDS):
             total, mean = 0.0, 0.0
             for j in range(count):

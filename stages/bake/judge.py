@@ -14,8 +14,8 @@ from pipeline.verdict import Finding, Limits, judged
 from stages.bake.regions import Votes
 from stages.bake.texels import Samples
 
-MOST = 100_000  # texels of a tile that are judged, an even choice: shares are then known to a thousandth
-LEAST = 200  # texels of skin below which they are not judged alone
+MAX_TEXELS = 100_000  # texels of a tile that are judged, an even choice: shares are then known to a thousandth
+MIN_SKIN = 200  # texels of skin below which they are not judged alone
 # Share of the texels that no photo saw. A head photographed all round in a rig: .25 (under the neck, inside the ears);
 # people photographed from three sides: .45; an arc of cameras before the face: .62 to .67.
 UNSEEN = Limits(0.35, 0.8, lower=False)
@@ -47,7 +47,7 @@ class Texels:
 def chosen(s: Samples, texel: Indices, size: int, votes: Votes | None, names: Sequence[str]) -> Texels:
     """An even choice of a tile's seen texels; texel (N,) their places in a picture of `size`."""
     seen = np.flatnonzero(s.unseen < 0.5)
-    rows = seen[:: max(1, -(-len(seen) // MOST))]
+    rows = seen[:: max(1, -(-len(seen) // MAX_TEXELS))]
     face = names.index("face") if "face" in names else -1
     skin = np.zeros(len(rows), np.bool_) if votes is None else votes.winners(texel[rows], size) == face
     return Texels(
@@ -71,22 +71,22 @@ def judge(t: Texels, figures: Mapping[str, float], *, person: bool) -> tuple[Fin
 
 def _seen(figures: Mapping[str, float]) -> list[Finding]:
     value = figures["unseen"]
-    said = f"{value:.0%} of the surface was seen by no photo; its shape and colour are a guess"
+    message = f"{value:.0%} of the surface was seen by no photo; its shape and colour are a guess"
     remedy = "photograph from the sides, from behind, from above and below as well"
-    return [judged("unseen", value, UNSEEN, said, remedy)]
+    return [judged("unseen", value, UNSEEN, message, remedy)]
 
 
 def _clamped(figures: Mapping[str, float]) -> list[Finding]:
     value = figures["albedo_clamped"]
-    said = f"the albedo of {value:.1%} of the surface was outside of what exists and was clamped"
+    message = f"the albedo of {value:.1%} of the surface was outside of what exists and was clamped"
     remedy = "look at clamped.png: shape, shadows or exposure are wrong there"
-    return [judged("albedo_clamped", value, CLAMPED, said, remedy)]
+    return [judged("albedo_clamped", value, CLAMPED, message, remedy)]
 
 
 def _f0(t: Texels, person: bool) -> list[Finding]:
     if not len(t.f0):
         return []
-    skin = t.skin.sum() >= LEAST
+    skin = t.skin.sum() >= MIN_SKIN
     of = t.f0[t.skin] if skin else t.f0
     where = "the skin's" if skin else "the surface's"
     mean, top = float(of.mean()), float(np.quantile(of, 0.999))
@@ -94,9 +94,9 @@ def _f0(t: Texels, person: bool) -> list[Finding]:
         "highlights were explained by a mirror: the photos are clipped, or light or subject moved; fix the exposure "
         "below clipping and keep the light still, or set inverse_rendering.specular=off"
     )
-    said = f"{where} F0 is {mean:.3f} on average (skin has .028, no stone or plastic more than .17)"
+    message = f"{where} F0 is {mean:.3f} on average (skin has .028, no stone or plastic more than .17)"
     out = [
-        judged("f0_mean", mean, F0_SKIN if skin else F0_MEAN, said, remedy),
+        judged("f0_mean", mean, F0_SKIN if skin else F0_MEAN, message, remedy),
         judged("f0_top", top, F0_TOP, f"{where} F0 is below {top:.3f} but for a thousandth", remedy),
     ]
     if person:
@@ -104,8 +104,8 @@ def _f0(t: Texels, person: bool) -> list[Finding]:
             "the asset looks matt under new light; photograph under a light with edges (window, soft box) and a fixed "
             "exposure"
         )
-        said = f"{where} F0 is {mean:.3f}" + (": nothing shines" if mean < F0_NONE.good else "")
-        out.append(judged("f0_none", mean, F0_NONE, said, matt))
+        message = f"{where} F0 is {mean:.3f}" + (": nothing shines" if mean < F0_NONE.good else "")
+        out.append(judged("f0_none", mean, F0_NONE, message, matt))
     return out
 
 
@@ -116,23 +116,25 @@ def _roughness(t: Texels) -> list[Finding]:
         return []
     low, high = ROUGHNESS_RANGE
     value = float(((of < low) | (of > high)).mean())
-    said = f"roughness lies outside {low:g} to {high:g} on {value:.1%} of the seen surface ({_range(of)} on most of it)"
+    message = (
+        f"roughness lies outside {low:g} to {high:g} on {value:.1%} of the seen surface ({_range(of)} on most of it)"
+    )
     remedy = (
         "the highlights do not tell how rough the surface is: photograph under a light with edges, from more directions"
     )
-    return [judged("roughness", value, ROUGHNESS, said, remedy)]
+    return [judged("roughness", value, ROUGHNESS, message, remedy)]
 
 
 def _skin(t: Texels) -> list[Finding]:
-    if t.skin.sum() < LEAST:
+    if t.skin.sum() < MIN_SKIN:
         return []
     of, (low, high) = t.luma[t.skin], SKIN_RANGE
     value = float(((of < low) | (of > high)).mean())
-    said = (
+    message = (
         f"albedo of the face lies outside skin's {low:g} to {high:g} on {value:.1%} of it ({_range(of)} on most of it)"
     )
     remedy = "exposure or light is not what the fit found: photograph with a colour chart, and with a fixed exposure"
-    return [judged("albedo_skin", value, SKIN_ALBEDO, said, remedy)]
+    return [judged("albedo_skin", value, SKIN_ALBEDO, message, remedy)]
 
 
 def _range(values: F32) -> str:

@@ -46,7 +46,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.deviation import zero_set_rms
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
-    from stages.bake.tally import together
+    from stages.bake.statistics import together
     from stages.bake.write import joined, write_maps
 
     uv, fitted = inputs.uv, inputs.inverse_rendering
@@ -63,16 +63,16 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
 
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch)
-    parts, tallies, judged, areas = [], [], [], Counter[int]()
+    parts, counted, judged, areas = [], [], [], Counter[int]()
     labels = inputs.masks.artifact.label_names
     for number in range(baker.tiles):
         baked = baker.tile(number)
         parts.append(write_maps(baked, context, number, baker.tiles))
-        tallies.append(baked.tally)
+        counted.append(baked.statistics)
         judged.append(chosen(baked.samples, baked.texel, baked.size, baked.votes, labels))
         areas.update(baked.regions)
         del baked
-    maps, all_tiles = joined(parts, [t.texels for t in tallies], context), together(tallies)
+    maps, all_tiles = joined(parts, [s.texels for s in counted], context), together(counted)
     pixel = footprint.pixel(mesh, (v.camera for v in views))
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
     figures = all_tiles.figures(detail=baker.detailed) | {k: round(1000 * v, 5) for k, v in sizes.items() if v}

@@ -24,12 +24,12 @@ from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
 
 NEWTON_STEPS = 3
-LEAST_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
+MIN_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
 REACH_CELLS = 1.5  # of the field's cells: the decimated mesh is never further from the zero set than that
-LEAST_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
+MIN_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
 ARRIVED_CELLS = 1e-3  # |d| below this many cells needs no further step: 2 micrometres
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
-LEAST_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
+MIN_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
 ALBEDO_RANGE = (0.005, 0.95)  # soot and fresh snow: nothing on a head is darker or brighter
 
 
@@ -145,7 +145,7 @@ def sample(
 def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
     """Newton's method along the normal: t (N,), the gradient there (N, 3), and where the surface was reached (N,).
 
-        t <- t - d / max(g . N, LEAST_SLOPE)
+        t <- t - d / max(g . N, MIN_SLOPE)
 
     clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not arrive keep t = 0; those
     that are within ARRIVED_CELLS cells of the zero set stay where they are.
@@ -157,11 +157,11 @@ def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
         on = np.flatnonzero(np.abs(value) > ARRIVED_CELLS * field.cell)
         if not len(on):
             break
-        slope = np.maximum(tangents.dot(gradient[on], normal[on]), LEAST_SLOPE)
+        slope = np.maximum(tangents.dot(gradient[on], normal[on]), MIN_SLOPE)
         t[on] = (t[on] - value[on] / slope).clip(-reach, reach)
         value[on], gradient[on] = _evaluate(field, start[on] + t[on, None] * normal[on])
     # a wall across the normal is not the surface that this texel stands for (the rim of the neck's cut)
-    facing = tangents.dot(_unit(gradient), normal) > LEAST_FACING
+    facing = tangents.dot(_unit(gradient), normal) > MIN_FACING
     landed = (np.abs(value) < LANDED_CELLS * field.cell) & facing
     return np.where(landed, t, 0.0), gradient, landed
 
@@ -169,7 +169,7 @@ def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
 def in_frame(world: F64, t: F64, b: F64, n: F64) -> F32:
     """(N, 3) directions in the frame T, B, N, kept on the outer side of the surface."""
     local = np.stack([tangents.dot(world, axis) for axis in (t, b, n)], 1)
-    local[:, 2] = np.maximum(local[:, 2], LEAST_Z)
+    local[:, 2] = np.maximum(local[:, 2], MIN_Z)
     return _unit(local).astype(np.float32)
 
 

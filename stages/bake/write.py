@@ -22,13 +22,13 @@ from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.maths import microfacet
 from pipeline.meshes import F32
 from stages.bake.build import Baked, bands
+from stages.bake.memmap_buffer import blank
 from stages.bake.regions import Votes
-from stages.bake.spool import blank
 from stages.bake.texels import Samples
 
 FOLDER = "textures"
 MM = 1000.0
-LEAST_INV_KAPPA = 1e-6
+MIN_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value of the coverage of a chart's texel that no photo saw
 OPTIONAL = ("clamped", "region")  # maps that are kept only where there is something on them
 IN_MEMORY = 1 << 27  # numbers of a picture; a larger one is put together in a file
@@ -63,7 +63,7 @@ KINDS: dict[str, MapKind] = {
     "specular_coefficients": MapKind(("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True),
     "lobe_coefficients": MapKind(("coefficients",), numbered=True),
     "specular_intensity": MapKind(("rho",), png=8),
-    "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, LEAST_INV_KAPPA)),
+    "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, MIN_INV_KAPPA)),
     "inv_kappa": MapKind(("inv_kappa",)),
     "roughness": MapKind(("inv_kappa",), microfacet.roughness_from_inv_kappa, png=8),
     "f0": MapKind(("f0",), png=16),  # about 0.03: 8 bits would leave 8 steps
@@ -89,7 +89,7 @@ def write_maps(baked: Baked, context: Context, tile: int = 0, count: int = 1) ->
     maps, place = {}, _Place(context, tile, count)
     for name, kind in KINDS.items():
         context.check()
-        if name == "clamped" and count == 1 and not baked.tally.clamped:
+        if name == "clamped" and count == 1 and not baked.statistics.clamped:
             continue
         maps[name] = _from_samples(name, kind, baked, place)
     covered = baked.covered()

@@ -7,12 +7,12 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 from pipeline.artifacts import CaptureSource, FileRef, GivenCamera, Located
+from stages.capture.quality import blurred
 from stages.capture.readers import describe
 from stages.capture.readers.described import indices_of
-from stages.capture.suspects import blurred
 
 if TYPE_CHECKING:
-    from stages.capture.gather import Gathered
+    from stages.capture.import_photo import ImportedPhoto
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,17 +55,19 @@ def candidates_of(source: Located[CaptureSource]) -> Found:
         found = [Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
                  for i, n, p in zip(indices_of(names), names, photos, strict=True)]  # fmt: skip
         return Found(sorted(found, key=lambda c: c.index), [], [], [])
-    said = describe(source.artifact.kind, source.folder, [source.path(c) for c in source.artifact.cameras])
+    described = describe(source.artifact.kind, source.folder, [source.path(c) for c in source.artifact.cameras])
     refs, masks = ({f.path: f for f in files} for files in (photos, source.artifact.masks))
     out = []
-    for v in said.views:
+    for v in described.views:
         if v.photo is None:
             continue
         ref = refs[v.photo.relative_to(source.folder).as_posix()]
         own = masks.get(v.mask.relative_to(source.folder).as_posix()) if v.mask is not None else None
         out.append(Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, own or _of(by_stem, v.name),
                               _of(plates, v.name)))  # fmt: skip
-    return Found(sorted(out, key=lambda c: c.index), list(said.left_out), list(said.absent), list(said.warnings))
+    return Found(
+        sorted(out, key=lambda c: c.index), list(described.left_out), list(described.absent), list(described.warnings)
+    )
 
 
 def _of(by_stem: dict[str, FileRef], name: str) -> FileRef | None:
@@ -91,8 +93,8 @@ def without_doubles(found: Found, given: bool) -> list[Candidate]:
 
 
 def useful(
-    candidates: list[Candidate], photos: list[Gathered], found: Found, drop_blurred: bool
-) -> tuple[list[Candidate], list[Gathered]]:
+    candidates: list[Candidate], photos: list[ImportedPhoto], found: Found, drop_blurred: bool
+) -> tuple[list[Candidate], list[ImportedPhoto]]:
     """Without blank and blurred photos, whose copies are removed."""
     seen = [p.detail for p in photos if p.detail is not None]
     soft = iter(blurred(seen) if drop_blurred and seen else [False] * len(seen))
@@ -110,7 +112,7 @@ def useful(
     return [c for c, _ in kept], [p for _, p in kept]
 
 
-def _remove(photo: Gathered) -> None:
+def _remove(photo: ImportedPhoto) -> None:
     """A photo that takes no part after all leaves nothing behind."""
     photo.image.unlink()
     if photo.clipped is not None:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.transforms import F64
 from pipeline.verdict import Finding, Limits, judged
-from stages.capture.look import Look
+from stages.capture.photo_figures import Look
 
 FEW_ALIKE = 5  # photos of one camera from which its median says something
 SOFT = 0.6  # of the median detail: sharp photos of rigs and films stay above .61, motion-blurred ones are at .51, .57
@@ -104,8 +104,10 @@ def _left_out(kept: int, names: Sequence[str]) -> Finding:
 
 
 def _formats(read: int, names: Sequence[str]) -> Finding:
-    said = f"{len(names)} files of a format that is not read are passed over" if names else "all pictures can be read"
-    return judged("formats", len(names) / max(1, read + len(names)), FORMATS, said,
+    message = (
+        f"{len(names)} files of a format that is not read are passed over" if names else "all pictures can be read"
+    )
+    return judged("formats", len(names) / max(1, read + len(names)), FORMATS, message,
                   "convert them to JPEG, PNG, TIFF or EXR, or move them out of the folder", views=names)  # fmt: skip
 
 

@@ -58,12 +58,12 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
 
 
 def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Located[CaptureSource]:
-    said = describe(kind, folder, files)
-    photos = [v.photo for v in said.views if v.photo is not None]
+    described = describe(kind, folder, files)
+    photos = [v.photo for v in described.views if v.photo is not None]
     if not photos:
-        raise _none_named(folder, files[0], said)
-    _once(said.views)
-    masks = {v.photo: v.mask for v in said.views if v.photo is not None and v.mask is not None}
+        raise _none_named(folder, files[0], described)
+    _once(described.views)
+    masks = {v.photo: v.mask for v in described.views if v.photo is not None and v.mask is not None}
     by_stem = (
         _beside(folder, [p for p in photos if p not in masks], MASK_FOLDERS, "mask") if len(masks) < len(photos) else []
     )
@@ -175,9 +175,9 @@ def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: 
     return [found[p] for p in photos if p in found]
 
 
-def _none_named(folder: Path, description: Path, said: Described) -> StageError:
+def _none_named(folder: Path, description: Path, described: Described) -> StageError:
     foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
-    value = said.warnings[0] if said.warnings else "; ".join(said.left_out[:3]) or "none"
+    value = described.warnings[0] if described.warnings else "; ".join(described.left_out[:3]) or "none"
     remedy = "put the photos where the file says, or into images/; or remove the file to have the cameras solved"
     if description.name == "params.json":
         remedy = "put 0.jpg, 1.jpg, ... beside params.json"

@@ -30,7 +30,7 @@ class Config(StageConfig):
         60, ge=8, le=500, description="frames to take from a film, spread over the camera's way"
     )
     drop_blurred: bool = Field(True, description="leave out photos with far less detail than the others")
-    chart: Literal["auto", "on", "off"] = Field(
+    colour_checker: Literal["auto", "on", "off"] = Field(
         "auto",
         description="a colour chart of 24 patches in some photos: off: not looked for; on: must be found; its white "
         "becomes the photos' white and unit",
@@ -59,7 +59,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     found = candidates_of(source)
     described = set(found.absent)
     candidates = without_doubles(found, given=source.artifact.cameras != ())
-    look = config.chart != "off"
+    look = config.colour_checker != "off"
     photos = [made.photo_of(source, c, (n, len(candidates)), look, context) for n, c in enumerate(candidates)]
     candidates, photos = useful(candidates, photos, found, config.drop_blurred)
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], found.absent)
@@ -69,7 +69,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     views = [made.view_of(source, c, p, c.index in held, found.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
     views = made.with_exposures(made.with_places(views, photos), photos, found.warnings)
-    views, chart = made.with_chart(views, photos, found.warnings, config.chart == "on", context)
+    views, chart = made.with_chart(views, photos, found.warnings, config.colour_checker == "on", context)
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     seen = [Photo(v.name, v.camera_group, v.width, v.height, v.exposure, v.holdout, p.look)
             for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
@@ -88,7 +88,7 @@ def _photos_of_film(source: Located[CaptureSource], config: Config, context: Con
     """The source itself; of a film, its frames."""
     if source.artifact.kind != "video":
         return source
-    from stages.capture.film import frames_of
+    from stages.capture.video import frames_of
 
     def tick(done: int, total: int) -> None:
         context.check()

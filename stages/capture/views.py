@@ -8,23 +8,23 @@ from pathlib import Path, PurePath
 from pipeline.artifacts import CaptureSource, CaptureView, ColourChart, FileRef, Located
 from pipeline.contract import Context
 from stages.capture.candidates import Candidate
-from stages.capture.charted import bring_to, read_charts
+from stages.capture.colour_correction import bring_to, read_charts
 from stages.capture.exif import metres_from
-from stages.capture.gather import Gathered, gather_mask, gather_photo
+from stages.capture.icc_profile import is_srgb
+from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
 from stages.capture.photometry import exposures
-from stages.capture.profile import is_srgb
 
 NAMED = 20  # files in one note
 
 
 def photo_of(
     source: Located[CaptureSource], candidate: Candidate, done: tuple[int, int], chart: bool, context: Context
-) -> Gathered:
+) -> ImportedPhoto:
     """The checked photo of a candidate, copied. done: how many are, of how many. chart: look for a colour chart."""
     context.check()
     context.progress(*done, f"checking {candidate.name}")
     target = context.workdir / "photos" / _stored_name(candidate)
-    return gather_photo(source.path(candidate.ref), candidate.ref, target, candidate.size, chart=chart)
+    return import_photo(source.path(candidate.ref), candidate.ref, target, candidate.size, chart=chart)
 
 
 def _stored_name(candidate: Candidate) -> str:
@@ -32,7 +32,7 @@ def _stored_name(candidate: Candidate) -> str:
 
 
 def view_of(
-    source: Located[CaptureSource], candidate: Candidate, photo: Gathered, held: bool, warnings: list[str],
+    source: Located[CaptureSource], candidate: Candidate, photo: ImportedPhoto, held: bool, warnings: list[str],
     context: Context,
 ) -> CaptureView:  # fmt: skip
     """A candidate with its checked photo as the manifest has it; its mask and plate are checked and copied."""
@@ -40,7 +40,7 @@ def view_of(
     if mask is not None:
         suffix = ".png" if photo.turned else Path(mask.path).suffix.lower()
         mask_path = context.workdir / "masks" / f"{candidate.index}_{PurePath(candidate.name).stem}{suffix}"
-        fault = gather_mask(source.path(mask), mask, mask_path, photo)
+        fault = import_mask(source.path(mask), mask, mask_path, photo)
         if fault is not None:
             warnings.append(f"{fault}; until then it is made from the photo")
             mask_path = None
@@ -57,7 +57,7 @@ def view_of(
     )  # fmt: skip
 
 
-def with_places(views: list[CaptureView], photos: list[Gathered]) -> list[CaptureView]:
+def with_places(views: list[CaptureView], photos: list[ImportedPhoto]) -> list[CaptureView]:
     """The views with their GPS positions, relative to the first: where on earth it was is nobody's business."""
     origin = next((p.exif.place for p in photos if p.exif.place is not None), None)
     if origin is None:
@@ -66,7 +66,7 @@ def with_places(views: list[CaptureView], photos: list[Gathered]) -> list[Captur
             for v, p in zip(views, photos, strict=True)]  # fmt: skip
 
 
-def with_exposures(views: list[CaptureView], photos: list[Gathered], warnings: list[str]) -> list[CaptureView]:
+def with_exposures(views: list[CaptureView], photos: list[ImportedPhoto], warnings: list[str]) -> list[CaptureView]:
     """The views with their exposures, where EXIF tells them and the photos bear it out."""
     found = exposures([p.exif.exposure for p in photos], [p.light for p in photos])
     if found is None:
@@ -77,30 +77,30 @@ def with_exposures(views: list[CaptureView], photos: list[Gathered], warnings: l
 
 
 def with_chart(
-    views: list[CaptureView], photos: list[Gathered], warnings: list[str], wanted: bool, context: Context
+    views: list[CaptureView], photos: list[ImportedPhoto], warnings: list[str], wanted: bool, context: Context
 ) -> tuple[list[CaptureView], ColourChart | None]:
     """The views in the colours of the chart that some of them show, and what it said; as they are without one."""
-    said = read_charts(views, [p.chart for p in photos], wanted)
-    warnings += said.told
-    if said.chart is None:
+    reading = read_charts(views, [p.chart for p in photos], wanted)
+    warnings += reading.warnings
+    if reading.chart is None:
         return views, None
 
     def tick(done: int, name: str) -> None:
         context.check()
         context.progress(done, len(views), f"bringing {name} to the chart's white")
 
-    return bring_to(said.chart, views, context.workdir, tick), said.chart
+    return bring_to(reading.chart, views, context.workdir, tick), reading.chart
 
 
 def _plate(
-    source: Located[CaptureSource], candidate: Candidate, photo: Gathered, warnings: list[str], context: Context
+    source: Located[CaptureSource], candidate: Candidate, photo: ImportedPhoto, warnings: list[str], context: Context
 ) -> FileRef | None:
     """The view without its subject, checked and turned as its photo is; None if there is none or it does not fit."""
     if candidate.plate is None:
         return None
     path = source.path(candidate.plate)
     target = context.workdir / "plates" / f"{candidate.index}_{path.name}"
-    plate = gather_photo(path, candidate.plate, target, candidate.size)
+    plate = import_photo(path, candidate.plate, target, candidate.size)
     if plate.clipped is not None:
         plate.clipped.unlink()  # of the subject's photo alone
     if (plate.width, plate.height) == (photo.width, photo.height):
@@ -117,7 +117,7 @@ def _group(width: int, height: int, serial: str, body: str, focal: float | None)
     return " | ".join(p for p in (f"{width}x{height}", serial, body, lens) if p)
 
 
-def foreign_colours(candidates: list[Candidate], photos: list[Gathered]) -> list[str]:
+def foreign_colours(candidates: list[Candidate], photos: list[ImportedPhoto]) -> list[str]:
     """A note for each colour profile that is not sRGB."""
     named: dict[str, list[str]] = {}
     for candidate, photo in zip(candidates, photos, strict=True):

@@ -13,8 +13,8 @@ from pydantic import Field, field_validator, model_validator
 from pipeline.contract import StageConfig
 from pipeline.units import Cells, ContentHash, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
 
-AUTO: Final = "auto"  # decided by evidence in mid-fit (stages.inverse_rendering.evidence)
-MOST_RANK, MOST_ORDER = 3, 10  # what a fit begins with until it knows better: the paper's own
+AUTO: Final = "auto"  # decided by evidence in mid-fit (stages.inverse_rendering.cross_validation)
+MAX_RANK, MAX_ORDER = 3, 10  # what a fit begins with until it knows better: the paper's own
 
 Preset = Literal["draft", "studio", "film", "paper"]
 Decision = Literal["auto", "on", "off"]
@@ -61,10 +61,10 @@ class Config(StageConfig):
     light_order: Annotated[int, Field(ge=0, le=10)] | Literal["auto"] = Field(
         default=AUTO, description="order of the light's spherical harmonics [NeuFace eq. 2]; auto: by evidence"
     )
-    light_from: Literal["lobe", "even"] = Field(
+    light_from: Literal["lobe", "uniform_albedo"] = Field(
         default="lobe",
         description="how the light is estimated in mid-fit; lobe: from what changes with the view, in closed form; "
-        "even: from skin of one albedo alone",
+        "uniform_albedo: from skin of one albedo alone",
     )
     attenuation: Literal["exponential", "exact", "phong"] = Field(
         default="exponential", description="how the lobe attenuates the light's bands [NeuFace eq. 11]"
@@ -76,7 +76,7 @@ class Config(StageConfig):
         default="crossing", description="density from the SDF; crossing: without bias; laplace: the paper's"
     )
     specular: Decision = Field(default=AUTO, description="model a specular term at all; auto: by evidence")
-    relief: Decision = Field(
+    refine_geometry: Decision = Field(
         default=AUTO,
         description="let the surface leave the prior that it begins as; auto: by evidence; off needs method fast",
     )
@@ -101,12 +101,12 @@ class Config(StageConfig):
         default=17, ge=8, le=24, description="log2 of the number of entries of the largest hash table"
     )
     hash_fine: Metres = Field(default=0.0008, gt=0, le=0.1, description="finest cell of the appearance encoding")
-    even_until: Share = Field(
+    uniform_albedo_until: Share = Field(
         default=0.36,
         ge=0,
         lt=1,
-        description="share of the fit at which the phase ends that finds the light alone; it begins at 0.3, so that a "
-        "smaller value leaves it out",
+        description="share of the fit at which the phase ends in which the light alone is found, for a uniform albedo; "
+        "it begins at 0.3, so that a smaller value leaves it out",
     )
     width: int = Field(default=64, ge=8, le=512, description="width of the appearance networks")
     depth: int = Field(default=2, ge=1, le=16, description="hidden layers of the appearance network")
@@ -148,8 +148,10 @@ class Config(StageConfig):
     specular_energy: float = Field(
         default=0.02, ge=0, description="weight of little specular, lambda 3 [NeuFace eq. 23]"
     )
-    shininess: float = Field(default=1e-3, ge=0, description="weight of the prior that holds 1 / kappa near skin's")
-    parsimony: float = Field(
+    shininess_prior: float = Field(
+        default=1e-3, ge=0, description="weight of the prior that holds 1 / kappa near skin's"
+    )
+    albedo_sparsity: float = Field(
         default=0.01, ge=0, description="weight of an albedo that varies little, so that shading goes to the light"
     )
     eikonal: float = Field(
@@ -189,15 +191,17 @@ class Config(StageConfig):
             filled["prior_digest"] = prior_digest(str(filled["prior_file"]))
         return filled
 
-    @field_validator("specular", "relief", mode="before")
+    @field_validator("specular", "refine_geometry", mode="before")
     @classmethod
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)
 
     @model_validator(mode="after")
     def _possible(self) -> Config:
-        if self.relief == "off" and self.method != "fast":
-            raise ValueError("relief = off is for method fast; the paper's displacement is what its method fits")
+        if self.refine_geometry == "off" and self.method != "fast":
+            raise ValueError(
+                "refine_geometry = off is for method fast; the paper's displacement is what its method fits"
+            )
         if self.seconds > 0 and self.method != "fast":
             raise ValueError("seconds is for method fast; the paper's schedule counts epochs")
         if self.method == "fast" and self.appearance != "hash":
@@ -205,7 +209,7 @@ class Config(StageConfig):
         return self
 
     @property
-    def lamps(self) -> bool:
+    def estimates_light(self) -> bool:
         """Whether the light is to be told by the lobe, and this kind of model can take it over."""
         return self.judges and (self.light_from, self.appearance, self.basis_inputs) == ("lobe", "hash", "cosine")
 
@@ -217,12 +221,12 @@ class Config(StageConfig):
     @property
     def first_rank(self) -> int:
         """k that the fit begins with."""
-        return MOST_RANK if isinstance(self.rank, str) else self.rank
+        return MAX_RANK if isinstance(self.rank, str) else self.rank
 
     @property
     def first_order(self) -> int:
         """SH order that the fit begins with."""
-        return MOST_ORDER if isinstance(self.light_order, str) else self.light_order
+        return MAX_ORDER if isinstance(self.light_order, str) else self.light_order
 
     @property
     def judges(self) -> bool:
@@ -259,13 +263,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rank": 3,
         "light_order": 10,
         "specular": "on",
-        "relief": "on",
+        "refine_geometry": "on",
         "resolution": "given",
         "shadows": False,
         "white": 5e-3,
         "specular_energy": 8e-3,
-        "parsimony": 0.0,
-        "even_until": 0.0,
+        "albedo_sparsity": 0.0,
+        "uniform_albedo_until": 0.0,
         "image_side": 1024,
         "steps": 129_000,
         "batch": 2048,
@@ -281,7 +285,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "density": "laplace",
         "calibration": "on",
         "mask": 0.0,
-        "shininess": 0.0,
+        "shininess_prior": 0.0,
         "smooth": 0.0,
         "lr_appearance": 1e-4,
         "lr_light": 1e-4,

@@ -20,31 +20,31 @@ from pipeline.errors import Cancelled, StageError
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
-from stages.inverse_rendering.choices import (
-    EVIDENCE_AT,
-    Choices,
-    decide,
-    light_up,
-    prior_surface,
-    restored,
-    take_over,
-    waiting_views,
-)
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.model_selection import (
+    SELECTION_AT,
+    Choices,
+    apply_light,
+    prior_surface,
+    restored,
+    select_model,
+    take_over,
+    validation_views,
+)
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import Batch, PhotoView, PixelTable
+from stages.inverse_rendering.ray_sampling import Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
-EVEN_FROM = 0.3  # share of the fit after which only the light is found for a while
+UNIFORM_FROM = 0.3  # share of the fit after which only the light is found for a while
 OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are open at the start
 OPEN_UNTIL = 0.5  # share of the fit after which all of them are
-EVEN_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
-EVEN_LIGHT_RATE = 10.0  # times the light's rate
-LIT_RATE = 0.1  # times the light's rate once it is known from the lobe
+UNIFORM_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
+UNIFORM_LIGHT_RATE = 10.0  # times the light's rate
+KNOWN_LIGHT_RATE = 0.1  # times the light's rate once it is known from the lobe
 SETTLING = 0.03  # share of the fit after it in which the surface rests
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
 CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
@@ -81,14 +81,14 @@ class Trainer:
     table: PixelTable | None = None
     choices: Choices | None = None
     history: list[float] = field(default_factory=list)  # running PSNR after each tenth of the fit
-    waiting: tuple[int, ...] = field(init=False)
+    validation: tuple[int, ...] = field(init=False)
     optimiser: torch.optim.Optimizer = field(init=False)
     guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
         self.optimiser = self.make_optimiser()
         self.guard = Guard(self.settings.max_dropped)
-        self.waiting = waiting_views(len(self.views), self.settings)
+        self.validation = validation_views(len(self.views), self.settings)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Of everything that has not its own."""
@@ -135,21 +135,21 @@ class Trainer:
             side = self.settings.image_side
             side = max(side // 2 ** (len(starts) - 1 - self.level), min(side, 256))
             self.table = PixelTable(self.views, side, self.device)
-            self.table.wait(() if self.choices else self.waiting)
-        if self.rests:
+            self.table.wait(() if self.choices else self.validation)
+        if self.geometry_frozen:
             self.grid.values.requires_grad_(False)
 
     @property
-    def rests(self) -> bool:
+    def geometry_frozen(self) -> bool:
         """Whether the surface stays the prior that it began as."""
-        return self.settings.relief == "off" or (self.choices is not None and not self.choices.relief)
+        return self.settings.refine_geometry == "off" or (self.choices is not None and not self.choices.refine_geometry)
 
-    def decide(self) -> None:
+    def select_model(self) -> None:
         """Find out what the scene requires, and leave out the rest."""
         assert self.table is not None
-        choices, lamp = decide(self)
+        choices, estimate = select_model(self)
         self.take(choices)
-        for parameter in light_up(self.model, lamp) if lamp is not None else ():
+        for parameter in apply_light(self.model, estimate) if estimate is not None else ():
             self.optimiser.state.pop(parameter, None)
         self.table.wait(())
 
@@ -166,7 +166,7 @@ class Trainer:
                     self.optimiser.state[new] = {
                         k: v[rows].clone() if v.shape == old.shape else v for k, v in known[old].items()
                     }
-        if self.rests and self.prior is not None:
+        if self.geometry_frozen and self.prior is not None:
             self.grid.restore(prior_surface(self).values.detach())
             self.grid.values.requires_grad_(False)
 
@@ -176,30 +176,33 @@ class Trainer:
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
 
-        Between EVEN_FROM and `even_until` a light that the lobe has told (lamp.py) rests with the surface while the
-        skin takes up what it leaves; then it moves slowly. Where no lobe tells it, everything rests but the light, and
-        the skin is even: the light, which began as the same from everywhere, explains what it can of the shading that
-        the albedo had taken up until then. Any earlier, and a surface that is still the hull bends to what is wrong.
+        Between UNIFORM_FROM and `uniform_albedo_until` a light that is known from the lobe (light_estimate.py) is
+        frozen together with the surface, while the skin takes up what it leaves; then it moves slowly. Where the lobe
+        does not tell it, everything is frozen but the light, and the albedo is uniform: the light, which began as the
+        same from everywhere, explains what it can of the shading that the albedo had taken up until then. Any earlier,
+        and a surface that is still the hull bends to what is wrong.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
-        interlude, lit = EVEN_FROM <= p < s.even_until, self.choices is not None and self.choices.lit
-        self.model.even = interlude and not lit
+        interlude = UNIFORM_FROM <= p < s.uniform_albedo_until
+        light_known = self.choices is not None and self.choices.light_known
+        self.model.uniform_albedo = interlude and not light_known
         for group in self.optimiser.param_groups:
             light = group["params"][0] is next(self.model.light.parameters())
             group["lr"] = group["start"] * decay * warm
-            if interlude and not lit:
-                group["lr"] *= EVEN_LIGHT_RATE if light else 0.0
-            elif lit and light:
-                group["lr"] *= 0.0 if interlude else LIT_RATE
+            if interlude and not light_known:
+                group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
+            elif light_known and light:
+                group["lr"] *= 0.0 if interlude else KNOWN_LIGHT_RATE
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
         opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
         _hashed(self.model).encoding.open_levels(opened)
-        still = EVEN_FROM <= p < s.even_until + SETTLING  # skin takes up what the new light leaves, not the surface
-        return 0.0 if still or self.rests else s.lr_sdf * self.model.geometry.cell * decay * warm
+        # skin takes up what the new light leaves, not the surface
+        still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
+        return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
@@ -214,8 +217,8 @@ class Trainer:
         """Draw, evaluate, move."""
         self.enter_level()
         assert self.table is not None
-        if self.choices is None and self.share() >= EVIDENCE_AT:
-            self.decide()
+        if self.choices is None and self.share() >= SELECTION_AT:
+            self.select_model()
         rate = self.set_rates()
         due = sum(self.share() >= s for s in SHADOWS_AT)
         if self.shadows_solved < due:
@@ -231,8 +234,8 @@ class Trainer:
         if not self._is_finite(loss):
             self._drop(batch, seed)
             return
-        if self.model.even:
-            self.model.light.even_gradient(EVEN_LIGHT_ORDER)
+        if self.model.uniform_albedo:
+            self.model.light.uniform_gradient(UNIFORM_LIGHT_ORDER)
         self.move(rate)
         self.step += 1
         if self.step % BAND_EVERY == 0:
@@ -264,8 +267,8 @@ class Trainer:
 
     def weights(self) -> Config:
         """The settings; once the light is known, skin need not be even: that would drive paint into the lobe."""
-        lit = self.choices is not None and self.choices.lit
-        return self.settings.changed(parsimony=0.0) if lit else self.settings
+        light_known = self.choices is not None and self.choices.light_known
+        return self.settings.changed(albedo_sparsity=0.0) if light_known else self.settings
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients that the optimiser does not know of are finite."""

@@ -13,14 +13,14 @@ import numpy.typing as npt
 from pipeline.fields.face import FaceModel
 from pipeline.footprint import edges
 from stages.inverse_rendering.config import AUTO, Config
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView, factor_for
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
 
 F64 = npt.NDArray[np.float64]
 CELL_PIXELS = 1.0  # a cell of the grid holds at least so much of a pixel
 FINE_PIXELS = 0.5  # the encoding's finest cell: views overlap, so that half a pixel still has data
 UTILISATION = 0.65  # of a texture by its charts
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +65,7 @@ def _surface_of(start: Start) -> tuple[F64, F64, float]:
     values = start.values
     inner = np.abs(values[1:-1, 1:-1, 1:-1]) < 0.75 * start.cell
     near = np.argwhere(inner) + 1
-    near = near[:: max(len(near) // MOST_POINTS, 1)]
+    near = near[:: max(len(near) // MAX_POINTS, 1)]
     i, j, k = near.T
     sides = [
         values[i + 1, j, k] - values[i - 1, j, k],

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pipeline.errors import StageError
 from stages.inverse_rendering.objective import Terms
-from stages.inverse_rendering.views import Batch
+from stages.inverse_rendering.ray_sampling import Batch
 
 log = logging.getLogger(__name__)
 SHOWN = 3  # rays that a report names

@@ -11,8 +11,8 @@ import numpy as np
 from pipeline.artifacts import Capture, MaskSet
 from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
-from stages.inverse_rendering.choices import FAINT, Facts
-from stages.inverse_rendering.evidence import more
+from stages.inverse_rendering.cross_validation import more
+from stages.inverse_rendering.model_selection import FAINT, Facts
 from stages.inverse_rendering.residuals import ViewError, decibels
 
 # Drafts of measured captures, all subject pixels of the fitted photos, the photos' noise taken off: scanned head 38 dB,
@@ -22,7 +22,7 @@ FIT_ERROR = Limits(27.0, 18.0)
 # The face alone in the same drafts: 38, 29, 21 and 5 dB. Hair and eyes move between photos, and a draft blurs them:
 # 25 to 37 dB where the shape is right, 13 to 20 where it is not.
 LABELS = {"face": Limits(27.0, 20.0), "hair": Limits(22.0, 15.0), "eyes": Limits(22.0, 13.0)}
-LEAST_LABELLED = 100  # pixels over all photos, below which an error by label is chance
+MIN_LABELLED = 100  # pixels over all photos, below which an error by label is chance
 BELOW = 6.0  # dB below the median of the photos: twice the error. One that is shown well counts for none of these
 WORST_VIEWS = Limits(0.0, 0.1, lower=False)  # share of the photos
 # dB that the running PSNR may end below its best: rises to the end on sound captures, 1.6 on one with moving shadows.
@@ -39,16 +39,17 @@ START = Limits(0.05, 0.15, lower=False)
 # Error of the photos kept back at the time of the evidence, over their mean radiance: scanned head .05, a man with a
 # phone .19, one on an arc of cameras .28, the lost head .45, a skull under moving shadows .51.
 AGREE = Limits(0.12, 0.35, lower=False)
-# What a highlight explains over what stays unexplained, as the decision weighs them (choices.py). At 0 nothing at all.
+# What a highlight explains over what stays unexplained, as the decision weighs them (model_selection.py). At 0 nothing
+# at all.
 SHINE = Limits(FAINT, 0.0)
 ALWAYS = Limits(0.0, 0.0)
-MOST_NAMED = 12
+MAX_NAMED = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
     """errors: of the fitted photos. history: running PSNR at each tenth of the fit. facts: how the model
-    was decided (choices.py). prior: what the fit began as (settings.py)."""
+    was decided (model_selection.py). prior: what the fit began as (settings.py)."""
 
     errors: Sequence[ViewError]
     capture: Capture
@@ -68,11 +69,11 @@ def start(f: Fitted) -> list[Finding]:
     error = _number(f.facts, "relief", "silhouette_error_of_prior")
     if error is None or f.prior != "hull":
         return []
-    said = f"the shape that the fit began with disagrees with {error:.1%} of what the masks of unused photos show"
+    message = f"the shape that the fit began with disagrees with {error:.1%} of what the masks of unused photos show"
     remedy = (
         "look at the masks in the report: one that lacks a part of the subject cuts that part off; mend or leave it out"
     )
-    return [judged("start_silhouette", error, START, said, remedy)]
+    return [judged("start_silhouette", error, START, message, remedy)]
 
 
 def errors(f: Fitted) -> list[Finding]:
@@ -82,7 +83,7 @@ def errors(f: Fitted) -> list[Finding]:
     own = np.array([max(e.square - e.noise**2, 0.0) for e in f.errors])
     value, noise = decibels(float(np.median(own))), decibels(float(np.median([e.noise for e in f.errors])) ** 2)
     relative = float(np.median([e.relative for e in f.errors]))
-    said = (
+    message = (
         f"the fitted model shows the photos with {value:.1f} dB in the median ({relative:.0%} of their mean radiance "
         f"is unexplained); their noise alone would allow {noise:.1f} dB"
     )
@@ -90,7 +91,7 @@ def errors(f: Fitted) -> list[Finding]:
         "the photos do not show one still subject in one light, or the shape is wrong: check masks and cameras in the "
         "report, and photograph again without movement and from more directions"
     )
-    return [judged("fit_error", value, FIT_ERROR, said, remedy, unit="dB", views=_worst(f, f.errors))]
+    return [judged("fit_error", value, FIT_ERROR, message, remedy, unit="dB", views=_worst(f, f.errors))]
 
 
 def by_label(f: Fitted) -> list[Finding]:
@@ -99,12 +100,12 @@ def by_label(f: Fitted) -> list[Finding]:
     for name, limits in LABELS.items():
         parts = [(e, e.labels[name]) for e in f.errors if name in e.labels]
         pixels = sum(p.pixels for _, p in parts)
-        if pixels < LEAST_LABELLED:
+        if pixels < MIN_LABELLED:
             continue
         value = decibels(sum(p.pixels * max(p.square - e.noise**2, 0.0) for e, p in parts) / pixels)
-        said = f"the fitted model shows the {name} with {value:.1f} dB in {len(parts)} photos"
+        message = f"the fitted model shows the {name} with {value:.1f} dB in {len(parts)} photos"
         remedy = f"look at the {name} in the report's views: where shape is wrong, photograph it from more directions"
-        out.append(judged(f"fit_error_{name}", value, limits, said, remedy, unit="dB"))
+        out.append(judged(f"fit_error_{name}", value, limits, message, remedy, unit="dB"))
     return out
 
 
@@ -115,11 +116,11 @@ def views(f: Fitted) -> list[Finding]:
     least = min(float(np.median([e.psnr for e in f.errors])) - BELOW, FIT_ERROR.good)
     bad = [e for e in f.errors if e.psnr < least]
     count = f"{len(bad)} of {len(f.errors)} photos are" if bad else "no photo is"
-    said = f"{count} shown with less than {least:.1f} dB, far below the median photo"
+    message = f"{count} shown with less than {least:.1f} dB, far below the median photo"
     remedy = (
         "look at these photos: another subject, movement, blur, a wrong mask or camera; leave them out and run again"
     )
-    return [judged("worst_views", len(bad) / len(f.errors), WORST_VIEWS, said, remedy, views=_worst(f, bad))]
+    return [judged("worst_views", len(bad) / len(f.errors), WORST_VIEWS, message, remedy, views=_worst(f, bad))]
 
 
 def empty(f: Fitted) -> list[Finding]:
@@ -127,15 +128,15 @@ def empty(f: Fitted) -> list[Finding]:
     if not f.errors:
         return []
     value = float(np.mean([e.missing for e in f.errors]))
-    said = f"{value:.1%} of the subject's pixels in the fitted photos see nothing of the model"
+    message = f"{value:.1%} of the subject's pixels in the fitted photos see nothing of the model"
     remedy = "a part of the subject is missing: look for masks or cameras that contradict the others"
     lacking = sorted((e for e in f.errors if e.missing > MISSING.usable), key=lambda e: -e.missing)
-    out = [judged("fit_missing", value, MISSING, said, remedy, views=_names(f, lacking))]
+    out = [judged("fit_missing", value, MISSING, message, remedy, views=_names(f, lacking))]
     value = float(np.mean([e.beyond for e in f.errors]))
-    said = f"{value:.1%} of the background's pixels around the subject in the fitted photos see the model"
+    message = f"{value:.1%} of the background's pixels around the subject in the fitted photos see the model"
     remedy = "something that most masks leave out was modelled: look for masks that show more than the others"
     covered = sorted((e for e in f.errors if e.beyond > BEYOND.usable), key=lambda e: -e.beyond)
-    return [*out, judged("fit_beyond", value, BEYOND, said, remedy, views=_names(f, covered))]
+    return [*out, judged("fit_beyond", value, BEYOND, message, remedy, views=_names(f, covered))]
 
 
 def fell(f: Fitted) -> list[Finding]:
@@ -144,12 +145,12 @@ def fell(f: Fitted) -> list[Finding]:
     if len(known) < 2:
         return []
     value = max(max(known) - known[-1], 0.0)
-    said = f"the fitted photos ended at {known[-1]:.1f} dB; the best on the way was {max(known):.1f} dB"
+    message = f"the fitted photos ended at {known[-1]:.1f} dB; the best on the way was {max(known):.1f} dB"
     remedy = (
         "what the fit decided half way made it worse: the light or the subject changes between photos; set "
         "inverse_rendering.specular=off or inverse_rendering.calibration=on and compare"
     )
-    return [judged("psnr_fell", value, FELL, said, remedy, unit="dB")]
+    return [judged("psnr_fell", value, FELL, message, remedy, unit="dB")]
 
 
 def choices(f: Fitted) -> list[Finding]:
@@ -163,12 +164,12 @@ def _agree(f: Fitted) -> list[Finding]:
     if with_it is None or without is None:
         return []
     value = min(with_it, without)
-    said = f"the photos' colours disagree by {value:.0%} of their mean where several show the same place"
+    message = f"the photos' colours disagree by {value:.0%} of their mean where several show the same place"
     remedy = (
         "light, subject or exposure changes from photo to photo, or the surface is wrong: fix the exposure, keep light "
         "and subject still"
     )
-    return [judged("photos_agree", value, AGREE, said, remedy)]
+    return [judged("photos_agree", value, AGREE, message, remedy)]
 
 
 def _shine(f: Fitted) -> list[Finding]:
@@ -179,14 +180,14 @@ def _shine(f: Fitted) -> list[Finding]:
         return []
     value = max(more(dull, best), 0.0) / max(best, 1e-9)
     if fact.get("modelled"):
-        said = f"highlights are {value:.2f} of what stays unexplained: they were modelled"
-        return [judged("specular", value, Limits(0.0, 0.0), said, "")]
-    said = f"no highlight was told from what stays unexplained ({value:.2f} of it, {FAINT:g} is needed): F0 is zero"
+        message = f"highlights are {value:.2f} of what stays unexplained: they were modelled"
+        return [judged("specular", value, Limits(0.0, 0.0), message, "")]
+    message = f"no highlight was told from what stays unexplained ({value:.2f} of it, {FAINT:g} is needed): F0 is zero"
     remedy = (
         "the asset looks matt under new light; photograph with fixed exposure under a light with edges (window, soft "
         "box) from more directions, or set inverse_rendering.specular=on"
     )
-    return [judged("specular", value, SHINE if shows_person(f.masks) else ALWAYS, said, remedy)]
+    return [judged("specular", value, SHINE if shows_person(f.masks) else ALWAYS, message, remedy)]
 
 
 def _colours(f: Fitted) -> list[Finding]:
@@ -195,8 +196,8 @@ def _colours(f: Fitted) -> list[Finding]:
     if fact.get("why") == "setting" or without is None or with_it is None:
         return []
     value = max(more(without, with_it), 0.0)
-    said = f"colours of their own explain {value:.1%} of the photos' mean radiance: they were "
-    return [judged("calibration", value, ALWAYS, said + ("fitted" if fact.get("modelled") else "left out"), "")]
+    message = f"colours of their own explain {value:.1%} of the photos' mean radiance: they were "
+    return [judged("calibration", value, ALWAYS, message + ("fitted" if fact.get("modelled") else "left out"), "")]
 
 
 def _worst(f: Fitted, of: Sequence[ViewError]) -> tuple[str, ...]:
@@ -205,7 +206,7 @@ def _worst(f: Fitted, of: Sequence[ViewError]) -> tuple[str, ...]:
 
 def _names(f: Fitted, of: Sequence[ViewError]) -> tuple[str, ...]:
     names = {v.index: v.name for v in f.capture.views}
-    return tuple(names.get(e.index, str(e.index)) for e in of[:MOST_NAMED])
+    return tuple(names.get(e.index, str(e.index)) for e in of[:MAX_NAMED])
 
 
 def _number(facts: Facts, part: str, name: str) -> float | None:

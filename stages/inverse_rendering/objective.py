@@ -14,8 +14,8 @@ from pipeline.fields.geometry import grid_of
 from pipeline.maths import density, losses
 from pipeline.maths.sdf import unit
 from stages.inverse_rendering.config import Config
+from stages.inverse_rendering.ray_sampling import WHOLE, Batch
 from stages.inverse_rendering.render import sample_shell, shade_shell, solid_behind
-from stages.inverse_rendering.views import WHOLE, Batch
 
 
 @dataclass(slots=True)
@@ -72,11 +72,11 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     energy = losses.specular_energy(shaded.specular)
     out.add("specular_energy", settings.specular_energy * energy.mean(), energy, rays)
-    uneven = losses.albedo_parsimony(shaded.albedo)
-    out.add("parsimony", settings.parsimony * uneven.mean(), uneven, rays)
+    uneven = losses.albedo_sparsity(shaded.albedo)
+    out.add("albedo_sparsity", settings.albedo_sparsity * uneven.mean(), uneven, rays)
     if model.spec.specular:
-        gauge = losses.shininess_gauge(shaded.inv_kappa, TYPICAL_INV_KAPPA)
-        out.add("shininess", settings.shininess * gauge.mean(), gauge, rays)
+        gauge = losses.shininess_prior(shaded.inv_kappa, TYPICAL_INV_KAPPA)
+        out.add("shininess_prior", settings.shininess_prior * gauge.mean(), gauge, rays)
     if grid_of(model.geometry).values.requires_grad:  # a surface that rests is as smooth as it is
         out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():

@@ -19,7 +19,7 @@ from pipeline.fields.face import FaceModel, Shaded
 from pipeline.maths.density import OPAQUE, crossing_weights, laplace_density, ray_weights
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
-from stages.inverse_rendering.views import Rays
+from stages.inverse_rendering.ray_sampling import Rays
 
 SHELL_CELLS, SHELL_BETAS = 1.5, 4.0
 MIN_COSINE = 0.25

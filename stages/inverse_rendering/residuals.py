@@ -20,13 +20,13 @@ from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.fields.face import FaceModel
 from pipeline.images import shrink_whole
 from stages.inverse_rendering.objective import calibrated_colours
+from stages.inverse_rendering.ray_sampling import WHOLE, Batch, PhotoView, PixelTable, factor_for
 from stages.inverse_rendering.stereo import noise_of
 from stages.inverse_rendering.systems import render_any
-from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable, factor_for
 
 U8 = npt.NDArray[np.uint8]
 PIXELS = 60_000  # of all photos' subjects together: about a second on two cores
-MOST_PIXELS, LEAST_PIXELS = 2000, 300  # of one photo: its PSNR is then known to about 0.2 and 0.5 dB
+MAX_PIXELS, MIN_PIXELS = 2000, 300  # of one photo: its PSNR is then known to about 0.2 and 0.5 dB
 SEED = 40_961
 DARK = 1e-6  # mean radiance below which a photo is black
 HALF = 0.5  # opacity from which the field is taken to be there
@@ -81,7 +81,7 @@ def view_errors(
 ) -> tuple[ViewError, ...]:
     """The error of every view that has pixels of its subject in the table. table: all views at `side` pixels. labels:
     (H, W) codes of each view at any size, None where there are none; names: what the codes mean."""
-    most = min(max(PIXELS // max(len(views), 1), LEAST_PIXELS), MOST_PIXELS)
+    most = min(max(PIXELS // max(len(views), 1), MIN_PIXELS), MAX_PIXELS)
     inside = _sample(table, table.inside, len(views), most, SEED)
     inside = [pool[table.alpha[pool] > WHOLE] for pool in inside]
     outside = _sample(table, table.outside, len(views), most // 4, SEED + 1)

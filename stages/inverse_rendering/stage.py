@@ -25,17 +25,17 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
-    from stages.inverse_rendering.clock import LEAST_TRAINING, Clock, seconds_to_predict
-    from stages.inverse_rendering.deliver import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.exposure import exposures_differ
     from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
-    from stages.inverse_rendering.gather import read_labels, read_views
+    from stages.inverse_rendering.initial_geometry import agreed, hull_start, sphere_start
     from stages.inverse_rendering.judge import Fitted, findings
+    from stages.inverse_rendering.load_views import read_labels, read_views
+    from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
-    from stages.inverse_rendering.start import agreed, hull_start, sphere_start
     from stages.inverse_rendering.stereo import start_from_photos
     from stages.inverse_rendering.systems import trainer_for
+    from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
 
     clock, settings = Clock(), config
     dropped = set(inputs.masks.artifact.dropped)
@@ -74,7 +74,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
-        trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, LEAST_TRAINING * settings.seconds)
+        trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, MIN_TRAINING * settings.seconds)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     model.save(context.workdir / "field.npz")
     write_light(model, context)

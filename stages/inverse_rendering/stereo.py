@@ -28,8 +28,8 @@ from pipeline.images import shrink_whole
 from pipeline.maths.correlation import FLOOR, agreement
 from pipeline.maths.tracing import box_interval
 from pipeline.pieces import filled, subject_pieces
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView, factor_for
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -37,12 +37,12 @@ SIDE = 512  # pixels of the photos' longest side: a patch then spans some 4 mm o
 HALF, SPACING = 2, 2.0  # a patch is (2 HALF + 1)^2 samples, so many pixels apart
 BLUR = 0.7  # pixels: what lies between samples two apart goes, and most of the noise with it
 VIEWS = 6  # that look at a point most squarely are compared
-LEAST_COSINE = 0.25  # between a normal and the way to a camera
+MIN_COSINE = 0.25  # between a normal and the way to a camera
 POINTS = 12_000  # of the surface that one sweep takes
 CERTAIN = 4e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise reaches 6e-2
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
 LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-INSIDE, LEAST_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
+INSIDE, MIN_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
     estimation (1996), with the median absolute deviation in the place of the mean.
     """
     inner = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
-    if inner.sum() < LEAST_PIXELS:
+    if inner.sum() < MIN_PIXELS:
         return 0.0
     answer = cv2.filter2D(image, -1, LAPLACIAN)[inner]
     return float(1.4826 * np.median(np.abs(answer)) / np.sqrt((LAPLACIAN**2).sum()))
@@ -197,7 +197,7 @@ def best_views(points: F64, normals: F64, start: Start, photos: Photos) -> tuple
         q = p @ photos.image_from_world[k, :, :3].T + photos.image_from_world[k, :, 3]
         uv = q[:, :2] / q[:, 2:].clamp(min=1e-9)
         room = torch.minimum(uv.amin(-1), torch.minimum(photos.width[k] - uv[:, 0], photos.height[k] - uv[:, 1]))
-        ok = (cosine > LEAST_COSINE) & (q[:, 2] > 0) & (room > 2 * HALF * SPACING)
+        ok = (cosine > MIN_COSINE) & (q[:, 2] > 0) & (room > 2 * HALF * SPACING)
         candidate = torch.nonzero(ok).squeeze(-1)
         hidden = _hidden(geometry, p[candidate], distance[candidate], photos.centre[k])
         ok[candidate[hidden]] = False

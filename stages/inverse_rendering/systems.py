@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from pipeline.fields.face import FaceModel
     from stages.inverse_rendering.config import Config
     from stages.inverse_rendering.fit import Trainer
-    from stages.inverse_rendering.start import Start
-    from stages.inverse_rendering.views import PhotoView, Rays
+    from stages.inverse_rendering.initial_geometry import Start
+    from stages.inverse_rendering.ray_sampling import PhotoView, Rays
 
 
 def trainer_for(
@@ -20,7 +20,7 @@ def trainer_for(
 ) -> Trainer:
     """A fit that has not begun, by the settings' method. prior: the surface that any relief is judged against."""
     if settings.method == "fast":
-        from stages.inverse_rendering.begin import new_trainer
+        from stages.inverse_rendering.initialise import new_trainer
 
         return new_trainer(views, start, settings, calibrated, device, prior)
     from stages.inverse_rendering.paper.trainer import new_paper_trainer

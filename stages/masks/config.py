@@ -47,7 +47,7 @@ class Config(StageConfig):
     hair_model_class: int = Field(
         -1, ge=-1, le=999, description="which class of hair_model is hair, counted from 0; -1: it knows nothing else"
     )
-    mend: bool = Field(True, description="cut a computed mask out anew where the other views contradict it")
+    resegment: bool = Field(True, description="segment again where the other views contradict it")
     seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
 
     @model_validator(mode="before")

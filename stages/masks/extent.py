@@ -17,7 +17,7 @@ from pipeline.artifacts import Camera, Extent
 from pipeline.extent import ASKED, BELOW, bounds, core, signed
 from pipeline.hull import Hull, surface_points, visual_hull
 from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
-from stages.masks.agree import CUBE, WRONG_SHARE, tolerated
+from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
 from stages.masks.region import F32, Bool
 
 CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head

@@ -1,8 +1,8 @@
 """How good the masks are: do they show one and the same closed body of a head's size, which the cameras see all of?
 
 Symbols: r radius of the region of interest. The hull is carved by the fitted views' masks and lets a few be wrong, as
-the check in agree.py does. Limits are from the captures that they were measured on: rigs and a person by hand all
-around (good), a film of an arc before a face and a skull seen from three sides (usable).
+the check in hull_consistency.py does. Limits are from the captures that they were measured on: rigs and a person by
+hand all around (good), a film of an arc before a face and a skull seen from three sides (usable).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pipeline.directions import STEEP, elevations, grid
 from pipeline.hull import Hull, render_silhouette, surface_points, visual_hull
 from pipeline.transforms import F64, matrix
 from pipeline.verdict import Finding, Limits, judged
-from stages.masks.agree import CUBE, WRONG_SHARE, tolerated
+from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
 from stages.masks.region import F32, region
 
 CELLS = 48  # along each edge of the hull's cube: 5 mm for a head, .1 to .3 s
 POOR = 0.85  # IoU with the others' hull below which one is looked for; the worst one of a good capture has .92
 APART, SPREADS = 0.06, 4.0  # IoU and robust standard deviations below the median: the intact differ by .03
-MOST_NAMED = 8  # photos that are told apart one by one, a hull of .1 to .3 s each
+MAX_NAMED = 8  # photos that are told apart one by one, a hull of .1 to .3 s each
 SHOWS = 0.02, 0.9  # share of the photo: nearly empty, nearly full; heads take .28 to .67
 NECK = -30.0  # degrees of elevation below which a head goes on into neck and shoulders
 HEAD_LITRES, HEAD_SHARE = 5.5, 0.27  # inside r: measured 4.7 to 7.6 litres, .22 to .31 of the ball
@@ -86,12 +86,12 @@ def extent_finding(faces: int, agreeing: int, cut: bool) -> Finding | None:
         return None
     if agreeing:
         what = "the head, the neck and the beginning of the shoulders" if cut else "the whole of what the masks show"
-        said = f"{agreeing} photos agree on where the head is; the asset is {what}"
+        message = f"{agreeing} photos agree on where the head is; the asset is {what}"
     else:
-        said = (
+        message = (
             f"a face is found in {faces} photos, but they do not agree on where it is: all that the masks show is asked"
         )
-    return judged("extent", agreeing, FACES, said,
+    return judged("extent", agreeing, FACES, message,
                   "take photos in which the face is seen from the front and from both sides, evenly lit, and check the "
                   "cameras")  # fmt: skip
 
@@ -105,7 +105,7 @@ def hull_findings(
     ball = 4 / 3 * np.pi * roi_radius**3
     share, head = volume / ball, HEAD_LITRES / 1e3 / ball if litres else HEAD_SHARE
     times = max(share, 1e-9) / head
-    said = f"{1e3 * volume:.1f} litres" if litres else f"{share:.0%} of the region of interest"
+    message = f"{1e3 * volume:.1f} litres" if litres else f"{share:.0%} of the region of interest"
     usual = f"{HEAD_LITRES:g} litres" if litres else f"{HEAD_SHARE:.0%}"
     hidden = unseen_share(hull, cameras, roi_radius)
     return (
@@ -113,7 +113,7 @@ def hull_findings(
                f"the body that the masks allow reaches the edge of the region of interest over {opening:.0%} of it",
                f"{FILM}; check that the background is not part of the masks"),
         judged("hull_volume", max(times, 1 / times), SIZE if litres else SIZE_NOMINAL,
-               f"the body that the masks allow has {said}, a head about {usual}",
+               f"the body that the masks allow has {message}, a head about {usual}",
                "check the masks (is the background part of them, or is the subject cut off?) and the scale; "
                "photograph from more sides", unit="times"),
         judged("hull_unseen", hidden, UNSEEN,
@@ -165,7 +165,7 @@ def disagreeing(first: Sequence[Seen], roi_radius: float) -> list[str]:
     if all((v.iou or 0.0) >= POOR for v in left):
         return lost
     out: list[str] = []
-    for _ in range(MOST_NAMED):
+    for _ in range(MAX_NAMED):
         if len(left) < 3:
             break
         ious = _ious(left, _carved(left, roi_radius, max(1, round(WRONG_SHARE * len(left)))), roi_radius)

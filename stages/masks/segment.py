@@ -20,18 +20,18 @@ from pipeline.faces.find import Face
 from pipeline.faces.landmarks3d import HeadFrame, head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.support import Support
-from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.config import Config
-from stages.masks.cut_out import cut
 from stages.masks.extent import BUST, asked, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
+from stages.masks.grabcut import cut
+from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.judge import Seen, extent_finding, judge
 from stages.masks.landmarks import agreed, save_landmarks
-from stages.masks.redraw import redrawn
+from stages.masks.refine_contour import refined_contour
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
-from stages.masks.solid import Solid, distinct, find_solid
 from stages.masks.sources import Plan, View, inverted, mask, plan, to_full_size
+from stages.masks.support_object import SupportedObject, distinct, find_supported_object
 from stages.masks.user_model import UserModel, hair_model, user_model
 
 WORKING_SIZE = 640  # longest edge at which people and objects are cut out
@@ -93,7 +93,7 @@ def segment(
     found = _opinions(masked, voting, poses, config, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     first = _seen(masked, [])
-    if config.mend:
+    if config.resegment:
         bad = _outliers(masked)
         mended = _each(lambda t: _mend(t[0], t[1], t[2], config, context),
                        list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
@@ -235,14 +235,14 @@ def _path(index: int, context: Context) -> Path:
     return context.workdir / "masks" / f"{index}.png"
 
 
-def _solid(poses: Located[CameraSet], seed: int) -> Solid | None:
+def _solid(poses: Located[CameraSet], seed: int) -> SupportedObject | None:
     """The object among the sparse points, if the cameras came with any."""
     ref = poses.artifact.points
     if ref is None:
         return None
     with np.load(poses.path(ref), allow_pickle=False) as data:
         points = np.asarray(data["points"], np.float64)
-    return find_solid(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
+    return find_supported_object(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
 
 
 def _opinions(
@@ -276,7 +276,7 @@ def _mend(made: Masked, opinion: Opinion, bad: bool, config: Config, context: Co
     small = np.asarray(resized(image, w, h), np.uint8)
     new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), config.seed)
     if made.source in LEARNED:
-        new = redrawn(small, new)
+        new = refined_contour(small, new)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 
 from pipeline.networks import network
-from stages.masks.cut_out import cut
-from stages.masks.redraw import redrawn
+from stages.masks.grabcut import cut
+from stages.masks.matting import largest_parts
+from stages.masks.refine_contour import refined_contour
 from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, working_size
-from stages.masks.soften import largest_parts
 
 MODEL = Path(__file__).parent / "models" / "selfie_segmentation.tflite"
 SIDE = 256  # the network's input
@@ -79,7 +79,7 @@ def person_mask(image: U8, disc: Disc, threshold: float, longest: int, seed: int
 
 def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, seed: int) -> Bool:
     """Hard mask (h, w) from a network's probability: the photo's colours and contrast decide near its contour, first
-    all of them (cut_out.py), then those beside it (redraw.py).
+    all of them (grabcut.py), then those beside it (refine_contour.py).
 
     scale: size in pixels of what the network took for one pixel.
     """
@@ -90,7 +90,7 @@ def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, s
     trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[eroded(inside, radius)] = cv2.GC_FGD
     trimap[~dilated(inside, radius)] = cv2.GC_BGD
-    return of_subject(redrawn(small, of_subject(cut(small, trimap, seed), disc)), disc)
+    return of_subject(refined_contour(small, of_subject(cut(small, trimap, seed), disc)), disc)
 
 
 def of_subject(inside: Bool, disc: Disc) -> Bool:

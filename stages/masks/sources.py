@@ -11,12 +11,12 @@ import numpy as np
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
 from stages.masks.config import Method
-from stages.masks.cut_out import INNER, OUTER, cut_by_region
-from stages.masks.key_out import Background, border_colours, find_background, key_out, key_out_plate
+from stages.masks.grabcut import INNER, OUTER, cut_by_region
+from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate
+from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized
 from stages.masks.segment_person import person_mask
-from stages.masks.soften import soft_edge
-from stages.masks.solid import Solid, cut_by_points
+from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
 LOOKED_AT = 12  # views from which the kind of background and subject is judged
@@ -53,13 +53,13 @@ class Plan:
 
     method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
-    solid: Solid | None = None
+    solid: SupportedObject | None = None
     model: UserModel | None = None
 
 
 def plan(
     views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
-    solid: Callable[[], Solid | None] = lambda: None, model: UserModel | None = None,
+    solid: Callable[[], SupportedObject | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
     """Choose the way from a few of the views that are fitted. solid: looks for the object among the sparse points.
     model: the user's network, which goes before all guesses.
@@ -102,7 +102,7 @@ def plan(
     return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
 
 
-def _by_points(solid: Solid | None) -> Plan:
+def _by_points(solid: SupportedObject | None) -> Plan:
     if solid is None:
         raise StageError("no object is found among the sparse points", where="masks.method=object",
                          value="no points, or too few that hang together", limit="cameras solved from the photos "

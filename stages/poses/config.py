@@ -25,7 +25,7 @@ class Config(StageConfig):
         1500, ge=200, le=20000, description="most features per photo"
     )
     neighbours: Views = Field(14, ge=2, description="partners that a photo is matched with; up to 20 photos, all")
-    patience: int = Field(
+    attempts: int = Field(
         3, ge=1, le=3, description="tries while photos lack a place: 1 plain, 2 without noise, 3 also as if seen askew"
     )
     mapper: Literal["auto", "incremental", "global"] = Field(

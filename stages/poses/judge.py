@@ -65,13 +65,13 @@ def contradicted(wrong: Sequence[str], known: int, total: int) -> Finding:
 def groups(placed: int, others: Sequence[Sequence[str]]) -> Finding:
     """The largest group of photos that fit together, but not with the placed ones. others: names in each."""
     largest = max(others, key=len, default=())
-    said = (
+    message = (
         f"{len(largest)} photos fit together, but not with the {placed} others"
         if largest
         else "all placed photos \
 fit together"
     )
-    return judged("largest_other_group", len(largest) / max(1, placed), GROUPS, said,
+    return judged("largest_other_group", len(largest) / max(1, placed), GROUPS, message,
                   "photograph the way between the groups; if they show another subject, make a capture of their own",
                   views=largest)  # fmt: skip
 
@@ -101,15 +101,15 @@ def _errors(found: CameraSet) -> list[Finding]:
     value = found.reprojection_error_px * PER / edge
     worst = sorted(found.view_errors_px.items(), key=lambda x: -x[1])
     far = [n for n, e in worst if e * PER / edge > REPROJECTION.good]
-    said = f"points on the subject are {found.reprojection_error_px:.2f} px from where the photos show them"
-    return [judged("reprojection_error", value, REPROJECTION, said,
+    message = f"points on the subject are {found.reprojection_error_px:.2f} px from where the photos show them"
+    return [judged("reprojection_error", value, REPROJECTION, message,
                    "keep subject and lens still; take photos that overlap more", unit="px per 1000 px",
                    views=far)]  # fmt: skip
 
 
 def _focal(found: CameraSet, views: Sequence[CaptureView]) -> list[Finding]:
-    told = {v.index: v.focal_px for v in views if v.focal_px}
-    ratios = {c.name: c.K[0][0] / told[c.index] for c in found.cameras if c.index in told}
+    known = {v.index: v.focal_px for v in views if v.focal_px}
+    ratios = {c.name: c.K[0][0] / known[c.index] for c in found.cameras if c.index in known}
     if found.source != "colmap" or not ratios:
         return []
     off = abs(float(np.median(list(ratios.values()))) - 1)
@@ -126,9 +126,9 @@ def _scale(found: CameraSet, stated: bool) -> Finding:
     radius = found.roi_radius * (1.0 if found.metric else capture_unit)
     known = found.metric or stated
     off = max(low / radius, radius / high, 1.0) if known else 1.0
-    said = f"the views see {radius:.3g} {'m' if found.metric else 'units'} around the subject"
+    message = f"the views see {radius:.3g} {'m' if found.metric else 'units'} around the subject"
     return judged("scale", off, Limits(1.0, float("inf"), lower=False),
-                  (said if known else "the size of the subject is not known, and made a head's")
+                  (message if known else "the size of the subject is not known, and made a head's")
                   + (f", where a head is {low} to {high} m" if off > 1 else ""),
                   "check poses.unit, poses.distance, poses.marker_mm or poses.pupils_mm", unit="times")  # fmt: skip
 
@@ -154,10 +154,10 @@ def _seen(counts: Counts) -> list[Finding]:
     shares = {name: share_seen(counts, where) for name, where in parts().items()}
     hidden = [f"the {n} ({s:.0%} seen)" for n, s in shares.items() if s < HIDDEN and n != "underside"]
     all_round = share_seen(counts, around())
-    told = f"; hardly seen by any photo: {', '.join(hidden)}" if hidden else ""
+    unseen = f"; hardly seen by any photo: {', '.join(hidden)}" if hidden else ""
     return [
         judged("directions_seen", all_round, SEEN,
-               f"{all_round:.0%} of the directions around the subject are seen by a photo{told}", AROUND),
+               f"{all_round:.0%} of the directions around the subject are seen by a photo{unseen}", AROUND),
         judged("front_seen", shares["front"], FRONT_SEEN, f"{shares['front']:.0%} of the front is seen by a photo",
                "photograph the face from both sides, in steps of 15 degrees; if this is its front already, its "
                "direction is wrong: take photos in which the face is seen"),

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from stages.poses.check import features_of
+from stages.poses.epipolar_check import features_of
 from stages.poses.features import PLAIN, Features
 from stages.poses.matching import match, verify
 from stages.poses.photos import StoredPhoto
 
-MOST_SUSPECTS, PARTNERS = 12, 12  # photos looked at, and photos that each is held against
+MAX_SUSPECTS, PARTNERS = 12, 12  # photos looked at, and photos that each is held against
 CLEAR, MANY = 2.0, 25  # matches of the flipped picture against the photo's own: so many times, and so many at least
 
 
@@ -49,7 +49,7 @@ class Flipped:
 
 def find_mirrored(photos: Sequence[StoredPhoto], suspects: Sequence[int], fine: Sequence[int], seed: int) -> list[int]:
     """Which of the `suspects` fit the photos `fine` only when they are turned over. Both are places in `photos`."""
-    asked = list(suspects)[:MOST_SUSPECTS]
+    asked = list(suspects)[:MAX_SUSPECTS]
     partners = list(fine)[:: max(1, -(-len(fine) // PARTNERS))]
     if not asked or not partners:
         return []

@@ -83,21 +83,21 @@ def normalise(
         else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
     )
     if known is not None:
-        scale, metric, told = _checked_scale(known, radius, warnings), True, known.told
+        scale, metric, source = _checked_scale(known, radius, warnings), True, known.source
     elif given:
-        scale, metric, told = given_scale(radius, warnings, unit)
+        scale, metric, source = given_scale(radius, warnings, unit)
     else:
-        scale, metric, told = NOMINAL_ROI / radius, False, NOMINAL
+        scale, metric, source = NOMINAL_ROI / radius, False, NOMINAL
     inverse = similarity(1.0 / scale, rotation.T, centre)
-    return Normalisation(inverse, radius * scale, metric, told, tuple(warnings))
+    return Normalisation(inverse, radius * scale, metric, source, tuple(warnings))
 
 
 def _checked_scale(known: Scale, radius: float, warnings: list[str]) -> float:
     """Metres per unit. A subject of no head's size is told, and taken as it is."""
     low, high = PLAUSIBLE_ROI
     if not low <= radius * known.metres_per_unit <= high:
-        warnings.append(f"with the scale {known.told} the views see {radius * known.metres_per_unit:.3g} m around the "
-                        f"subject, where a head is {low} to {high} m; check it")  # fmt: skip
+        warnings.append(f"with the scale {known.source} the views see {radius * known.metres_per_unit:.3g} m around "
+                        f"the subject, where a head is {low} to {high} m; check it")  # fmt: skip
     return known.metres_per_unit
 
 

@@ -18,7 +18,7 @@ from pipeline.transforms import F64
 from stages.poses.normalise import nearest_point
 
 if TYPE_CHECKING:
-    from stages.poses.solve import Model
+    from stages.poses.mapper import Model
 
 GOOD_SCORE = 0.9  # below this a solution is doubted, and more effort is worth its time
 FOCAL_OFF = (

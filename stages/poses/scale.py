@@ -45,7 +45,7 @@ class Scale:
     """metres_per_unit, and where it is from in words."""
 
     metres_per_unit: float
-    told: str
+    source: str
 
 
 def check_distance(spec: str) -> str:
@@ -81,7 +81,7 @@ def _place(text: str, cameras: Sequence[Camera]) -> F64:
     """(3,) centre of the camera so named, or the point where the rays of PHOTO@X,Y+... meet."""
     if "@" not in text:
         return np.asarray(matrix(_camera(text, cameras).world_from_cam)[:3, 3], np.float64)
-    sights = []
+    observed = []
     for part in text.split("+"):
         name, _, at = part.strip().rpartition("@")
         try:
@@ -89,8 +89,8 @@ def _place(text: str, cameras: Sequence[Camera]) -> F64:
         except ValueError as e:
             raise UsageError("a point of the known distance is not understood", where="poses.distance", value=part,
                              limit="PHOTO@X,Y", remedy="write for example 1.jpg@812,440") from e  # fmt: skip
-        sights.append((_camera(name, cameras), np.array([x, y])))
-    point = meeting_point(sights)
+        observed.append((_camera(name, cameras), np.array([x, y])))
+    point = meeting_point(observed)
     if point is None:
         raise StageError("the photos don't see the point of the known distance in one place", where="poses.distance",
                          value=text, limit=f"rays that meet within {MET:.1%} of the photo's longest edge, from two "
@@ -107,26 +107,26 @@ def _camera(name: str, cameras: Sequence[Camera]) -> Camera:
                      remedy="name a photo that found its place")  # fmt: skip
 
 
-def meeting_point(sights: Sequence[tuple[Camera, F64]]) -> F64 | None:
+def meeting_point(observed: Sequence[tuple[Camera, F64]]) -> F64 | None:
     """(3,) the point nearest to the rays through pixels uv (2,), or None if there is none that all of them see.
 
     sum_i (1 - d_i d_i^T) (x - o_i) = 0
     """
-    if len(sights) < 2:
+    if len(observed) < 2:
         return None
-    x = _nearest(sights)
-    met = all(_miss(camera, x, uv) <= MET * max(camera.width, camera.height) for camera, uv in sights)
+    x = _nearest(observed)
+    met = all(_miss(camera, x, uv) <= MET * max(camera.width, camera.height) for camera, uv in observed)
     return x if met else None
 
 
-def _nearest(sights: Sequence[tuple[Camera, F64]]) -> F64:
+def _nearest(observed: Sequence[tuple[Camera, F64]]) -> F64:
     """(3,) the point nearest to the rays; NaN where they are as good as parallel."""
     A, b = np.zeros((3, 3)), np.zeros(3)
-    for camera, uv in sights:
+    for camera, uv in observed:
         o, d = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv[None])
         across = np.eye(3) - np.outer(d[0], d[0])
         A, b = A + across, b + across @ o
-    if np.linalg.eigvalsh(A)[0] < 1e-4 * len(sights):  # a sixth of a degree between two rays
+    if np.linalg.eigvalsh(A)[0] < 1e-4 * len(observed):  # a sixth of a degree between two rays
         return np.full(3, np.nan)
     return np.asarray(np.linalg.solve(A, b), np.float64)
 
@@ -211,8 +211,10 @@ def eyes_of(seen: Sequence[tuple[Camera, tuple[F64, F64]]]) -> Eyes | None:
 
 def by_pupils(eyes: Eyes, metres: float) -> Scale:
     """From the distance of the pupils."""
-    told = f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {eyes.photos} photos to {eyes.off:.1%}"
-    return Scale(metres / float(np.linalg.norm(eyes.left - eyes.right)), told)
+    source = (
+        f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {eyes.photos} photos to {eyes.off:.1%}"
+    )
+    return Scale(metres / float(np.linalg.norm(eyes.left - eyes.right)), source)
 
 
 def by_positions(

@@ -24,10 +24,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
         UsageError: given cameras are asked for and there are none.
         StageError: the given cameras share no view, or the photos can't be placed.
     """
-    from stages.poses.given import given_cameras
+    from stages.poses.given_cameras import given_cameras
     from stages.poses.judge import judge
-    from stages.poses.place import sparse_points
-    from stages.poses.solved import solved_cameras
+    from stages.poses.sfm_result import solved_cameras
+    from stages.poses.write_cameras import sparse_points
 
     views = inputs.capture.artifact.views
     all_given = all(v.camera is not None for v in views)

@@ -12,9 +12,9 @@ from pipeline import tiles
 from pipeline.images import read_encoded, read_exr
 from pipeline.verdict import Verdict
 from stages.report.by_label import LabelErrors, pooled
-from stages.report.captured import captured
+from stages.report.capture_figures import captured
+from stages.report.collect import Results
 from stages.report.compare import JudgedView
-from stages.report.gather import Results
 from stages.report.metrics import Scores, encoded, mean_scores
 from stages.report.page import Picture, Pictures, ViewRow, render_page
 from stages.report.pictures import (

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from pipeline.artifacts import HeldOutView, Located, ViewMask
 from pipeline.images import read_alpha, read_encoded, read_exr, read_linear, shrink
 from stages.report.by_label import LabelErrors, label_errors
-from stages.report.gather import Results, own_colours
+from stages.report.collect import Results, own_colours
 from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]

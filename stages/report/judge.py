@@ -88,9 +88,9 @@ def _lost(rows: Sequence[Row]) -> list[Finding]:
     if not both:
         return []
     value = max(float(np.mean(both)), 0.0)
-    said = f"the exported asset is {value:.1f} dB below the fitted model in the same views"
+    message = f"the exported asset is {value:.1f} dB below the fitted model in the same views"
     remedy = "mesh or texture is too coarse or in shreds: look at charts and handles; more texels (bake.size) may help"
-    return [judged("asset_against_model", value, LOST, said, remedy, unit="dB")]
+    return [judged("asset_against_model", value, LOST, message, remedy, unit="dB")]
 
 
 def _named(scored: Sequence[tuple[int, Scores]], names: Mapping[int, str]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from stages.report.gather import own_colours
+from stages.report.collect import own_colours
 
 ISLAND = re.compile(r'(<script type="application/json" id="timing">).*?(</script>)', re.S)
 TABLE = re.compile(r"(<!-- timing -->).*?(<!-- /timing -->)", re.S)
@@ -46,7 +46,7 @@ class Pictures:
     light: Picture | None = None
     scale: str = ""
     scale_top: float = 0.0
-    captured: object | None = None  # stages.report.captured.Captured
+    captured: object | None = None  # stages.report.capture_figures.Captured
     verdict: object | None = None  # stages.report.verdict.VerdictShown
 
 

@@ -47,8 +47,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
 
     from pipeline.verdict import verdict_of_inputs
     from stages.report.build import build_page, build_rows, summary
+    from stages.report.collect import figures
     from stages.report.compare import judged_views, unjudged
-    from stages.report.gather import figures
     from stages.report.judge import judge
 
     rows, total = [], max(1, len(inputs.usd.artifact.views), len(inputs.inverse_rendering.artifact.held_out))

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pipeline.verdict import Finding, Level, Verdict
-from stages.report.captured import photos_named
-from stages.report.gather import Started
+from stages.report.capture_figures import photos_named
+from stages.report.collect import Started
 from stages.report.page import Picture
 
 TROUBLES_SHOWN = 6  # with their photos; the table below has all

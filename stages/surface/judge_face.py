@@ -32,7 +32,7 @@ HIDDEN = {"eyes": EYES, "nose": NOSE, "mouth": (*MOUTH, *LIPS)}
 OUTER = 33, 263
 OUTER_MM = 88.0  # between the outer corners of the eyes, for captures without a scale; adults have 80 to 100
 FRONT = 0.75  # cosine to the face's front: 41 degrees
-MIN_PHOTOS, MOST_PHOTOS, MOST_PAIRS = 3, 30, 200
+MIN_PHOTOS, MAX_PHOTOS, MAX_PAIRS = 3, 30, 200
 # On a scanned head of exact cameras the network's landmarks lie 2.2 mm from the true surface in the median, single ones
 # up to 8 mm, and reproject with 3.4 mm; where a blob of the visual hull hides the face, 58, 80 and 13 mm.
 SHAPE = Limits(5.0, 12.0, lower=False)
@@ -97,7 +97,7 @@ def in_front(found: Landmarks) -> Landmarks:
     frame = head_frame(found.xyz)
     away = np.array([matrix(c.world_from_cam)[:3, 3] for c in found.cameras]).reshape(-1, 3) - frame.eyes
     use = np.flatnonzero(away @ frame.axes[2] > FRONT * np.linalg.norm(away, axis=1))
-    use = use[:: max(1, -(-len(use) // MOST_PHOTOS))]
+    use = use[:: max(1, -(-len(use) // MAX_PHOTOS))]
     return Landmarks([found.cameras[int(n)] for n in use], found.uv[use], found.xyz)
 
 
@@ -124,7 +124,7 @@ def reprojected(found: Landmarks, occluder: Occluder) -> tuple[float, float]:
     middle = np.median(found.xyz[stable], 0)
     pairs = list(permutations(range(len(found.cameras)), 2))
     off, scaled = [], []
-    for n, m in pairs[:: -(-len(pairs) // MOST_PAIRS)]:
+    for n, m in pairs[:: -(-len(pairs) // MAX_PAIRS)]:
         camera = found.cameras[m]
         pixels = residuals([camera], found.uv[m][None, stable], np.where(np.isfinite(at[n]), at[n], 0.0))[0]
         pixels = np.where(np.isfinite(at[n]).all(1), pixels, np.inf)
@@ -152,7 +152,7 @@ def _depth(mm: npt.NDArray[np.float64]) -> list[Finding]:
     of = {name: float(np.nanmedian(mm[:, list(points)])) for name, points in HIDDEN.items()}
     deepest = max(of, key=lambda name: of[name])
     buried = max(of[deepest], 0.0)
-    said = (
+    message = (
         f"{deepest}: {buried:.1f} mm behind the mesh as the photos see it"
         if buried > BURIED.good
         else f"eyes, nose and mouth lie on the mesh, none more than {buried:.1f} mm behind it"
@@ -161,15 +161,15 @@ def _depth(mm: npt.NDArray[np.float64]) -> list[Finding]:
     )
     return [
         judged("face_shape_mm", shape, SHAPE, f"the face's landmarks {where}", REMEDY, unit="mm"),
-        judged("nose_buried_mm", buried, BURIED, said, REMEDY, unit="mm"),
+        judged("nose_buried_mm", buried, BURIED, message, REMEDY, unit="mm"),
     ]
 
 
 def _again(pixels: float, distance: float, mm: float) -> Finding:
-    said = (
+    message = (
         f"the mesh under a landmark of one photo is {pixels:.1f} pixels ({mm * distance:.1f} mm) from that landmark in "
         "another photo, in the median"
         if np.isfinite(distance)
         else "photos see nothing of the mesh where they show the face's landmarks"
     )
-    return judged("face_reprojection_mm", mm * distance, REPROJECTED, said, REMEDY, unit="mm")
+    return judged("face_reprojection_mm", mm * distance, REPROJECTED, message, REMEDY, unit="mm")

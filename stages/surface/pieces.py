@@ -12,11 +12,11 @@ import numpy as np
 
 from pipeline import meshes
 from pipeline.meshes import F64, Faces, Indices, Mesh
-from pipeline.visibility import Occluder, View, sight
+from pipeline.visibility import Occluder, View, view_cosines
 
 WORTH_ASKING = 0.02  # of the largest piece's area: smaller ones are specks, whatever the photos see of them
-MOST_VIEWS = 24  # that vote, spread evenly over all
-MOST_POINTS = 20_000  # of the surface that are looked at
+MAX_VIEWS = 24  # that vote, spread evenly over all
+MAX_POINTS = 20_000  # of the surface that are looked at
 
 Votes = Callable[[Mesh, Indices], F64]  # of a mesh and the piece (F,) of each face: a share for each piece
 
@@ -28,15 +28,15 @@ def votes(mesh: Mesh, piece: Indices, views: Sequence[View], check: Callable[[],
     """
     count = int(piece.max()) + 1
     total = np.zeros(count)
-    step = -(-len(mesh.faces) // MOST_POINTS)
+    step = -(-len(mesh.faces) // MAX_POINTS)
     faces = np.arange(0, len(mesh.faces), step)
     vectors = meshes.area_vectors(mesh.vertices, mesh.faces[faces])
     centre = mesh.vertices.astype(np.float64)[mesh.faces[faces]].mean(1)
     area, normal = np.linalg.norm(vectors, axis=1), meshes.unit(vectors)
     occluder = Occluder(mesh)
-    for i in np.unique(np.linspace(0, len(views) - 1, min(MOST_VIEWS, len(views))).astype(int)) if views else ():
+    for i in np.unique(np.linspace(0, len(views) - 1, min(MAX_VIEWS, len(views))).astype(int)) if views else ():
         check()
-        cosine, _ = sight(views[i], centre, normal, occluder)
+        cosine, _ = view_cosines(views[i], centre, normal, occluder)
         away = centre - np.asarray(views[i].camera.world_from_cam, np.float64)[:3, 3]
         filled = np.bincount(piece[faces], area * cosine / (away * away).sum(1), count)
         total += filled / max(float(filled.sum()), 1e-30)

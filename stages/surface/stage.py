@@ -49,7 +49,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     """Mesh the zero set. Raises StageError when the field has none."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
-    from pipeline.visibility import Occluder, seen_by, sight
+    from pipeline.visibility import Occluder, seen_by, view_cosines
     from stages.surface.build import build
     from stages.surface.judge import judge
     from stages.surface.judge_face import face_findings
@@ -74,7 +74,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
             context.check()
             context.progress(i, len(views), "visibility")
             rest = np.flatnonzero(~seen)
-            seen[rest] = sight(view, points[rest], normals[rest], occluder)[0] > 0
+            seen[rest] = view_cosines(view, points[rest], normals[rest], occluder)[0] > 0
         return seen
 
     trims, extent = config.unseen == "trimmed", inputs.masks.artifact.extent

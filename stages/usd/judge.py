@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, Limits, judged
-from stages.usd import findings as checks
+from stages.usd.check import findings as checks
 
 F32 = npt.NDArray[np.float32]
 AGAINST_MODEL = Limits(28.0, 20.0)  # dB
@@ -111,10 +111,10 @@ def _encoded(linear: F32) -> npt.NDArray[np.float64]:
 
 def _texts(found: Iterable[tuple[str, checks.Finding]]) -> list[str]:
     """Each fault once: a component and the scene that refers to it show the same."""
-    said: dict[tuple[str, str, str], str] = {}
+    messages: dict[tuple[str, str, str], str] = {}
     for file, f in found:
-        said.setdefault((f.check, f.message, f.where), f"{file}: {f.check}: {f.message} {f.where}".strip())
-    return list(said.values())
+        messages.setdefault((f.check, f.message, f.where), f"{file}: {f.check}: {f.message} {f.where}".strip())
+    return list(messages.values())
 
 
 def _quoted(texts: list[str]) -> str:

@@ -43,11 +43,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     """Write asset/, check it, then render from what was written."""
     from pipeline.verdict import verdict_of_inputs
     from stages.usd import judge
-    from stages.usd.export import THUMBNAIL, export
-    from stages.usd.mark import mark
+    from stages.usd.check.validate import checks_run, found_in
     from stages.usd.naming import check_name
-    from stages.usd.previews import render_held_out, render_previews, render_thumbnail
-    from stages.usd.validate import checks_run, found_in
+    from stages.usd.render.previews import render_held_out, render_previews, render_thumbnail
+    from stages.usd.write.export import THUMBNAIL, export
+    from stages.usd.write.mark import mark
 
     name = check_name(config.name)
     total = 4

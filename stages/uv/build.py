@@ -13,15 +13,15 @@ from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.verdict import Finding
 from stages.uv import decimate
+from stages.uv.chart_quality import Quality, measure
 from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import front_of
 from stages.uv.judge import judge
-from stages.uv.measure import Quality, measure
 from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, most_tiles, unwrap
 
-MOST_OVERLAP, MOST_FLIPPED, MOST_EMPTY, MOST_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
+MAX_OVERLAP, MAX_FLIPPED, MAX_EMPTY, MAX_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
 MANY_CRUMBS = 50
 
 Step = Callable[[int, int, str], None]
@@ -65,7 +65,7 @@ def build(
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")
-    mesh = (remeshed if config.remesh == "even" else decimate.decimated)(dense, config.target_faces)
+    mesh = (remeshed if config.remesh == "uniform" else decimate.decimated)(dense, config.target_faces)
     proxy = decimate.decimated(mesh, config.proxy_faces)
     with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
         away = beside.submit(_away, dense, mesh, proxy)
@@ -107,14 +107,14 @@ def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, f
 
 def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
     checks = (
-        (quality.overlap, MOST_OVERLAP, "of the covered texels lie under two faces"),
-        (quality.flipped, MOST_FLIPPED, "of the surface is mirrored in its chart"),
-        (quality.empty, MOST_EMPTY, "of the surface has no area in texture space"),
-        (against, MOST_AGAINST, "of the decimated surface looks against the dense mesh"),
+        (quality.overlap, MAX_OVERLAP, "of the covered texels lie under two faces"),
+        (quality.flipped, MAX_FLIPPED, "of the surface is mirrored in its chart"),
+        (quality.empty, MAX_EMPTY, "of the surface has no area in texture space"),
+        (against, MAX_AGAINST, "of the decimated surface looks against the dense mesh"),
     )
     out = [f"{value:.2%} {what}" for value, limit, what in checks if value > limit]
-    if quality.crumbs > MANY_CRUMBS:
-        out.append(f"{quality.crumbs} of {quality.charts} charts are fragments: the surface is rough")
+    if quality.fragments > MANY_CRUMBS:
+        out.append(f"{quality.fragments} of {quality.charts} charts are fragments: the surface is rough")
     return tuple(out)
 
 

@@ -1,7 +1,7 @@
 """From a mesh to charts: pieces, laid flat, parted where that helps, packed.
 
 Pieces are found and first laid flat on the mesh with its bumps smoothed away, because noise would break them into
-crumbs; the last rigid steps are on the true surface, so that the stretch that counts is the true one.
+fragments; the last rigid steps are on the true surface, so that the stretch that counts is the true one.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 from pipeline import meshes, raster
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.density import Front, dense_charts, enlarged, face_parted, scale_for
-from stages.uv.flatten import Flat, flattened, rigid, signed, unfolded
 from stages.uv.pack import LOOSEST, boxed, pack
-from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment, without_crumbs
-from stages.uv.tiling import Tiling, packed
+from stages.uv.parameterise import Flat, parameterised, rigid, signed, unfolded
+from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment, without_fragments
+from stages.uv.tile_count import Tiling, packed
 
 TRUE_STEPS = 6  # rigid steps on the true surface
 LARGE = 0.2  # of the area: such charts are parted when they fill too little of their rectangle
@@ -24,7 +24,7 @@ FULL = 0.7  # of its rectangle that a large chart should fill
 TRIES = 5  # packings
 ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
 WORTH = 0.005  # of the square: a packing that gains less is not looked for
-MOST_CHARTS = 40
+MAX_CHARTS = 40
 ONE = Tiling()
 CHECK = 768  # texels along a chart's longest side: where two layers of it would show
 
@@ -62,11 +62,11 @@ def unwrapped(
     surface = surface_of(mesh, smooth, front)
     label = segment(smooth, mesh.faces, surface.pairs)
     if front is not None:
-        label = without_crumbs(smooth, mesh.faces, face_parted(label, front, surface.pairs), surface.pairs)
+        label = without_fragments(smooth, mesh.faces, face_parted(label, front, surface.pairs), surface.pairs)
     known: dict[bytes, Flat] = {}
     best: tuple[float, Charts, Indices] | None = None
     tries = 0
-    while tries < TRIES and int(label.max()) < MOST_CHARTS:
+    while tries < TRIES and int(label.max()) < MAX_CHARTS:
         flats = flats_of(surface, label, known)
         part = _must_part(surface, flats)
         if part is None:
@@ -98,7 +98,7 @@ def _tiled(surface: Surface, label: Indices, known: dict[bytes, Flat], padding: 
         flats = flats_of(surface, label, known)
         part = next((i for i, f in enumerate(flats) if not f.good or _longest(surface, f) > limit), None)
         pieces = int(label.max())
-        if part is None or pieces > MOST_CHARTS * tiling.most:
+        if part is None or pieces > MAX_CHARTS * tiling.most:
             break
         label = _parted(surface, label, flats[part])
         if int(label.max()) <= pieces:  # a piece of one face
@@ -130,7 +130,7 @@ def flats_of(surface: Surface, label: Indices, known: dict[bytes, Flat]) -> list
     order = np.argsort(label, kind="stable")
     keys = [m.tobytes() for m in np.split(order, np.searchsorted(label[order], np.arange(1, count)))]
     new = np.array([k not in known for k in keys])
-    for flat in flattened(surface.smooth, surface.faces, surface.pairs, label, new):
+    for flat in parameterised(surface.smooth, surface.faces, surface.pairs, label, new):
         known[flat.member.tobytes()] = _on_true_surface(surface, flat)
     return [known[k] for k in keys]
 
@@ -140,7 +140,7 @@ def laid_flat(surface: Surface, member: Indices) -> Flat:
     label = np.zeros(len(surface.area), np.int64)
     label[member] = 1
     wanted = np.array([False, True])
-    return _on_true_surface(surface, flattened(surface.smooth, surface.faces, surface.pairs, label, wanted)[0])
+    return _on_true_surface(surface, parameterised(surface.smooth, surface.faces, surface.pairs, label, wanted)[0])
 
 
 def _on_true_surface(surface: Surface, flat: Flat) -> Flat:

@@ -14,9 +14,9 @@ class Config(StageConfig):
     """Size of the meshes and how they are cut into charts."""
 
     target_faces: Triangles = Field(50_000, ge=200, le=2_000_000, description="size of the mesh that is textured")
-    remesh: Literal["adaptive", "even"] = Field(
+    remesh: Literal["adaptive", "uniform"] = Field(
         "adaptive",
-        description="adaptive: few triangles where it is flat; even: one size and shape, for sculpting and quads",
+        description="adaptive: few triangles where it is flat; uniform: one size and shape, for sculpting and quads",
     )
     proxy_faces: Triangles = Field(5_000, ge=100, le=200_000, description="size of the coarse stand-in (proxy)")
     tiles: Annotated[int, Field(ge=1, le=10)] | Literal["auto"] = Field(

@@ -23,7 +23,7 @@ from pipeline.meshes import F64, Charts, Faces, Indices, Mask, Mesh
 from stages.uv.segment import FLOW, Dual, connected
 
 SHARE = 0.42  # of the area under charts for the face: 0.40 is promised, and texels on borders take some
-MOST = 5.0  # s at most: a head with shoulders needs 4; beyond, the rest would be blurred for little
+MAX_SCALE = 5.0  # s at most: a head with shoulders needs 4; beyond, the rest would be blurred for little
 SHOWS = 0.25  # share of a chart that is face, from which on it is enlarged
 WIDER = 1.35  # the region's outline over the face's, from the middle of the face
 
@@ -68,7 +68,7 @@ def scale_for(front: Front, dense: Mask, area: F64) -> float:
     face, part, total = (float(area[m].sum()) for m in (front.face & dense, dense, np.ones_like(dense)))
     left = face - SHARE * part
     wanted = np.inf if left <= 0 else SHARE * (total - part) / left
-    return float(np.sqrt(np.clip(wanted, 1.0, MOST**2)))
+    return float(np.sqrt(np.clip(wanted, 1.0, MAX_SCALE**2)))
 
 
 def dense_charts(label: Indices, front: Front, area: F64) -> Mask:

@@ -8,8 +8,8 @@ surface is stretched; people photographed by hand have 9 to 32 charts and 1 to 6
 from __future__ import annotations
 
 from pipeline.verdict import Finding, Limits, judged
+from stages.uv.chart_quality import STRETCHED, Quality
 from stages.uv.decimate import Deviation
-from stages.uv.measure import STRETCHED, Quality
 
 # more than 40: the surface does not come apart into a few discs (stages.uv.charts)
 CHARTS = Limits(40, 400, lower=False)
@@ -39,9 +39,9 @@ def judge(
         judged("charts", q.charts, CHARTS, f"the surface comes apart into {q.charts} charts", SHAPE),
         judged(
             "fragments",
-            q.crumbs,
+            q.fragments,
             FRAGMENTS,
-            f"{q.crumbs} of {q.charts} charts are fragments with less than half a thousandth of the surface",
+            f"{q.fragments} of {q.charts} charts are fragments with less than half a thousandth of the surface",
             SHAPE,
         ),
         judged(
@@ -101,9 +101,9 @@ def _face(share: float | None) -> tuple[Finding, ...]:
     """Of the texels; nothing where no landmarks say what the face is, or uv.face is off."""
     if share is None:
         return ()
-    said = f"the face has {share:.1%} of the area under charts"
+    message = f"the face has {share:.1%} of the area under charts"
     remedy = (
         "the mesh does not have the face where the photos show it (look at face_shape_mm), or the face is a small part "
         "of it: check the masks"
     )
-    return (judged("face_share", share, FACE, said, remedy),)
+    return (judged("face_share", share, FACE, message, remedy),)

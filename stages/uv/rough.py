@@ -19,21 +19,21 @@ import numpy as np
 from pipeline import meshes
 from pipeline.meshes import F64, Charts, Faces, Indices, Mask, Mesh
 from stages.uv.charts import Surface, flats_of, laid_flat, surface_of, together
-from stages.uv.flatten import Flat, local_frames, signed
+from stages.uv.parameterise import Flat, local_frames, signed
 from stages.uv.segment import connected, halved, segment
 
 log = logging.getLogger("neuface.uv")
 ROUNDS = 24  # of parting what does not lie flat; of a shredded torso with 50,000 faces 12 leave 0.1 % of the area
-MOST_PIECES = 1500  # from here on xatlas is quicker
+MAX_PIECES = 1500  # from here on xatlas is quicker
 FRAGMENT = 5e-4  # of the area. Of a head's 0.15 m^2 75 mm^2, a square of 9 mm
 MERGES = 300  # of fragments that are tried, the smallest first: a fifth of a second each with large neighbours
 SHORT = 1e-3
-LEAST_HEIGHT = 1e-2  # of a face's length: faces without area are drawn as high, so that they have texels
+MIN_HEIGHT = 1e-2  # of a face's length: faces without area are drawn as high, so that they have texels
 
 
 def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
     """Texture vertices (U, 2) in one common scale, faces (F, 3) into them and the chart (F,) of each: not packed yet.
-    None where that would take more than MOST_PIECES charts.
+    None where that would take more than MAX_PIECES charts.
 
     smooth: (V, 3) vertices without bumps.
     """
@@ -43,14 +43,14 @@ def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
     for _ in range(ROUNDS):
         flats = flats_of(surface, label, known)
         bad = [f for f in flats if not f.good and len(f.member) > 1]
-        if not bad or len(flats) > MOST_PIECES:
+        if not bad or len(flats) > MAX_PIECES:
             break
         label = _all_parted(surface, label, bad)
     flats = flats_of(surface, label, known)
     flats = _merged(surface, flats)
     log.info("uv: %d pieces, %d of them laid face by face", len(flats), sum(not f.good for f in flats))
     flats = [one for f in flats for one in ([f] if f.good else _face_by_face(surface, f))]
-    if len(flats) > MOST_PIECES:
+    if len(flats) > MAX_PIECES:
         return None
     return together(surface, flats)
 
@@ -100,11 +100,11 @@ def _merged(surface: Surface, flats: list[Flat]) -> list[Flat]:
 
 
 def _face_by_face(surface: Surface, flat: Flat) -> list[Flat]:
-    """Each face of a piece as a chart of its own, without stretch; one without area is drawn LEAST_HEIGHT high."""
+    """Each face of a piece as a chart of its own, without stretch; one without area is drawn MIN_HEIGHT high."""
     faces = surface.faces[flat.member].astype(np.int64)
     frame = local_frames(surface.true, faces)
     span = float(np.ptp(surface.true, axis=0).max())
     frame[:, 1, 0] = np.maximum(frame[:, 1, 0], 1e-6 * span)
-    frame[:, 2, 1] = np.maximum(frame[:, 2, 1], LEAST_HEIGHT * frame[:, 1, 0])
+    frame[:, 2, 1] = np.maximum(frame[:, 2, 1], MIN_HEIGHT * frame[:, 1, 0])
     own = np.arange(3, dtype=np.int32)[None]
     return [Flat(flat.member[i : i + 1], own, frame[i], faces[i], good=True) for i in range(len(faces))]

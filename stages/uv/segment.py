@@ -26,7 +26,7 @@ FRONT_COST = 12.0  # times what a seam elsewhere costs
 FRONT_FROM, FRONT_TO = 0.1, 0.5  # cosines to FRONT between which the cost grows
 BEND = 0.4  # most bend of a chart: a little more than half a cylinder (0.36), less than half a sphere (0.5)
 FRONT_BEND = 0.6  # where the border that would go away lies in front: a face reaches from ear to ear
-LARGER_BEND = 0.5  # allowed when a crumb is taken up
+LARGER_BEND = 0.5  # allowed when a fragment is taken up
 CRUMB = 0.012  # of the area: smaller pieces are given to a neighbour
 ROUNDS = 400
 ENDS = 0.3  # of a piece: where its ends are when it is parted
@@ -67,7 +67,7 @@ def segment(vertices: F64, faces: Faces, pairs: Dual) -> Indices:
     label = _grown(vectors, area, pairs)
     label = _straightened(label, vectors, area, pairs, float(np.ptp(vertices, axis=0).max()))
     label = connected(label, pairs)
-    return _without_crumbs(label, vectors, area, pairs)
+    return _without_fragments(label, vectors, area, pairs)
 
 
 def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
@@ -82,10 +82,10 @@ def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def without_crumbs(vertices: F64, faces: Faces, label: Indices, pairs: Dual) -> Indices:
+def without_fragments(vertices: F64, faces: Faces, label: Indices, pairs: Dual) -> Indices:
     """Pieces (F,) that were parted otherwise, small ones given to their neighbours."""
     vectors = meshes.area_vectors(vertices, faces)
-    return _without_crumbs(label, vectors, np.linalg.norm(vectors, axis=1), pairs)
+    return _without_fragments(label, vectors, np.linalg.norm(vectors, axis=1), pairs)
 
 
 def _bent(normal: F64, area: F64) -> F64:
@@ -174,7 +174,7 @@ def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: fl
     return label
 
 
-def _without_crumbs(label: Indices, vectors: F64, area: F64, pairs: Dual) -> Indices:
+def _without_fragments(label: Indices, vectors: F64, area: F64, pairs: Dual) -> Indices:
     """Pieces below CRUMB of the area go to the neighbour with the costliest border that bears it."""
     total = area.sum()
     for _ in range(ROUNDS):

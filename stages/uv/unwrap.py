@@ -2,7 +2,7 @@
 (MIT) where even these do not lie flat.
 
 xatlas too cuts and flattens the mesh with its bumps smoothed away, in the same connectivity: noise in the surface
-would otherwise break its charts into hundreds of crumbs. Its mirrored charts are turned over.
+would otherwise break its charts into hundreds of fragments. Its mirrored charts are turned over.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from stages.uv.config import Config
 from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
 from stages.uv.rough import in_pieces, short
-from stages.uv.tiling import Tiling, packed
-from stages.uv.unfold import folded, one_by_one, taken_apart
+from stages.uv.split_overlaps import folded, one_by_one, taken_apart
+from stages.uv.tile_count import Tiling, packed
 
 log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
@@ -66,7 +66,7 @@ def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float 
 def most_tiles(config: Config, texel: float | None) -> int:
     """How many tiles may be filled. texel: the largest that is wished for; auto without one knows no need of more."""
     if config.tiles == "auto":
-        return 1 if texel is None else tiles.MOST
+        return 1 if texel is None else tiles.MAX_TILES
     return config.tiles
 
 
@@ -100,7 +100,7 @@ def _with_texels(charts: Charts, mesh: Mesh, config: Config, tiling: Tiling, fro
 
 
 def _flat(uvs: F64, faces: Faces, mesh: Mesh, config: Config) -> tuple[F64, Faces]:
-    """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.unfold)."""
+    """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.split_overlaps)."""
     areas, corners = meshes.areas(mesh.vertices, mesh.faces), mesh.vertices.astype(np.float64)[mesh.faces]
     uvs = evened(turned_over(uvs, faces), faces, areas)
     for turn in range(UNFOLDINGS):
@@ -212,7 +212,7 @@ def spread(uvs: F64, faces: Faces) -> F64:
 
 
 def _packed(uvs: F64, faces: Faces, config: Config) -> Charts:
-    """The charts in one square as xatlas places them: quick for hundreds of crumbs, but not tight.
+    """The charts in one square as xatlas places them: quick for hundreds of fragments, but not tight.
 
     xatlas leaves faces out that are smaller than 1e-7 in the given unit, and puts them anywhere: on a surface in metres
     a tenth of a square millimetre. So the charts are given to it larger.

@@ -36,7 +36,7 @@ def test_no_python_in_docker(repo: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "module", ["stages", "workflows.plan", "workflows.commands", "workflows.cli", "stages.presets"]
+    "module", ["stages", "workflows.run.plan", "workflows.cli.commands", "workflows.cli.main", "stages.presets"]
 )
 def test_importing_is_light(module: str, repo: Path) -> None:
     code = f"import sys, {module}; print(*sorted(m for m in {HEAVY!r} if m in sys.modules))"
@@ -44,7 +44,7 @@ def test_importing_is_light(module: str, repo: Path) -> None:
     assert done.stdout.split() == []
 
 
-@pytest.mark.parametrize("module", ["workflows.cli", "stages.__main__", "workflows.flows"])
+@pytest.mark.parametrize("module", ["workflows.cli.main", "stages.__main__", "workflows.flows"])
 def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path) -> None:
     code = (
         "import os, sys\n"
@@ -127,4 +127,4 @@ def test_data_files_are_packaged(repo: Path) -> None:
 
 def test_console_script_is_installed() -> None:
     found = [e for e in importlib.metadata.entry_points(group="console_scripts") if e.name == "neuface"]
-    assert [e.value for e in found] == ["workflows.entry:main"]
+    assert [e.value for e in found] == ["workflows.cli.entry:main"]

@@ -15,7 +15,7 @@ import torch
 from pipeline.artifacts import FileRef
 from pipeline.images import MAX_BYTES
 from stages.capture.scan import scan_capture
-from stages.usd.validate import _image_fault
+from stages.usd.check.validate import _image_fault
 from tests.support.facescape_tree import write_tree
 
 SOURCES = [p for top in ("pipeline", "stages", "workflows") for p in sorted(Path(top).rglob("*.py"))]
@@ -102,7 +102,7 @@ def test_a_member_of_an_archive_lands_nowhere_else_and_bombs_are_not_unpacked(tm
 
 
 def test_servers_listen_on_this_machine_unless_asked(repo: Path) -> None:
-    from workflows.cli import parser
+    from workflows.cli.main import parser
 
     assert parser().parse_args(["serve"]).host == "127.0.0.1"
     text = (repo / "docker/compose.yaml").read_text()

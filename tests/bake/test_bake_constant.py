@@ -12,7 +12,7 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.meshes import Charts, Mesh
 from stages.bake.build import Baker
 from stages.bake.write import KINDS
-from stages.uv import measure, unwrap
+from stages.uv import chart_quality, unwrap
 from stages.uv.config import Config
 from tests.support.analytic_fields import AnalyticField, Distance, sphere, union
 
@@ -90,7 +90,7 @@ def test_one_material_gives_even_maps(name: str) -> None:
     assert charts.uvs.tobytes() == again.uvs.tobytes() and charts.faces.tobytes() == again.faces.tobytes()
     assert np.isfinite(charts.uvs).all() and charts.uvs.min() >= 0 and charts.uvs.max() <= 1
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).all()  # none empty, none flipped
-    assert measure.measure(mesh, charts).overlap == 0
+    assert chart_quality.measure(mesh, charts).overlap == 0
     twice = [Baker(field, mesh, charts, (), SIZE, lambda *_: None).tile(0) for _ in range(2)]
     for kind in KINDS:
         images = [KINDS[kind].values(b.samples)[b.nearest] for b in twice]
@@ -101,4 +101,4 @@ def test_one_material_gives_even_maps(name: str) -> None:
         assert np.ptp(flat, axis=0).max() <= 2e-6 * np.abs(flat).max()
     normal = KINDS["normal"].values(twice[0].samples)
     assert np.isfinite(normal).all() and np.allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
-    assert twice[0].tally.deviation < 0.002  # facets of 15 degrees: r (1 - cos) is 0.6 mm
+    assert twice[0].statistics.deviation < 0.002  # facets of 15 degrees: r (1 - cos) is 0.6 mm

@@ -202,7 +202,7 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
     away = world_from_cam[:3, 3] - x
     cosine = (away * n).sum(1) / np.linalg.norm(away, axis=1)
     seen = cosines > 0
-    assert seen.sum() > 300 and not seen[cosine < detail_kernels.LEAST_COSINE - 1e-6].any()
+    assert seen.sum() > 300 and not seen[cosine < detail_kernels.MIN_COSINE - 1e-6].any()
     assert np.allclose(cosines[seen], cosine[seen], atol=1e-5)
     assert np.abs(10 * out[seen, :2] * PIXELS - uv[seen]).max() < 0.02  # the square root's 16 bits
     assert seen[cosine > 0.5].all()
@@ -239,7 +239,7 @@ def test_shade_is_the_radiance_of_a_white_surface() -> None:
     n = np.eye(3)
     assert np.allclose(detail.shade(light, n, np.ones((3, 3), np.float32)), [1, 2, 3], rtol=1e-4)
     dark = detail.shade(light, n, np.full((3, 3), 1e-6, np.float32))
-    assert np.allclose(dark, detail.LEAST_LIGHT * 2, rtol=1e-4)
+    assert np.allclose(dark, detail.MIN_LIGHT * 2, rtol=1e-4)
 
 
 def test_clipped_pixels_have_no_say(scene: Scene, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.verdict import Finding
-from stages.bake.judge import LEAST, MOST, Texels, chosen, judge, together
+from stages.bake.judge import MAX_TEXELS, MIN_SKIN, Texels, chosen, judge, together
 from stages.bake.regions import Votes
 from stages.bake.texels import Samples
 
@@ -60,7 +60,7 @@ def test_f0_of_the_skin_counts_and_not_that_of_all() -> None:
     """Wet eyes and metal on the clothes are not skin."""
     studs = head(f0=lambda t: np.where(t.skin, t.f0, 0.9))
     assert by_name(studs)["f0_mean"].level == "good"
-    assert by_name(head(skin=LEAST - 1, f0=lambda t: np.where(t.skin, t.f0, 0.9)))["f0_mean"].level == "unusable"
+    assert by_name(head(skin=MIN_SKIN - 1, f0=lambda t: np.where(t.skin, t.f0, 0.9)))["f0_mean"].level == "unusable"
 
 
 def test_a_few_texels_beyond_physics() -> None:
@@ -115,9 +115,9 @@ def test_only_what_was_seen_is_chosen() -> None:
 
 
 def test_an_even_choice_of_many() -> None:
-    n = 2 * MOST + 1
+    n = 2 * MAX_TEXELS + 1
     t = chosen(samples(n, np.zeros(n)), np.arange(n), 1024, None, ())
-    assert MOST / 2 < len(t.f0) <= MOST and np.ptp(t.f0) > 0.99 * n
+    assert MAX_TEXELS / 2 < len(t.f0) <= MAX_TEXELS and np.ptp(t.f0) > 0.99 * n
 
 
 def test_tiles_together_and_nothing_seen() -> None:

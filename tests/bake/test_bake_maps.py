@@ -17,7 +17,7 @@ from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import Occluder, View
 from stages.bake.ambient import ambient
 from stages.bake.build import Baked, Baker
-from stages.bake.gutter import nearest_rows
+from stages.bake.dilate import nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
 from stages.surface.build import build as surface_build
@@ -261,7 +261,7 @@ def test_nearest_texels_are_found_across_bands_and_holes(monkeypatch: pytest.Mon
     covered[40:70] = False
     rows, columns = np.nonzero(covered)
     for halo in (512, 4):
-        monkeypatch.setattr("stages.bake.gutter.HALO", halo)
+        monkeypatch.setattr("stages.bake.dilate.HALO", halo)
         for first in range(0, 96, 8):
             got = nearest_rows(covered, first, first + 8)
             for r, c in ((0, 0), (3, 31), (7, 63)):
@@ -297,10 +297,10 @@ def test_albedo_is_clamped_to_what_skin_can_be(field: AnalyticField, mesh_and_ch
     albedo, clamped = np.asarray(baked.samples.albedo), np.asarray(baked.samples.clamped)
     assert albedo.max() == np.float32(0.95) and clamped.max() == pytest.approx(0.05, abs=1e-6)
     assert (
-        baked.tally.figures(detail=False)["albedo_clamped"] == pytest.approx((clamped > 0).mean(), abs=1e-6)
+        baked.statistics.figures(detail=False)["albedo_clamped"] == pytest.approx((clamped > 0).mean(), abs=1e-6)
         and (clamped > 0).any()
     )
-    assert any("was clamped" in w for w in baked.tally.warnings(0, 0))
+    assert any("was clamped" in w for w in baked.statistics.warnings(0, 0))
     maps = write_maps(baked, Context(tmp_path, tmp_path))
     marked = read_exr(tmp_path / "textures/clamped.exr")[0][..., 0]
     assert np.array_equal(marked.reshape(-1)[baked.texel] > 0, clamped > 0) and "clamped" in maps
@@ -316,7 +316,7 @@ def test_coverage_holds_every_touched_texel(mesh_and_charts: tuple[Mesh, Charts]
     covered = baked.covered()
     assert covered[row.clip(0, SIZE - 1), column.clip(0, SIZE - 1)].all()
     assert (
-        covered.mean() == baked.tally.coverage
+        covered.mean() == baked.statistics.coverage
         and covered.mean() < 1.35 * unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces).sum()
     )
 
@@ -342,8 +342,8 @@ def test_cap_is_left_where_it_is() -> None:
     assert on_cap.sum() > 50 and not baked.samples.landed[on_cap].any()
     assert np.abs(baked.samples.displacement[on_cap]).max() == 0
     assert np.allclose(baked.samples.normal[on_cap], [0, 0, 1], atol=1e-5)
-    assert any("the fitted surface does not reach" in w for w in baked.tally.warnings(0, 0)) and any(
-        "no fitted view" in w for w in baked.tally.warnings(0, 0)
+    assert any("the fitted surface does not reach" in w for w in baked.statistics.warnings(0, 0)) and any(
+        "no fitted view" in w for w in baked.statistics.warnings(0, 0)
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 from pipeline.contract import Context
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
-from pipeline.visibility import Occluder, View, sight
+from pipeline.visibility import Occluder, View, view_cosines
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.regions import Poll, Votes
@@ -37,7 +37,7 @@ def mesh_and_charts() -> tuple[Mesh, Charts]:
 
 
 def weight_of(view: View, points: np.ndarray, normals: np.ndarray, occluder: Occluder) -> np.ndarray:
-    return sight(view, points, normals, occluder)[0]
+    return view_cosines(view, points, normals, occluder)[0]
 
 
 def test_confidence_of_a_sphere_is_its_cosines() -> None:

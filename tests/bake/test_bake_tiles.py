@@ -16,7 +16,7 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import Occluder
-from stages.bake import detail, regions, tally
+from stages.bake import detail, regions, statistics
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.stage import Config, Inputs, region_shares, run
@@ -70,7 +70,7 @@ def written(
     baked = [baker.tile(t) for t in range(COUNT)]
     context = Context(folder, folder)
     parts = [write_maps(b, context, t, COUNT) for t, b in enumerate(baked)]
-    return folder, baked, joined(parts, [b.tally.texels for b in baked], context)  # type: ignore[return-value]
+    return folder, baked, joined(parts, [b.statistics.texels for b in baked], context)  # type: ignore[return-value]
 
 
 def test_one_material_is_even_over_all_tiles_and_their_gutters(ball: Mesh, charts: Charts) -> None:
@@ -86,7 +86,7 @@ def test_every_tile_holds_its_part_of_the_surface(
     ball: Mesh, charts: Charts, written: tuple[Path, list[Baked], dict[str, object]]
 ) -> None:
     for t in range(COUNT):
-        mesh, own = tiles.alone(ball, charts, t)
+        mesh, own = tiles.single_tile(ball, charts, t)
         hits = raster.rasterise(raster.texel_corners(own, SIZE), SIZE, 0, SIZE)
         x = (mesh.vertices[mesh.faces[hits.face]] * hits.weights[..., None]).sum(1).astype(np.float64)
         x *= RADIUS / np.linalg.norm(x, axis=1, keepdims=True)
@@ -111,7 +111,7 @@ def test_files_and_figures_of_all_tiles(written: tuple[Path, list[Baked], dict[s
     assert maps["albedo"].maximum == pytest.approx(float(inside.max()))  # type: ignore[attr-defined]
     coverage = [read_encoded(folder / f"textures/coverage.{1001 + t}.png") for t in range(COUNT)]
     assert maps["coverage"].mean == pytest.approx(np.mean(coverage) / 255, abs=2e-3)  # type: ignore[attr-defined]
-    whole = tally.together([b.tally for b in baked])
+    whole = statistics.together([b.statistics for b in baked])
     assert whole.coverage == pytest.approx(np.mean(covered))
     unseen = np.concatenate([b.samples.unseen for b in baked]) > 0.5
     assert whole.figures(detail=False)["unseen"] == pytest.approx(float(unseen.mean()), abs=1e-6)
@@ -140,7 +140,7 @@ def test_regions_and_their_shares_of_the_surface(
 
 
 def test_a_tile_is_hidden_by_what_lies_in_another(ball: Mesh, charts: Charts) -> None:
-    part, own = tiles.alone(ball, charts, 0)
+    part, own = tiles.single_tile(ball, charts, 0)
     wall = np.float32([[-0.1, -0.1, 0.1], [0.1, -0.1, 0.1], [0.1, 0.1, 0.1], [-0.1, 0.1, 0.1]])
     both = Occluder(
         Mesh(
@@ -150,10 +150,10 @@ def test_a_tile_is_hidden_by_what_lies_in_another(ball: Mesh, charts: Charts) ->
         )
     )
     for t in range(COUNT):
-        part, own = tiles.alone(ball, charts, t)
+        part, own = tiles.single_tile(ball, charts, t)
         assert sighted(part, own, VIEWS[:1], 64, quiet, both).confidence.max() == 0
     assert any(
-        sighted(*tiles.alone(ball, charts, t), VIEWS[:1], 64, quiet, Occluder(ball)).confidence.max() > 0.4
+        sighted(*tiles.single_tile(ball, charts, t), VIEWS[:1], 64, quiet, Occluder(ball)).confidence.max() > 0.4
         for t in range(COUNT)
     )
 

@@ -12,8 +12,8 @@ from skimage.color import lab2xyz
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_linear, write_exr
-from stages.capture.chart import HUES, PATCHES, REFLECTANCES, Patches, find_chart, hues, places
-from stages.capture.gauge import Gauge, gauge_of
+from stages.capture.colour_checker import HUES, PATCHES, REFLECTANCES, Patches, find_chart, hues, places
+from stages.capture.colour_matrix import ColourMatrix, colour_matrix_of
 
 LAB = np.array([
     [37.986, 13.555, 14.059], [65.711, 18.13, 17.81], [49.927, -4.88, -21.925], [43.139, -13.095, 21.905],
@@ -84,9 +84,9 @@ def test_a_chart_is_found_and_says_what_the_camera_did(turns: int) -> None:
     edges = np.array([[[11, 10], [569, 10], [569, 390], [11, 390]]], np.float32)  # half a gap around the patches
     edges = cv2.perspectiveTransform(edges, cv2.getPerspectiveTransform(card, np.float32(quad)))[0]
     assert np.abs(found.corners - 0.5 - edges).max() < 1
-    gauge = gauge_of(found)
-    assert isinstance(gauge, Gauge) and gauge.way == "matrix" and gauge.error < 0.03
-    assert close_to(gauge.matrix, np.linalg.inv(CAMERA))
+    correction = colour_matrix_of(found)
+    assert isinstance(correction, ColourMatrix) and correction.way == "matrix" and correction.error < 0.03
+    assert close_to(correction.matrix, np.linalg.inv(CAMERA))
 
 
 def test_files_of_any_depth_and_uneven_light() -> None:
@@ -95,9 +95,9 @@ def test_files_of_any_depth_and_uneven_light() -> None:
     for image in (eight, eight.astype(np.uint16) * 257, (3 * linear).astype(np.float32)):
         found = find_chart(image)
         assert found is not None
-        gauge = gauge_of(found)
+        correction = colour_matrix_of(found)
         scale = 3 if image.dtype == np.float32 else 1
-        assert isinstance(gauge, Gauge) and close_to(gauge.matrix, np.linalg.inv(scale * CAMERA))
+        assert isinstance(correction, ColourMatrix) and close_to(correction.matrix, np.linalg.inv(scale * CAMERA))
     assert find_chart(eight[..., :1]) is None  # a grey photo has no colours to tell
     assert find_chart(encoded(NOISE)) is None
 
@@ -121,32 +121,34 @@ def test_as_few_numbers_as_explain_the_chart() -> None:
     rng = np.random.default_rng(3)
     gains = exact(np.diag([0.8, 0.5, 0.3]))
     noisy = Patches(QUAD, gains.colours * rng.normal(1, 0.01, (PATCHES, 1)), gains.usable)
-    found = gauge_of(noisy)
-    assert isinstance(found, Gauge) and found.way == "gains" and close_to(found.matrix, np.diag([1.25, 2, 1 / 0.3]))
-    mixed = gauge_of(exact(CAMERA))
-    assert isinstance(mixed, Gauge) and mixed.way == "matrix" and mixed.error < 1e-9
+    found = colour_matrix_of(noisy)
+    assert (
+        isinstance(found, ColourMatrix) and found.way == "gains" and close_to(found.matrix, np.diag([1.25, 2, 1 / 0.3]))
+    )
+    mixed = colour_matrix_of(exact(CAMERA))
+    assert isinstance(mixed, ColourMatrix) and mixed.way == "matrix" and mixed.error < 1e-9
     assert mixed.matrix == pytest.approx(np.linalg.inv(CAMERA))
     uneven = Patches(QUAD, exact(CAMERA).colours * (1 + places() @ [0.2, 0.1])[:, None], np.ones(PATCHES, bool))
-    assert gauge_of(uneven).matrix == pytest.approx(np.linalg.inv(CAMERA))
+    assert colour_matrix_of(uneven).matrix == pytest.approx(np.linalg.inv(CAMERA))
 
 
 def test_clipped_patches_do_not_count_and_too_few_are_refused() -> None:
     found = find_chart(encoded(2.2 * SCENE))
     assert found is not None and not found.usable[18] and found.usable[21:].all()
-    gauge = gauge_of(found)
-    assert isinstance(gauge, Gauge) and gauge.patches == found.usable.sum() < PATCHES
-    assert close_to(gauge.matrix, np.linalg.inv(2.2 * CAMERA))
+    correction = colour_matrix_of(found)
+    assert isinstance(correction, ColourMatrix) and correction.patches == found.usable.sum() < PATCHES
+    assert close_to(correction.matrix, np.linalg.inv(2.2 * CAMERA))
     few = Patches(found.corners, found.colours, np.arange(PATCHES) < 13)
-    assert "13 patches of 24" in str(gauge_of(few))
+    assert "13 patches of 24" in str(colour_matrix_of(few))
 
 
 def test_what_is_no_chart_is_refused() -> None:
     rng = np.random.default_rng(0)
     for _ in range(8):  # other colours, and the chart's own in another order
         for colours in (rng.random((PATCHES, 3)), REFLECTANCES[rng.permutation(PATCHES)]):
-            assert "does not show" in str(gauge_of(Patches(QUAD, colours, np.ones(PATCHES, bool))))
+            assert "does not show" in str(colour_matrix_of(Patches(QUAD, colours, np.ones(PATCHES, bool))))
     steep = Patches(QUAD, exact(CAMERA).colours * (1 + places() @ [0.7, 0.25])[:, None], np.ones(PATCHES, bool))
-    assert "unevenly" in str(gauge_of(steep))
+    assert "unevenly" in str(colour_matrix_of(steep))
 
 
 def test_all_photos_come_to_the_charts_white(tmp_path: Path, gather) -> None:
@@ -177,29 +179,29 @@ def test_all_photos_come_to_the_charts_white(tmp_path: Path, gather) -> None:
 def test_off_on_and_without_one_nothing_changes(tmp_path: Path, gather) -> None:
     for i in range(3):
         write(tmp_path / f"{i}.png", SCENE if i == 0 else NOISE @ CAMERA.T, seed=i)
-    off = gather(tmp_path, chart="off", drop_blurred=False)
+    off = gather(tmp_path, colour_checker="off", drop_blurred=False)
     assert off.artifact.chart is None and [v.exposure for v in off.artifact.views] == [1, 1, 1]
     assert off.path(off.artifact.views[0].image).read_bytes() == (tmp_path / "0.png").read_bytes()
-    assert gather(tmp_path, chart="on", drop_blurred=False).artifact.chart is not None
+    assert gather(tmp_path, colour_checker="on", drop_blurred=False).artifact.chart is not None
     write(tmp_path / "0.png", NOISE @ CAMERA.T, seed=7)
     auto = gather(tmp_path)
     assert auto.artifact.chart is None and not auto.artifact.warnings
     assert auto.path(auto.artifact.views[0].image).read_bytes() == (tmp_path / "0.png").read_bytes()
     with pytest.raises(StageError, match="no colour chart is found") as caught:
-        gather(tmp_path, chart="on")
-    assert "capture.chart=auto" in str(caught.value)
+        gather(tmp_path, colour_checker="on")
+    assert "capture.colour_checker=auto" in str(caught.value)
 
 
 def test_a_chart_that_is_none_is_named(tmp_path: Path, gather, monkeypatch) -> None:
     for i in range(3):
         write(tmp_path / f"{i}.png", NOISE, seed=i)
     wrong = Patches(QUAD, np.random.default_rng(1).random((PATCHES, 3)), np.ones(PATCHES, bool))
-    monkeypatch.setattr("stages.capture.gather.find_chart", lambda image: wrong)
+    monkeypatch.setattr("stages.capture.import_photo.find_chart", lambda image: wrong)
     found = gather(tmp_path).artifact
     assert found.chart is None
     assert "1.png: the colour chart does not show" in "; ".join(found.warnings)
     with pytest.raises(StageError, match=r"0\.png"):
-        gather(tmp_path, chart="on")
+        gather(tmp_path, colour_checker="on")
 
 
 def test_float_files_stay_float_and_cameras_have_maps_of_their_own(tmp_path: Path, gather) -> None:

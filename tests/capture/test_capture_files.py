@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from stages.capture.exif import Exif, metres_from, read_exif
-from stages.capture.gather import turn_upright
-from stages.capture.intact import fault_of
+from stages.capture.import_photo import turn_upright
+from stages.capture.integrity import fault_of
 
 TEXTURE = np.random.default_rng(0).integers(0, 255, (600, 640, 3), np.uint8)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import StageError
-from stages.capture.film import choose
 from stages.capture.scan import scan_capture
+from stages.capture.video import choose
 
 
 def film(path: Path, shifts: list[int], soft: frozenset[int] = frozenset(), size: tuple[int, int] = (160, 120)) -> Path:

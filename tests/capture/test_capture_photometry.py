@@ -12,8 +12,8 @@ from pipeline.artifacts import CameraSet, Capture, FileRef, Located, MaskSet, Vi
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_alpha
 from stages.capture.photometry import clipped, exposures, mean_light
-from stages.inverse_rendering.gather import read_views
-from stages.inverse_rendering.views import PhotoView, PixelTable
+from stages.inverse_rendering.load_views import read_views
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 from tests.capture.test_capture_files import exif_jpeg, place_block
 
 NOISE = cv2.GaussianBlur(np.random.default_rng(5).random((160, 200, 3)), (0, 0), 2)

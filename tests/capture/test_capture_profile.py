@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from stages.capture.profile import is_srgb, profile_name
+from stages.capture.icc_profile import is_srgb, profile_name
 from tests.support.textured_ball import flat
 
 

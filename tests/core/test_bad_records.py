@@ -13,7 +13,7 @@ from pipeline.artifacts import CaptureSource, FileRef
 from pipeline.errors import DiskError, StageError, UsageError, stage_error_from_os_error
 from pipeline.store import LINEAGE, MANIFEST, RUN, Store, lineage
 from stages.presets import configs_for, parse_sets, read_config_file
-from workflows.cli import main
+from workflows.cli.main import main
 
 KEY = "0" * 64
 

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import yaml
 
-from workflows.access import CLIENT_LOGIN, CSRF, ORIGINS, ROOTS, SERVER_LOGIN
-from workflows.environment import SLOTS_ON_DISK
+from workflows.server.access import CLIENT_LOGIN, CSRF, ORIGINS, ROOTS, SERVER_LOGIN
+from workflows.server.environment import SLOTS_ON_DISK
 
 CLOSED = {"type": "object", "properties": {}, "additionalProperties": False}  # no variable, and none can be added
 

@@ -19,6 +19,13 @@ FOLDERS = {
     "pipeline/demo": "### pipeline/demo/",
     "stages": "## stages/",
     "workflows": "## workflows/",
+    "workflows/cli": "### workflows/cli/",
+    "workflows/run": "### workflows/run/",
+    "workflows/server": "### workflows/server/",
+    "workflows/batch": "### workflows/batch/",
+    "workflows/store": "### workflows/store/",
+    "workflows/bench": "### workflows/bench/",
+    "workflows/evaluation": "### workflows/evaluation/",
 }
 
 

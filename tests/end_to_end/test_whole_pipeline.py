@@ -78,8 +78,8 @@ def done(capture: Path, child_environment: dict[str, str], tmp_path_factory: pyt
 
 
 def test_the_asset_is_valid_and_close_to_the_truth(done: Path, capture: Path) -> None:
-    from stages.usd.validate import validate
-    from workflows.truth import measure
+    from stages.usd.check.validate import validate
+    from workflows.evaluation.demo import measure
 
     assert not [f for f in validate(done / "asset/head.usd") if f.level == "error"]
     record = json.loads((done / "run.json").read_text())
@@ -150,7 +150,7 @@ def manifest(record: Path, out: Path, stage: str) -> str:
 
 
 def test_a_run_killed_three_times_ends_in_a_valid_asset(done: Path, killed: Path) -> None:
-    from stages.usd.validate import validate
+    from stages.usd.check.validate import validate
 
     assert not [f for f in validate(killed / "asset/head.usd") if f.level == "error"]
     assert not list((killed / ".store").glob("*/*.partial-*"))

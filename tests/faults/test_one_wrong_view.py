@@ -16,8 +16,8 @@ import pytest
 from pipeline.artifacts import CameraSet, Capture, FittedFace, MaskSet
 from pipeline.demo.capture import write_demo_capture
 from pipeline.images import read_exr, read_linear
-from workflows.plan import RunRequest, make_plan
-from workflows.runner import run_here, run_plan
+from workflows.run.plan import RunRequest, make_plan
+from workflows.run.runner import run_here, run_plan
 
 pytestmark = pytest.mark.slow
 

@@ -15,9 +15,9 @@ from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_linear, write_exr
 from pipeline.picture_size import declared_size_of
 from stages.capture.exif import Exif, read_exif
-from stages.capture.gather import Gathered, gather_mask, gather_photo
+from stages.capture.icc_profile import profile_name
+from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
 from stages.capture.photometry import exposures
-from stages.capture.profile import profile_name
 from stages.capture.readers.sizes import picture_size
 from tests.capture.test_capture_files import exif_jpeg, place_block
 from tests.support.fuzzing import bounded, fuzzed
@@ -60,7 +60,7 @@ def test_damaged_photos(whole: dict[str, bytes], place: Path, suffix: str, how: 
         values = read_linear(path)
         assert values.dtype == np.float32 and values.shape[2] == 3
     with bounded():
-        found = gather_photo(path, FileRef.of(place, path), place / "photos" / path.name, None)
+        found = import_photo(path, FileRef.of(place, path), place / "photos" / path.name, None)
         assert min(found.width, found.height) >= 64 and np.isfinite(found.light)
 
 
@@ -76,10 +76,10 @@ def test_damaged_masks(place: Path, suffix: str, how: list) -> None:
     else:
         cv2.imwrite(str(path), mask)
     path.write_bytes(damaged(path.read_bytes(), how, in_head(how)))
-    photo = Gathered(place / "x.png", 80, 70, Exif(), False)
+    photo = ImportedPhoto(place / "x.png", 80, 70, Exif(), False)
     target = place / "masks" / path.name
     with bounded():
-        if gather_mask(path, FileRef.of(place, path), target, photo) is None:
+        if import_mask(path, FileRef.of(place, path), target, photo) is None:
             assert 0 <= read_alpha(target).min() <= read_alpha(target).max() <= 1
 
 

@@ -15,8 +15,8 @@ from pipeline.store import LINEAGE, MANIFEST, RUN, Store, lineage
 from stages.presets import read_config_file
 from tests.support.fuzzing import bounded, fuzzed
 from tests.support.mutations import WORDS, as_json, damaged, damages, nonsense, replaced, reworded, swaps
-from workflows.batch_captures import find
-from workflows.plan import RunRequest, check_settings
+from workflows.batch.captures import find
+from workflows.run.plan import RunRequest, check_settings
 
 SETTINGS = {"bake": {"size": 2048}, "poses": {"check": True, "given": "refine", "given_deviation": 0.01},
             "capture": {"holdout": "every:5:2", "min_views": 4}, "usd": {"name": "anna", "author": "A"}}  # fmt: skip

@@ -12,10 +12,10 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import Cancelled
-from stages.inverse_rendering import clock, fit
-from stages.inverse_rendering.clock import FINER, seconds_to_predict
+from stages.inverse_rendering import fit, time_budget
 from stages.inverse_rendering.fit import Trainer, run_fit
 from stages.inverse_rendering.stage import Config
+from stages.inverse_rendering.time_budget import FINER, seconds_to_predict
 from tests.inverse_rendering.test_fit import SMALL, ball_view, hooks, trainer
 
 TICK = 0.25  # seconds between two looks at the clock
@@ -68,7 +68,7 @@ def test_the_pace_so_far_tells_the_total(ticking: None) -> None:
 def test_rendering_the_held_out_views_is_kept_free(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten times the rays that are timed take ten times as long, and views of no pixels none."""
     times = iter([0.0, 5.0, 5.0, 7.0])  # the first call loads; the second counts
-    monkeypatch.setattr(clock, "time", SimpleNamespace(monotonic=lambda: next(times)))
+    monkeypatch.setattr(time_budget, "time", SimpleNamespace(monotonic=lambda: next(times)))
     t = trainer()
     view = ball_view(5)
     camera = Camera(

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.artifacts import Capture, CaptureView, FileRef
 from pipeline.colour import as_photographed
-from stages.inverse_rendering.deliver import held_out_responses
+from stages.inverse_rendering.outputs import held_out_responses
 
 
 def capture(groups: str, held: tuple[int, ...], exposure: float = 1.0) -> Capture:

@@ -15,14 +15,14 @@ import torch
 
 from pipeline.maths import sh
 from pipeline.transforms import F64
-from stages.inverse_rendering import evidence
-from stages.inverse_rendering.begin import new_trainer
-from stages.inverse_rendering.choices import Choices, decide, restored, waiting_views
+from stages.inverse_rendering import cross_validation
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import footprint, supported
-from stages.inverse_rendering.sightings import pictures, sight, surface_points
-from stages.inverse_rendering.start import Start
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.initialise import new_trainer
+from stages.inverse_rendering.model_selection import Choices, restored, select_model, validation_views
+from stages.inverse_rendering.observations import observe, pictures, surface_points
 from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
 SMALL = Config(
@@ -47,7 +47,7 @@ def trainer(ball: Ball, radius: float = RADIUS, **settings: Any) -> Trainer:
 
 
 def chosen(ball: Ball, radius: float = RADIUS, **settings: Any) -> Choices:
-    return decide(trainer(ball, radius, **settings))[0]
+    return select_model(trainer(ball, radius, **settings))[0]
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_lobe_that_is_small_beside_what_stays_unexplained_is_none() -> None:
     assert chosen(Ball(faint)).specular
     got = chosen(Ball(grainy))
     lobe = [float(got.facts["specular"][k]) for k in ("error_without", "error_with")]
-    assert not got.specular and evidence.more(*lobe) > 2 * evidence.NEGLIGIBLE
+    assert not got.specular and cross_validation.more(*lobe) > 2 * cross_validation.NEGLIGIBLE
 
 
 @pytest.mark.parametrize("band", [1, 4, 7])
@@ -127,13 +127,13 @@ def test_gains_are_found() -> None:
         return np.full(3, 1.1 if view % 2 else 0.9)
 
     t = trial_of(trainer(Ball(gain=gain)))
-    found = evidence.solve_response(t, None, gain=True).gain
+    found = cross_validation.solve_response(t, None, gain=True).gain
     assert np.allclose(found[1::2] / found[::2], 1.1 / 0.9, rtol=0.02)
 
 
 def test_relief_is_there_where_the_prior_is_wrong(dull: Choices) -> None:
-    assert not dull.relief
-    assert chosen(Ball(), radius=RADIUS + 0.006).relief
+    assert not dull.refine_geometry
+    assert chosen(Ball(), radius=RADIUS + 0.006).refine_geometry
 
 
 @pytest.mark.slow
@@ -164,9 +164,9 @@ def test_bases_stay_where_noise_hides_what_they_do() -> None:
 # ------------------------------------------------------------------ settings
 def test_settings_are_never_overruled() -> None:
     got = chosen(
-        Ball(), specular="on", rank=2, light_order=8, calibration="on", relief="on"
+        Ball(), specular="on", rank=2, light_order=8, calibration="on", refine_geometry="on"
     )  # the Lambertian ball needs none of these
-    assert (got.specular, got.rank, got.light_order, got.relief) == (True, 2, 8, True)
+    assert (got.specular, got.rank, got.light_order, got.refine_geometry) == (True, 2, 8, True)
     assert all(f["why"] == "setting" for f in got.facts.values())
     assert not chosen(Ball(gloss(5)), specular="off").specular
 
@@ -178,14 +178,14 @@ def test_too_few_views_are_told() -> None:
 
 def test_waiting_views_are_few_and_spread() -> None:
     for count in (8, 11, 43, 200):
-        out = waiting_views(count, Config())
+        out = validation_views(count, Config())
         assert len(set(out)) == len(out) and 2 <= len(out) <= 6 and max(out) < count
-    assert waiting_views(43, Config(preset="paper")) == ()
+    assert validation_views(43, Config(preset="paper")) == ()
     t = trainer(Ball())
     assert t.table is not None
-    assert not np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.waiting).any()
+    assert not np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.validation).any()
     t.table.wait(())
-    assert np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.waiting).any()
+    assert np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.validation).any()
 
 
 @pytest.mark.parametrize(("given", "kept"), [("true", "on"), (False, "off"), ("auto", "auto")])
@@ -234,7 +234,7 @@ def test_a_checkpoint_of_a_chosen_model(tmp_path: Any) -> None:
 
 @pytest.mark.slow
 def test_a_surface_that_rests_is_the_prior() -> None:
-    t = trainer(Ball(), radius=0.104, relief="off", steps=20)
+    t = trainer(Ball(), radius=0.104, refine_geometry="off", steps=20)
     t.prior = start(0.104)
     while t.step < 12:
         t.advance()
@@ -243,10 +243,10 @@ def test_a_surface_that_rests_is_the_prior() -> None:
 
 
 # ------------------------------------------------------------------ the arithmetic
-def trial_of(t: Trainer) -> evidence.Trial:
+def trial_of(t: Trainer) -> cross_validation.ValidationSamples:
     assert t.table is not None
     x, n = surface_points(t.model.geometry, t.table.draw(1500, 0.0, 3).rays)
-    out = evidence.trial(sight(t.model.geometry, pictures(t.views), x, n), t.waiting, t.model)
+    out = cross_validation.validation_samples(observe(t.model.geometry, pictures(t.views), x, n), t.validation, t.model)
     assert out is not None
     return out
 
@@ -256,7 +256,7 @@ def test_sightings_show_the_ball() -> None:
     t = trainer(Ball())
     assert t.table is not None
     x, n = surface_points(t.model.geometry, t.table.draw(1500, 0.0, 3).rays)
-    seen = sight(t.model.geometry, pictures(t.views), x, n)
+    seen = observe(t.model.geometry, pictures(t.views), x, n)
     true = texture(seen.normal) * (0.7 + 0.3 * seen.normal[:, 1:2])
     assert np.sqrt(np.mean((seen.colour - true) ** 2)) < 0.01
     assert seen.cosine.min() > 0.35
@@ -270,7 +270,7 @@ def test_the_lobe_is_a_least_squares_fit() -> None:
     few = np.flatnonzero(t.train & (t.point < 60))
     keep = np.isin(t.point, t.point[few])
     sub = replace_rows(t, keep)
-    left, _ = evidence.lobe(sub, 2, evidence.alike(sub))
+    left, _ = cross_validation.lobe(sub, 2, cross_validation.alike(sub))
     points, which = np.unique(sub.point, return_inverse=True)
     dummies = np.eye(len(points))[which]
     a = np.concatenate([dummies, sub.features[:, :9]], 1)
@@ -278,22 +278,24 @@ def test_the_lobe_is_a_least_squares_fit() -> None:
     assert np.abs(left - (sub.colour - a @ b))[sub.train].max() < 1e-5
 
 
-def replace_rows(t: evidence.Trial, keep: Any) -> evidence.Trial:
-    return evidence.Trial(
+def replace_rows(t: cross_validation.ValidationSamples, keep: Any) -> cross_validation.ValidationSamples:
+    return cross_validation.ValidationSamples(
         t.point[keep], t.view[keep], t.colour[keep], t.features[keep], t.cosine[keep], t.x[keep],
         t.train[keep], t.tune[keep], t.test[keep], t.counts,
     )  # fmt: skip
 
 
 def test_errors_are_compared_in_quadrature() -> None:
-    assert evidence.more(5.0, 4.0) == pytest.approx(3.0) and evidence.more(4.0, 5.0) == pytest.approx(-3.0)
-    assert evidence.more(2.0, 2.0) == 0.0
+    assert cross_validation.more(5.0, 4.0) == pytest.approx(3.0) and cross_validation.more(4.0, 5.0) == pytest.approx(
+        -3.0
+    )
+    assert cross_validation.more(2.0, 2.0) == 0.0
 
 
 def test_the_least_rank_is_not_led_by_noise() -> None:
-    assert evidence.least_rank([0.13, 0.1001, 0.1]) == 2
-    assert evidence.least_rank([0.1001, 0.1, 0.102]) == 1
-    assert evidence.least_rank([0.004, 0.001]) == 1  # both are negligible
+    assert cross_validation.least_rank([0.13, 0.1001, 0.1]) == 2
+    assert cross_validation.least_rank([0.1001, 0.1, 0.102]) == 1
+    assert cross_validation.least_rank([0.004, 0.001]) == 1  # both are negligible
 
 
 # ------------------------------------------------------------------ resolution

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.transforms import F64
 from stages.inverse_rendering.exposure import DRIFT, exposures_differ, gain_spread
-from stages.inverse_rendering.start import Start
+from stages.inverse_rendering.initial_geometry import Start
 from tests.support.balls import RADIUS, Ball, gloss, start
 
 

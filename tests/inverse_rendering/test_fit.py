@@ -14,13 +14,13 @@ import torch
 
 from pipeline import transforms
 from pipeline.errors import Cancelled, StageError
-from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.objective import calibrated_colours, terms
-from stages.inverse_rendering.predict import predict_view
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView, PixelTable, factor_for, image_rays
+from stages.inverse_rendering.outputs import predict_view
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, factor_for, image_rays
 
 RADIUS, SIDE = 0.1, 64
 SMALL = Config(
@@ -103,7 +103,7 @@ def test_the_ball_is_found(fitted: Trainer) -> None:
 def test_the_fit_finds_out_what_the_ball_requires(fitted: Trainer) -> None:
     """It is Lambertian, its photos are of one camera, and it began 8 mm too large (test_evidence.py has more)."""
     c = fitted.choices
-    assert c is not None and not c.specular and not c.calibrated and c.relief and c.light_order == 3
+    assert c is not None and not c.specular and not c.calibrated and c.refine_geometry and c.light_order == 3
     assert len(fitted.model.light()) == 16 and all(f["why"] == "evidence" for k, f in c.facts.items() if k != "rank")
 
 
@@ -117,7 +117,7 @@ def test_shading_goes_to_the_light(fitted: Trainer) -> None:
 
     up, aside = slope(fitted)
     assert abs(up - 0.371) < 0.06 and aside < 0.05
-    free = trainer(SMALL.changed(parsimony=0.0, even_until=0.0))
+    free = trainer(SMALL.changed(albedo_sparsity=0.0, uniform_albedo_until=0.0))
     run_fit(free, hooks())
     assert slope(free)[0] < 0.28
 
@@ -189,8 +189,8 @@ def test_a_torn_or_foreign_checkpoint_is_not_used(tmp_path: Path) -> None:
 
 
 WEIGHTS = {
-    "mask": 2.0, "eikonal": 3.0, "rgb": 5.0, "white": 7.0, "specular_energy": 11.0, "parsimony": 13.0,
-    "shininess": 17.0, "smooth": 19.0,
+    "mask": 2.0, "eikonal": 3.0, "rgb": 5.0, "white": 7.0, "specular_energy": 11.0, "albedo_sparsity": 13.0,
+    "shininess_prior": 17.0, "smooth": 19.0,
 }  # fmt: skip
 
 
@@ -209,7 +209,7 @@ def weighed_ball() -> Trainer:
         t.model.calibration.embedding.normal_()
         t.model.spatial.encoding.table.normal_()
         t.model.spatial.net[-1].weight.mul_(10)
-    t.model.even = False
+    t.model.uniform_albedo = False
     return t
 
 
@@ -251,8 +251,8 @@ def test_the_objective_is_eq_20_by_hand() -> None:
         "rgb": np.abs(srgb - target).mean(1).sum() / 512,
         "white": np.abs(light - light.mean(1)[:, None]).mean(1).sum(),
         "specular_energy": shaded.specular.double().numpy().mean(),
-        "parsimony": np.abs(log - middle).mean(),
-        "shininess": (np.log(shaded.inv_kappa.double().numpy() / 0.1) ** 2).mean(),
+        "albedo_sparsity": np.abs(log - middle).mean(),
+        "shininess_prior": (np.log(shaded.inv_kappa.double().numpy() / 0.1) ** 2).mean(),
         "smooth": 0.5 * (1 - (n * near).sum(1)).mean(),
     }
     assert list(found.scalars) == list(parts)
@@ -278,10 +278,10 @@ def test_background_alone_asks_for_nothing_but_a_mask_and_a_distance() -> None:
     "name", ["light.coefficients", "spatial.net.4.bias", "basis.net.4.bias", "calibration.net.2.weight"]
 )
 def test_the_objectives_gradient_is_that_of_differences(name: str) -> None:
-    """Along a random direction of one part of the model. The median that parsimony holds fixed is left out, and so is
-    what depends on the shape alone."""
+    """Along a random direction of one part of the model. The median that albedo_sparsity holds fixed is left out,
+    and so is what depends on the shape alone."""
     t = weighed_ball()
-    settings = t.settings.changed(parsimony=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
+    settings = t.settings.changed(albedo_sparsity=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
     batch = t.pixels.draw(512, 0.25, 0)
     p = dict(t.model.named_parameters())[name]
     way = torch.randn(p.shape, generator=torch.Generator().manual_seed(1))
@@ -393,8 +393,8 @@ def test_rays_undo_the_lens() -> None:
 
 def test_what_lies_behind_an_edge_shows() -> None:
     """A ray that grazes a small ball before a large one: covered, in the render and for the mask's term."""
+    from stages.inverse_rendering.ray_sampling import Rays
     from stages.inverse_rendering.render import render_rays, sample_shell, solid_behind
-    from stages.inverse_rendering.views import Rays
 
     lo, cell = -0.14, 0.005
     i = np.stack(np.meshgrid(*[np.arange(57)] * 3, indexing="ij"), -1)

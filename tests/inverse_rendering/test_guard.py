@@ -11,12 +11,12 @@ import torch
 
 from pipeline.errors import StageError
 from stages.inverse_rendering import objective
-from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
 from stages.inverse_rendering.guard import Guard
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.initialise import new_trainer
+from stages.inverse_rendering.ray_sampling import PhotoView
 from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
 
 SHORT = SMALL.changed(steps=8, batch=256, levels=1, shadows=False, max_dropped=3)
@@ -164,7 +164,7 @@ def test_one_view_and_one_pixel() -> None:
 
 
 def test_an_empty_batch_costs_nothing() -> None:
-    from stages.inverse_rendering.views import Batch, Rays
+    from stages.inverse_rendering.ray_sampling import Batch, Rays
 
     t = trainer()
     none = torch.zeros(0, 3)

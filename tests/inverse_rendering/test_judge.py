@@ -13,12 +13,12 @@ import torch
 from pipeline.artifacts import Capture, CaptureView, FileRef, MaskSet, ViewMask
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, worst
-from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.fit import Trainer, run_fit
+from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.judge import Fitted, findings
-from stages.inverse_rendering.predict import predict_view
+from stages.inverse_rendering.outputs import predict_view
+from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.residuals import LabelError, ViewError, photo_noise, view_errors
-from stages.inverse_rendering.views import PhotoView
 from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks, trainer
 
 REF = FileRef(path="a.png", sha256="0" * 64, size=1)

@@ -13,9 +13,9 @@ from scipy.special import sph_harm_y
 from pipeline.fields.appearance import SKIN_F0, TYPICAL_INV_KAPPA
 from pipeline.maths import sh
 from pipeline.maths.split_sum import alpha_from_inv_kappa
-from stages.inverse_rendering import lamp as lamp_module
-from stages.inverse_rendering.lamp import LEAST_EXPLAINED, light_from_lobe, reflectance
-from stages.inverse_rendering.sightings import LEAST_COSINE, Sightings
+from stages.inverse_rendering import light_estimate as lamp_module
+from stages.inverse_rendering.light_estimate import MIN_EXPLAINED, light_from_lobe, reflectance
+from stages.inverse_rendering.observations import MIN_COSINE, Observations
 
 F64 = npt.NDArray[np.float64]
 ORDER = 3
@@ -45,12 +45,14 @@ def true_light(seed: int = 0, ratio: float = 1.6) -> F64:
     return c
 
 
-def sightings(light: F64, noise: float = 0.0, lobe: float = 1.0, spots: float = 0.0, gain: Any = None) -> Sightings:
+def observations(
+    light: F64, noise: float = 0.0, lobe: float = 1.0, spots: float = 0.0, gain: Any = None
+) -> Observations:
     """Points all over a ball, each seen by the cameras in front of it. spots: how uneven the albedo is."""
     rng = np.random.default_rng(1)
     n, eyes = unit(rng.normal(size=(POINTS, 3))), unit(rng.normal(size=(VIEWS, 3)))
     cosine = n @ eyes.T
-    point, view = np.nonzero(cosine > LEAST_COSINE)
+    point, view = np.nonzero(cosine > MIN_COSINE)
     normal, wo = n[point], eyes[view]
     c = cosine[point, view]
     falls = np.repeat([np.exp(-b * (b + 1) * TYPICAL_INV_KAPPA / 2) for b in range(ORDER + 1)], [1, 3, 5, 7])
@@ -63,10 +65,10 @@ def sightings(light: F64, noise: float = 0.0, lobe: float = 1.0, spots: float = 
     if gain is not None:
         colour = colour * gain[view]
     x = torch.from_numpy(0.1 * n)
-    return Sightings(x, torch.from_numpy(n), point.astype(np.int64), view.astype(np.int64), colour, wo)
+    return Observations(x, torch.from_numpy(n), point.astype(np.int64), view.astype(np.int64), colour, wo)
 
 
-def solved(seen: Sightings, **changes: Any) -> Any:
+def solved(seen: Observations, **changes: Any) -> Any:
     return light_from_lobe(
         seen, changes.get("order", ORDER), changes.get("gain", np.ones((VIEWS, 3))), changes.get("kind", "exponential")
     )
@@ -74,24 +76,24 @@ def solved(seen: Sightings, **changes: Any) -> Any:
 
 def test_a_known_light_is_found_with_its_level() -> None:
     light = true_light()
-    lamp = solved(sightings(light))
-    assert lamp.explained > 0.99 and lamp.scale == pytest.approx(1.0, rel=0.04)  # as fine as SCALES are
-    assert np.allclose(lamp.coefficients, light, atol=0.04)
+    estimate = solved(observations(light))
+    assert estimate.explained > 0.99 and estimate.scale == pytest.approx(1.0, rel=0.04)  # as fine as SCALES are
+    assert np.allclose(estimate.coefficients, light, atol=0.04)
 
 
 def test_spots_noise_and_gains_do_not_move_it() -> None:
     """Spots drop out exactly; noise as large as half the lobe averages out."""
     light = true_light(3)
     gain = np.random.default_rng(2).uniform(0.8, 1.2, (VIEWS, 3))
-    lamp = solved(sightings(light, noise=0.01, spots=0.3, gain=gain), gain=gain)
-    shape = np.corrcoef(lamp.coefficients[1:], light[1:])[0, 1]
-    assert shape > 0.98 and abs(lamp.coefficients[0] / light[0] - 1) < 0.05
+    estimate = solved(observations(light, noise=0.01, spots=0.3, gain=gain), gain=gain)
+    shape = np.corrcoef(estimate.coefficients[1:], light[1:])[0, 1]
+    assert shape > 0.98 and abs(estimate.coefficients[0] / light[0] - 1) < 0.05
 
 
 def test_the_bands_scale_comes_from_even_skin(monkeypatch: pytest.MonkeyPatch) -> None:
     """A solver that takes the lobe for wider than it is finds bands from 1 on too strong; even skin takes that back."""
     light = true_light(ratio=2.4)
-    seen = sightings(light)
+    seen = observations(light)
     grid = np.linspace(0, 1, 1001)
     table = reflectance(grid)
     monkeypatch.setattr(lamp_module, "TYPICAL_INV_KAPPA", 0.4)
@@ -104,24 +106,24 @@ def test_the_bands_scale_comes_from_even_skin(monkeypatch: pytest.MonkeyPatch) -
 def test_a_light_without_a_first_band_is_not_blown_up() -> None:
     light = np.zeros((ORDER + 1) ** 2)
     light[0], light[5] = 1.5, 0.5
-    found = solved(sightings(light, noise=0.002))
+    found = solved(observations(light, noise=0.002))
     assert np.allclose(found.coefficients, light, atol=0.15)
 
 
 def test_nothing_is_made_of_noise() -> None:
-    assert solved(sightings(true_light(), noise=0.05, lobe=0.0)) is None
-    assert solved(sightings(true_light()), order=0) is None
-    few = sightings(true_light())
+    assert solved(observations(true_light(), noise=0.05, lobe=0.0)) is None
+    assert solved(observations(true_light()), order=0) is None
+    few = observations(true_light())
     keep = few.point < 100
-    few = Sightings(few.x, few.n, few.point[keep], few.view[keep], few.colour[keep], few.wo[keep])
+    few = Observations(few.x, few.n, few.point[keep], few.view[keep], few.colour[keep], few.wo[keep])
     assert solved(few) is None
-    assert LEAST_EXPLAINED > 0
+    assert MIN_EXPLAINED > 0
 
 
 def test_black_and_constant_photos_have_no_light() -> None:
-    seen = sightings(true_light())
+    seen = observations(true_light())
     for value in (0.0, 0.5):
-        flat = Sightings(seen.x, seen.n, seen.point, seen.view, np.full_like(seen.colour, value), seen.wo)
+        flat = Observations(seen.x, seen.n, seen.point, seen.view, np.full_like(seen.colour, value), seen.wo)
         assert solved(flat) is None
 
 
@@ -154,15 +156,15 @@ def test_harmonics_agree_with_the_projects() -> None:
 
 def test_a_fit_takes_the_light_over() -> None:
     """A glossy ball: the light is put in, the lobe begins anew, and the fit goes on with both; a checkpoint knows."""
-    from stages.inverse_rendering.choices import restored
+    from stages.inverse_rendering.model_selection import restored
     from tests.inverse_rendering.test_evidence import trainer
     from tests.support.balls import Ball, gloss
 
     t = trainer(Ball(gloss(4, 0.02)))
     before = t.model.light().detach().clone()
-    t.decide()
+    t.select_model()
     c = t.choices
-    assert c is not None and c.lit and c.facts["light"]["from"] == "what changes with the view"
+    assert c is not None and c.light_known and c.facts["light"]["from"] == "what changes with the view"
     light = t.model.light().detach()
     assert not torch.equal(before[: len(light)], light) and torch.equal(light[:, 0], light[:, 2])
     strongest = int(light[1:, 0].abs().argmax()) + 1
@@ -174,17 +176,17 @@ def test_a_fit_takes_the_light_over() -> None:
         strength = rho * t.model.basis.integral(x, k, n, n)
     assert torch.allclose(strength, torch.full((9,), float(reflectance(np.ones(1))[0])), rtol=0.05)
     assert torch.allclose(s, torch.full((9,), TYPICAL_INV_KAPPA), rtol=1e-3)
-    assert t.weights().parsimony == 0 and restored(c.plain()).lit
+    assert t.weights().albedo_sparsity == 0 and restored(c.plain()).light_known
     for _ in range(3):
         t.advance()
     assert np.isfinite(t.loss)
 
 
-@pytest.mark.parametrize("changes", [{"light_from": "even"}, {"basis_inputs": "paper"}, {"specular": "off"}])
+@pytest.mark.parametrize("changes", [{"light_from": "uniform_albedo"}, {"basis_inputs": "paper"}, {"specular": "off"}])
 def test_where_the_lobe_is_not_asked(changes: dict[str, Any]) -> None:
     from tests.inverse_rendering.test_evidence import trainer
     from tests.support.balls import Ball, gloss
 
     t = trainer(Ball(gloss(4, 0.25)), **changes)
-    t.decide()
-    assert t.choices is not None and not t.choices.lit and t.weights().parsimony > 0
+    t.select_model()
+    assert t.choices is not None and not t.choices.light_known and t.weights().albedo_sparsity > 0

@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.artifacts import Camera, Cut, Extent
 from pipeline.extent import GROWN
-from stages.inverse_rendering.start import agreed, hull_start
-from stages.inverse_rendering.views import PhotoView, PixelTable
+from stages.inverse_rendering.initial_geometry import agreed, hull_start
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 
 F32 = npt.NDArray[np.float32]
 HEAD, TORSO = ((0.0, 0.02, 0.0), 0.09), ((0.0, -0.14, 0.0), 0.12)

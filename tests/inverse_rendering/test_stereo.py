@@ -11,8 +11,8 @@ import torch
 
 from pipeline import transforms
 from stages.inverse_rendering import stereo
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import PhotoView
 
 RADIUS, SIDE = 0.1, 192
 LENS = np.array([0.08, -0.02, 0.002, -0.001, 0.0])
@@ -149,7 +149,7 @@ def test_views_behind_do_not_see() -> None:
     order, seen, pixel = stereo.best_views(p, n, start, photos)
     way = torch.nn.functional.normalize(photos.centre[order] - torch.from_numpy(p)[:, None].float(), dim=-1)
     cosine = (way * torch.from_numpy(n)[:, None].float()).sum(-1)
-    assert (cosine[seen] > stereo.LEAST_COSINE - 1e-4).all()
+    assert (cosine[seen] > stereo.MIN_COSINE - 1e-4).all()
     assert (cosine.diff(dim=1)[seen[:, 1:]] <= 1e-4).all()
     assert pixel == pytest.approx(0.4 / (1.9 * SIDE), rel=0.15)
 
@@ -169,9 +169,9 @@ def test_a_hidden_view_gives_way_to_the_next() -> None:
     along = np.clip((((centre - RADIUS * n)[:, None] * way).sum(-1) / (way**2).sum(-1)), 0, 1)
     miss = np.linalg.norm(RADIUS * n[:, None] + along[..., None] * way - centre, axis=-1)
     cosine = (way * n[:, None]).sum(-1) / np.linalg.norm(way, axis=-1)
-    wanted = (cosine > stereo.LEAST_COSINE) & (miss > radius)
-    clear = (np.abs(miss - radius) > start.cell).all(1) & (np.abs(cosine - stereo.LEAST_COSINE) > 1e-3).all(1)
-    assert clear.sum() > 100 and ((~wanted) & (cosine > stereo.LEAST_COSINE))[clear].any()
+    wanted = (cosine > stereo.MIN_COSINE) & (miss > radius)
+    clear = (np.abs(miss - radius) > start.cell).all(1) & (np.abs(cosine - stereo.MIN_COSINE) > 1e-3).all(1)
+    assert clear.sum() > 100 and ((~wanted) & (cosine > stereo.MIN_COSINE))[clear].any()
     for i in np.flatnonzero(clear):
         best = np.argsort(-np.where(wanted[i], cosine[i], -1), kind="stable")[: min(stereo.VIEWS, wanted[i].sum())]
         assert (

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from stages.masks.redraw import LOUD, REACH, continued, redrawn
-from stages.masks.soften import soft_edge
+from stages.masks.matting import soft_edge
+from stages.masks.refine_contour import LOUD, REACH, continued, refined_contour
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
@@ -47,7 +47,7 @@ def bitten() -> Bool:
 
 def drawn(picture: U8, mask: Bool) -> Bool:
     """The contour drawn anew, and pixels that both sides share divided, as the stage does it."""
-    return np.asarray(soft_edge(picture, redrawn(picture, mask), 2) >= 0.5)
+    return np.asarray(soft_edge(picture, refined_contour(picture, mask), 2) >= 0.5)
 
 
 def off(mask: Bool, truth: Bool) -> float:
@@ -82,7 +82,7 @@ def test_crumbs_go_and_pinholes_close() -> None:
     picture[313:318, 130:134] = SKIN
     pierced = truth.copy()
     pierced[300:310, 160:170] = False
-    new = redrawn(picture, pierced)
+    new = refined_contour(picture, pierced)
     assert new[300:310, 160:170].all()
     assert not new[313:318, 125:136].any()
 
@@ -99,26 +99,26 @@ def test_what_touches_the_subject_and_goes_on_is_background() -> None:
 
 def test_a_noisy_photo_is_left_alone() -> None:
     picture, _ = scene(ramp(), noise=6 * LOUD)
-    assert (redrawn(picture, bitten()) == bitten()).all()
+    assert (refined_contour(picture, bitten()) == bitten()).all()
 
 
 @pytest.mark.parametrize("mask", [np.zeros((40, 40), bool), np.ones((40, 40), bool), np.eye(40, dtype=bool)])
 def test_masks_without_two_sides_stay(mask: Bool) -> None:
     picture = np.full((40, 40, 3), 128, np.uint8)
-    assert (redrawn(picture, mask) == mask).all()
+    assert (refined_contour(picture, mask) == mask).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 300), (300, 2)])
 def test_the_smallest_pictures(shape: tuple[int, int]) -> None:
     mask = np.zeros(shape, bool)
     mask[: (shape[0] + 1) // 2, : (shape[1] + 1) // 2] = True
-    assert (redrawn(np.zeros((*shape, 3), np.uint8), mask) == mask).all(), "black on black tells nothing"
+    assert (refined_contour(np.zeros((*shape, 3), np.uint8), mask) == mask).all(), "black on black tells nothing"
 
 
 def test_a_subject_cut_by_the_frame_keeps_the_frame() -> None:
     picture, truth = scene(ramp(20, 60))
     half = slice(0, SIZE // 2)
-    new = redrawn(np.ascontiguousarray(picture[half]), truth[half])
+    new = refined_contour(np.ascontiguousarray(picture[half]), truth[half])
     assert (new[-1] == truth[half][-1]).mean() > 0.99
 
 
@@ -138,4 +138,4 @@ def test_an_affine_background_goes_on_behind_the_subject() -> None:
 
 def test_two_runs_are_the_same() -> None:
     picture, _ = scene(ramp())
-    assert (redrawn(picture, bitten()) == redrawn(picture, bitten())).all()
+    assert (refined_contour(picture, bitten()) == refined_contour(picture, bitten())).all()

@@ -16,9 +16,9 @@ from pipeline.support import Support, find_support, is_level
 from pipeline.transforms import F64, matrix, pixel_centres, rays, rows
 from stages.masks import sources
 from stages.masks.region import Disc
-from stages.masks.solid import distinct, find_solid, silhouette_of_points
 from stages.masks.sources import View
 from stages.masks.stage import STAGE, Config, Inputs
+from stages.masks.support_object import distinct, find_supported_object, silhouette_of_points
 from tests.support.textured_ball import camera_on_orbit
 
 WIDTH, HEIGHT, RADIUS, ROI = 160, 120, 0.1, 0.16
@@ -63,7 +63,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_the_table_is_found_and_the_ball_stands_on_it() -> None:
-    found = find_solid(points(), cameras(), ROI, 0)
+    found = find_supported_object(points(), cameras(), ROI, 0)
     assert found is not None and found.support is not None
     np.testing.assert_allclose(found.support.normal, [0, 1, 0], atol=0.02)
     assert found.support.offset == pytest.approx(TABLE, abs=0.002)
@@ -73,8 +73,8 @@ def test_the_table_is_found_and_the_ball_stands_on_it() -> None:
 def test_a_ball_alone_has_no_support_and_few_points_no_object() -> None:
     centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras()])
     assert find_support(points(1500, 0), centres, ROI, 0) is None
-    assert find_solid(points(60, 30), cameras(), ROI, 0) is None
-    floating = find_solid(points(1500, 0), cameras(), ROI, 0)
+    assert find_supported_object(points(60, 30), cameras(), ROI, 0) is None
+    floating = find_supported_object(points(1500, 0), cameras(), ROI, 0)
     assert floating is not None and floating.support is None and len(floating.points) >= 1300
 
 
@@ -92,7 +92,7 @@ def test_a_wall_is_not_level() -> None:
 
 
 def test_projected_points_fill_the_silhouette() -> None:
-    found = find_solid(points(), cameras(), ROI, 0)
+    found = find_supported_object(points(), cameras(), ROI, 0)
     assert found is not None
     for c in cameras():
         inside, gap = silhouette_of_points(c, found, HEIGHT, WIDTH)
@@ -146,6 +146,6 @@ def test_a_statue_is_no_person(
     noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)  # no background of one colour
     camera = cameras(1)[0]
     views = [View(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
-    solid = find_solid(points(), cameras(), ROI, 0) if points_at_hand else None
+    solid = find_supported_object(points(), cameras(), ROI, 0) if points_at_hand else None
     assert solid is not None or not points_at_hand
     assert sources.plan(views, "auto", 0.5, 64, 0, lambda: solid).method == wanted

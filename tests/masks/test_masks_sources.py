@@ -14,11 +14,11 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.colour import srgb_from_linear
 from pipeline.transforms import rigid, rows
-from stages.masks.cut_out import cut, cut_by_region
-from stages.masks.key_out import Background, border_colours, find_background, key_out
+from stages.masks.grabcut import cut, cut_by_region
+from stages.masks.keying import Background, border_colours, find_background, key_out
+from stages.masks.matting import largest_parts, soft_edge
 from stages.masks.region import Disc, dilated, eight_bit, eroded, region, resized, working_size
 from stages.masks.segment_person import MODEL, of_subject, person_mask, person_probability, probability
-from stages.masks.soften import largest_parts, soft_edge
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]

@@ -17,7 +17,7 @@ from pipeline.images import read_alpha, write_png
 from pipeline.store import Store
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 from stages.masks import segment
-from stages.masks.agree import Opinion, contradiction, hole, opinions, outliers, tolerated, trimap
+from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, tolerated, trimap
 from stages.masks.sources import View
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.masks.test_masks_user_model import write_red_detector
@@ -200,7 +200,7 @@ def test_computed_outlier_is_mended(scene: Scene, tmp_path: Path) -> None:
     image = paint(ball_alpha(c), 0.0)
     image[:, : SIZE // 2] *= 0.02
     scene.repaint(6, image)
-    lost, alphas = run(scene, tmp_path / "s", mend=False)
+    lost, alphas = run(scene, tmp_path / "s", resegment=False)
     assert lost.dropped == (6,) and iou(alphas[6], ball_alpha(c)) < 0.7
     mended, alphas = run(scene, tmp_path / "s")
     assert mended.dropped == () and mended.masks[6].source == "key+hull"

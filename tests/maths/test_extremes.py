@@ -192,7 +192,7 @@ def steepness(m: Module) -> None:
 
 
 def gauge(m: Module) -> None:
-    out, _ = derive(lambda s: m.shininess_gauge(s, 0.1), torch.tensor([0.0, 1e-30, 1e-8, 0.1, 1e6]))
+    out, _ = derive(lambda s: m.shininess_prior(s, 0.1), torch.tensor([0.0, 1e-30, 1e-8, 0.1, 1e6]))
     assert out[3] == 0
 
 
@@ -243,7 +243,7 @@ CHECKS: dict[str, tuple[str, Callable[[Module], None]]] = {
 
 GUARDS = [
     ("attenuation_exact", "EXTRA_ORDERS = 8", "EXTRA_ORDERS = 0"),
-    ("attenuation_exact", "LEAST_ORDER = 10", "LEAST_ORDER = -7"),
+    ("attenuation_exact", "MIN_ORDER = 10", "MIN_ORDER = -7"),
     ("attenuation_exact", "s.clamp(max=1e9)", "s"),
     ("attenuation_exact", "* (1 + t / (1 + t))", ""),
     ("attenuation_exact", "torch.sqrt(1 + (top + 1) * (top + 2) * t * t * (1 + t / (1 + t)))", "0.0"),

@@ -57,9 +57,9 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "losses.rgb_l1": (lambda p: losses.rgb_l1(p, torch.full((4, 3), 0.05, dtype=torch.float64)), (draw(4, 3),)),
     "losses.white_light": (losses.white_light, (draw(9, 3),)),
     "losses.specular_energy": (losses.specular_energy, (draw(4, 3),)),
-    "losses.shininess_gauge": (lambda s: losses.shininess_gauge(s, 0.1), (draw(4, low=0.2),)),
-    "losses.albedo_parsimony": (  # the median, which is held fixed by design, is that of rows that stay
-        lambda a: losses.albedo_parsimony(torch.cat([a, torch.full((20, 3), 0.5, dtype=torch.float64)]))[:5],
+    "losses.shininess_prior": (lambda s: losses.shininess_prior(s, 0.1), (draw(4, low=0.2),)),
+    "losses.albedo_sparsity": (  # the median, which is held fixed by design, is that of rows that stay
+        lambda a: losses.albedo_sparsity(torch.cat([a, torch.full((20, 3), 0.5, dtype=torch.float64)]))[:5],
         (draw(5, 3),),
     ),
     "losses.eikonal": (lambda g: (losses.eikonal(g), losses.eikonal(g, False)), (draw(4, 3, high=0.4),)),

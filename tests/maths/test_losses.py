@@ -39,22 +39,22 @@ def test_the_other_terms() -> None:
     assert losses.normal_consistency(n, n).item() == 0 and losses.normal_consistency(n, -n).item() == 2
 
 
-def test_shininess_gauge_is_even_and_finite_at_a_mirror() -> None:
+def test_shininess_prior_is_even_and_finite_at_a_mirror() -> None:
     s = torch.tensor([0.1, 0.2, 0.05, 0.0, 1e6], requires_grad=True)
-    found = losses.shininess_gauge(s, 0.1)
+    found = losses.shininess_prior(s, 0.1)
     assert found[0].item() == 0 and found[1].item() == pytest.approx(found[2].item(), rel=1e-5)
     found.sum().backward()
     assert torch.isfinite(found).all() and torch.isfinite(s.grad).all()
 
 
-def test_parsimony_counts_departures_from_the_usual_skin() -> None:
+def test_albedo_sparsity_counts_departures_from_the_usual_skin() -> None:
     even = torch.full((9, 3), 0.3)
-    assert losses.albedo_parsimony(even).abs().max().item() == 0
+    assert losses.albedo_sparsity(even).abs().max().item() == 0
     spotted = even.clone()
     spotted[0] *= 0.5
-    found = losses.albedo_parsimony(spotted)
+    found = losses.albedo_sparsity(spotted)
     assert found[0].item() == pytest.approx(0.6931, abs=1e-4) and found[1:].abs().max().item() == 0
-    assert torch.allclose(losses.albedo_parsimony(spotted * 0.7), found, atol=1e-6)  # blind to the light's strength
+    assert torch.allclose(losses.albedo_sparsity(spotted * 0.7), found, atol=1e-6)  # blind to the light's strength
     black = torch.zeros(3, 3, requires_grad=True)
-    losses.albedo_parsimony(black).sum().backward()
+    losses.albedo_sparsity(black).sum().backward()
     assert torch.isfinite(black.grad).all()

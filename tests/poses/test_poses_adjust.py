@@ -13,12 +13,12 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, inverse_rigid, matrix, project, rigid, rows
-from stages.poses.adjust import Refine, settle, settle_near
+from stages.poses.bundle_adjustment import Refine, settle, settle_near
 from stages.poses.features import Features
-from stages.poses.known import triangulate
+from stages.poses.mapper import Lens, reconstruct
 from stages.poses.matching import Verified, promising_pairs
-from stages.poses.photogrammetry import GLOBAL_FROM, mappers
-from stages.poses.solve import Lens, reconstruct
+from stages.poses.sfm import GLOBAL_FROM, mappers
+from stages.poses.triangulate import triangulate
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
 SIZE = (320, 280)

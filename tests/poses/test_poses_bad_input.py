@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid, matrix, rigid
-from stages.poses.check import epipolar_pixels, near_pairs
+from stages.poses.epipolar_check import epipolar_pixels, near_pairs
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -54,9 +54,9 @@ def test_photos_in_another_order_than_their_cameras(ball: Path, tmp_path: Path, 
         (folder / f"{i}.jpg").write_bytes((ball / f"{(3 * i + 2) % 7}.jpg").read_bytes())
     found = place(capture_of(folder)).artifact
     assert len(found.cameras) == 7 and found.unregistered == ()  # nobody knows which are right
-    told = {f.check: f for f in found.findings}["cameras_against_photos"]
-    assert told.level == "unusable" and "contradict the cameras of" in told.said
-    assert "poses.method=colmap" in told.remedy and len(told.views) > 3 and told.views[0].endswith(".jpg")
+    source = {f.check: f for f in found.findings}["cameras_against_photos"]
+    assert source.level == "unusable" and "contradict the cameras of" in source.said
+    assert "poses.method=colmap" in source.remedy and len(source.views) > 3 and source.views[0].endswith(".jpg")
 
 
 def test_right_cameras_pass_the_check(ball: Path, capture_of, place) -> None:
@@ -96,7 +96,7 @@ def test_photos_from_one_spot(tmp_path: Path, capture_of, place) -> None:
         pose = rigid(ORBIT[3][:3, :3] @ turn, ORBIT[3][:3, 3])
         cv2.imwrite(str(folder / f"{i}.png"), photograph(pose, K, SIZE)[..., ::-1])
     with pytest.raises(StageError, match="one spot") as caught:
-        place(capture_of(folder), patience=1)
+        place(capture_of(folder), attempts=1)
     assert "walk around" in caught.value.remedy
 
 
@@ -109,10 +109,10 @@ def test_two_scenes_a_mirrored_and_a_rotated_photo(ball: Path, tmp_path: Path, c
         cv2.imwrite(str(folder / f"{i + 20}.png"), mirrored)
     pose = camera_on_orbit(3.0, 6.0, 0.6, np.zeros(3))
     cv2.imwrite(str(folder / "40.png"), np.rot90(photograph(pose, K, SIZE)[..., ::-1]))
-    found = place(capture_of(folder), max_features=700, patience=1).artifact
+    found = place(capture_of(folder), max_features=700, attempts=1).artifact
     assert found.unregistered == ("20.png", "21.png", "22.png")
     assert {c.name for c in found.cameras} >= {"40.png", "0.jpg"} and len(found.cameras) == 8
     assert set(found.view_errors_px) == {c.name for c in found.cameras}
-    told = "\n".join(found.warnings)
-    assert "20.png, 21.png, 22.png (other group)" in told and "a capture of their own" in told
+    source = "\n".join(found.warnings)
+    assert "20.png, 21.png, 22.png (other group)" in source and "a capture of their own" in source
     assert found.groups == (8, 3) and all("fits 2 more photos" in reason for reason in found.left_out.values())

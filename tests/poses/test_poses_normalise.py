@@ -11,8 +11,8 @@ from pipeline.errors import StageError
 from pipeline.faces.landmarks3d import HeadFrame
 from pipeline.transforms import F64, apply, matrix, project, rescale_camera, rows, similarity
 from stages.poses.normalise import NOMINAL_ROI, Normalisation, least_turn, nearest_point, normalise, robust_direction
-from stages.poses.place import in_asset
 from stages.poses.scale import Eyes
+from stages.poses.write_cameras import in_asset
 from tests.support.textured_ball import camera_on_orbit
 
 SIZE = (400, 300)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from pipeline.transforms import inverse_rigid, project
-from stages.poses import matching, photogrammetry
+from stages.poses import matching, sfm
 from stages.poses.config import Config
 from stages.poses.features import PLAIN, Features
-from stages.poses.held import HELD, firmly_held
-from stages.poses.left_out import disjoint, linked, reasons
+from stages.poses.mapper import Lens, Model, Pose, Refine, reconstruct
 from stages.poses.matching import Verified, verify
-from stages.poses.photogrammetry import GLOBAL_FROM, SEEDS, best_of, match_pairs
 from stages.poses.quality import GOOD_SCORE, better, quality, score
-from stages.poses.solve import Lens, Model, Pose, Refine, reconstruct
+from stages.poses.sfm import GLOBAL_FROM, SEEDS, best_of, match_pairs
+from stages.poses.unregistered import disjoint, linked, reasons
+from stages.poses.well_supported import HELD, well_supported
 from tests.support.textured_ball import camera_on_orbit
 
 
@@ -142,10 +142,10 @@ def test_the_stage_takes_the_better_seed(tmp_path: Path, monkeypatch: pytest.Mon
         asked.append(seed)
         return stray if seed < 9 else right
 
-    monkeypatch.setattr(photogrammetry, "reconstruct", mapper)
+    monkeypatch.setattr(sfm, "reconstruct", mapper)
     pair = {(0, 1): Verified(np.eye(3), np.zeros((20, 2), np.uint32))}
     config = Config(seed=7, max_image_size=200, max_features=200, neighbours=4)
-    found = photogrammetry._place(PHOTOS, [], pair, config, True, tmp_path, lambda *_: None)
+    found = sfm._place(PHOTOS, [], pair, config, True, tmp_path, lambda *_: None)
     assert found is right and asked == [7, 9]  # the two photos that match have places: nothing to ask for loosely
 
 
@@ -153,11 +153,11 @@ def test_the_stage_takes_the_better_seed(tmp_path: Path, monkeypatch: pytest.Mon
 def test_groups_hang_together_by_all_their_photos() -> None:
     a = {i: set(range(100)) for i in range(5)}
     b = {i: set(range(1000, 1100)) | set(range(10 * (i - 5), 10 * (i - 5) + 12)) for i in range(5, 9)}
-    assert firmly_held(a | b) == list(range(9))  # 12 points each, 42 in all
+    assert well_supported(a | b) == list(range(9))  # 12 points each, 42 in all
     thin = {i: set(range(1000, 1100)) | set(range(12)) for i in range(5, 9)}
-    assert firmly_held(a | thin) == [0, 1, 2, 3, 4]  # 12 points each, the same 12
-    assert firmly_held({**a, 9: set(range(HELD - 1))}) == [0, 1, 2, 3, 4]
-    assert firmly_held({**a, 9: set(range(HELD))}) == [0, 1, 2, 3, 4, 9] and firmly_held({}) == []
+    assert well_supported(a | thin) == [0, 1, 2, 3, 4]  # 12 points each, the same 12
+    assert well_supported({**a, 9: set(range(HELD - 1))}) == [0, 1, 2, 3, 4]
+    assert well_supported({**a, 9: set(range(HELD))}) == [0, 1, 2, 3, 4, 9] and well_supported({}) == []
 
 
 def two_rings() -> tuple[list[np.ndarray], list[Features], dict[tuple[int, int], Verified]]:
@@ -236,12 +236,12 @@ def test_each_photo_without_a_place_has_its_reason() -> None:
     verified = {(4, 5): pair(60), (0, 6): pair(17), (1, 6): pair(22)}
     counts: Sequence[int] = [1500] * 7 + [20, 1500, 1500]
     details = [1.0] * 8 + [0.3, 1.0]
-    told = reasons([4, 5, 6, 7, 8, 9], [0, 1, 2, 3], [[4, 5]], counts, details, verified)
-    assert [told[i].split(":")[0] for i in range(4, 10)] == [
+    source = reasons([4, 5, 6, 7, 8, 9], [0, 1, 2, 3], [[4, 5]], counts, details, verified)
+    assert [source[i].split(":")[0] for i in range(4, 10)] == [
         "other group", "other group", "weak match", "few features", "blurred", "no match",
     ]  # fmt: skip
-    assert "1 more photo " in told[4] and "2 photos, 22 spots" in told[6]
-    assert "20 spots" in told[7] and "30%" in told[8]
+    assert "1 more photo " in source[4] and "2 photos, 22 spots" in source[6]
+    assert "20 spots" in source[7] and "30%" in source[8]
 
 
 def test_groups_of_photos() -> None:

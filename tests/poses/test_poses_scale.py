@@ -47,7 +47,7 @@ def at(point: list[float], *cameras: int) -> str:
 def test_two_cameras_a_known_distance_apart() -> None:
     apart = np.linalg.norm(POSES[0][:3, 3] - POSES[4][:3, 3]) / WORLD
     found = by_distance(f"0.jpg to 4 = {apart:.9f}", CAMERAS)
-    assert found.metres_per_unit == pytest.approx(1 / WORLD, rel=1e-6) and "0.jpg to 4" in found.told
+    assert found.metres_per_unit == pytest.approx(1 / WORLD, rel=1e-6) and "0.jpg to 4" in found.source
 
 
 def test_two_points_seen_in_photos() -> None:
@@ -91,31 +91,31 @@ def test_markers_of_a_known_size(kind: str) -> None:
     assert all(set(f) == {3, 7} for _, f in found)
     scale = by_markers(found, 0.05)
     assert scale is not None and scale.metres_per_unit == pytest.approx(1 / WORLD, rel=2e-3)
-    assert "2 markers of 50 mm (numbers 3, 7)" in scale.told
+    assert "2 markers of 50 mm (numbers 3, 7)" in scale.source
     assert by_markers(found[:1], 0.05) is None  # one photo sees no depth
     wrong = [(c, {3: f[3] + [[40, 0], [0, 0], [0, 0], [0, 0]]}) for c, f in found]
     assert by_markers(wrong, 0.05) is None  # no square
     assert find_markers(photo_of_markers(flat[0], kind, 0.05 * WORLD, (3, 3)), kind) == {}  # which is which?
 
 
-def pupils(sights: list) -> Scale | None:
-    eyes = eyes_of(sights)
+def pupils(observed: list) -> Scale | None:
+    eyes = eyes_of(observed)
     return None if eyes is None else by_pupils(eyes, 0.063)
 
 
 def test_pupils_seen_in_photos() -> None:
     rng = np.random.default_rng(0)
     eyes = [[-0.0315 * WORLD, 0.02, 0.08], [0.0315 * WORLD, 0.02, 0.08]]
-    sights = [(c, (seen(eyes[0], c) + rng.normal(size=2), seen(eyes[1], c) + rng.normal(size=2))) for c in CAMERAS]
-    found = pupils(sights)
+    observed = [(c, (seen(eyes[0], c) + rng.normal(size=2), seen(eyes[1], c) + rng.normal(size=2))) for c in CAMERAS]
+    found = pupils(observed)
     assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
-    assert "63 mm between the pupils, seen in 5 photos" in found.told
-    swapped = [*sights[:4], (sights[4][0], (sights[4][1][0] + 90, sights[4][1][1] - 90))]  # another face
+    assert "63 mm between the pupils, seen in 5 photos" in found.source
+    swapped = [*observed[:4], (observed[4][0], (observed[4][1][0] + 90, observed[4][1][1] - 90))]  # another face
     found = pupils(swapped)
     assert found is not None and found.metres_per_unit == pytest.approx(1 / WORLD, rel=0.03)
-    assert "seen in 4 photos" in found.told and pupils(swapped[2:]) is None
-    assert pupils(sights[:2]) is None
-    assert pupils([sights[0]] * 4) is None  # one view sees no depth
+    assert "seen in 4 photos" in found.source and pupils(swapped[2:]) is None
+    assert pupils(observed[:2]) is None
+    assert pupils([observed[0]] * 4) is None  # one view sees no depth
 
 
 def test_positions_tell_where_they_are_spread_wider_than_wrong() -> None:
@@ -129,7 +129,7 @@ def test_positions_tell_where_they_are_spread_wider_than_wrong() -> None:
 
     found, _ = by_positions(cameras, places(1.0, 20.0))
     assert found is not None and found.metres_per_unit == pytest.approx(20 / 30, rel=0.05)
-    assert "18 photos" in found.told
+    assert "18 photos" in found.source
     none, why = by_positions(cameras, places(3.0, 1.0))
     assert none is None and "m wrong" in why
     none, why = by_positions(cameras[:4], places(0.1, 20.0))
@@ -178,8 +178,8 @@ def test_the_published_scale_dictionary(tmp_path: Path, capture_of, place) -> No
     found = place(capture, check=False).artifact
     assert found.metric and found.scale == "from FaceScape's scale dictionary" and found.warnings == ()
     assert matrix(found.cameras[2].world_from_cam)[:3, 3] == pytest.approx(POSES[2][:3, 3] / WORLD, abs=1e-6)
-    told = place(capture, check=False, unit="metres").artifact  # what is said goes first
-    assert told.scale.startswith("metres")
+    source = place(capture, check=False, unit="metres").artifact  # what is said goes first
+    assert source.scale.startswith("metres")
     for entry, says in (([0.0, Rt.tolist()], "no scale"), ([mm], "not understood"), ([mm, [[1]]], "wrong shape")):
         table.write_text(json.dumps({"17": {"4": entry}}))
         with pytest.raises(StageError, match=says):

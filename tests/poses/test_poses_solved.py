@@ -13,10 +13,10 @@ from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
 from stages.poses.config import Config
 from stages.poses.features import ASKEW, PATIENT, PLAIN, detect, grey8
+from stages.poses.mapper import opencv_distortion
 from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
-from stages.poses.photogrammetry import _askew, detect_all, match_all
 from stages.poses.photos import photos_of
-from stages.poses.solve import opencv_distortion
+from stages.poses.sfm import _oblique, detect_all, match_all
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -80,7 +80,7 @@ def test_photos_of_something_else_are_named(ball: Path, tmp_path: Path, capture_
         noise = cv2.GaussianBlur(rng.integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8), (0, 0), 2)
         cv2.imwrite(str(folder / f"{i}.jpg"), cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX))
     capture = capture_of(folder, drop_blurred=False)
-    found = place(capture, patience=2).artifact
+    found = place(capture, attempts=2).artifact
     assert found.unregistered == ("20.jpg", "21.jpg") and "20.jpg, 21.jpg (" in found.warnings[-1]
     assert list(found.left_out) == ["20.jpg", "21.jpg"] and found.groups == (7,)
     assert all(reason.split(":")[0] in ("no match", "blurred") for reason in found.left_out.values())
@@ -93,7 +93,7 @@ def test_too_few_placed_photos_are_unusable_and_the_others_are_named(
     folder = no_overlap(tmp_path / "mixed")
     for i in range(4):
         (folder / f"{i + 10}.jpg").write_bytes((ball / f"{i}.jpg").read_bytes())
-    found = place(capture_of(folder), patience=2).artifact
+    found = place(capture_of(folder), attempts=2).artifact
     assert set(found.unregistered) == {"0.jpg", "1.jpg", "2.jpg", "3.jpg", "4.jpg"}
     (placed,) = (f for f in found.findings if f.check == "photos_placed")
     assert placed.level == "unusable" and set(placed.views) == set(found.unregistered)
@@ -128,7 +128,7 @@ def no_overlap(folder: Path) -> Path:
 
 def test_photos_without_overlap_fail_clearly(tmp_path: Path, capture_of, place) -> None:
     with pytest.raises(StageError) as caught:
-        place(capture_of(no_overlap(tmp_path / "c")), patience=1)
+        place(capture_of(no_overlap(tmp_path / "c")), attempts=1)
     error = caught.value
     assert error.where == "poses" and "of 5 placed" in error.value and "0.jpg" in error.value
     assert "overlapping" in error.remedy and error.limit == "at least 3 that are not held out"
@@ -139,7 +139,7 @@ def test_photos_without_any_feature_fail_clearly(tmp_path: Path, capture_of, pla
     for i in range(3):
         cv2.imwrite(str(tmp_path / "c" / f"{i}.jpg"), np.tile(np.linspace(60, 90 + i, 200), (200, 1)))
     with pytest.raises(StageError, match="nothing in common"):
-        place(capture_of(tmp_path / "c"), patience=1)
+        place(capture_of(tmp_path / "c"), attempts=1)
 
 
 def test_the_user_can_stop_it(ball: Path, capture_of, place) -> None:
@@ -217,7 +217,7 @@ def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -
     config = Config(max_image_size=200, neighbours=4).changed(max_features=150)  # fewer than a user may set
     plain = detect_all(photos, config, PLAIN, lambda *_: None)
     verified = match_all(photos, plain, config, PLAIN, lambda *_: None)
-    both, joint = _askew(photos, plain, verified, config, lambda *_: None, [0])
+    both, joint = _oblique(photos, plain, verified, config, lambda *_: None, [0])
     first, second = joint[0, 1].matches.T
     assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
     new = joint[0, 1].matches[first >= len(plain[0].uv)]

@@ -12,7 +12,7 @@ from support.synthetic_results import SyntheticResults, write_results
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.directions import count_seen
-from stages.report.captured import KINDS, _axes, captured, outlined
+from stages.report.capture_figures import KINDS, _axes, captured, outlined
 
 
 @pytest.fixture(scope="module")

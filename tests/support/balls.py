@@ -13,9 +13,9 @@ import torch
 from pipeline import transforms
 from pipeline.maths import sh
 from pipeline.transforms import F64
-from stages.inverse_rendering.lamp import reflectance
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import PhotoView
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.light_estimate import reflectance
+from stages.inverse_rendering.ray_sampling import PhotoView
 
 RADIUS, SIDE, FOCAL, DISTANCE = 0.1, 96, 170.0, 0.5
 

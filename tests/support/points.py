@@ -147,7 +147,7 @@ def read_until(stream: Any, words: str) -> str:
 
 
 if __name__ == "__main__":
-    from workflows.cli import main
+    from workflows.cli.main import main
 
     instrument()
     sys.exit(main())

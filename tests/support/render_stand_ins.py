@@ -7,9 +7,9 @@ from functools import lru_cache
 import numpy as np
 from support.synthetic_asset import RADIUS, ball
 
-from stages.usd.exported import ExportedAsset
-from stages.usd.mesh import UvSurface
-from stages.usd.view import View
+from stages.usd.render.camera import View
+from stages.usd.render.exported import ExportedAsset
+from stages.usd.write.mesh import UvSurface
 
 
 @lru_cache(maxsize=1)

@@ -23,7 +23,8 @@ from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
 from tests.support.points import instrument, reach
 from tests.support.toy_stages import finding
-from workflows import adapter, batch_local
+from workflows.batch import local
+from workflows.server import adapter
 
 
 class Worked(Artifact):
@@ -123,15 +124,15 @@ if REAL:
 else:
     adapter.FIT = "work"  # what holds a slot of the pool's GPUs
 registry.REGISTRY = tuple(counted(s) for s in (registry.REGISTRY if REAL else TOYS))
-batch_local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
+local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
-        from workflows.batch_child import main as child
+        from workflows.batch.child import main as child
 
         sys.exit(child(sys.argv[2:]))
-    from workflows.cli import main
+    from workflows.cli.main import main
 
     sys.exit(main())
 else:  # what a worker's entrypoint names

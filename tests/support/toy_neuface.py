@@ -13,6 +13,6 @@ registry.REGISTRY, registry.FIT = TOYS, "third"
 stages.capture.scan.scan_capture = source  # type: ignore[assignment]
 
 if __name__ == "__main__":
-    from workflows.cli import main
+    from workflows.cli.main import main
 
     sys.exit(main())

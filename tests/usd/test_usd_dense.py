@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.usd import mesh as meshes
-from stages.usd.mesh import UvSurface, half_gap, uv_fault, with_uvs_from
+from stages.usd.write import mesh as meshes
+from stages.usd.write.mesh import UvSurface, half_gap, uv_fault, with_uvs_from
 
 GAP = 0.08
 SCALE = 0.2

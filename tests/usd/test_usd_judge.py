@@ -9,8 +9,8 @@ import pytest
 from support.synthetic_asset import ball, run_stage, write_inputs
 
 from stages.usd import judge
-from stages.usd.findings import Finding as Check
-from stages.usd.validate import found_in
+from stages.usd.check.findings import Finding as Check
+from stages.usd.check.validate import found_in
 
 
 def levels(asset) -> dict[str, str]:

@@ -89,7 +89,7 @@ def test_only_what_the_user_said_is_recorded(exported, inputs: SyntheticInputs, 
 
 
 def test_opening_lookdev_shows_a_held_out_photo(exported, inputs: SyntheticInputs) -> None:
-    from stages.usd.exported import read_cameras
+    from stages.usd.render.exported import read_cameras
 
     path = exported[0] / "asset/lookdev.usda"
     stage = Usd.Stage.Open(str(path))
@@ -106,7 +106,7 @@ def test_opening_lookdev_shows_a_held_out_photo(exported, inputs: SyntheticInput
 
 
 def test_cameras_are_read_back_as_they_were(exported, inputs: SyntheticInputs) -> None:
-    from stages.usd.exported import read_cameras
+    from stages.usd.render.exported import read_cameras
 
     found = read_cameras(exported[0] / "asset/lookdev.usda")
     for camera in inputs.poses.artifact.cameras:
@@ -169,7 +169,7 @@ def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
     import cv2
 
     from pipeline.images import write_png
-    from stages.usd.package import AR_SIDE, bounded_png
+    from stages.usd.write.package import AR_SIDE, bounded_png
 
     big = np.zeros((4096, 4096, 3), np.float32)
     big[:, 2048:] = [1.0, 0.5, 0.25]
@@ -181,7 +181,7 @@ def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
 
 def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path) -> None:
     """The fit's own share of the light stands where the export's would."""
-    from stages.usd.exported import load_exported
+    from stages.usd.render.exported import load_exported
 
     arrays = texture_arrays()
     ratio = np.full_like(arrays["albedo"], 0.8)

@@ -12,7 +12,7 @@ from support.synthetic_asset import smooth_light
 
 from pipeline.errors import StageError
 from pipeline.maths.sh import sh_basis
-from stages.usd.light import (
+from stages.usd.write.light import (
     environment,
     latlong_directions,
     latlong_weights,

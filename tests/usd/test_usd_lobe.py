@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from pipeline.maths import microfacet
-from stages.usd.lobe import COSINES, INV_KAPPA_SCALE, REFERENCE_F0, ROWS, basis_table, fit_figures, in_groups, lobe_fit
+from stages.usd.write.ggx_conversion import (
+    COSINES,
+    INV_KAPPA_SCALE,
+    REFERENCE_F0,
+    ROWS,
+    basis_table,
+    fit_figures,
+    in_groups,
+    lobe_fit,
+)
 
 
 def test_table_times_the_layers_reflectance_is_the_basis() -> None:

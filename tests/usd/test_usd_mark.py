@@ -12,9 +12,9 @@ from support.synthetic_asset import SyntheticInputs, run_stage
 
 from pipeline.artifacts import Located
 from pipeline.verdict import Limits, Verdict, judged
-from stages.usd.mark import mark
-from stages.usd.package import read_package
-from stages.usd.validate import validate
+from stages.usd.check.validate import validate
+from stages.usd.write.mark import mark
+from stages.usd.write.package import read_package
 
 BAD = judged("hull", 0.2, Limits(0.9, 0.5), 'The hull is "open" at 20 %.', "mask the neck", views=["a.jpg"])
 FAIR = judged("sharp", 0.7, Limits(0.9, 0.5), "70 % are sharp.", "use a tripod")

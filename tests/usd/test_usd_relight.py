@@ -9,14 +9,13 @@ from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
 from pipeline.maths.microfacet import KAPPA_RANGE
-from stages.usd import kernels
-from stages.usd.lamps import Lamps, checked_environment, lamps
-from stages.usd.light import latlong_directions, latlong_weights
-from stages.usd.maps import vertex_image
-from stages.usd.relight import Environment, table_of
-from stages.usd.render import Renderer
-from stages.usd.transport import DARKEST, Transport, occlusion
-from stages.usd.view import orbit_view
+from stages.usd.render.camera import orbit_view
+from stages.usd.render.median_cut import Lamps, checked_environment, lamps
+from stages.usd.render.relight import Environment, table_of
+from stages.usd.render.render import Renderer, kernels
+from stages.usd.write.light import latlong_directions, latlong_weights
+from stages.usd.write.maps import vertex_image
+from stages.usd.write.transport import DARKEST, Transport, occlusion
 
 
 def sky(width: int = 64) -> np.ndarray:

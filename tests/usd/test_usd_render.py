@@ -8,9 +8,9 @@ from support.render_stand_ins import asset, sphere_points
 from support.synthetic_asset import RADIUS, smooth_light, texture_arrays, write_inputs
 
 from pipeline.transforms import inverse_rigid, project
-from stages.usd.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
-from stages.usd.render import Renderer, bilinear, lookup, tangents
-from stages.usd.view import View, orbit_view
+from stages.usd.render.camera import View, orbit_view
+from stages.usd.render.render import Renderer, bilinear, lookup, tangents
+from stages.usd.write.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
 
 SIZE = 64
 
@@ -182,7 +182,7 @@ def test_nothing_in_sight_is_black() -> None:
 
 
 def test_exported_maps_are_read_back(exported) -> None:
-    from stages.usd.exported import load_exported
+    from stages.usd.render.exported import load_exported
 
     read, wanted = load_exported(exported[0] / "asset/head.usd"), texture_arrays()
     assert read.occlusion is not None
@@ -195,7 +195,7 @@ def test_exported_maps_are_read_back(exported) -> None:
 def test_channels_are_in_the_order_of_their_numbers(tmp_path) -> None:
     """c10 comes after c9, not after c1."""
     from pipeline.images import write_exr
-    from stages.usd.exported import numbered
+    from stages.usd.render.exported import numbered
 
     values = np.broadcast_to(np.arange(12, dtype=np.float32), (2, 2, 12))
     write_exr(tmp_path / "textures/x_specular_coefficients.exr", values, tuple(f"c{i}" for i in range(12)))

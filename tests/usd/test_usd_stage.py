@@ -16,8 +16,8 @@ from pipeline.errors import StageError, UsageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.transforms import inverse_rigid, matrix, project
 from stages.usd.naming import check_name, name_from
-from stages.usd.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
+from stages.usd.write.shading import ior_from_f0
 
 
 def test_files_are_those_of_the_interface(exported) -> None:
@@ -70,7 +70,7 @@ def test_component_structure(exported) -> None:
 
 
 def test_mesh_survives_the_round_trip(exported, inputs: SyntheticInputs) -> None:
-    from stages.usd.exported import read_usd_mesh
+    from stages.usd.render.exported import read_usd_mesh
 
     found, wanted = read_usd_mesh(exported[0] / "asset/head.usd"), ball()
     np.testing.assert_array_equal(found.vertices[found.faces], wanted["vertices"][wanted["faces"]])
@@ -155,7 +155,7 @@ import pickle, sys
 from pathlib import Path
 sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
 from pipeline.contract import Context
-from stages.usd.shading import ior_from_f0
+from stages.usd.write.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())
 named = {n: getattr(made, n) for n in Inputs.__slots__}
@@ -189,7 +189,7 @@ def test_package_is_aligned_png_only_and_opens(exported) -> None:
 
 @pytest.mark.parametrize("length", range(1, 70))
 def test_package_aligns_names_of_any_length(tmp_path: Path, length: int) -> None:
-    from stages.usd.package import write_package
+    from stages.usd.write.package import write_package
 
     path = tmp_path / "x.usdz"
     write_package(path, [("a" * length, b"12345"), ("b", b"6" * length)])
@@ -228,7 +228,7 @@ def test_without_held_out_views_a_few_fitted_ones_are_rendered(tmp_path: Path) -
 
 
 def test_large_fitted_views_are_rendered_smaller() -> None:
-    from stages.usd.previews import factor_for, spread
+    from stages.usd.render.previews import factor_for, spread
 
     camera = cameras(1, 2000, 3000).cameras[0]
     assert factor_for(camera) == 5

@@ -17,12 +17,12 @@ from support.synthetic_asset import RADIUS, ball, cut_in_two, run_stage, write_i
 from pipeline.artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
-from stages.usd.exported import load_exported
-from stages.usd.mesh import UvSurface, half_gap, on_tile, tile_count, with_uvs_from, without_overlap
-from stages.usd.relight import vertex_values
-from stages.usd.render import Renderer, bilinear
-from stages.usd.validate import validate
-from stages.usd.view import orbit_view
+from stages.usd.check.validate import validate
+from stages.usd.render.camera import orbit_view
+from stages.usd.render.exported import load_exported
+from stages.usd.render.relight import vertex_values
+from stages.usd.render.render import Renderer, bilinear
+from stages.usd.write.mesh import UvSurface, half_gap, on_tile, tile_count, with_uvs_from, without_overlap
 
 NUMBERS = ("1001", "1002")
 

@@ -12,9 +12,9 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from pipeline.errors import StageError
-from stages.usd.chart_checks import _fans, overlap
+from stages.usd.check.chart_checks import _fans, overlap
+from stages.usd.check.validate import checks_run, validate
 from stages.usd.judge import validity
-from stages.usd.validate import checks_run, validate
 
 
 @pytest.fixture
@@ -277,7 +277,7 @@ def test_missing_payload(asset: Path) -> None:
 
 
 def test_damaged_package(asset: Path) -> None:
-    from stages.usd.package import write_package
+    from stages.usd.write.package import write_package
 
     write_package(
         asset / "head.usdz",

@@ -15,8 +15,8 @@ from stages.surface.trim import cut
 from stages.uv import decimate, unwrap
 from stages.uv import pack as packing
 from stages.uv.build import Built, build
+from stages.uv.chart_quality import measure, stretch
 from stages.uv.config import Config
-from stages.uv.measure import measure, stretch
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
 
 

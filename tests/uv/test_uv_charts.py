@@ -9,11 +9,11 @@ import trimesh
 from pipeline import meshes
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
-from stages.usd.render import _square, _triangle
-from stages.uv import flatten, segment, unwrap
+from stages.usd.render.render import _square, _triangle
+from stages.uv import parameterise, segment, unwrap
+from stages.uv.chart_quality import measure
 from stages.uv.charts import unwrapped
 from stages.uv.config import Config
-from stages.uv.measure import measure
 from tests.support.analytic_fields import AnalyticField, bumpy_head
 
 
@@ -97,11 +97,11 @@ def patch(height: float, n: int = 24) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_cylinder_unrolls_to_its_rectangle() -> None:
     points, faces = patch(2.0)
-    uv = flatten.rigid(points, faces, flatten.conformal(points, faces))
+    uv = parameterise.rigid(points, faces, parameterise.conformal(points, faces))
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     flat, true = (np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (uv, points))
     np.testing.assert_allclose(flat, true, rtol=2e-3)
-    assert (flatten.signed(uv, faces) > 0).all()
+    assert (parameterise.signed(uv, faces) > 0).all()
     diagonal = np.linalg.norm(uv[0] - uv[-1])
     assert diagonal == pytest.approx(np.hypot(1.5, 2.0), rel=2e-3)
 
@@ -111,7 +111,7 @@ def test_conformal_maps_keep_angles() -> None:
     made = trimesh.creation.icosphere(4, 1.0)
     keep = made.triangles_center[:, 2] > 0.4
     vertices, faces, _ = meshes.compact(made.vertices, made.faces[keep].astype(np.int32))
-    uv = flatten.conformal(np.asarray(vertices, np.float64), faces.astype(np.int64))
+    uv = parameterise.conformal(np.asarray(vertices, np.float64), faces.astype(np.int64))
 
     def angles(p: np.ndarray) -> np.ndarray:
         a, b = p[faces[:, 1]] - p[faces[:, 0]], p[faces[:, 2]] - p[faces[:, 0]]
@@ -137,21 +137,21 @@ def test_rings_are_cut_once_and_discs_never(shape: str, cuts: int) -> None:
     a, b = order[twin], order[twin + 1]
     length = np.linalg.norm(points[e[a, 0]] - points[e[a, 1]], axis=1)
     pairs = segment.Dual(a % len(faces), b % len(faces), e[a], length, length)
-    cut = flatten.disc_cuts(faces, pairs)
+    cut = parameterise.disc_cuts(faces, pairs)
     assert cut is not None and bool(cut.any()) == bool(cuts)
-    local, vertex = flatten.joined_corners(faces, pairs, cut)
-    assert flatten.border_loops(local).max() == 0
+    local, vertex = parameterise.joined_corners(faces, pairs, cut)
+    assert parameterise.border_loops(local).max() == 0
     inner = np.linalg.norm(points[pairs.edge[cut][:, 0]] - points[pairs.edge[cut][:, 1]], axis=1).sum()
     assert inner < 0.6  # the shortest way from the hole to the border: 0.45 rad or 0.6 along the wall
 
 
 def test_unfolding_mends_a_mirrored_triangle() -> None:
     points, faces = patch(2.0, 8)
-    uv = flatten.rigid(points, faces, flatten.conformal(points, faces))
+    uv = parameterise.rigid(points, faces, parameterise.conformal(points, faces))
     broken = uv.copy()
     broken[27] += 3 * (uv[28] - uv[27])  # an inner vertex beyond its neighbour
-    assert (flatten.signed(broken, faces) <= 0).any()
-    assert (flatten.signed(flatten.unfolded(faces, broken), faces) > 0).all()
+    assert (parameterise.signed(broken, faces) <= 0).any()
+    assert (parameterise.signed(parameterise.unfolded(faces, broken), faces) > 0).all()
 
 
 def test_pixel_filters_have_their_moments() -> None:
@@ -168,7 +168,7 @@ def test_closed_pieces_are_no_discs() -> None:
     made = trimesh.creation.icosphere(2, 1.0)
     faces = made.faces.astype(np.int64)
     pairs = segment.dual(np.asarray(made.vertices), faces.astype(np.int32), np.ones(len(made.vertices)))
-    assert flatten.disc_cuts(faces, pairs) is None
+    assert parameterise.disc_cuts(faces, pairs) is None
 
 
 def test_least_cut_parts_a_dumbbell_at_its_waist() -> None:

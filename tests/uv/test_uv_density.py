@@ -12,7 +12,7 @@ from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
 from stages.uv.build import build
 from stages.uv.config import Config
-from stages.uv.density import MOST, SHARE, Front, dense_charts, enlarged, face_share, front_of, scale_for
+from stages.uv.density import MAX_SCALE, SHARE, Front, dense_charts, enlarged, face_share, front_of, scale_for
 from stages.uv.unwrap import chart_of_face, signed_areas
 from tests.support.analytic_fields import AnalyticField, bumpy_head
 from tests.support.faces import face
@@ -50,7 +50,7 @@ def test_the_face_is_a_chart_with_two_fifths_of_the_texels(head: Mesh) -> None:
     area = meshes.areas(made.mesh.vertices, made.mesh.faces)
     density = np.sqrt(np.abs(signed_areas(made.charts.uvs.astype(np.float64), made.charts.faces)) / area)
     ratio = np.median(density[front.face]) / np.median(density[~front.region])
-    assert 1.2 < ratio <= MOST + 0.01
+    assert 1.2 < ratio <= MAX_SCALE + 0.01
 
 
 def test_a_small_face_is_enlarged_up_to_a_limit(head: Mesh) -> None:
@@ -58,10 +58,10 @@ def test_a_small_face_is_enlarged_up_to_a_limit(head: Mesh) -> None:
     tiny = front_of(head, landmarks(0.2))
     large = front_of(head, landmarks(1.2))
     assert tiny is not None and large is not None
-    assert scale_for(tiny, tiny.face, area) == MOST
-    assert 1 <= scale_for(large, large.face, area) < MOST
+    assert scale_for(tiny, tiny.face, area) == MAX_SCALE
+    assert 1 <= scale_for(large, large.face, area) < MAX_SCALE
     everything = np.ones(len(area), np.bool_)
-    assert scale_for(large, everything, area) in (1.0, MOST)  # nothing is left to be coarser
+    assert scale_for(large, everything, area) in (1.0, MAX_SCALE)  # nothing is left to be coarser
     assert front_of(head, None) is None and front_of(head, face() + (0, 5, 0)) is None
 
 

@@ -81,7 +81,9 @@ def test_few_triangles_are_kept_and_twice_is_the_same(dense: Mesh) -> None:
 
 def test_charts_on_even_triangles(dense: Mesh) -> None:
     made = build(
-        dense, Config(target_faces=5000, proxy_faces=1000, texture_size=512, padding=4, remesh="even"), lambda *_: None
+        dense,
+        Config(target_faces=5000, proxy_faces=1000, texture_size=512, padding=4, remesh="uniform"),
+        lambda *_: None,
     )
     assert unevenness(made.mesh) < 0.2 and made.quality.overlap == 0 and made.warnings == ()
     assert len(made.proxy.faces) <= 1200

@@ -17,14 +17,14 @@ from stages.surface.build import build as surface_build
 from stages.uv import build as building
 from stages.uv import decimate, rough, unwrap
 from stages.uv.build import build
+from stages.uv.chart_quality import Quality, measure
 from stages.uv.decimate import Deviation
 from stages.uv.judge import judge
-from stages.uv.measure import Quality, measure
 from stages.uv.stage import Config, Inputs, run
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
 
 GOOD = Quality(
-    charts=7, crumbs=0, utilisation=0.7, overlap=0.0, stretch=1.2, stretch_max=3.0, flipped=0.0, empty=0.0,
+    charts=7, fragments=0, utilisation=0.7, overlap=0.0, stretch=1.2, stretch_max=3.0, flipped=0.0, empty=0.0,
     seam_front=0.4, tile_utilisation=(0.7,),
 )  # fmt: skip
 NEAR = Deviation(1e-5, 2e-5)
@@ -49,7 +49,7 @@ def sound(mesh: Mesh, charts: Charts) -> Quality:
 def test_a_surface_in_shreds_gets_few_charts_that_all_have_texels(noise: float, most: int) -> None:
     mesh = shredded(3, noise)
     q = sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
-    assert q.charts < most and q.crumbs < 0.3 * most
+    assert q.charts < most and q.fragments < 0.3 * most
 
 
 @pytest.mark.slow
@@ -149,10 +149,10 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
     [
         ("charts", {"charts": 64}, "usable"),
         ("charts", {"charts": 1052}, "unusable"),
-        ("fragments", {"crumbs": 50, "charts": 60}, "usable"),
-        ("fragments", {"crumbs": 506, "charts": 583}, "unusable"),
-        ("fragments", {"crumbs": 746, "charts": 833}, "unusable"),
-        ("fragments", {"crumbs": 3767, "charts": 3945}, "unusable"),
+        ("fragments", {"fragments": 50, "charts": 60}, "usable"),
+        ("fragments", {"fragments": 506, "charts": 583}, "unusable"),
+        ("fragments", {"fragments": 746, "charts": 833}, "unusable"),
+        ("fragments", {"fragments": 3767, "charts": 3945}, "unusable"),
         ("overlap", {"overlap": 0.005}, "usable"),
         ("overlap", {"overlap": 0.05}, "unusable"),
         ("texels_missing", {"empty": 0.0061}, "unusable"),

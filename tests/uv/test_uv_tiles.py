@@ -17,9 +17,9 @@ from pipeline.transforms import rows
 from stages.uv import charts as charting
 from stages.uv import pack as packing
 from stages.uv import unwrap
-from stages.uv.measure import measure
+from stages.uv.chart_quality import measure
 from stages.uv.stage import Config, Inputs, run
-from stages.uv.tiling import Tiling, packed
+from stages.uv.tile_count import Tiling, packed
 from tests.uv.test_uv_build import random_charts
 
 RADIUS = 0.1
@@ -49,7 +49,7 @@ def checked(mesh: Mesh, charts: Charts, padding: float, size: int = 512) -> np.n
         assert len(set(tile[label == k])) == 1
     density = []
     for t in range(int(tile.max()) + 1):
-        part, own = tiles.alone(mesh, charts, t)
+        part, own = tiles.single_tile(mesh, charts, t)
         inside = own.uvs[own.faces]
         assert inside.min() >= padding / 2 and inside.max() <= 1 - padding / 2
         assert np.allclose(inside + [t, 0], corners[tile == t], atol=1e-6)

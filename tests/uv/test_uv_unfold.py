@@ -8,9 +8,9 @@ import pytest
 from pipeline import meshes, raster
 from pipeline.meshes import Charts, Mesh
 from stages.uv import unwrap as unwrapping
+from stages.uv.chart_quality import measure
 from stages.uv.config import Config
-from stages.uv.measure import measure
-from stages.uv.unfold import folded, one_by_one, taken_apart
+from stages.uv.split_overlaps import folded, one_by_one, taken_apart
 from stages.uv.unwrap import signed_areas, unwrap
 
 

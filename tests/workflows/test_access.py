@@ -13,9 +13,10 @@ from prefect.exceptions import TerminationSignal
 
 from pipeline.errors import Cancelled, UsageError
 from stages.registry import REGISTRY
-from workflows import access, flows
-from workflows.access import CLIENT_LOGIN, CSRF, FILE_SETTINGS, ORIGINS, ROOTS, SERVER_LOGIN
-from workflows.session import Session, session
+from workflows import flows
+from workflows.run.session import Session, session
+from workflows.server import access
+from workflows.server.access import CLIENT_LOGIN, CSRF, FILE_SETTINGS, ORIGINS, ROOTS, SERVER_LOGIN
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from support.synthetic_asset import write_inputs  # noqa: E402
 
 from pipeline.contract import Context  # noqa: E402
 from pipeline.images import read_exr, write_exr  # noqa: E402
-from workflows.cli import main  # noqa: E402
+from workflows.cli.main import main  # noqa: E402
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,15 @@ from hypothesis import strategies as st
 
 from pipeline.errors import Cancelled, DiskError, StageError, TimeLimitError, UsageError
 from pipeline.verdict import Level
-from workflows import batch_captures, batch_faults
-from workflows.batch import Ended, run_batch
-from workflows.batch_captures import NAME, find, ranges
-from workflows.batch_commands import seconds
-from workflows.batch_faults import Fault, fault_in, fault_of, smaller
-from workflows.batch_ledger import Entry, Ledger, Summary, fingerprint, idempotency_key
-from workflows.batch_page import ODD, Row, ranked, write_page
-from workflows.batch_request import BatchRequest, asset_name
-from workflows.plan import RunRequest
+from workflows.batch import captures, failures
+from workflows.batch.captures import NAME, find, ranges
+from workflows.batch.commands import seconds
+from workflows.batch.failures import Failure, failure_in, failure_of, smaller
+from workflows.batch.loop import Ended, run_batch
+from workflows.batch.page import ODD, Row, ranked, write_page
+from workflows.batch.request import BatchRequest, asset_name
+from workflows.batch.state import BatchState, Entry, Summary, fingerprint, idempotency_key
+from workflows.run.plan import RunRequest
 
 
 @pytest.fixture
@@ -137,15 +137,15 @@ def test_every_name_that_passes_stays_inside(name: str) -> None:
     ],
 )
 def test_kinds_of_faults(error: Exception, kind: str) -> None:
-    assert fault_of(error).kind == kind
-    in_state = fault_in(f"Flow run encountered an exception: {type(error).__name__}: {error}")
+    assert failure_of(error).kind == kind
+    in_state = failure_in(f"Flow run encountered an exception: {type(error).__name__}: {error}")
     assert in_state.kind == kind  # as Prefect words it
     assert in_state.passes == (kind in ("memory", "lost"))
 
 
 @pytest.mark.parametrize("name", ["ConnectError", "ReadTimeout", "RemoteProtocolError", "PrefectHTTPStatusError"])
 def test_a_server_that_was_away_may_be_back(name: str) -> None:
-    assert fault_in(f"Flow run encountered an exception: {name}: all connection attempts failed").kind == "lost"
+    assert failure_in(f"Flow run encountered an exception: {name}: all connection attempts failed").kind == "lost"
 
 
 def test_half_the_rays_until_it_makes_no_sense() -> None:
@@ -174,7 +174,7 @@ class Scripted:
     def __init__(
         self,
         out: Path,
-        script: dict[str, list[Fault | None]],
+        script: dict[str, list[Failure | None]],
         batch: int = 4096,
         levels: dict[str, Level] | None = None,
     ) -> None:
@@ -199,25 +199,25 @@ class Scripted:
         return [Ended(name, fault, self.batch, self.levels.get(name))]
 
     def close(self, stopped: bool) -> Iterable[Ended]:
-        ended = [Ended(n, Fault(kind="stopped", message="stopped")) for n in self.under_way]
+        ended = [Ended(n, Failure(kind="stopped", message="stopped")) for n in self.under_way]
         self.under_way = []
         return ended
 
 
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_faults, "BACK_OFF", 0.01)
+    monkeypatch.setattr(failures, "BACK_OFF", 0.01)
 
 
 def request(tree: Path, **changes: Any) -> BatchRequest:
     return BatchRequest(root=str(tree), out=str(tree.parent / "out"), **changes)
 
 
-LOST, MEMORY = Fault(kind="lost", message="gone"), Fault(kind="memory", message="full")
-BAD, DISK = Fault(kind="capture", message="bad photo\nmore"), Fault(kind="disk", message="no space")
+LOST, MEMORY = Failure(kind="lost", message="gone"), Failure(kind="memory", message="full")
+BAD, DISK = Failure(kind="capture", message="bad photo\nmore"), Failure(kind="disk", message="no space")
 
 
-def go(tree: Path, script: dict[str, list[Fault | None]], **changes: Any) -> tuple[Any, Scripted]:
+def go(tree: Path, script: dict[str, list[Failure | None]], **changes: Any) -> tuple[Any, Scripted]:
     asked = request(tree, **changes)
     runner = Scripted(Path(asked.out), script)
     return run_batch(asked, runner), runner
@@ -265,24 +265,24 @@ def test_strict_makes_nothing_anew_and_force_does(tree: Path, change: dict[str, 
         ({}, {"2/1_neutral": "usable"}, [], 0),
         ({}, {"2/1_neutral": "usable"}, ["--strict"], 3),
         ({}, {"2/1_neutral": "unusable"}, [], 3),
-        ({"1/2_smile": [Fault(kind="capture", message="bad")]}, {"2/1_neutral": "unusable"}, [], 1),
+        ({"1/2_smile": [Failure(kind="capture", message="bad")]}, {"2/1_neutral": "unusable"}, [], 1),
     ],
 )
 def test_exit_codes_of_a_batch(
     tree: Path,
     monkeypatch: pytest.MonkeyPatch,
-    script: dict[str, list[Fault | None]],
+    script: dict[str, list[Failure | None]],
     levels: dict[str, Level],
     options: list[str],
     code: int,
 ) -> None:
-    from workflows import batch_local
-    from workflows.cli import main
+    from workflows.batch import local
+    from workflows.cli.main import main
 
     out = tree.parent / "out"
     runner = Scripted(out, script, levels=levels)
     runner.kill = lambda: None  # type: ignore[attr-defined]
-    monkeypatch.setattr(batch_local, "Processes", lambda request, slots: runner)
+    monkeypatch.setattr(local, "Processes", lambda request, slots: runner)
     assert main(["batch", str(tree), "--out", str(out), *options]) == code
 
 
@@ -329,7 +329,7 @@ def test_ctrl_c_leaves_what_was_under_way_waiting(tree: Path) -> None:
     runner = Scripted(Path(asked.out), {})
     with pytest.raises(Cancelled):
         run_batch(asked, runner, stopped=lambda: len(runner.started) >= 2)
-    states = [Ledger(asked.folder).read(i).state for i in find(tree)]
+    states = [BatchState(asked.folder).read(i).state for i in find(tree)]
     assert sorted(states) == ["done", "waiting", "waiting", "waiting", "waiting"]
     assert (asked.folder / "index.html").is_file()
 
@@ -337,10 +337,10 @@ def test_ctrl_c_leaves_what_was_under_way_waiting(tree: Path) -> None:
 def test_a_batch_that_was_killed_joins_what_it_submitted(tree: Path) -> None:
     """The same attempt, so the same idempotency key: a server hands back the run that it has."""
     asked = request(tree, subjects="2")
-    ledger, item = Ledger(asked.folder), find(tree, "2")[0]
+    state, item = BatchState(asked.folder), find(tree, "2")[0]
     run = asked.run_request(item.capture, item.name, (), item.own)
     entry = Entry(name=item.name, capture=str(item.capture), state="submitted", attempt=4, fingerprint=fingerprint(run))
-    ledger.write(entry)
+    state.write(entry)
     runner = Scripted(Path(asked.out), {})
     run_batch(asked, runner)
     assert runner.started == [("2/1_neutral", 4, ())]
@@ -356,10 +356,10 @@ def test_idempotency_keys_differ_by_all_that_matters(tree: Path) -> None:
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"name": "../x", "capture": "c"}', b'{"name":"a","asset":"/etc/x"}'])
 def test_a_damaged_ledger_is_a_new_one(tree: Path, content: bytes) -> None:
-    ledger, item = Ledger(tree.parent / "out/batch"), find(tree)[0]
-    ledger.write(Entry(name=item.name, capture="c", state="done"))
-    next(ledger.folder.iterdir()).write_bytes(content)
-    assert ledger.read(item).state == "waiting"
+    state, item = BatchState(tree.parent / "out/batch"), find(tree)[0]
+    state.write(Entry(name=item.name, capture="c", state="done"))
+    next(state.folder.iterdir()).write_bytes(content)
+    assert state.read(item).state == "waiting"
 
 
 def test_results_never_land_among_the_captures(tree: Path) -> None:
@@ -378,7 +378,7 @@ def test_wrong_words_are_told_before_anything_is_written(tree: Path, change: dic
 
 @pytest.mark.parametrize("option", [["--attempts", "0"], ["--seed", "-1"], ["--preset", "besst"], ["--chunk", "9999"]])
 def test_wrong_options_are_exit_code_2(tree: Path, option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    from workflows.cli import main
+    from workflows.cli.main import main
 
     assert main(["batch", str(tree), "--out", str(tree.parent / "out"), *option]) == 2
     assert "what to do:" in capsys.readouterr().err
@@ -431,7 +431,7 @@ def test_equal_figures_and_few_of_them_are_never_odd() -> None:
 
 
 def test_the_page_escapes_and_links(tree: Path) -> None:
-    evil = Fault(kind="capture", message="<script>alert(1)</script> in a.jpg")
+    evil = Failure(kind="capture", message="<script>alert(1)</script> in a.jpg")
     out = tree.parent / "out"
     for name in ("asset/thumbnails/default.png", "report/index.html"):
         (out / "1/1_neutral" / name).parent.mkdir(parents=True)
@@ -463,4 +463,4 @@ def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: 
 
 
 def test_records_folder_is_the_reserved_name() -> None:
-    assert BatchRequest(root="r", out="/o").folder == Path("/o") / batch_captures.RECORDS
+    assert BatchRequest(root="r", out="/o").folder == Path("/o") / captures.RECORDS

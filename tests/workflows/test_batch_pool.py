@@ -30,7 +30,7 @@ from tests.support.servers import (
     postgres_programs,
     wait_healthy,
 )
-from workflows.environment import SLOTS_ON_DISK
+from workflows.server.environment import SLOTS_ON_DISK
 
 TOY = Path(__file__).parents[1] / "support" / "toy_batch.py"
 CAPTURES = {f"{s}/{e}": (s, e) != (2, "1_neutral") for s in (1, 2, 3) for e in ("1_neutral", "2_smile")}
@@ -146,13 +146,13 @@ def test_a_night_with_a_killed_worker_server_and_database(
             runs = ask(url, "/flow_runs/filter", {"limit": 50}, LOGIN)
             limits = ask(url, "/v2/concurrency_limits/filter", {}, LOGIN)
             queues = ask(url, "/work_pools/heads/queues/filter", {}, LOGIN)
-    said = (tmp_path / "batch.log").read_text()
-    assert code == 1, said
+    notify = (tmp_path / "batch.log").read_text()
+    assert code == 1, notify
     summary = json.loads((tmp_path / "out/batch/summary.json").read_text())
-    assert summary["counts"] == {"done": 5, "unusable": 0, "failed": 1, "submitted": 0, "waiting": 0}, said
+    assert summary["counts"] == {"done": 5, "unusable": 0, "failed": 1, "submitted": 0, "waiting": 0}, notify
     failed = summary["captures"][0]
     assert failed["name"] == "2/1_neutral" and PHOTO in failed["fault"]
-    assert "2/1_neutral: trying again" not in said and said.count("2/1_neutral: FAILED") == failed["attempts"]
+    assert "2/1_neutral: trying again" not in notify and notify.count("2/1_neutral: FAILED") == failed["attempts"]
     assert len(list((tmp_path / "out").glob("*/*/asset/*.usd"))) == 5
     assert len(list(store.glob("*/*/manifest.json"))) == 5 * STAGES and damaged(store) == []
     assert max(c["attempts"] for c in summary["captures"]) >= 2, "the killed worker's capture was tried again"
@@ -162,9 +162,11 @@ def test_a_night_with_a_killed_worker_server_and_database(
     assert {r["work_queue_name"] for r in runs} == {"high"}
     assert [(q["name"], q["priority"]) for q in queues if q["name"] == "high"] == [("high", 1)]
     assert [(x["name"], x["limit"]) for x in limits] == [("neuface-fits", 2)]
-    alone = tmp_path / "tally alone"
+    undisturbed_tally = tmp_path / "tally alone"
     undisturbed = [sys.executable, TOY, "batch", tree, "--out", tmp_path / "alone", "--workers", "2", *SETS]
-    subprocess.run([str(c) for c in undisturbed], env={**environment, "NEUFACE_TALLY": str(alone)}, timeout=PATIENCE)
+    subprocess.run(
+        [str(c) for c in undisturbed], env={**environment, "NEUFACE_TALLY": str(undisturbed_tally)}, timeout=PATIENCE
+    )
     once = counts(tally)
     assert set(once.values()) == {1} and once.total() == 5 * STAGES, "no stage came to its end twice"
-    assert by_stage(once) == by_stage(counts(alone))
+    assert by_stage(once) == by_stage(counts(undisturbed_tally))

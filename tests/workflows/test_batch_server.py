@@ -13,12 +13,13 @@ import pytest
 from prefect.client.schemas.objects import StateType
 
 from pipeline.errors import StageError, UsageError
-from workflows import batch_prefect, flows
-from workflows.alone import alone
-from workflows.batch_ledger import Entry, Summary
-from workflows.batch_prefect import Pool
-from workflows.batch_request import BatchRequest
-from workflows.environment import SLOTS_ON_DISK
+from workflows import flows
+from workflows.batch import pool as pool_module
+from workflows.batch.pool import Pool
+from workflows.batch.request import BatchRequest
+from workflows.batch.state import Entry, Summary
+from workflows.run.run_lock import exclusive_run
+from workflows.server.environment import SLOTS_ON_DISK
 
 
 class Clock:
@@ -35,7 +36,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     fake = Clock()
-    monkeypatch.setattr(batch_prefect, "time", fake)
+    monkeypatch.setattr(pool_module, "time", fake)
     return fake
 
 
@@ -43,7 +44,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 def pool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock) -> Pool:
     """A pool whose server answers nothing and says yes to all."""
     monkeypatch.setattr(
-        batch_prefect, "get_current_settings", lambda: SimpleNamespace(api=SimpleNamespace(url="http://x"))
+        pool_module, "get_current_settings", lambda: SimpleNamespace(api=SimpleNamespace(url="http://x"))
     )
     monkeypatch.setattr(Pool, "_prepare", lambda self: uuid4())
     made = Pool(BatchRequest(root="/r", out=str(tmp_path / "out"), lost_after=30, stage_limit=100))
@@ -58,7 +59,7 @@ def look(pool: Pool, run: Any, state: StateType, message: str = "", name: str = 
 
 def new_run(pool: Pool, clock: Clock, name: str = "a") -> Any:
     request = pool.request.run_request(Path("/c"), name, (), {})
-    return batch_prefect._Run(uuid4(), name, request, quiet_since=clock.now)
+    return pool_module._Run(uuid4(), name, request, quiet_since=clock.now)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +108,7 @@ def test_running_without_a_process_is_lost_after_a_while(pool: Pool, clock: Cloc
 
 def test_a_process_that_holds_the_lock_is_never_lost(pool: Pool, clock: Clock, tmp_path: Path) -> None:
     run = new_run(pool, clock)
-    with alone(pool.request.store_path, Path(run.request.out), lambda: False, print):
+    with exclusive_run(pool.request.store_path, Path(run.request.out), lambda: False, print):
         for _ in range(10):
             clock.now += 1000
             assert look(pool, run, StateType.RUNNING) is None
@@ -134,7 +135,7 @@ def test_a_server_that_is_away_is_asked_again_and_not_for_ever(
     def client(sync_client: bool) -> Any:
         yield None
 
-    monkeypatch.setattr(batch_prefect, "get_client", client)
+    monkeypatch.setattr(pool_module, "get_client", client)
     answers = iter([httpx.ConnectError("refused"), httpx.ReadTimeout("slow"), 7])
 
     def ask(_: Any) -> int:
@@ -151,7 +152,7 @@ def test_a_server_that_is_away_is_asked_again_and_not_for_ever(
 
     with pytest.raises(StageError, match="does not answer"):
         Pool._patiently(None, never)  # type: ignore[arg-type]
-    assert batch_prefect.AWAY <= clock.now - begin < batch_prefect.AWAY + 60
+    assert pool_module.AWAY <= clock.now - begin < pool_module.AWAY + 60
 
 
 def test_a_server_that_forgets_who_holds_a_slot_is_told(
@@ -181,7 +182,7 @@ def test_as_many_runs_at_a_time_as_a_chunk_has(pool: Pool) -> None:
 
 
 def test_without_a_server_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_prefect, "get_current_settings", lambda: SimpleNamespace(api=SimpleNamespace(url=None)))
+    monkeypatch.setattr(pool_module, "get_current_settings", lambda: SimpleNamespace(api=SimpleNamespace(url=None)))
     with pytest.raises(UsageError, match="PREFECT_API_URL"):
         Pool(BatchRequest(root="/r", out="/o"))
 
@@ -194,8 +195,8 @@ def test_the_batch_flow_fails_when_a_capture_has_no_asset(
     states = ["failed"] * failed + ["done"] * 2
     summary = Summary([Entry(name=f"{i}", capture="/c", state=s) for i, s in enumerate(states)])  # type: ignore[arg-type]
     asked: list[BatchRequest] = []
-    monkeypatch.setattr(batch_prefect, "Pool", lambda request: None)
-    monkeypatch.setattr("workflows.batch.run_batch", lambda request, *a, **k: (asked.append(request), summary)[1])
+    monkeypatch.setattr(pool_module, "Pool", lambda request: None)
+    monkeypatch.setattr("workflows.batch.loop.run_batch", lambda request, *a, **k: (asked.append(request), summary)[1])
     monkeypatch.setattr(flows, "report_batch", lambda out, counts: None)
     if failed:
         with pytest.raises(RuntimeError, match="1 of 3 captures have no asset"):
@@ -212,8 +213,8 @@ def test_the_batch_flow_ends_in_a_state_of_its_own_when_results_are_refused(
 ) -> None:
     state = "unusable" if level == "unusable" else "done"
     summary = Summary([Entry(name="0", capture="/c", state=state, level=level)])  # type: ignore[arg-type]
-    monkeypatch.setattr(batch_prefect, "Pool", lambda request: None)
-    monkeypatch.setattr("workflows.batch.run_batch", lambda request, *a, **k: summary)
+    monkeypatch.setattr(pool_module, "Pool", lambda request: None)
+    monkeypatch.setattr("workflows.batch.loop.run_batch", lambda request, *a, **k: summary)
     monkeypatch.setattr(flows, "report_batch", lambda out, counts: None)
     ended = flows.facescape_batch.fn(root="/r", out=str(tmp_path), strict=strict)
     assert getattr(ended, "name", None) == name

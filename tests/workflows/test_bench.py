@@ -11,10 +11,10 @@ import pytest
 
 from pipeline.errors import UsageError
 from stages.inverse_rendering.stage import Config
-from workflows import bench_ablations as bench
-from workflows.bench_ablations import FULL, TABLES, Result, Row, ordering, report, settings_of, unique
-from workflows.cli import parser
-from workflows.console import Console
+from workflows.bench import ablations as bench
+from workflows.bench.ablations import FULL, TABLES, Result, Row, ordering, report, settings_of, unique
+from workflows.cli.console import Console
+from workflows.cli.main import parser
 
 BUDGET = {"steps": 3, "side": 64, "batch": 32, "holdout": "every:5:2", "capture": "ball"}
 

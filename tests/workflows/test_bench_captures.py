@@ -16,13 +16,13 @@ from support import toy_capture_run
 
 from pipeline.errors import Cancelled, UsageError
 from stages.capture.scan import scan_capture
-from workflows import bench_captures as bench
-from workflows import bench_captures_child as child
-from workflows.bench_captures_against import compare
-from workflows.bench_captures_find import HELD_OUT, NO_ALL_ON, NO_PHOTOS, find, root_of
-from workflows.bench_captures_table import FIGURES, markdown
-from workflows.cli import parser
-from workflows.console import Console
+from workflows.bench import captures as bench
+from workflows.bench import captures_child as child
+from workflows.bench.captures_against import compare
+from workflows.bench.captures_find import HELD_OUT, NO_ALL_ON, NO_PHOTOS, find, root_of
+from workflows.bench.captures_table import FIGURES, markdown
+from workflows.cli.console import Console
+from workflows.cli.main import parser
 
 TOY = (sys.executable, str(Path(toy_capture_run.__file__)))
 
@@ -99,13 +99,13 @@ def test_a_truth_is_never_part_of_a_capture(tmp_path: Path, place: str) -> None:
     """Photos, masks and cameras in truth/ change nothing of what a run is given."""
     photos(tmp_path / place)
     (tmp_path / "mask").mkdir()
-    [alone] = find(tmp_path.parent, only=[tmp_path.name])
-    before = scan_capture(alone.capture).artifact
+    [exclusive_run] = find(tmp_path.parent, only=[tmp_path.name])
+    before = scan_capture(exclusive_run.capture).artifact
     photos(tmp_path / "truth")
     photos(tmp_path / "truth" / "mask")
     (tmp_path / "truth" / "params.json").write_text("{}")
     [beside] = find(tmp_path.parent, only=[tmp_path.name])
-    assert beside == alone and scan_capture(beside.capture).artifact == before
+    assert beside == exclusive_run and scan_capture(beside.capture).artifact == before
 
 
 # ------------------------------------------------------------------ how runs end
@@ -317,8 +317,8 @@ def test_against_is_printed_at_the_end(root: Path, capsys: pytest.CaptureFixture
     (root / "good_2" / "better").write_text("")
     capsys.readouterr()
     run(root, "--only", "good_2", "--against", str(before))
-    told = capsys.readouterr().out
-    assert "good_2: asset_psnr [asset (dB)] 20.00 -> 21.00 (+1.00), better" in told
-    assert "1 captures compared" in told and "bad_3" not in told
+    summary_line = capsys.readouterr().out
+    assert "good_2: asset_psnr [asset (dB)] 20.00 -> 21.00 (+1.00), better" in summary_line
+    assert "1 captures compared" in summary_line and "bad_3" not in summary_line
     with pytest.raises(UsageError, match="table can't be read"):
         run(root, "--against", str(root.parent / "nothing.json"))

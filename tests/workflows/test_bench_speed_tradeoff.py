@@ -12,12 +12,13 @@ import pytest
 
 from pipeline.errors import UsageError
 from stages.inverse_rendering.stage import Config
-from workflows import bench_speed, bench_tradeoff, machine, tradeoff_measure
-from workflows.bench_tradeoff import KNOBS, front
-from workflows.cli import parser
-from workflows.console import Console
-from workflows.tradeoff_measure import Measured
-from workflows.tradeoff_plot import plot
+from workflows.bench import speed, tradeoff, tradeoff_measure
+from workflows.bench.tradeoff import KNOBS, front
+from workflows.bench.tradeoff_measure import Measured
+from workflows.bench.tradeoff_plot import plot
+from workflows.cli.console import Console
+from workflows.cli.main import parser
+from workflows.run import host_info
 
 
 def trade(tmp_path: Path, *more: str) -> Any:
@@ -31,67 +32,65 @@ def measured(seconds: float, psnr: float) -> Measured:
 # ------------------------------------------------------------------ machine
 def test_growth_finds_a_power_law() -> None:
     x = [1.0, 2.0, 5.0]
-    a, b = machine.growth(x, [3 * v**1.7 for v in x])
+    a, b = host_info.growth(x, [3 * v**1.7 for v in x])
     assert (a, b) == pytest.approx((3, 1.7))
-    assert np.isnan(machine.growth([1, 1], [2, 3])).all() and np.isnan(machine.growth([1, 2], [0, 3])).all()
+    assert np.isnan(host_info.growth([1, 1], [2, 3])).all() and np.isnan(host_info.growth([1, 2], [0, 3])).all()
 
 
 def test_the_machine_is_told() -> None:
-    m = machine.machine()
-    text = machine.told(m)
+    m = host_info.machine()
+    text = host_info.describe(m)
     assert str(m["date"]) in text and str(m["torch"]) in text and f"{m['cores']} cores" in text
 
 
 def test_seconds_each_is_the_least_after_a_warm_up() -> None:
     calls: list[int] = []
-    assert machine.seconds_each(lambda: calls.append(1), 0.0, 3) < 0.1 and len(calls) == 4
+    assert host_info.seconds_each(lambda: calls.append(1), 0.0, 3) < 0.1 and len(calls) == 4
 
 
 # ------------------------------------------------------------------ speed
 def test_every_axis_goes_through_the_middle() -> None:
-    setups = bench_speed.setups()
-    assert setups[0] == bench_speed.MIDDLE and len(setups) == 7
+    setups = speed.setups()
+    assert setups[0] == speed.MIDDLE and len(setups) == 7
     for s in setups[1:]:
-        assert sum(s[k] != bench_speed.MIDDLE[k] for k in s) == 1
+        assert sum(s[k] != speed.MIDDLE[k] for k in s) == 1
 
 
 def test_laws_are_exponents_of_single_axes() -> None:
     points = [
-        bench_speed.Point(
-            **s, step_ms=2.0 * s["cells"], rays_per_s=1, start_s=0.1 * s["side"] ** 2, memory_mb=s["views"]
-        )
-        for s in bench_speed.setups()
+        speed.Point(**s, step_ms=2.0 * s["cells"], rays_per_s=1, start_s=0.1 * s["side"] ** 2, memory_mb=s["views"])
+        for s in speed.setups()
     ]
-    laws = bench_speed.laws(points)
+    laws = speed.laws(points)
     assert laws["cells"]["step_ms"] == 1.0 and laws["side"]["start_s"] == 2.0 and laws["views"]["memory_mb"] == 1.0
     assert laws["views"]["step_ms"] == 0.0
 
 
 def test_parts_are_settings_of_the_fit() -> None:
-    for part in bench_speed.PARTS.values():
-        assert set(part) <= set(bench_speed.WHOLE)
-    t = bench_speed.trainer(8, 32, 24, 64, "cpu", bench_speed.PARTS["nothing but albedo and light"])
+    for part in speed.PARTS.values():
+        assert set(part) <= set(speed.WHOLE)
+    t = speed.trainer(8, 32, 24, 64, "cpu", speed.PARTS["nothing but albedo and light"])
     t.advance()
-    assert not t.model.spec.specular and t.rests and t.waiting == ()
+    assert not t.model.spec.specular and t.geometry_frozen and t.validation == ()
 
 
 @pytest.mark.slow
 def test_training_of_the_ball_is_timed() -> None:
-    p = bench_speed.measure(8, 32, 24, 64, 0.0, "cpu")
+    p = speed.measure(8, 32, 24, 64, 0.0, "cpu")
     assert p.step_ms > 0 and p.rays_per_s == pytest.approx(64 / (p.step_ms / 1e3), rel=0.02)
-    s = bench_speed.harmonics(0.0, "cpu")
+    s = speed.harmonics(0.0, "cpu")
     assert s["forward_per_s"] > s["with_gradients_per_s"] > 0
     found = {
-        "machine": machine.machine(),
+        "machine": host_info.machine(),
         "device": "cpu",
         "batch": 64,
-        "training": [bench_speed.asdict(p)],
-        "growth": bench_speed.laws([p]),
+        "training": [speed.asdict(p)],
+        "growth": speed.laws([p]),
         "parts_ms": {"the whole model": 10.0, "no lobe": 7.5},
         "sh": s,
         "picture_ms": {"field": 1234.5},
     }
-    text = "\n".join(bench_speed.report(found))
+    text = "\n".join(speed.report(found))
     assert f"| 8 | 32 | 24 | {p.step_ms} |" in text and "field 1,2" in text
     assert "| no lobe | 7.5 | 25% |" in text
 
@@ -126,33 +125,33 @@ def test_a_bench_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         seen.append(knob.name)
         return measured(10 + len(seen), 30 + 0.1 * len(knob.name))
 
-    monkeypatch.setattr(machine, "apart", apart)
-    assert bench_tradeoff.run(trade(tmp_path, "--points", "SH order"), Console()) == 0
-    assert bench_tradeoff.run(trade(tmp_path, "--stop-after", "0"), Console()) == 0
+    monkeypatch.setattr(host_info, "apart", apart)
+    assert tradeoff.run(trade(tmp_path, "--points", "SH order"), Console()) == 0
+    assert tradeoff.run(trade(tmp_path, "--stop-after", "0"), Console()) == 0
     assert seen == ["SH order 2", "SH order 4", "SH order 6"]
-    bench_tradeoff.run(trade(tmp_path), Console())
+    tradeoff.run(trade(tmp_path), Console())
     assert len(seen) == len(KNOBS) == len(set(seen))
     out = tmp_path / "out"
     kept = json.loads((out / "tradeoff.json").read_text())
     assert list(kept["points"]) == [k.name for k in KNOBS] and kept["budget"]["capture"] == "photos"
     text = (out / "tradeoff.md").read_text()
     assert "Two seeds differ by" in text and "**" in text
-    bench_tradeoff.run(trade(tmp_path, "--points", "k = 5", "--steps", "7"), Console())
+    tradeoff.run(trade(tmp_path, "--points", "k = 5", "--steps", "7"), Console())
     assert list(json.loads((out / "tradeoff.json").read_text())["points"]) == ["k = 5"]
 
 
 def test_presets_are_points_as_they_are(tmp_path: Path) -> None:
-    draft, studio = bench_tradeoff.presets_named("draft, studio")
+    draft, studio = tradeoff.presets_named("draft, studio")
     assert (draft.preset, studio.preset) == ("draft", "studio")
     assert tradeoff_measure.settings_of(studio, trade(tmp_path)) == ()
-    assert bench_tradeoff.presets_named("") == []
+    assert tradeoff.presets_named("") == []
     with pytest.raises(UsageError, match="no preset"):
-        bench_tradeoff.presets_named("hasty")
+        tradeoff.presets_named("hasty")
 
 
 def test_an_unknown_point_is_told(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no point"):
-        bench_tradeoff.run(trade(tmp_path, "--points", "warp drive"), Console())
+        tradeoff.run(trade(tmp_path, "--points", "warp drive"), Console())
 
 
 def test_the_plot_shows_every_point_inside_its_frame() -> None:

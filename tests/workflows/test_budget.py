@@ -11,12 +11,12 @@ from pipeline.errors import UsageError
 from pipeline.store import Store
 from stages.presets import configs_for
 from stages.registry import FIT
-from workflows import budget
-from workflows.budget import DRAFT_RATE, LEAST_FIT, RUNGS, BudgetPlan, choose
-from workflows.cli import parser
-from workflows.commands import request_from
-from workflows.plan import RunRequest, check_settings, make_plan, preview
-from workflows.runner import run_here, run_plan
+from workflows.cli.commands import request_from
+from workflows.cli.main import parser
+from workflows.run import budget
+from workflows.run.budget import DRAFT_RATE, MIN_FIT, RUNGS, BudgetPlan, choose
+from workflows.run.plan import RunRequest, check_settings, make_plan, preview
+from workflows.run.runner import run_here, run_plan
 
 NAMES = [r.name for r in RUNGS]
 
@@ -42,8 +42,10 @@ def test_a_rung_is_filled_with_rays_and_all_stages_fit() -> None:
 
 def test_too_little_time_still_leaves_an_asset_and_is_told() -> None:
     plan = choose(5.0, DRAFT_RATE)
-    assert plan.rung == "coarse" and plan.seconds == LEAST_FIT + RUNGS[0].before and not plan.fits
-    assert "longer than the budget" in plan.told(5.0) and "longer" not in choose(3600.0, DRAFT_RATE).told(3600.0)
+    assert plan.rung == "coarse" and plan.seconds == MIN_FIT + RUNGS[0].before and not plan.fits
+    assert "longer than the budget" in plan.describe(5.0) and "longer" not in choose(3600.0, DRAFT_RATE).describe(
+        3600.0
+    )
 
 
 def test_every_rung_is_valid_settings() -> None:
@@ -89,8 +91,8 @@ def test_the_run_plans_before_the_fit_alone(
     photos: Path, toys: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With toy stages, the second of which plays the fit."""
-    from workflows import plan as planning
-    from workflows import runner
+    from workflows.run import plan as planning
+    from workflows.run import runner
 
     asked: list[Any] = []
 
@@ -102,7 +104,7 @@ def test_the_run_plans_before_the_fit_alone(
     monkeypatch.setattr(planning, "FIT", "second")
     monkeypatch.setattr(runner, "planned", found)
     monkeypatch.setattr(BudgetPlan, "settings", lambda self: {})
-    monkeypatch.setattr(BudgetPlan, "told", lambda self, budget: "planned")
+    monkeypatch.setattr(BudgetPlan, "describe", lambda self, budget: "planned")
     plan = make_plan(RunRequest(capture=str(photos), out=str(tmp_path / "out"), budget=60.0))
     assert [s.key is None for s in preview(plan)] == [False, True, True]
     done = run_plan(plan, run_here(plan))

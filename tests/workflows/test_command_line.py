@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.points import PATIENCE, hold, read_until
-from workflows.cli import main, parser
+from workflows.cli.main import main, parser
 
 TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
 

@@ -20,8 +20,8 @@ from pipeline.images import write_png
 from tests.support.facescape_tree import write_tree
 from tests.support.points import PATIENCE, wait_for
 from tests.support.servers import LOGIN, ask, descendants, free_port, guarded, login_headers, wait_healthy
-from workflows.batch_request import BatchRequest
-from workflows.plan import RunRequest
+from workflows.batch.request import BatchRequest
+from workflows.run.plan import RunRequest
 
 PREFECT = Path(sys.executable).parent / "prefect"
 CLOSED = {"job_configuration": {"namespace": "x"}, "variables": {"properties": {}, "additionalProperties": False}}

@@ -45,6 +45,32 @@ def test_a_renamed_one_sets_the_new_one_which_wins(caplog: Messages, monkeypatch
     assert configs_for("draft", both, registry=TOYS)["first"].model_dump()["plus"] == 8
 
 
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("capture.chart", "on"), ("poses.patience", 2), ("masks.mend", False), ("inverse_rendering.relief", "off"),
+     ("inverse_rendering.even_until", 0.4), ("inverse_rendering.shininess", 0.5), ("inverse_rendering.parsimony", 0.5)],
+)  # fmt: skip
+def test_each_renamed_setting_still_sets_what_it_set(path: str, value: object, caplog: Messages) -> None:
+    stage, _, name = path.partition(".")
+    configs = configs_for("draft", parse_sets([f"{path}={value}"]))
+    assert configs[stage].model_dump()[old_names.RENAMED[path]] == value
+    assert f"--set {path} is called {stage}.{old_names.RENAMED[path]} now" in caplog.text
+
+
+def test_the_renamed_settings_are_the_ones_tested_above() -> None:
+    assert len(old_names.RENAMED) == 7
+
+
+@pytest.mark.parametrize(
+    ("path", "old", "new"),
+    [(path, old, new) for path, values in old_names.RENAMED_VALUES.items() for old, new in values.items()],
+)
+def test_a_renamed_value_is_the_new_one(path: str, old: str, new: str, caplog: Messages) -> None:
+    stage, _, name = path.partition(".")
+    assert configs_for("draft", parse_sets([f"{path}={old}"]))[stage].model_dump()[name] == new
+    assert f"{path}={new} now" in caplog.text
+
+
 def test_a_name_that_never_was_stays_an_error(caplog: Messages) -> None:
     with pytest.raises(UsageError, match="unknown setting of poses"):
         configs_for("draft", parse_sets(["poses.use_mask=1"]))

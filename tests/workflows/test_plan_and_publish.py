@@ -13,13 +13,13 @@ import pytest
 from pipeline.artifacts import Artifact, FileRef, HeldOutView, Located, UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import Cancelled, StageError, UsageError
-from workflows.folders import writable
-from workflows.plan import RunRequest, make_plan, preview
-from workflows.publish import asset_hash, publish
-from workflows.published import LIST
-from workflows.replace import swap
-from workflows.runner import run_here, run_plan
-from workflows.session import Session, session
+from workflows.run.output_dirs import writable
+from workflows.run.plan import RunRequest, make_plan, preview
+from workflows.run.publish import asset_hash, publish
+from workflows.run.published import LIST
+from workflows.run.replace import swap
+from workflows.run.runner import run_here, run_plan
+from workflows.run.session import Session, session
 
 pytestmark = pytest.mark.usefixtures("toys")
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workflows.cli import main
-from workflows.schedule import Farm, Load, load_of, simulate
+from workflows.batch.schedule import Farm, Load, load_of, simulate
+from workflows.cli.main import main
 
 
 def test_one_worker_is_the_sum() -> None:

@@ -11,7 +11,7 @@ import pytest
 from stages.presets import PRESETS
 from stages.registry import REGISTRY
 from stages.settings import all_settings
-from workflows.cli import main
+from workflows.cli.main import main
 
 
 def shown(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -86,7 +86,7 @@ def test_an_unknown_name_is_told_as_elsewhere(word: str, told: list[str], capsys
 
 def test_it_loads_nothing_that_is_heavy() -> None:
     code = (
-        "import sys; from workflows.cli import main; main(['settings']);"
+        "import sys; from workflows.cli.main import main; main(['settings']);"
         "sys.exit(str([m for m in ('torch', 'numba', 'cv2', 'scipy', 'prefect', 'pxr') if m in sys.modules] or ''))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -100,7 +100,7 @@ def test_a_terminal_that_is_gone_changes_no_exit_code(photos: Path, child_enviro
 
 
 @pytest.mark.parametrize("number", ALL)
-@pytest.mark.parametrize("module", ["argparse", "pipeline.errors", "workflows.schedule"])
+@pytest.mark.parametrize("module", ["argparse", "pipeline.errors", "workflows.batch.schedule"])
 def test_a_signal_during_the_imports_shows_no_traceback(
     tmp_path: Path, child_environment: dict[str, str], number: signal.Signals, module: str
 ) -> None:
@@ -111,7 +111,7 @@ def test_a_signal_during_the_imports_shows_no_traceback(
         "TEST_AT_IMPORT": module,
         "TEST_SIGNAL": str(int(number)),
     }
-    for how in (["-m", "workflows.cli"], ["-c", "from workflows.entry import main; main()"]):
+    for how in (["-m", "workflows.cli"], ["-c", "from workflows.cli.entry import main; main()"]):
         child = start(environment, *how, "run", "x", "--out", tmp_path / "out")
         out, err = child.communicate(timeout=120)
         assert (child.returncode, out, err) == (128 + number, "", ""), how
@@ -123,7 +123,8 @@ def test_a_command_without_stages_is_tidied_and_stops(
 ) -> None:
     program = f"""
 import sys, os, signal
-from workflows import cli, commands
+from workflows.cli.main import main
+from workflows.cli import commands
 def command(options, console):
     try:
         os.kill(os.getpid(), {int(number)})
@@ -131,7 +132,7 @@ def command(options, console):
     finally:
         print("tidied")
 commands.doctor_command = command
-sys.exit(cli.main(["doctor"]))
+sys.exit(main(["doctor"]))
 """
     child = start(child_environment, "-c", program)
     out, err = child.communicate(timeout=120)
@@ -142,7 +143,7 @@ def test_nohup_is_heeded(photos: Path, child_environment: dict[str, str]) -> Non
     program = """
 import os, signal, sys, threading
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
-from workflows.interrupt import as_exceptions, interruptible
+from workflows.run.interrupt import as_exceptions, interruptible
 stop = threading.Event()
 with as_exceptions(), interruptible(stop, print):
     os.kill(os.getpid(), signal.SIGHUP)
@@ -155,7 +156,7 @@ with as_exceptions(), interruptible(stop, print):
 def test_pycolmap_takes_no_signal_from_a_run(child_environment: dict[str, str]) -> None:
     program = """
 import os, signal, sys, threading
-from workflows.interrupt import interruptible
+from workflows.run.interrupt import interruptible
 stop = threading.Event()
 with interruptible(stop, lambda text: None) as caught:
     from {where}
@@ -182,7 +183,7 @@ PARENT = """
 import os, subprocess, sys, time
 code = '''
 import os, sys, time
-from workflows.interrupt import end_with
+from workflows.run.interrupt import end_with
 end_with(int(sys.argv[1]))
 print(os.getpid(), flush=True)
 time.sleep(3600)
@@ -194,8 +195,8 @@ time.sleep(3600)
 
 @pytest.mark.parametrize(
     "how", ["'-c', code, str(os.getpid())",
-            "'-m', 'workflows.kept_child', str(os.getpid()), '-c', 'import os, time; print(os.getpid(), flush=True); "
-            "time.sleep(3600)'"],
+            "'-m', 'workflows.server.kept_child', str(os.getpid()), '-c', 'import os, time; "
+            "print(os.getpid(), flush=True); time.sleep(3600)'"],
 )  # fmt: skip
 def test_a_child_dies_with_a_killed_parent(child_environment: dict[str, str], how: str) -> None:
     parent = start(child_environment, "-c", PARENT.format(how=how))
@@ -208,7 +209,7 @@ def test_a_child_dies_with_a_killed_parent(child_environment: dict[str, str], ho
 
 
 def test_a_child_whose_parent_is_gone_does_not_begin(child_environment: dict[str, str]) -> None:
-    ended = subprocess.run([sys.executable, "-c", "import sys; from workflows.interrupt import end_with; "
+    ended = subprocess.run([sys.executable, "-c", "import sys; from workflows.run.interrupt import end_with; "
                             "end_with(1 if __import__('os').getppid() != 1 else 2); print('began')"],
                            env=child_environment, capture_output=True, text=True)  # fmt: skip
     assert (ended.returncode, ended.stdout) == (128 + signal.SIGKILL, "")

@@ -18,9 +18,9 @@ from pipeline.contract import inputs_from, key
 from pipeline.errors import Cancelled, StageError
 from tests.support.points import wait_for
 from tests.support.toy_stages import TOYS, source
-from workflows import adapter, slots
-from workflows.plan import RunRequest, make_plan
-from workflows.session import Session, session
+from workflows.run.plan import RunRequest, make_plan
+from workflows.run.session import Session, session
+from workflows.server import adapter, concurrency
 
 
 def refused(status: int) -> httpx.HTTPStatusError:
@@ -56,7 +56,7 @@ class Server:
 @pytest.fixture
 def serving(monkeypatch: pytest.MonkeyPatch) -> Any:
     for name, value in {"ASK": 0.01, "RENEW": 0.02, "GIVE_BACK": 0.3, "AWAY": 0.2}.items():
-        monkeypatch.setattr(slots, name, value)
+        monkeypatch.setattr(concurrency, name, value)
 
     def begin(*script: Exception) -> Server:
         server = Server(*script)
@@ -65,7 +65,7 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Any:
         def client(sync_client: bool) -> Iterator[Server]:
             yield server
 
-        monkeypatch.setattr(slots, "get_client", client)
+        monkeypatch.setattr(concurrency, "get_client", client)
         return server
 
     return begin
@@ -76,7 +76,7 @@ AWAY, TAKEN = httpx.ConnectError("refused"), refused(423)
 
 def test_a_slot_is_waited_for_kept_and_given_back(serving: Any) -> None:
     server = serving(TAKEN, AWAY, refused(503), TAKEN)
-    with slots.slot("gpus", lambda: False):
+    with concurrency.slot("gpus", lambda: False):
         assert server.asked == ["take"] * 5
         wait_for(lambda: server.asked.count("renew") >= 2)
     assert server.asked[-1] == "give back"
@@ -87,7 +87,7 @@ def test_a_slot_is_waited_for_kept_and_given_back(serving: Any) -> None:
 
 def test_a_server_that_is_away_costs_neither_the_slot_nor_the_fit(serving: Any) -> None:
     server = serving()
-    with slots.slot("gpus", lambda: False):
+    with concurrency.slot("gpus", lambda: False):
         server.script = [AWAY] * 4
         wait_for(lambda: server.asked.count("renew") >= 6)
         server.script = [refused(410)]  # it took the slot back: the fit goes on
@@ -98,25 +98,25 @@ def test_a_server_that_is_away_costs_neither_the_slot_nor_the_fit(serving: Any) 
 
 def test_a_server_that_stays_away_is_not_waited_for_for_ever(serving: Any, caplog: pytest.LogCaptureFixture) -> None:
     server = serving()
-    with slots.slot("gpus", lambda: False):
+    with concurrency.slot("gpus", lambda: False):
         server.script = [AWAY] * 10_000
     assert "free again in 300 s" in caplog.text
-    with pytest.raises(httpx.ConnectError), slots.slot("gpus", lambda: False):
+    with pytest.raises(httpx.ConnectError), concurrency.slot("gpus", lambda: False):
         pytest.fail("there was no slot")
 
 
 def test_no_such_limit_is_no_leave_to_run_without(serving: Any) -> None:
     serving()
-    with pytest.raises(StageError, match="does not exist"), slots.slot("none", lambda: False):
+    with pytest.raises(StageError, match="does not exist"), concurrency.slot("none", lambda: False):
         pytest.fail("there was no slot")
     serving(refused(401))
-    with pytest.raises(httpx.HTTPStatusError), slots.slot("gpus", lambda: False):
+    with pytest.raises(httpx.HTTPStatusError), concurrency.slot("gpus", lambda: False):
         pytest.fail("there was no slot")
 
 
 def test_ctrl_c_ends_the_wait(serving: Any) -> None:
     server = serving(*[TAKEN] * 1000)
-    with pytest.raises(Cancelled), slots.slot("gpus", lambda: len(server.asked) > 3):
+    with pytest.raises(Cancelled), concurrency.slot("gpus", lambda: len(server.asked) > 3):
         pytest.fail("there was no slot")
 
 

@@ -11,14 +11,14 @@ import pytest
 
 from pipeline.artifacts import sha256_of
 from pipeline.store import LINEAGE, Store, lineage
-from workflows.alone import alone
-from workflows.batch_ledger import Entry, Ledger
-from workflows.cli import main
-from workflows.plan import RunRequest, make_plan
-from workflows.publish import publish
-from workflows.published import note_published
-from workflows.runner import run_here, run_plan
-from workflows.store_care import belongings, garbage, purge, remove
+from workflows.batch.state import BatchState, Entry
+from workflows.cli.main import main
+from workflows.run.plan import RunRequest, make_plan
+from workflows.run.publish import publish
+from workflows.run.published import note_published
+from workflows.run.run_lock import exclusive_run
+from workflows.run.runner import run_here, run_plan
+from workflows.store.gc import belongings, garbage, purge, remove
 
 pytestmark = pytest.mark.usefixtures("toys")
 
@@ -80,7 +80,7 @@ def test_while_a_run_is_under_way_a_day_is_the_least(photos: Path, tmp_path: Pat
     run(photos, tmp_path / "out", store.root)
     (tmp_path / "out/run.json").unlink()
     age(store.root, days=0.5)
-    with alone(store.root, tmp_path / "other", lambda: False, print):
+    with exclusive_run(store.root, tmp_path / "other", lambda: False, print):
         assert garbage(store, 3600) == []
     assert len(garbage(store, 3600)) == 3
 
@@ -134,7 +134,7 @@ def two_subjects(tmp_path: Path) -> Path:
         done = run_plan(plan, run_here(plan))
         if until is None:
             publish(plan, done)
-        Ledger(out / "batch").write(Entry(name=name, capture=str(photos)))
+        BatchState(out / "batch").write(Entry(name=name, capture=str(photos)))
     (out / "batch/logs").mkdir()
     (out / "batch/logs/4__1_neutral.log").write_text("x")
     (out / "batch/index.html").write_text("4 and 40")
@@ -222,7 +222,7 @@ def test_purge_command_of_a_single_run(photos: Path, tmp_path: Path, capsys: pyt
     assert "nothing is known of this subject" in capsys.readouterr().err
     assert main(["store", "purge", "photos", "--out", str(out), "--dry-run"]) == 0
     assert "would be removed" in capsys.readouterr().out and (out / "run.json").is_file()
-    with alone(out / ".store", out, lambda: False, print):
+    with exclusive_run(out / ".store", out, lambda: False, print):
         assert main(["store", "purge", "photos", "--out", str(out)]) == 1
     assert "under way" in capsys.readouterr().err and (out / "run.json").is_file()
     assert main(["store", "purge", "photos", "--out", str(out)]) == 0

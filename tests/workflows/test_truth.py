@@ -14,8 +14,7 @@ from pipeline.artifacts import Capture, CaptureView, FileRef, GivenCamera
 from pipeline.colour import srgb_from_linear
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import inverse_rigid, rigid, rows
-from workflows import truth
-from workflows import truth_geometry as geometry
+from workflows.evaluation import demo, geometry
 
 RADIUS, SIZE = 0.1, 96
 EYES = [np.array(e, float) for e in ((0, 0, 1), (0.3, 0.2, 1), (-0.3, 0.1, 1), (0, -0.3, 1))]
@@ -79,7 +78,7 @@ def run(tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_known_errors_are_measured_as_they_are(run: tuple[Path, Path]) -> None:
-    figures = truth.measure(*run, Capture(kind="facescape", views=tuple(views())))
+    figures = demo.measure(*run, Capture(kind="facescape", views=tuple(views())))
     assert figures.psnr == pytest.approx(20, abs=0.01)
     assert figures.psnr_asset == pytest.approx(40, abs=0.05)
     assert figures.accuracy_mean == pytest.approx(1, abs=0.02)
@@ -95,7 +94,7 @@ def test_a_gain_does_not_explain_a_pattern(run: tuple[Path, Path]) -> None:
     pattern = np.full((SIZE, SIZE, 3), 0.3, np.float32)
     pattern[::2] = 0.5
     write_exr(capture / "truth/albedo/0.exr", pattern)
-    figures = truth.measure(out, capture, Capture(kind="facescape", views=tuple(views())))
+    figures = demo.measure(out, capture, Capture(kind="facescape", views=tuple(views())))
     shown = [1.055 * x ** (1 / 2.4) - 0.055 for x in (0.4, 0.3, 0.5)]  # the best constant, then the pattern
     expected = -10 * np.log10(((shown[0] - shown[1]) ** 2 + (shown[0] - shown[2]) ** 2) / 2)
     assert figures.albedo == pytest.approx(expected, abs=0.2)
@@ -109,16 +108,16 @@ def test_tiles_are_read_side_by_side() -> None:
 
 def test_only_what_several_views_see_counts() -> None:
     mesh = trimesh.creation.icosphere(4, RADIUS)
-    seen = truth.seen_by(mesh, views())
+    seen = demo.seen_by(mesh, views())
     assert len(seen) > 1000
     assert seen[:, 2].min() > -0.02  # the back is not seen
-    assert len(truth.seen_by(mesh, views()[:2])) == 0
+    assert len(demo.seen_by(mesh, views()[:2])) == 0
 
 
 def test_a_surface_behind_another_is_not_seen() -> None:
     screen = trimesh.creation.box((0.06, 0.06, 0.002), transform=rigid(np.eye(3), np.array([0, 0, 0.13])))
     both = trimesh.util.concatenate([trimesh.creation.icosphere(4, RADIUS), screen])
-    seen = truth.seen_by(both, views())
+    seen = demo.seen_by(both, views())
     middle = np.hypot(seen[:, 0], seen[:, 1]) < 0.015  # 3 cm behind the screen: hidden from every one of these views
     assert (seen[middle, 2] > 0.12).all()
     assert middle.sum() > 50

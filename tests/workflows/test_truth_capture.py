@@ -15,9 +15,8 @@ from pipeline import meshes
 from pipeline.artifacts import CaptureView, FileRef, GivenCamera
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import apply, centre_K_from_corner_K, inverse_rigid, rigid, rows, similarity
-from workflows import truth_capture, truth_person
-from workflows import truth_geometry as geometry
-from workflows.bench_captures_figures import Run, figures_of, texture_of
+from workflows.bench.captures_figures import Run, figures_of, texture_of
+from workflows.evaluation import geometry, rendered_person, stored_truth
 
 RADIUS, SIZE = 0.1, 96
 EYES = [np.array(e, float) for e in ((0, 0, 1), (0.3, 0.2, 1), (-0.3, 0.1, 1), (0, -0.3, 1))]
@@ -101,7 +100,7 @@ def test_a_larger_sphere_in_another_world_is_measured_in_millimetres(tmp_path: P
     asset = sphere(RADIUS + 0.0015)
     asset.apply_transform(np.linalg.inv(capture_from_asset))
     run = made_up(tmp_path, asset, capture_from_asset, capture={"views": views()}, poses={"source": "given"})
-    figures, labels = truth_capture.measure(run, scan)
+    figures, labels = stored_truth.measure(run, scan)
     for name in ("accuracy_mm", "completeness_mm", "chamfer_mm"):
         assert figures[name] == pytest.approx(1.5, abs=0.03)
     assert figures["albedo_gain"] == pytest.approx(2, abs=1e-3) and figures["albedo_gain_db"] > 80
@@ -115,7 +114,7 @@ def test_what_the_truths_outline_leaves_out_does_not_count_for_accuracy(tmp_path
     plate = trimesh.creation.box((0.02, 0.02, 0.02), transform=rigid(np.eye(3), np.array([0, 0.115, 0.02])))
     asset = trimesh.util.concatenate([sphere(), plate])
     run = made_up(tmp_path, asset, np.eye(4), capture={"views": views()}, poses={"source": "given"})
-    with_plate, _ = truth_capture.measure(run, scan)
+    with_plate, _ = stored_truth.measure(run, scan)
     assert with_plate["accuracy_mm"] > 0.1 and with_plate["completeness_mm"] < 0.05
     for i, eye in enumerate(EYES):
         camera = geometry.Camera("", K, pose(eye), SIZE, SIZE)
@@ -124,7 +123,7 @@ def test_what_the_truths_outline_leaves_out_does_not_count_for_accuracy(tmp_path
         subject[at[inside, 1], at[inside, 0]] = 1
         write_png(scan / f"truth/mask/{i}.png", subject)
         write_png(scan / f"truth/alpha/{i}.png", subject)
-    without, _ = truth_capture.measure(run, scan)
+    without, _ = stored_truth.measure(run, scan)
     assert without["accuracy_mm"] < 0.2 * with_plate["accuracy_mm"]
 
 
@@ -133,14 +132,14 @@ def test_held_out_views_do_not_say_what_is_seen(tmp_path: Path, scan: Path) -> N
     shown = views()
     shown[1]["holdout"] = True
     run = made_up(tmp_path, sphere(), np.eye(4), capture={"views": shown}, poses={"source": "given"})
-    figures, _ = truth_capture.measure(run, scan)
+    figures, _ = stored_truth.measure(run, scan)
     assert figures["chamfer_mm"] is None and figures["accuracy_mm"] is None
 
 
 def test_without_truth_or_with_solved_cameras_nothing_is_measured(tmp_path: Path, scan: Path) -> None:
     run = made_up(tmp_path, sphere(), np.eye(4), capture={"views": views()}, poses={"source": "colmap"})
-    assert truth_capture.measure(run, scan) == ({}, {})
-    assert truth_capture.measure(run, tmp_path) == ({}, {})
+    assert stored_truth.measure(run, scan) == ({}, {})
+    assert stored_truth.measure(run, tmp_path) == ({}, {})
 
 
 # ------------------------------------------------------------------ persons
@@ -151,7 +150,7 @@ def test_true_cameras_follow_the_files_convention(tmp_path: Path) -> None:
     photo = {"name": "IMG_7.jpg", "K": rows(K), "distortion": [0.1, 0, 0, 0, 0], "width": SIZE, "height": SIZE,
              "world_to_camera": rows(world_to_camera), "head_motion": rows(motion)}  # fmt: skip
     (tmp_path / "cameras.json").write_text(json.dumps({"photos": [photo]}))
-    [(stem, camera)] = truth_person.true_cameras(tmp_path).items()
+    [(stem, camera)] = rendered_person.true_cameras(tmp_path).items()
     points = np.random.default_rng(0).uniform(-0.08, 0.08, (200, 3))
     seen = np.concatenate([points, np.ones((200, 1))], 1) @ (world_to_camera @ motion).T
     x, y = seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2]
@@ -198,7 +197,7 @@ def test_a_person_in_a_world_of_its_own(tmp_path: Path, person: Path) -> None:
     asset = sphere()
     asset.apply_transform(ASSET_FROM_HEAD)
     run = made_up(tmp_path, asset, np.eye(4), capture={"views": []}, poses=solved(ASSET_FROM_HEAD))
-    figures, labels = truth_capture.measure(run, person)
+    figures, labels = stored_truth.measure(run, person)
     assert figures["skin_median_mm"] < 0.02 and figures["depth_p95_mm"] < 0.02 and figures["face_missed"] == 0
     assert figures["albedo_db"] > 80 and labels == {}
 
@@ -210,15 +209,15 @@ def test_a_dent_in_the_face_is_seen_along_the_rays(tmp_path: Path, person: Path)
     asset.vertices[front] *= (RADIUS - 0.004) / RADIUS
     asset.apply_transform(ASSET_FROM_HEAD)
     run = made_up(tmp_path, asset, np.eye(4), capture={"views": []}, poses=solved(ASSET_FROM_HEAD))
-    figures, _ = truth_capture.measure(run, person)
+    figures, _ = stored_truth.measure(run, person)
     assert 3 < figures["depth_p95_mm"] < 4.5
 
 
 def test_depths_before_behind_and_beside() -> None:
     points = np.array([[0, 0, 0.1], [0, 0, 0.1], [0.5, 0, 0]])
     eyes = np.array([[0, 0, 1.0]] * 3)
-    assert np.allclose(truth_person.depths(sphere(0.102), points[:2], eyes[:2]), 0.002, atol=1e-5)
-    found = truth_person.depths(sphere(0.097), points, eyes)
+    assert np.allclose(rendered_person.depths(sphere(0.102), points[:2], eyes[:2]), 0.002, atol=1e-5)
+    found = rendered_person.depths(sphere(0.097), points, eyes)
     assert np.allclose(found[:2], -0.003, atol=1e-5) and np.isnan(found[2])
 
 
@@ -230,7 +229,7 @@ def test_closest_points_mend_cameras_that_are_slightly_off() -> None:
         1.01, trimesh.transformations.rotation_matrix(0.01, (0, 1, 0))[:3, :3], np.array([0.002, -0.001, 0])
     )
     moved = bumpy.copy().apply_transform(off)
-    mended = truth_person.refined(moved, points)
+    mended = rendered_person.refined(moved, points)
     assert np.abs(apply(mended @ off, points) - points).max() < 2e-4
     assert np.abs(apply(off, points) - points).max() > 2e-3
 
@@ -238,14 +237,14 @@ def test_closest_points_mend_cameras_that_are_slightly_off() -> None:
 def test_no_alignment_hides_a_surface_that_is_elsewhere() -> None:
     """A head that is far too small: closest points would grow it."""
     points = geometry.spread(sphere(), 5_000)[0]
-    assert np.array_equal(truth_person.refined(sphere(0.09), points), np.eye(4))
+    assert np.array_equal(rendered_person.refined(sphere(0.09), points), np.eye(4))
 
 
 def test_two_cameras_place_nothing(tmp_path: Path, person: Path) -> None:
     poses = solved(np.eye(4))
     poses["cameras"] = poses["cameras"][:2]
     run = made_up(tmp_path, sphere(), np.eye(4), capture={"views": []}, poses=poses)
-    assert truth_capture.measure(run, person)[0] == {}
+    assert stored_truth.measure(run, person)[0] == {}
 
 
 def test_psnr_by_label(tmp_path: Path, person: Path) -> None:
@@ -270,7 +269,7 @@ def test_psnr_by_label(tmp_path: Path, person: Path) -> None:
     render[: half // 2, :, :3] = linear_from_srgb(np.float32(encoded + 0.01))
     for index in (0, 1):
         write_exr(run.out / f"report/views/{index}.exr", render)
-    found = truth_person.by_label(run, person / "truth")["model"]
+    found = rendered_person.by_label(run, person / "truth")["model"]
     assert found["skin"]["psnr"] == pytest.approx(20, abs=0.05)
     assert found["hair"]["psnr"] == pytest.approx(40, abs=0.5)
     assert set(found) == {"skin", "hair", "outline"}

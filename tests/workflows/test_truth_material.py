@@ -13,7 +13,7 @@ import torch
 from pipeline.demo import head, light, skin
 from pipeline.maths import microfacet, sh
 from tests.fields.test_face import ball_model
-from workflows import truth_material as tm
+from workflows.evaluation import demo_material as tm
 
 
 @pytest.fixture

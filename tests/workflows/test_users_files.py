@@ -15,10 +15,10 @@ import pytest
 from pipeline.artifacts import FileRef, HeldOutView, Located, UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import StageError
-from workflows import replace
-from workflows.plan import Plan, RunRequest, make_plan
-from workflows.publish import publish
-from workflows.published import LIST
+from workflows.run import replace
+from workflows.run.plan import Plan, RunRequest, make_plan
+from workflows.run.publish import publish
+from workflows.run.published import LIST
 
 pytestmark = pytest.mark.usefixtures("toys")
 

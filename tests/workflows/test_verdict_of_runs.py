@@ -14,14 +14,14 @@ from pipeline.contract import Done
 from pipeline.verdict import Level
 from stages import registry
 from tests.support.toy_stages import finding
-from workflows import estimate
-from workflows.cli import main
-from workflows.console import Console
-from workflows.plan import RunRequest, make_plan
-from workflows.publish import publish
-from workflows.runner import run_here, run_plan
-from workflows.session import Session, Silent, session
-from workflows.verdict import exit_code, is_refused, last_lines, level_in, level_of_state, state_name
+from workflows.cli.console import Console
+from workflows.cli.main import main
+from workflows.run import estimate
+from workflows.run.plan import RunRequest, make_plan
+from workflows.run.publish import publish
+from workflows.run.runner import run_here, run_plan
+from workflows.run.session import Session, Silent, session
+from workflows.run.verdict import exit_code, is_refused, last_lines, level_in, level_of_state, state_name
 
 pytestmark = pytest.mark.usefixtures("toys", "fit")
 
@@ -114,10 +114,10 @@ def test_an_unusable_early_stage_ends_the_run_without_an_asset_and_nothing_is_lo
     assert [d.stage for d in done] == ["first", "second"]
     assert "asset" not in record and list(record["stages"]) == ["first", "second"]
     assert record["verdict"]["level"] == "unusable" and exit_code(record) == 3
-    told = "\n".join(notes)
-    assert "20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again." in told
-    assert "photos to look at or to take again: a.jpg, b.jpg" in told
-    assert "the run ends here, before third" in told and "--force goes on" in told
+    remaining_time = "\n".join(notes)
+    assert "20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again." in remaining_time
+    assert "photos to look at or to take again: a.jpg, b.jpg" in remaining_time
+    assert "the run ends here, before third" in remaining_time and "--force goes on" in remaining_time
     done, record, notes = run(photos, ("second", "unusable"), force=True)
     assert [d.reused for d in done] == [True, True, False]
     assert exit_code(record) == 3  # forced, and still unusable
@@ -176,7 +176,10 @@ def test_the_rest_is_estimated_from_earlier_runs_with_the_same_settings(
 
 def test_a_budget_is_its_own_estimate(photos: Path) -> None:
     plan = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "out"), budget=600))
-    assert estimate.told(plan, []) == "the rest (first to third) has what is left of the budget: about 10 minutes"
+    assert (
+        estimate.remaining_time(plan, [])
+        == "the rest (first to third) has what is left of the budget: about 10 minutes"
+    )
 
 
 @pytest.mark.parametrize("preset", ["draft", "studio", "film"])
@@ -215,7 +218,7 @@ def test_check_solves_where_asked_goes_on_after_unusable_and_writes_json(photos:
 
 
 def test_check_runs_on_when_cameras_were_given(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from workflows import check as checking
+    from workflows.cli import check as checking
 
     monkeypatch.setattr(checking, "_has_cameras", lambda done: True)
     assert check(photos, "--set", "second.level=unusable") == 3
@@ -242,10 +245,10 @@ def test_check_keeps_what_it_found_where_a_store_is_named(photos: Path) -> None:
 def test_check_tells_what_it_knows_before_an_error(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--solve", "--json", "-", "--set", "first.level=usable", "--set", "second.fault=stage"]
     assert check(photos, *options) == 1
-    told = capsys.readouterr()
-    content = json.loads(told.out)
+    remaining_time = capsys.readouterr()
+    content = json.loads(remaining_time.out)
     assert "the toy is broken" in content["error"] and content["level"] == "usable"
-    assert "the toy is broken" in told.err
+    assert "the toy is broken" in remaining_time.err
     assert check(photos, *[o for o in options if o not in ("--json", "-")]) == 1
     assert "take the broken toys again" in capsys.readouterr().out
 
@@ -258,7 +261,7 @@ def test_check_of_photos_that_can_not_be_read_is_1(photos: Path, capsys: pytest.
 def test_has_cameras() -> None:
     from types import SimpleNamespace
 
-    from workflows.check import _has_cameras
+    from workflows.cli.check import _has_cameras
 
     def done(*cameras: object) -> Any:
         views = [SimpleNamespace(camera=c) for c in cameras]

@@ -48,7 +48,7 @@ class CubemapLight(nn.Module):
         out: Tensor = self.harmonics @ self.texels()
         return out
 
-    def even_gradient(self, order: int) -> None:
+    def uniform_gradient(self, order: int) -> None:
         """While nothing but the light moves: the same for all colours. A map has no order to keep to."""
         if self.raw.grad is not None:
             self.raw.grad.copy_(self.raw.grad.mean(-1, keepdim=True).expand_as(self.raw.grad))

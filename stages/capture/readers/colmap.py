@@ -91,8 +91,8 @@ def _model(folder: Path, suffix: str) -> tuple[dict[int, Any], list[_Image]]:
                   for i in model.images.values() if i.has_pose]  # fmt: skip
         cameras = {i.camera_id: model.cameras[i.camera_id] for i in images} | dict(model.cameras.items())
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError, KeyError, TypeError) as e:
-        said = printable((str(e).strip().splitlines() or [type(e).__name__])[-1])
-        raise fault("the COLMAP model can't be read", folder.name, said, WHOLE, AGAIN) from e
+        message = printable((str(e).strip().splitlines() or [type(e).__name__])[-1])
+        raise fault("the COLMAP model can't be read", folder.name, message, WHOLE, AGAIN) from e
     return cameras, sorted(images, key=lambda i: natural_key(i.name))
 
 

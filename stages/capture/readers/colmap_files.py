@@ -29,15 +29,15 @@ PARAMETERS = {
     16: 6,
     17: 2,
 }  # fmt: skip  (numbers of each camera model; others are left to COLMAP)
-MOST_BYTES = 1 << 31
-MOST_NAME = 4096
+MAX_BYTES = 1 << 31
+MAX_NAME = 4096
 
 
 def miscounted(files: Sequence[Path]) -> str | None:
     """What is wrong with the counts, or None. Text models have none that COLMAP trusts."""
     for path in files:
-        if path.stat().st_size > MOST_BYTES:
-            return f"{path.name} has more than {MOST_BYTES // 2**30} GB"
+        if path.stat().st_size > MAX_BYTES:
+            return f"{path.name} has more than {MAX_BYTES // 2**30} GB"
         skip = _SKIPS.get(path.name)
         if skip is None:
             continue
@@ -65,7 +65,7 @@ def _camera(data: bytes, at: int) -> int:
 
 
 def _image(data: bytes, at: int) -> int:
-    end = data.index(b"\0", at + 64, at + 65 + MOST_NAME)
+    end = data.index(b"\0", at + 64, at + 65 + MAX_NAME)
     (points,) = struct.unpack_from("<Q", data, end + 1)
     return int(end + 9 + 24 * points)
 

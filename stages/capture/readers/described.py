@@ -20,21 +20,21 @@ from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fa
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
 LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
-MOST_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
-MOST_DIGITS = 300  # of a number in a file's name that is compared as one
-MOST_STEPS = 100  # of the search: a lens that can be described takes about ten
+MAX_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
+MAX_DIGITS = 300  # of a number in a file's name that is compared as one
+MAX_STEPS = 100  # of the search: a lens that can be described takes about ten
 GRID = 17  # half the positions along each edge of the frame at which a lens is compared
 
 
 def description(path: Path) -> bytes:
     """A description's bytes. Raises StageError if it is larger than any is, before anything is read."""
     size = path.stat().st_size
-    if size > MOST_BYTES:
+    if size > MAX_BYTES:
         raise StageError(
             "the cameras' file is too large",
             where=path.name,
             value=f"{size / 1e6:.0f} MB",
-            limit=f"{MOST_BYTES / 1e6:.0f} MB",
+            limit=f"{MAX_BYTES / 1e6:.0f} MB",
             remedy="export the cameras alone, without points and pictures",
         )
     return path.read_bytes()
@@ -91,7 +91,7 @@ class Reader(Protocol):
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that puts 2.jpg before 10.jpg."""
     parts = re.findall(r"\d+|\D+", name)
-    return tuple((0, int(p), p) if p.isdecimal() and len(p) < MOST_DIGITS else (1, 0, p.lower()) for p in parts)
+    return tuple((0, int(p), p) if p.isdecimal() and len(p) < MAX_DIGITS else (1, 0, p.lower()) for p in parts)
 
 
 def indices_of(names: Sequence[str]) -> list[int]:
@@ -144,7 +144,7 @@ def five_terms(
     p, worst = start, np.inf
     if len(xy) >= 9:
         with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):  # it ran off to infinity
-            p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1), max_nfev=MOST_STEPS).x
+            p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1), max_nfev=MAX_STEPS).x
             worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max())
     if not worst <= LENS_LIMIT:
         raise fault(

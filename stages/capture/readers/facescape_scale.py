@@ -19,7 +19,7 @@ from stages.capture.readers.described import read_json
 from stages.capture.readers.values import fault, number, shown, table
 
 NAME = "Rt_scale_dict.json"
-LEAST_SCALE = 1e-9  # millimetres in a unit of the capture's world, or the other way round
+MIN_SCALE = 1e-9  # millimetres in a unit of the capture's world, or the other way round
 REMEDY = "copy the file again, or take it out of the tree to have the unit recognised"
 
 
@@ -42,9 +42,9 @@ def metres_from_world(folder: Path) -> F64 | None:
         raise fault("an entry of the scale dictionary is not understood", where, shown(found),
                     "a number, and a 3 x 4 matrix", REMEDY)  # fmt: skip
     scale, pose = number(found[0], where, REMEDY), checked_pose(table(found[1], where, REMEDY), where)
-    if not LEAST_SCALE <= scale <= 1 / LEAST_SCALE:
+    if not MIN_SCALE <= scale <= 1 / MIN_SCALE:
         raise fault("an entry of the scale dictionary has no scale", where, scale,
-                    f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)  # fmt: skip
+                    f"{MIN_SCALE:g} to {1 / MIN_SCALE:g}", REMEDY)  # fmt: skip
     return (
         similarity(1e-3, np.eye(3), np.zeros(3))
         @ rigid(pose[:3, :3], pose[:3, 3])

@@ -36,7 +36,7 @@ from stages.capture.readers.described import (
 from stages.capture.readers.values import fault, pixels, printable, words
 
 HEAD = 4096  # bytes in which the format shows
-LEAST_SCALE = 1e-9  # of the chunk: from its own units to the world's, or the other way round
+MIN_SCALE = 1e-9  # of the chunk: from its own units to the world's, or the other way round
 REMEDY = "export the cameras again (File > Export > Export Cameras, Agisoft XML), or remove the file"
 Lens = tuple[F64, F64, tuple[int, int]]
 
@@ -105,8 +105,8 @@ def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
     R = words(rotation, 9, where, REMEDY).reshape(3, 3) if rotation else np.eye(3)
     t = words(translation, 3, where, REMEDY) if translation else np.zeros(3)
     s = float(words(scale, 1, where, REMEDY)[0]) if scale else 1.0
-    if not LEAST_SCALE <= s <= 1 / LEAST_SCALE:
-        raise fault("the chunk has no scale", where, s, f"{LEAST_SCALE:g} to {1 / LEAST_SCALE:g}", REMEDY)
+    if not MIN_SCALE <= s <= 1 / MIN_SCALE:
+        raise fault("the chunk has no scale", where, s, f"{MIN_SCALE:g} to {1 / MIN_SCALE:g}", REMEDY)
     checked_rotation(R, where)
     return similarity(s, R, t)
 

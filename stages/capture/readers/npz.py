@@ -20,7 +20,7 @@ from pipeline.transforms import F64
 from stages.capture.readers.described import description
 from stages.capture.readers.values import fault, printable
 
-MOST_ARRAY = 16_384  # bytes of one matrix with its header
+MAX_ARRAY = 16_384  # bytes of one matrix with its header
 HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError,
           OverflowError, TypeError, SyntaxError, TokenError)  # fmt: skip
@@ -34,14 +34,14 @@ def arrays_of(path: Path, wanted: re.Pattern[str], remedy: str) -> Iterator[tupl
                 name = entry.filename.removesuffix(".npy")
                 if wanted.fullmatch(name):
                     with archive.open(entry) as stream:
-                        yield name, _array(stream.read(MOST_ARRAY + 1))
+                        yield name, _array(stream.read(MAX_ARRAY + 1))
     except BROKEN as e:
         raise fault("the cameras' file can't be read", path.name, printable(str(e)), "an npz of arrays", remedy) from e
 
 
 def _array(data: bytes) -> F64:
-    if len(data) > MOST_ARRAY:
-        raise ValueError(f"an array of more than {MOST_ARRAY} bytes")
+    if len(data) > MAX_ARRAY:
+        raise ValueError(f"an array of more than {MAX_ARRAY} bytes")
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in HEADERS:

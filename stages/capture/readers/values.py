@@ -15,9 +15,9 @@ import numpy as np
 from pipeline.errors import StageError
 from pipeline.transforms import F64
 
-MOST = 1e15  # magnitude of any number: far beyond every unit, and its square is still a number
+MAX_MAGNITUDE = 1e15  # magnitude of any number: far beyond every unit, and its square is still a number
 LONGEST_EDGE = 1_000_000  # pixels
-MOST_NUMBERS, MOST_LETTERS = 64, 10_000  # of one table, of one text
+MAX_NUMBERS, MAX_LETTERS = 64, 10_000  # of one table, of one text
 DIGITS = 9  # of a view's number
 LONGEST_NAME = 240  # bytes: file systems take 255, and a suffix is tried behind it
 LONGEST_PATH = 1000  # bytes, below the capture's folder
@@ -39,33 +39,33 @@ def shown(value: object) -> str:
 
 def printable(name: str) -> str:
     """A name from a file that can be written everywhere: what is no Unicode is escaped, what is long is cut."""
-    clean = name[:MOST_LETTERS].encode("utf-8", "backslashreplace").decode()
+    clean = name[:MAX_LETTERS].encode("utf-8", "backslashreplace").decode()
     return clean if len(clean) <= 120 else f"{clean[:80]}...{clean[-20:]}"
 
 
 def number(value: object, where: str, remedy: str = PLAIN) -> float:
-    """A finite number. Raises StageError for text, flags, lists and what is not finite or beyond MOST."""
+    """A finite number. Raises StageError for text, flags, lists and what is not finite or beyond MAX_MAGNITUDE."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise fault("a camera parameter is not a number", where, shown(value), "a number", remedy)
-    if isinstance(value, int) and abs(value) > MOST:
+    if isinstance(value, int) and abs(value) > MAX_MAGNITUDE:
         raise _too_large(where, value, remedy)
     return float(finite(np.array(float(value)), where, remedy))
 
 
 def table(value: object, where: str, remedy: str = ROWS) -> F64:
-    """A number, a row of numbers or rows of equal length, of at most MOST_NUMBERS. Raises StageError."""
+    """A number, a row of numbers or rows of equal length, of at most MAX_NUMBERS. Raises StageError."""
     rows: list[Any] = value if isinstance(value, list) else [value]
     nested = bool(rows) and all(isinstance(r, list) for r in rows)
     width = len(rows[0]) if nested else 1
-    flat = [x for r in rows[:MOST_NUMBERS] for x in r[:MOST_NUMBERS]] if nested else rows[: MOST_NUMBERS + 1]
+    flat = [x for r in rows[:MAX_NUMBERS] for x in r[:MAX_NUMBERS]] if nested else rows[: MAX_NUMBERS + 1]
     even = not nested or all(len(r) == width for r in rows)
     if not even or any(isinstance(x, bool) or not isinstance(x, int | float) for x in flat):
         raise fault("a camera parameter is not a table of numbers", where, shown(value), "numbers only", remedy)
-    if len(rows) * width > MOST_NUMBERS:
-        raise fault("a camera parameter has the wrong shape", where, f"more than {MOST_NUMBERS} numbers",
-                    f"at most {MOST_NUMBERS} numbers", remedy)  # fmt: skip
+    if len(rows) * width > MAX_NUMBERS:
+        raise fault("a camera parameter has the wrong shape", where, f"more than {MAX_NUMBERS} numbers",
+                    f"at most {MAX_NUMBERS} numbers", remedy)  # fmt: skip
     for x in flat:
-        if isinstance(x, int) and abs(x) > MOST:
+        if isinstance(x, int) and abs(x) > MAX_MAGNITUDE:
             raise _too_large(where, x, remedy)
     return finite(np.array(value, np.float64), where, remedy)
 
@@ -74,7 +74,7 @@ def words(text: str | None, count: int, where: str, remedy: str) -> F64:
     """(count,) numbers that are written with spaces between them. Raises StageError."""
     text = text or ""
     try:
-        if len(text) > MOST_LETTERS:
+        if len(text) > MAX_LETTERS:
             raise ValueError
         found = np.array([float(w) for w in text.split()], np.float64)
     except ValueError as e:
@@ -85,11 +85,11 @@ def words(text: str | None, count: int, where: str, remedy: str) -> F64:
 
 
 def finite(values: F64, where: str, remedy: str = "write it again from the calibration, or take the view out") -> F64:
-    """The values themselves. Raises StageError if any is NaN, infinite or beyond MOST."""
+    """The values themselves. Raises StageError if any is NaN, infinite or beyond MAX_MAGNITUDE."""
     if not np.isfinite(values).all():
         raise fault("a camera parameter is not finite", where, shown(values.tolist()),
                     "finite numbers only (no NaN, no Infinity)", remedy)  # fmt: skip
-    if np.abs(values).max(initial=0.0) > MOST:
+    if np.abs(values).max(initial=0.0) > MAX_MAGNITUDE:
         raise _too_large(where, float(np.abs(values).max()), remedy)
     return values
 
@@ -113,10 +113,10 @@ def flag(value: object, where: str, remedy: str = "write true or false, without 
 
 def label(value: object, where: str, remedy: str = "write it as text between quotation marks") -> str:
     """A name: text, or a whole number that stands for one. Raises StageError."""
-    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MOST:
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_MAGNITUDE:
         return str(value)
-    if not isinstance(value, str) or len(value) > MOST_LETTERS or "\0" in value:
-        raise fault("a name is not text", where, shown(value), f"text of at most {MOST_LETTERS} letters", remedy)
+    if not isinstance(value, str) or len(value) > MAX_LETTERS or "\0" in value:
+        raise fault("a name is not text", where, shown(value), f"text of at most {MAX_LETTERS} letters", remedy)
     return value.encode("utf-8", "backslashreplace").decode()  # half a pair of surrogates is no letter
 
 
@@ -129,4 +129,4 @@ def view_number(digits: str, where: str) -> int:
 
 
 def _too_large(where: str, value: float, remedy: str) -> StageError:
-    return fault("a camera parameter is too large", where, shown(value), f"at most {MOST:g}", remedy)
+    return fault("a camera parameter is too large", where, shown(value), f"at most {MAX_MAGNITUDE:g}", remedy)

@@ -20,7 +20,7 @@ from pipeline.fields.paper.displaced import DisplacedSdf
 from pipeline.maths.density import laplace_density, ray_weights
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import sphere_interval
-from stages.inverse_rendering.views import Rays
+from stages.inverse_rendering.ray_sampling import Rays
 
 SHELL = 5e-4  # metres: samples lie in t_0 +- 0.5 mm
 NEGLIGIBLE = 1e-6  # samples of less weight are not shaded: eight bits of colour have steps of 4e-3

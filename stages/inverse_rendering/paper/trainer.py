@@ -22,13 +22,13 @@ from pipeline.fields.paper.prior_imface import ImFacePrior
 from pipeline.fields.paper.priors import HullPrior
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
-from stages.inverse_rendering.begin import spec_for
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.initialise import spec_for
 from stages.inverse_rendering.objective import Terms, calibrated_colours
 from stages.inverse_rendering.paper.render import geometry_of, render_samples
-from stages.inverse_rendering.start import Start
-from stages.inverse_rendering.views import WHOLE, Batch, PhotoView, PixelTable
+from stages.inverse_rendering.ray_sampling import WHOLE, Batch, PhotoView, PixelTable
 
 HALVED_EVERY, HALVED_UNTIL = 0.125, 0.75  # shares of the run: every 375 of 3,000 epochs, until 75 %
 EMPTY = 0.01  # alpha below which a pixel shows nothing of the subject
@@ -130,8 +130,8 @@ def paper_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer
     codes = {id(p) for n, p in model.named_parameters() if n.startswith("geometry.prior.z_")}
     slow = [p for n, p in model.named_parameters() if n.startswith("geometry.prior.") and id(p) not in codes]
     slow_ids = {id(p) for p in slow}
-    lamp = {id(p) for p in model.light.parameters()}
-    rest = [p for p in model.parameters() if id(p) not in slow_ids | lamp]
+    estimate = {id(p) for p in model.light.parameters()}
+    rest = [p for p in model.parameters() if id(p) not in slow_ids | estimate]
     groups = [
         {"params": rest, "start": settings.lr_appearance},
         {"params": list(model.light.parameters()), "start": settings.lr_light},

@@ -14,15 +14,15 @@ from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel, FittedField, load_model
 from pipeline.fields.paper.sinusoidal import SinusoidalField, positional_encoding
 from pipeline.maths.density import laplace_density, ray_weights
-from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import run_fit
+from stages.inverse_rendering.initial_geometry import sphere_start
+from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.objective import Terms
+from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.paper import trainer as paper
 from stages.inverse_rendering.paper.render import geometry_of, render_samples
-from stages.inverse_rendering.predict import predict_view
-from stages.inverse_rendering.start import sphere_start
-from stages.inverse_rendering.views import Rays
+from stages.inverse_rendering.ray_sampling import Rays
 from tests.inverse_rendering.test_fit import RADIUS, SMALL, ball_start, ball_view, hooks
 from tests.support.imface_checkpoint import ours, published
 
@@ -339,7 +339,7 @@ def test_without_a_prior_the_grid_starts_as_a_sphere() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"preset": "paper", "relief": "off"}, "relief = off"),
+        ({"preset": "paper", "refine_geometry": "off"}, "refine_geometry = off"),
         ({"preset": "paper", "seconds": 10.0}, "seconds is for"),
         ({"appearance": "sinusoidal"}, "for method paper"),
     ],

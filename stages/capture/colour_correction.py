@@ -1,0 +1,111 @@
+"""A capture in whose photos a colour chart was found: all photos brought to the chart's white, and how.
+
+Symbols: c linear colour of a photo, e its exposure, M its camera's map to reflectances (stages.capture.colour_matrix).
+Stored is k M c, with the largest k up to 1 at which every colour of every photo is within a file's range; k is the
+chart's `level`: a perfect white at its place has k e in a stored photo. e stays what EXIF says of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.artifacts import CaptureView, ChartFound, ColourChart, FileRef
+from pipeline.colour import srgb_from_linear
+from pipeline.errors import StageError
+from pipeline.images import read_encoded, read_linear, write_exr, write_png
+from pipeline.transforms import matrix, rows
+from stages.capture.colour_checker import F64, Patches
+from stages.capture.colour_matrix import ColourMatrix, colour_matrix_of
+
+
+@dataclass(frozen=True, slots=True)
+class ChartReading:
+    """What the charts said. warnings: on those of no use."""
+
+    chart: ColourChart | None
+    warnings: list[str]
+
+
+def read_charts(views: Sequence[CaptureView], found: Sequence[Patches | None], wanted: bool) -> ChartReading:
+    """The chart that fits best of each camera's photos. found: of each view.
+
+    Raises:
+        StageError: wanted, and no photo shows one that is of use.
+    """
+    best: dict[str, tuple[ColourMatrix, CaptureView, Patches]] = {}
+    seen, warnings = [], []
+    for view, patches in zip(views, found, strict=True):
+        if patches is None:
+            continue
+        correction = colour_matrix_of(_unexposed(patches, view.exposure))
+        if isinstance(correction, str):
+            warnings.append(f"{view.name}: the colour chart {correction}; it is not used")
+            continue
+        seen.append(view.name)
+        other = best.get(view.camera_group)
+        if other is None or correction.error < other[0].error:
+            best[view.camera_group] = (correction, view, patches)
+    if wanted and not best:
+        raise StageError("no colour chart is found", where="capture.colour_checker=on",
+                         value="; ".join(warnings[:3]) or "none seen",
+                         limit="a classic chart of 24 patches, whole, flat and at least a fifth of a photo's longer "
+                         "edge wide", remedy="photograph it close to the face in the same light, or set "
+                         "capture.colour_checker=auto")  # fmt: skip
+    if not best:
+        return ChartReading(None, warnings)
+    fits = tuple(_fit(*b) for _, b in sorted(best.items()))
+    k = 1 / max(1.0, *(float(matrix(f.matrix).clip(0).sum(1).max()) for f in fits))
+    return ChartReading(ColourChart(photos=tuple(seen), level=round(k, 6), fits=fits), warnings)
+
+
+def _unexposed(patches: Patches, exposure: float) -> Patches:
+    return Patches(patches.corners, patches.colours / exposure, patches.usable)
+
+
+def _fit(correction: ColourMatrix, view: CaptureView, patches: Patches) -> ChartFound:
+    white = np.linalg.solve(correction.matrix, np.ones(3)).round(4)
+    return ChartFound(camera_group=view.camera_group, photo=view.name, index=view.index,
+                      corners=rows(patches.corners.round(3)), matrix=rows(correction.matrix.round(6)),
+                      way=correction.way, error=round(correction.error, 4), patches=correction.patches,
+                      white=(float(white[0]), float(white[1]), float(white[2])))  # fmt: skip
+
+
+def bring_to(
+    chart: ColourChart, views: Sequence[CaptureView], folder: Path, tick: Callable[[int, str], None]
+) -> list[CaptureView]:
+    """The views with photos (and clean plates) in the chart's colours, whose files take the place of the copies in
+    `folder`. Cameras that saw no chart get the mean of the others' maps. tick: done, name."""
+    of = {f.camera_group: chart.level * matrix(f.matrix) for f in chart.fits}
+    mean = np.asarray(np.mean(list(of.values()), axis=0), np.float64)
+    out = []
+    for n, view in enumerate(views):
+        tick(n, view.name)
+        m = of.get(view.camera_group, mean)
+        changed = {"image": FileRef.of(folder, recoloured(folder / view.image.path, m))}
+        if view.plate is not None:
+            changed["plate"] = FileRef.of(folder, recoloured(folder / view.plate.path, m))
+        out.append(view.model_copy(update=changed))
+    return out
+
+
+def recoloured(path: Path, m: F64) -> Path:
+    """Write m c in the place of a photo, as 16-bit PNG, or EXR of a float file; the new file. Colours that no Rec.709
+    light has are clamped at 0."""
+    image = read_encoded(path)
+    colours = np.asarray((read_linear(path) @ m.T.astype(np.float32)).clip(0), np.float32)
+    path.unlink()
+    if not np.issubdtype(image.dtype, np.integer):
+        target = path.with_suffix(".exr")
+        write_exr(target, colours)
+        return target
+    encoded = np.asarray(srgb_from_linear(colours), np.float32)
+    if image.shape[2] == 4:
+        alpha = image[..., 3:].astype(np.float32) / np.float32(np.iinfo(image.dtype.name).max)
+        encoded = np.concatenate([encoded, alpha], 2)
+    target = path.with_suffix(".png")
+    write_png(target, encoded, bits=16)
+    return target

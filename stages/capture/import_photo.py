@@ -1,0 +1,194 @@
+"""Checks photos and masks one by one and puts what takes part into one folder.
+
+A photo's bytes are copied as they are. Only a photo whose EXIF orientation is not 1 is turned upright once and written
+as PNG, because everything behind this stage reads stored pixels and knows nothing of EXIF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import FileRef, sha256_of
+from pipeline.errors import StageError
+from pipeline.images import read_encoded, refuse_bombs
+from pipeline.sharpness import detail
+from stages.capture.colour_checker import Patches, find_chart
+from stages.capture.exif import Exif, read_exif
+from stages.capture.icc_profile import profile_name
+from stages.capture.integrity import fault_of
+from stages.capture.photo_figures import Look, look_at
+from stages.capture.photometry import clipped, mean_light
+from stages.capture.quality import is_blank, small_grey
+
+Image = npt.NDArray[np.generic]
+MIN_EDGE = 64  # pixels: below it neither features nor a fit have anything to hold on to
+_TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True), 5: (3, True), 7: (1, True)}
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedPhoto:
+    """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
+    stages.capture.quality, None if the photo is blank. profile: the name of its colour profile, None without one.
+    clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance.
+    chart: a colour chart in it, where one was looked for and seen. look: its figures, None if it is blank."""
+
+    image: Path
+    width: int
+    height: int
+    exif: Exif
+    turned: bool
+    detail: float | None = None
+    profile: str | None = None
+    clipped: Path | None = None
+    light: float = 0.0
+    chart: Patches | None = None
+    look: Look | None = None
+
+
+def turn_upright(image: Image, orientation: int) -> Image:
+    """The picture as it is meant to be seen. (H, W, C) -> (H, W, C) or (W, H, C); orientation 1..8 as in EXIF."""
+    quarter, mirrored = _TURNS.get(orientation, (0, False))
+    turned = np.rot90(image, quarter)  # rot90 turns anticlockwise; 6 asks for a quarter clockwise, so three of them
+    return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)
+
+
+def import_photo(
+    path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False
+) -> ImportedPhoto:
+    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be turned).
+
+    chart: look for a colour chart.
+    declared: (width, height) that the camera's description gives, or None. A given camera belongs to the
+    stored pixels if their size is the declared one; then nothing is turned, whatever EXIF says.
+    Raises StageError if the file is not whole, too small or large, not finite, or not of the declared size.
+    """
+    data = _read(path, ref)
+    image = _decode(path, data)
+    exif = read_exif(data)
+    h, w = image.shape[:2]
+    upright = (h, w) if exif.orientation >= 5 else (w, h)
+    turn = exif.orientation != 1 and (declared is None or (w, h) != declared == upright)
+    size = upright if turn else (w, h)
+    if declared is not None and size != declared:
+        raise StageError(
+            "the photo is not of the size that its camera declares",
+            where=path.name,
+            value=f"{size[0]} x {size[1]}",
+            limit=f"{declared[0]} x {declared[1]}",
+            remedy="use the photos that were calibrated, at their own size; or correct width, height and K together",
+        )
+    if min(size) < MIN_EDGE:
+        raise StageError(
+            "the photo is too small",
+            where=path.name,
+            value=f"{size[0]} x {size[1]}",
+            limit=f"at least {MIN_EDGE} pixels along each edge",
+            remedy="use the original photo, not a preview",
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if turn:
+        target = target.with_suffix(".png")
+        image = turn_upright(image, exif.orientation)
+        _write_png(target, image)
+    else:
+        target.write_bytes(data)
+    grey = small_grey(image)
+    blank, ends = is_blank(grey), clipped(image)
+    return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile_name(data),
+                    _write_clipped(ends, target), mean_light(grey), find_chart(image) if chart else None,
+                    None if blank else look_at(image, grey, ends))  # fmt: skip
+
+
+def _write_clipped(where: npt.NDArray[np.bool_], photo: Path) -> Path | None:
+    """The picture of a photo's clipped pixels (255) in clipped/ beside its folder, or None if there are none."""
+    if not where.any():
+        return None
+    path = photo.parent.parent / "clipped" / f"{photo.stem}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_png(path, where[..., None].astype(np.uint8) * 255)
+    return path
+
+
+def import_mask(path: Path, ref: FileRef, target: Path, photo: ImportedPhoto) -> str | None:
+    """Check one mask against its photo and copy it to `target`; or say why it is of no use, and copy nothing.
+
+    A mask of the upright size is taken as upright; one that only fits the stored pixels is turned with its photo.
+    Raises StageError if the file is not whole.
+    """
+    data = _read(path, ref)
+    image = _decode(path, data)
+    size = (image.shape[1], image.shape[0])
+    turn = photo.turned and size != (photo.width, photo.height) and size == (photo.height, photo.width)
+    if size != (photo.width, photo.height) and not turn:
+        sizes = f"{size[0]} x {size[1]} and its photo {photo.width} x {photo.height}"
+        return f"the mask {path.name} is {sizes}; export it at the photo's size"
+    plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
+    peak = float(np.iinfo(plane.dtype.name).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
+    inside = float((plane.astype(np.float64) > peak / 2).mean())
+    if inside in (0.0, 1.0):
+        return (f"the mask {path.name} is {'empty' if inside == 0 else 'full'}; draw it again, 0 on the background and "
+                "255 on the subject")  # fmt: skip
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if turn:
+        _write_png(target.with_suffix(".png"), turn_upright(image, photo.exif.orientation))
+    else:
+        target.write_bytes(data)
+    return None
+
+
+def _read(path: Path, ref: FileRef) -> bytes:
+    """The file's bytes, if they still are those that were hashed."""
+    if not path.is_file() or path.stat().st_size != ref.size or sha256_of(path) != ref.sha256:
+        raise StageError(
+            "a file changed while the capture was read",
+            where=path.name,
+            value="other bytes than at the start" if path.is_file() else "it is gone",
+            limit="the same content throughout",
+            remedy="let the copying finish, then run again",
+        )
+    return path.read_bytes()
+
+
+def _decode(path: Path, data: bytes) -> Image:
+    if not data:
+        raise StageError(
+            "the image is empty",
+            where=path.name,
+            value="0 bytes",
+            limit="a complete image file",
+            remedy="copy the file again from the camera, or take it out of the folder",
+        )
+    refuse_bombs(path, len(data))  # before `fault_of`, which decodes what says it is a JPEG
+    fault = fault_of(data)
+    if fault is not None:
+        raise StageError(
+            "the image is not complete",
+            where=path.name,
+            value=fault,
+            limit="a complete image file",
+            remedy="copy the file again from the camera, or take it out of the folder",
+        )
+    image = read_encoded(path)
+    if np.issubdtype(image.dtype, np.floating) and not np.isfinite(image).all():
+        raise StageError(
+            "the image has values that are not finite",
+            where=path.name,
+            value=f"{int((~np.isfinite(image)).sum())} NaN or Inf values",
+            limit="finite radiance",
+            remedy="export the image again",
+        )
+    return image
+
+
+def _write_png(path: Path, image: Image) -> None:
+    """Stored values as they are, RGB order; the fastest compression, for photos hardly shrink further."""
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
+    ok, buffer = cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not ok:
+        raise RuntimeError(f"{path.name}: PNG can't hold an array of {image.shape} {image.dtype}")
+    path.write_bytes(buffer.tobytes())

@@ -1,0 +1,88 @@
+"""From artifacts to arrays: photos, masks and cameras as the fit takes them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline import transforms
+from pipeline.artifacts import Camera, CameraSet, Capture, FileRef, Located, MaskSet
+from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
+from stages.inverse_rendering.ray_sampling import F32, PhotoView, factor_for
+from stages.inverse_rendering.residuals import U8
+
+
+def read_views(
+    capture: Located[Capture], poses: CameraSet, masks: Located[MaskSet], indices: list[int], side: int
+) -> list[PhotoView]:
+    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`.
+
+    Photos are divided by their exposures: the start of what the per-image calibration then refines.
+    """
+    cameras = {c.index: c for c in poses.cameras}
+    alphas = {m.index: m for m in masks.artifact.masks}
+    photos = {v.index: v for v in capture.artifact.views}
+    views = []
+    for i in indices:
+        c = cameras[i]
+        views.append(
+            shrunk(
+                PhotoView(
+                    i,
+                    read_linear(capture.path(photos[i].image)) / np.float32(photos[i].exposure),
+                    read_alpha(masks.path(alphas[i].mask)),
+                    transforms.matrix(c.K),
+                    transforms.matrix(c.world_from_cam),
+                    np.array(c.distortion),
+                    _clipped(capture, photos[i].clipped),
+                    asked=_asked(masks, alphas[i].asked),
+                ),
+                side,
+            )
+        )
+    return views
+
+
+def read_labels(masks: Located[MaskSet], indices: list[int]) -> list[U8 | None]:
+    """(H, W) codes of some views' labels, None where a view has none."""
+    files = {m.index: m.labels for m in masks.artifact.masks}
+    found = (files.get(i) for i in indices)
+    return [None if f is None else np.asarray(read_encoded(masks.path(f))[..., 0], np.uint8) for f in found]
+
+
+def shrunk(view: PhotoView, side: int) -> PhotoView:
+    """The view at the smallest whole-block size that still has `side` pixels, so that large photos fit in memory.
+
+    Lens positions are kept exact: intrinsics scale with the image, distortion does not change.
+    """
+    f = factor_for(view.size, max(side, 1024))
+    if f == 1:
+        return view
+    K = view.K.copy()
+    K[:2] /= f
+    clipped = None if view.clipped is None else shrink_whole(view.clipped, f)
+    rgb, alpha = shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)
+    asked = None if view.asked is None else shrink_whole(view.asked, f)
+    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, K=K)
+
+
+def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
+    return None if file is None else read_alpha(capture.path(file))
+
+
+def _asked(masks: Located[MaskSet], file: FileRef | None) -> F32 | None:
+    return None if file is None else read_alpha(masks.path(file))
+
+
+def camera_only(c: Camera) -> PhotoView:
+    """A camera as a view without a photo: what a prediction may see of a held-out view."""
+    empty = np.broadcast_to(np.zeros((), np.float32), (c.height, c.width, 3))
+    return PhotoView(
+        c.index,
+        empty,
+        empty[..., 0],
+        transforms.matrix(c.K),
+        transforms.matrix(c.world_from_cam),
+        np.array(c.distortion),
+    )

@@ -1,0 +1,348 @@
+"""What the scene requires, decided once in mid-fit from the evidence, and taken over by the model. Settings that are
+not 'auto' are never overruled.
+
+The fit begins with the whole model. When `SELECTION_AT` of the steps are done, every part that the evidence does not
+call for is left out for the rest of the fit: a lobe that nothing shows, bases beyond the rank, bands of the light
+beyond the order, colour matrices of cameras that agree, a surface that the prior already is. Until then a few views
+(`waiting`) are kept from the fit; it is their error that decides. They join it afterwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from pipeline.fields.appearance import START_RHO, IntegratedBasis, SpatialField, restart_lobe
+from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import GridSdf
+from pipeline.fields.light import ShLight
+from pipeline.fields.parts import Geometry
+from pipeline.maths import sh
+from stages.inverse_rendering import cross_validation
+from stages.inverse_rendering.config import AUTO, Config
+from stages.inverse_rendering.cross_validation import NEGLIGIBLE, ValidationSamples, more
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lobe, reflectance
+from stages.inverse_rendering.observations import observe, pictures, surface_points
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+
+SELECTION_AT = 0.3  # share of the steps: the surface is found to a millimetre, most of the work is still to come
+RAYS = 1500
+MAX_ESTIMATE_ORDER = 6  # beyond, a lobe of skin's width lets nothing through
+SEED = 715_517
+MIN_VIEWS = 8  # fewer can spare none
+VALIDATION_SHARE, MAX_VALIDATION = 0.12, 6
+DIFFUSE_ORDER = 3  # what diffuse skin tells of a light [NeuFace eq. 15]
+DIFFERENT = 0.02  # of the mean radiance: cameras that differ by less are not told from what the lobe leaves
+FAINT = 0.3  # of what stays unexplained: less than that is made up from it. Heads have 0.6 to 0.8, a dull stone one 0.2
+TELLING = 0.75  # of the lobe's own size: with a larger rest, bases are not told apart (docs/model.md)
+SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
+
+Facts = dict[str, dict[str, str | float | bool]]
+
+
+class Fit(Protocol):
+    """What is read of a fit under way. waiting: positions of the views that it has not seen."""
+
+    views: list[PhotoView]
+    settings: Config
+    device: str
+    model: FaceModel
+    prior: Start | None
+    level: int
+    table: PixelTable | None
+    validation: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Choices:
+    """What is modelled from now on. columns: the bases that stay. facts: how each was decided, for the report. lit: the
+    light is known from the lobe (light_estimate.py)."""
+
+    specular: bool
+    light_order: int
+    columns: tuple[int, ...]
+    calibrated: bool
+    refine_geometry: bool
+    facts: Facts
+    light_known: bool = False
+
+    @property
+    def rank(self) -> int:
+        """k."""
+        return len(self.columns)
+
+    def plain(self) -> dict[str, Any]:
+        """As a checkpoint holds it."""
+        return asdict(self)
+
+
+def restored(plain: dict[str, Any]) -> Choices:
+    """Inverse of `plain`."""
+    return Choices(**{**plain, "columns": tuple(plain["columns"])})
+
+
+def open_questions(s: Config) -> bool:
+    """Whether anything is left to the evidence."""
+    return s.judges and AUTO in (s.specular, s.rank, s.light_order, s.calibration, s.refine_geometry)
+
+
+def validation_views(count: int, settings: Config) -> tuple[int, ...]:
+    """Positions of the views that the fit does not see until the evidence is in: about one in eight, spread evenly."""
+    if count < MIN_VIEWS or not open_questions(settings):
+        return ()
+    n = min(max(round(VALIDATION_SHARE * count), 2), MAX_VALIDATION)
+    return tuple(int((i + 0.5) * count / n) for i in range(n))
+
+
+# ------------------------------------------------------------------ deciding
+def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
+    """Judge what is open with the waiting views; and the light, if what changes with the view tells it."""
+    s, model = fit.settings, fit.model
+    given = Choices(
+        s.specular != "off",
+        s.first_order,
+        tuple(range(s.first_rank)),
+        model.spec.calibrated,
+        s.refine_geometry != "off",
+        {},
+    )
+    wanted = s.estimates_light and s.specular != "off"
+    why = "setting" if not open_questions(s) else f"fewer than {MIN_VIEWS} views: nothing to judge by"
+    out = replace(given, facts=_facts(given, s, why))
+    if not fit.validation and not wanted:
+        return out, None
+    shots = pictures(fit.views)
+    rays = _table(fit).draw(RAYS, 0.0, SEED + s.seed).rays
+    seen = observe(model.geometry, shots, *surface_points(model.geometry, rays))
+    found = cross_validation.validation_samples(seen, fit.validation, model) if fit.validation else None
+    gain = np.ones((len(fit.views), 3))
+    if found is not None:
+        out = _judge_colours(given, s, found, model)
+        if out.calibrated:
+            gain = cross_validation.solve_response(found, out.light_order, gain=True).gain
+        if s.refine_geometry == AUTO and fit.prior is not None:
+            out = _judge_refinement(out, fit, found, shots)
+    elif fit.validation:
+        out = replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
+    estimate = None
+    if wanted and out.specular:
+        estimate = light_from_lobe(seen, min(out.light_order, MAX_ESTIMATE_ORDER), gain, model.spec.attenuation)
+    return _with_light_source(out, estimate), estimate
+
+
+def _with_light_source(c: Choices, estimate: LightEstimate | None) -> Choices:
+    """The choices with where the light came from."""
+    light: dict[str, str | float | bool] = {"from": "even skin"}
+    if estimate is not None:
+        told = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
+        light = {"from": "what changes with the view", **told}
+    return replace(c, light_known=estimate is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
+
+
+def apply_light(model: FaceModel, estimate: LightEstimate) -> list[nn.Parameter]:
+    """Put the light into the model, and a lobe that is skin's usual one everywhere. Hands back what was overwritten."""
+    spatial, basis, light = own_parts(model)
+    last = spatial.net[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        light.coefficients.zero_()
+        light.coefficients[: len(estimate.coefficients)] = torch.from_numpy(estimate.coefficients).to(last.weight)[
+            :, None
+        ]
+    restart_lobe(last, START_RHO)
+    pretrain_basis(basis)
+    return [*last.parameters(), *basis.parameters(), light.coefficients]
+
+
+def own_parts(model: FaceModel) -> tuple[SpatialField, IntegratedBasis, ShLight]:
+    """Our own parts of a model. Others are never judged, and keep all that they began with."""
+    spatial, basis, light = model.spatial, model.basis, model.light
+    assert isinstance(spatial, SpatialField) and isinstance(basis, IntegratedBasis) and isinstance(light, ShLight)
+    return spatial, basis, light
+
+
+def pretrain_basis(basis: IntegratedBasis) -> None:
+    """Make the bases together reflect as rough skin does, where the strength is START_RHO and all c are 1."""
+    basis.learn(lambda cosine: torch.from_numpy(reflectance(cosine.cpu().numpy())).to(cosine) / START_RHO)
+
+
+def _table(fit: Fit) -> PixelTable:
+    assert fit.table is not None
+    return fit.table
+
+
+def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceModel) -> Choices:
+    """Lobe, calibration, order and rank, each given what the others need."""
+    full, facts = model.spec.light_order, _facts(given, s, "not judged")
+    most = _best_order(t, full) if given.specular else None
+    one, gains = cross_validation.alike(t), cross_validation.solve_response(t, most, gain=True)
+    offsets = cross_validation.solve_response(t, most, gain=False)
+    gains_alone = cross_validation.solve_response(t, None, gain=True)
+    without, with_gains, control = (cross_validation.validation_error(t, most, r) for r in (one, gains, offsets))
+    alone = cross_validation.validation_error(t, None, gains_alone)
+    differ = more(without, with_gains) > DIFFERENT and (with_gains < control or alone < without)
+    calibrated = differ if s.calibration == AUTO else given.calibrated
+    facts["calibration"] = _fact(calibrated, s.calibration, without, with_gains) | {
+        "error_with_offsets": round(control, 5),
+        "error_with_gains_alone": round(alone, 5),
+    }
+    used = gains if calibrated else one
+    orders = [cross_validation.validation_error(t, order, used) for order in range(full + 1)]
+    dull = alone if calibrated else cross_validation.validation_error(t, None, one)
+    best = min(orders)
+    clearly = more(dull, best) > max(NEGLIGIBLE, FAINT * best)
+    specular = clearly if s.specular == AUTO else given.specular
+    facts["specular"] = _fact(specular, s.specular, dull, best)
+    order = given.light_order
+    if s.light_order == AUTO:
+        order = next(o for o in range(full + 1) if more(orders[o], best) < NEGLIGIBLE) if specular else 0
+        order = max(order, DIFFUSE_ORDER)
+        facts["light"] = {"order": order, "why": "evidence", "error_of_order": _listed(orders)}
+    columns = given.columns
+    if s.rank == AUTO and not specular:
+        facts["rank"]["why"] = "no lobe, so that its bases are not used"
+    if s.rank == AUTO and specular:
+        ranks = cross_validation.by_rank(t, order, used, given.rank)
+        clear = min(ranks) < TELLING * more(dull, best)
+        k = cross_validation.least_rank(ranks) if clear else given.rank
+        columns = strongest(model, t, k)
+        why = "evidence" if clear else "the rest is too large beside the lobe to tell; fewer would save no time"
+        facts["rank"] = {"k": k, "why": why, "error_of_rank": _listed(ranks)}
+    return Choices(specular, order, columns, calibrated, given.refine_geometry, facts)
+
+
+def _best_order(t: ValidationSamples, full: int) -> int:
+    """The order with the least held-out error while cameras count as alike: a higher one would fit noise."""
+    errors = [cross_validation.validation_error(t, order, cross_validation.alike(t)) for order in range(full + 1)]
+    return int(np.argmin(errors))
+
+
+def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[Any]) -> Choices:
+    """Whether the fitted surface explains the waiting views better than the prior."""
+    prior = prior_surface(fit)
+    seen = observe(prior, shots, *surface_points(prior, _table(fit).draw(RAYS, 0.0, SEED + 1).rays))
+    before = cross_validation.validation_samples(seen, fit.validation, fit.model)
+    own, theirs = (silhouette_error(fit, g) for g in (fit.model.geometry, prior))
+    moved = theirs > own + SILHOUETTE
+    fact: dict[str, str | float | bool] = {
+        "modelled": moved,
+        "why": "evidence",
+        "silhouette_error_of_prior": round(theirs, 5),
+        "silhouette_error": round(own, 5),
+    }
+    if before is not None:  # else the prior is so far off that hardly a point of it is seen as the subject
+        was, now = (_consistency(x, out.calibrated) for x in (before, t))
+        moved = moved or more(was, now) > NEGLIGIBLE
+        fact |= _fact(moved, AUTO, was, now)
+    return replace(out, refine_geometry=moved, facts=out.facts | {"relief": fact})
+
+
+def _consistency(t: ValidationSamples, calibrated: bool) -> float:
+    """Held-out error of a surface alone: the waiting views from the mean of what the others show of each point."""
+    response = cross_validation.solve_response(t, None, gain=True) if calibrated else cross_validation.alike(t)
+    return cross_validation.validation_error(t, None, response)
+
+
+def silhouette_error(fit: Fit, geometry: Geometry) -> float:
+    """Share of the waiting views' rays that hit where the mask shows nothing, or pass where it shows the subject."""
+    batch = _table(fit).only(fit.validation).draw(RAYS, 0.5, SEED + 2)
+    hit = _hits(geometry, batch.rays.o, batch.rays.d)
+    return float((hit != (batch.alpha > 0.5)).double().mean())
+
+
+def _hits(geometry: Geometry, o: Tensor, d: Tensor) -> Tensor:
+    from pipeline.maths.tracing import box_interval
+
+    near, far = box_interval(o, d, *geometry.box())
+    _, hit, _ = geometry.trace(o, d, near, far)
+    return hit & (far > near)
+
+
+def prior_surface(fit: Fit) -> GridSdf:
+    """The prior's surface, on the present grid."""
+    assert fit.prior is not None
+    prior = fit.prior.surface("cpu")
+    for _ in range(fit.level):
+        prior.refine()
+    prior.to(fit.device)
+    prior.to_device(fit.device)
+    return prior
+
+
+def strongest(model: FaceModel, t: ValidationSamples, k: int) -> tuple[int, ...]:
+    """The k bases that carry most of c . B on average, in their order."""
+    with torch.no_grad():
+        x = torch.from_numpy(t.x[:: max(len(t.x) // 4096, 1)]).float().to(model.beta.device)
+        c = model.spatial(x)[2]
+        up = torch.tensor([[0.0, 0.0, 1.0]], device=x.device)
+        share = (c.mean(0) * model.shading.bases(up, up)[0]).cpu().numpy()
+    return tuple(sorted(int(j) for j in np.argsort(-share, kind="stable")[:k]))
+
+
+def _facts(c: Choices, s: Config, why: str) -> Facts:
+    """Where nothing was tested."""
+    return {
+        "specular": {"modelled": c.specular, "why": "setting" if s.specular != AUTO else why},
+        "light": {"order": c.light_order, "why": "setting" if s.light_order != AUTO else why},
+        "rank": {"k": c.rank, "why": "setting" if s.rank != AUTO else why},
+        "calibration": {"modelled": c.calibrated, "why": "setting" if s.calibration != AUTO else why},
+        "relief": {"modelled": c.refine_geometry, "why": "setting" if s.refine_geometry != AUTO else why},
+    }
+
+
+def _fact(modelled: bool, setting: str, without: float, with_it: float) -> dict[str, str | float | bool]:
+    return {
+        "modelled": modelled,
+        "why": "evidence" if setting == AUTO else "setting",
+        "error_without": round(without, 5),
+        "error_with": round(with_it, 5),
+    }
+
+
+def _listed(errors: list[float]) -> str:
+    return ", ".join(f"{e:.5f}" for e in errors)
+
+
+# ------------------------------------------------------------------ taking over
+def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]]:
+    """Leave out of the model what is not wanted. Hands back, for every parameter that became smaller, the one that it
+    was and the rows of it that stay."""
+    swaps: dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]] = {}
+    spec = model.spec
+    if c.rank < spec.rank:
+        heads = [*range(5), *(5 + j for j in c.columns)]
+        spatial, basis, _ = own_parts(model)
+        for net, rows in ((spatial.net, heads), (basis.net, list(c.columns))):
+            last = net[-1]
+            assert isinstance(last, nn.Linear)
+            for name in ("weight", "bias"):
+                old = getattr(last, name)
+                new = nn.Parameter(old.detach()[rows].clone())
+                setattr(last, name, new)
+                swaps[new] = (old, rows)
+            last.out_features = len(rows)
+        spatial.rank = c.rank
+    if c.light_order < spec.light_order:
+        kept = slice(0, sh.count(c.light_order))
+        _, _, light = own_parts(model)
+        old = light.coefficients
+        light.coefficients = nn.Parameter(old.detach()[kept].clone())
+        swaps[light.coefficients] = (old, kept)
+    if not c.calibrated:
+        _still(model)
+    model.spec = replace(spec, rank=c.rank, light_order=c.light_order, specular=c.specular, calibrated=c.calibrated)
+    return swaps
+
+
+def _still(model: FaceModel) -> None:
+    """Every colour matrix becomes the identity."""
+    last = model.calibration.net[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.zero_()

@@ -1,0 +1,150 @@
+"""Surface points with what every photo shows of them: the raw material of the evidence (cross_validation.py).
+
+Symbols: P points x with normals n; an observation is one of M pairs (point, view) in which the view sees the point:
+c (M, 3) the photo's linear colour there, wo (M, 3) towards the camera. Points are where random rays of the photos meet
+the surface, so that they lie as dense as the photos look.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from pipeline import transforms
+from pipeline.fields.parts import Geometry
+from pipeline.images import shrink_whole
+from pipeline.maths import sh
+from pipeline.maths.sdf import unit
+from pipeline.maths.tracing import box_interval
+from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, Rays, factor_for
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+I64 = npt.NDArray[np.int64]
+MIN_COSINE = 0.35  # flatter views smear a pixel over too much surface
+CLEARANCE_CELLS = 2.5  # how far before the point a ray may end and still count as having seen it
+SIDE = 256  # pixels: coarse enough for a surface that is a millimetre off
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A photo at the size at which colours are looked up, sRGB decoded; `view` its camera at the photo's own size."""
+
+    view: PhotoView
+    factor: int
+    rgb: F32
+    alpha: F32
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """x, n (P, 3); point, view (M,) into the points and the fit's views; colour, wo (M, 3)."""
+
+    x: Tensor
+    n: Tensor
+    point: I64
+    view: I64
+    colour: F64
+    wo: F64
+
+    @property
+    def normal(self) -> F64:
+        """(M, 3)."""
+        return np.asarray(self.n.double().cpu().numpy()[self.point], np.float64)
+
+    @property
+    def cosine(self) -> F64:
+        """n . wo, (M,)."""
+        return np.asarray((self.normal * self.wo).sum(1), np.float64)
+
+    @property
+    def mirror(self) -> F64:
+        """w_r (M, 3)."""
+        return np.asarray(2 * self.cosine[:, None] * self.normal - self.wo, np.float64)
+
+
+def point_means(point: I64, values: F64, counts: F64) -> F64:
+    """(P,) or (P, C) mean of values (M,) or (M, C) over the observations of each point, whose number is counts (P,)."""
+    columns = values.reshape(len(values), -1).T
+    total = np.stack([np.bincount(point, column, len(counts)) for column in columns], -1)
+    return np.asarray((total / counts[:, None]).reshape(-1, *values.shape[1:]), np.float64)
+
+
+def lobe_basis(direction: F64, falls: F64) -> F64:
+    """A_l Y_lm (M, (L + 1)^2) at directions (M, 3); falls: A_l of each lobe, (M, L + 1), or of all, (1, L + 1)."""
+    order = falls.shape[1] - 1
+    spread = np.repeat(falls, 2 * np.arange(order + 1) + 1, axis=1)
+    return np.asarray(sh.sh_basis(torch.from_numpy(direction), order).numpy() * spread, np.float64)
+
+
+def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
+    """All photos at about `side` pixels."""
+    out = []
+    for view in views:
+        f = factor_for(view.size, side)
+        out.append(Picture(view, f, shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)))
+    return out
+
+
+def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
+    """x and unit n (P, 3) where rays meet the surface; rays that meet nothing are left out."""
+    with torch.no_grad():
+        near, far = box_interval(rays.o, rays.d, *geometry.box())
+        t, hit, _ = geometry.trace(rays.o, rays.d, near, far)
+        x = (rays.o + t[:, None] * rays.d)[hit & (far > near)]
+        return x, unit(geometry(x)[1])
+
+
+def observe(geometry: Geometry, shots: list[Picture], x: Tensor, n: Tensor) -> Observations:
+    """Every photo's look at the points: inside the frame and the mask, not too flat, nothing before it."""
+    points, normals = (a.detach().cpu().double().numpy() for a in (x, n))
+    parts = [_seen_by(geometry, shot, points, normals, x) for shot in shots]
+    view = np.concatenate([np.full(len(p[0]), i, np.int64) for i, p in enumerate(parts)])
+    point, colour, wo = (np.concatenate([p[k] for p in parts]) for k in range(3))
+    return Observations(x, n, point.astype(np.int64), view, colour, wo)
+
+
+def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Tensor) -> tuple[I64, F64, F64]:
+    """Indices of the points that one photo sees, their colours there and the directions to the camera."""
+    view = shot.view
+    centre = view.world_from_cam[:3, 3]
+    away = centre - points
+    distance = np.linalg.norm(away, axis=1)
+    wo = away / distance[:, None]
+    uv, depth = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, points)
+    at = np.nan_to_num(uv / shot.factor - 0.5, nan=-1.0)
+    h, w = shot.alpha.shape
+    inside = (depth > 0) & (at >= 0).all(1) & (at[:, 0] < w - 1) & (at[:, 1] < h - 1)
+    chosen = np.flatnonzero(inside & ((wo * normals).sum(1) > MIN_COSINE))
+    value, least = _look_up(shot, at[chosen])
+    chosen, value = chosen[least > WHOLE], value[least > WHOLE]
+    free = _free(geometry, centre, wo[chosen], distance[chosen], x)
+    return chosen[free], value[free], wo[chosen[free]]
+
+
+def _look_up(shot: Picture, at: F64) -> tuple[F64, F64]:
+    """Bilinear colour (N, 3) at pixel positions, and the least alpha of the four pixels."""
+    low = np.floor(at).astype(np.int64)
+    f = at - low
+    value, least = np.zeros((len(at), 3)), np.ones(len(at))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            i, j = low[:, 1] + dy, low[:, 0] + dx
+            weight = (f[:, 0] if dx else 1 - f[:, 0]) * (f[:, 1] if dy else 1 - f[:, 1])
+            value += weight[:, None] * shot.rgb[i, j]
+            least = np.minimum(least, shot.alpha[i, j])
+    return value, least
+
+
+def _free(geometry: Geometry, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
+    """Whether rays from the camera reach the points."""
+    d = torch.from_numpy(-wo).to(x)
+    o = torch.from_numpy(centre).to(x).expand_as(d).contiguous()
+    reach = torch.from_numpy(distance).to(x) - CLEARANCE_CELLS * geometry.cell
+    near, far = box_interval(o, d, *geometry.box())
+    _, hit, _ = geometry.trace(o, d.contiguous(), near, torch.minimum(far, reach).contiguous())
+    return np.asarray((~hit).cpu().numpy(), bool)

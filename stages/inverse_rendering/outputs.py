@@ -1,0 +1,130 @@
+"""From the fitted model to files: the light, the held-out views, and the facts that the report shows."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import CameraSet, Capture, HeldOutView, Matrix
+from pipeline.colour import as_photographed
+from pipeline.contract import Context
+from pipeline.fields.face import FaceModel
+from pipeline.images import write_exr, write_png_from_linear
+from pipeline.transforms import rows
+from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.footprint import Footprint
+from stages.inverse_rendering.load_views import camera_only
+from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
+from stages.inverse_rendering.systems import render_any
+
+F32 = npt.NDArray[np.float32]
+
+
+def write_light(model: FaceModel, context: Context) -> None:
+    """light.json: raw coefficients and the conventions that they need."""
+    coefficients = model.light().detach().cpu().double().numpy().round(7).tolist()
+    (context.workdir / "light.json").write_text(
+        json.dumps(
+            {
+                "order": model.spec.light_order,
+                "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
+                "frame": "asset coordinates, +Y up, direction towards the light",
+                "colour": "linear Rec.709 radiance",
+                "coefficients": coefficients,
+            },
+            indent=1,
+        )
+    )
+
+
+def held_out_responses(model: FaceModel, capture: Capture, fitted: Sequence[int]) -> dict[int, Matrix]:
+    """Rows of e_n A_g for every held-out view: its exposure, and the mean colour response of the fitted photos
+    (indices in the model's order) by the same kind of camera; the mean response, I, where there are none. [NeuFace
+    eq. 19]
+
+    Differs: the paper has one kind of camera, and scores its test views after a 3 x 3 matrix of their own. What a kind
+    of camera does to colours is known from its fitted photos, without a look at the held-out ones.
+    """
+    group = {v.index: v.camera_group for v in capture.views}
+    matrices = model.calibration().detach().cpu().double().numpy() if model.spec.calibrated else None
+    out = {}
+    for view in (v for v in capture.views if v.holdout):
+        alike = [n for n, i in enumerate(fitted) if group[i] == view.camera_group]
+        mean = matrices[alike].mean(0) if matrices is not None and alike else np.eye(3)
+        out[view.index] = rows(view.exposure * mean)
+    return out
+
+
+def predict_held_out(
+    model: FaceModel,
+    capture: Capture,
+    poses: CameraSet,
+    fitted: Sequence[int],
+    side: int,
+    samples: int,
+    context: Context,
+) -> tuple[HeldOutView, ...]:
+    """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
+    responses = held_out_responses(model, capture, fitted)
+    known = [c for c in poses.cameras if c.index in responses]
+    out = []
+    for n, c in enumerate(known):
+        context.check()
+        context.progress(n, len(known), "held-out views")
+        factor = factor_for((c.width, c.height), side, exact=True)
+        view = camera_only(c)
+        response = responses[c.index]
+        rgba = as_photographed(predict_view(model, view, factor, samples, context.device), response)
+        exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
+        write_exr(context.workdir / exr, rgba)
+        write_png_from_linear(context.workdir / png, rgba[..., :3])
+        files = {"exr": context.file(exr), "png": context.file(png)}
+        out.append(HeldOutView(index=c.index, **files, scale=factor, response=response))
+    return tuple(out)
+
+
+def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, device: str) -> F32:
+    """(H / factor, W / factor, 4) linear RGBA, premultiplied; the lens's distortion is in the rays.
+
+    No calibration is applied: the colours are those of the mean response, A = I.
+    """
+    w, h = view.size[0] // factor, view.size[1] // factor
+    colour, opacity = render_any(model, image_rays(view, factor, device), samples)
+    rgba = np.concatenate([colour.cpu().numpy(), opacity.cpu().numpy()[:, None]], 1)
+    return rgba.reshape(h, w, 4).astype(np.float32)
+
+
+def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[str, str | float | bool]]:
+    """What was modelled, what was left out, and the evidence for it, for the report."""
+    settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
+    decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
+    return {
+        **decided,
+        "geometry": {
+            "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
+            "cell_mm": round(model.geometry.cell * 1e3, 4),
+            "why": "no licensed prior" if settings.prior == "hull" else "setting",
+        },
+        "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
+        "schedule": _schedule(trainer),
+        "density": {"kind": settings.density, "why": "setting"},
+        "system": {
+            "method": settings.method,
+            "shading": settings.shading,
+            "light": settings.light,
+            "integral": settings.integral,
+            "attenuation": settings.attenuation,
+            "why": "setting",
+        },
+        "faults": {"dropped_steps": guard.dropped, "why": guard.causes[-1] if guard.causes else "none"},
+    }
+
+
+def _schedule(trainer: Trainer) -> dict[str, str | float | bool]:
+    """How long the fit was, and what set its length. Seconds are left out where they do not repeat."""
+    if not trainer.settings.by_clock:
+        return {"steps": trainer.step, "why": "setting"}
+    return {"steps": trainer.step, "seconds_of_the_stage": trainer.settings.seconds, "why": "ended by the clock"}

@@ -1,0 +1,50 @@
+"""A fit by the clock: what is left for training once reading the photos before it and rendering the held-out views
+after it have had their share of the stage's time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+
+from pipeline.artifacts import Camera
+from pipeline.fields.face import FaceModel
+from stages.inverse_rendering.config import Config
+from stages.inverse_rendering.load_views import camera_only
+from stages.inverse_rendering.ray_sampling import Rays, factor_for, image_rays
+from stages.inverse_rendering.render import render_rays
+
+MIN_TRAINING = 0.25  # share of the stage's seconds that training has in any case: a field must come out of it
+TRIED = 20_000  # rays of a held-out view that are timed
+FINER = 1.5  # times what a view takes on the coarse grid that the fit begins with
+
+
+class Clock:
+    """Seconds since it was made."""
+
+    def __init__(self) -> None:
+        self.begun = time.monotonic()
+
+    def elapsed(self) -> float:
+        """Seconds."""
+        return time.monotonic() - self.begun
+
+
+def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Config, device: str) -> float:
+    """What rendering the held-out views (cameras of the photos) will take, by timing some of their rays."""
+    if not held:
+        return 0.0
+    factors = [factor_for((c.width, c.height), settings.image_side, exact=True) for c in held]
+    pixels = sum((c.width // f) * (c.height // f) for c, f in zip(held, factors, strict=True))
+    rays = image_rays(camera_only(held[0]), factors[0], device)
+    every = slice(None, None, max(len(rays.o) // TRIED, 1))
+    some = Rays(rays.o[every].contiguous(), rays.d[every].contiguous())
+    taken = []
+    for _ in range(2):  # the first call loads what the second then has at hand
+        clock = Clock()
+        render_rays(model, some, settings.samples)
+        if device == "cuda":
+            torch.cuda.synchronize()
+        taken.append(clock.elapsed())
+    return FINER * min(taken) * pixels / max(len(some.o), 1)

@@ -1,0 +1,102 @@
+"""Subject against a known background (black, green ..., or a clean plate): what hangs together with the frame is it.
+
+Colour alone can't do it: brows, nostrils and beards are as black as a black background. They don't reach the frame,
+the background does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stages.masks.matting import largest_parts, soft_edge
+from stages.masks.region import F32, U8, Bool
+
+RING = 0.015  # of the shorter edge: width of the border that is looked at
+NEAR = 24  # 8-bit levels: first guess of what is background
+SAMPLES = 4000  # border pixels per view
+MAX_SPREAD = 6.0  # levels, robust standard deviation: above it a background is not uniform
+MIN_SHARE, MIN_SHARE_ANY = 0.5, 0.25  # of all border pixels, and of one view's, that must be background
+HOLE = 0.005  # of the photo: an enclosed patch of background colour this large may be a hole
+UNCHANGED = 0.3  # share of a photo that its clean plate surely shows too
+PLATE_NOISE, PLATE_LEVELS = 6.0, (8.0, 32.0)  # tolerance against the plate: times the noise, within these levels
+EDGE = 3  # pixels: the threshold's contour is right to this
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """A uniform background: 8-bit sRGB colour, and how far a pixel may be from it (levels, largest channel)."""
+
+    colour: tuple[float, float, float]
+    tolerance: float
+
+
+def border_colours(image: U8) -> U8:
+    """(N, 3) pixels of the outermost ring, evenly thinned to at most SAMPLES."""
+    h, w = image.shape[:2]
+    width = max(2, round(RING * min(h, w)))
+    ring = np.ones((h, w), bool)
+    ring[width:-width, width:-width] = False
+    found = image[ring]
+    return np.ascontiguousarray(found[:: -(-len(found) // SAMPLES)])
+
+
+def find_background(borders: Sequence[U8]) -> Background | None:
+    """The one colour around the subject in all views, or None if there is no such colour. borders: (N_i, 3) each."""
+    if not borders:
+        return None
+    pooled = np.concatenate(borders).astype(np.float32)
+    colour = np.median(pooled, axis=0)
+    for _ in range(5):
+        near = np.abs(pooled - colour).max(1) <= NEAR
+        if not near.any():
+            return None
+        colour = np.median(pooled[near], axis=0)
+    near = np.abs(pooled - colour).max(1) <= NEAR
+    spread = 1.4826 * np.median(np.abs(pooled[near] - colour).max(1))
+    tolerance = float(np.clip(5 * spread, 5, NEAR))
+    shares = [float((np.abs(b.astype(np.float32) - colour).max(1) <= tolerance).mean()) for b in borders]
+    if spread > MAX_SPREAD or np.median(shares) < MIN_SHARE or min(shares) < MIN_SHARE_ANY:
+        return None
+    return Background((float(colour[0]), float(colour[1]), float(colour[2])), tolerance)
+
+
+def key_out(image: U8, background: Background) -> F32:
+    """Alpha (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
+    apart = [np.abs(image[..., k].astype(np.float32) - np.float32(background.colour[k])) for k in range(3)]
+    away = np.maximum(np.maximum(apart[0], apart[1]), apart[2])
+    return soft_edge(image, _inside(away, background.tolerance), EDGE)
+
+
+def key_out_plate(image: U8, plate: U8) -> F32:
+    """Alpha (H, W) of what a photo has and its clean plate, taken with the same camera, has not; (H, W, 3) 8-bit sRGB.
+
+    Exposure may have drifted: the plate is brought to the photo by one gain, over pixels that differ least.
+    """
+    photo, empty = image.astype(np.float32), plate.astype(np.float32)
+    like = np.abs(photo - empty).max(2)
+    same = like <= np.quantile(like, UNCHANGED)
+    gain = float(np.median((photo[same] + 1) / (empty[same] + 1)))
+    away = np.abs(photo - empty * np.float32(gain)).max(2)
+    away = np.asarray(cv2.GaussianBlur(away, (0, 0), 1.0), np.float32)  # noise goes, a subject is larger
+    tolerance = float(np.clip(PLATE_NOISE * np.median(away[same]), *PLATE_LEVELS))
+    return soft_edge(image, _inside(away, tolerance), EDGE)
+
+
+def _inside(away: F32, tolerance: float) -> Bool:
+    """(H, W) of the subject, from the distance of each pixel from the background in levels."""
+    like = away <= tolerance
+    count, label, stats, _ = cv2.connectedComponentsWithStats(like.astype(np.uint8), connectivity=4)
+    frame = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
+    outer = np.zeros(count, bool)
+    # a dark collar cut by the frame is a small patch there; the background is not
+    outer[[i for i in np.unique(frame) if i and stats[i, cv2.CC_STAT_AREA] >= 1e-3 * like.size]] = True
+    for i in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= HOLE * like.size):
+        if i and not outer[i]:  # a hole is as flat as the background around; dark skin or cloth is not
+            outer[i] = bool(away[label == i].std() <= 0.25 * tolerance)
+    inside = largest_parts(~outer[label], 0.02)
+    opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return np.asarray(opened) > 0

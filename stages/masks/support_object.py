@@ -1,0 +1,111 @@
+"""An object that no network knows, from the sparse points of structure from motion: what stands on the support.
+
+Symbols: points (N, 3) asset coordinates; R radius of the region of interest; plane n . x = o, n towards the cameras.
+What rises from the support (pipeline.support) within reach of the region of interest and hangs together is the object;
+its points, seen from anywhere, fill its silhouette.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import ndimage, spatial
+
+from pipeline.artifacts import Camera
+from pipeline.support import CLEAR, Support, find_support
+from pipeline.transforms import F64, inverse_rigid, matrix, project
+from stages.masks.grabcut import cut
+from stages.masks.region import U8, Bool, dilated, eroded, resized, working_size
+
+AROUND, REACH = 2.5, 1.6  # R: where a support is looked for; how far the object may reach
+LINK, COMPANY = 0.1, 4  # R: points nearer than this hang together; of so many others at least
+MIN_POINTS = 200
+SPACING = 0.07  # R: gaps between projected points that are closed
+GREY = 6  # levels: a photo whose channels differ less has no colours
+TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class SupportedObject:
+    """Points on an object, and what it stands on if that was found."""
+
+    points: F64
+    support: Support | None
+    roi_radius: float
+
+
+def find_supported_object(
+    points: F64, cameras: Sequence[Camera], roi_radius: float, seed: int
+) -> SupportedObject | None:
+    """The object, or None if too few points say where it is."""
+    centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras])
+    distance = np.linalg.norm(points, axis=1)
+    support = find_support(points[distance < AROUND * roi_radius], centres, roi_radius, seed)
+    own = distance < REACH * roi_radius
+    if support is not None:
+        own &= points @ support.normal - support.offset > CLEAR * roi_radius
+    found = _largest_cluster(points[own], LINK * roi_radius)
+    return SupportedObject(found, support, roi_radius) if len(found) >= MIN_POINTS else None
+
+
+def _largest_cluster(points: F64, link: float) -> F64:
+    """The points of the largest group in which each is within about `link` of others; wrong ones stand alone."""
+    if len(points) <= COMPANY:
+        return points
+    farthest = spatial.cKDTree(points).query(points, COMPANY + 1)[0][:, -1]
+    points = points[farthest < link]
+    if not len(points):
+        return points
+    index = ((points - points.min(0)) / link).astype(np.intp) + 1
+    grid = np.zeros(index.max(0) + 2, bool)
+    grid[tuple(index.T)] = True
+    label, _ = ndimage.label(ndimage.binary_dilation(grid, np.ones((3, 3, 3))))
+    of = np.asarray(label)[tuple(index.T)]
+    return np.asarray(points[of == np.bincount(of).argmax()], np.float64)
+
+
+def cut_by_points(image: U8, camera: Camera, solid: SupportedObject, longest: int, seed: int) -> Bool:
+    """Hard mask at the working size: the silhouette of the object's points decides where, the photo the edge."""
+    w, h = working_size(image.shape[1], image.shape[0], longest)
+    small = np.asarray(resized(image, w, h), np.uint8)
+    inside, gap = silhouette_of_points(camera, solid, h, w)
+    trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap[eroded(inside, max(1, gap // 2))] = cv2.GC_FGD
+    trimap[~dilated(inside, 2 * gap)] = cv2.GC_BGD
+    return cut(distinct(small), trimap, seed)
+
+
+def silhouette_of_points(camera: Camera, solid: SupportedObject, height: int, width: int) -> tuple[Bool, int]:
+    """(height, width) where the object's points project, gaps closed and holes filled; the gap in pixels."""
+    K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
+    uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, solid.points)
+    scale = width / camera.width
+    front = np.isfinite(uv).all(1)
+    if not front.any():
+        return np.zeros((height, width), bool), 1
+    gap = max(1, int(np.ceil(SPACING * solid.roi_radius * K[0, 0] * scale / float(np.median(z[front])))))
+    gap = min(gap, max(height, width) // 4)
+    pad = 2 * gap + 2  # so that what is closed or filled beyond the frame counts in it
+    canvas = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
+    at = np.floor(uv[front] * scale).astype(np.int64) + pad
+    at = at[(at >= 0).all(1) & (at[:, 0] < canvas.shape[1]) & (at[:, 1] < canvas.shape[0])]
+    canvas[at[:, 1], at[:, 0]] = 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * gap + 1, 2 * gap + 1))
+    closed = ndimage.binary_fill_holes(cv2.morphologyEx(canvas, cv2.MORPH_CLOSE, disc))
+    return np.asarray(closed)[pad:-pad, pad:-pad] > 0, gap
+
+
+def distinct(image: U8) -> U8:
+    """(H, W, 3) in which subject and background differ most: the colours; of a grey photo brightness, its local mean
+    and how strongly it varies there, because a grey level alone says little."""
+    spread = image.max(2).astype(np.int16) - image.min(2)
+    if float(np.quantile(spread, 0.9)) > GREY:
+        return image
+    grey = image[..., 1].astype(np.float32)
+    mean = np.asarray(cv2.GaussianBlur(grey, (0, 0), TEXTURE_PIXELS), np.float32)
+    square = np.asarray(cv2.GaussianBlur(grey * grey, (0, 0), TEXTURE_PIXELS), np.float32)
+    varies = TEXTURE_GAIN * np.sqrt(np.maximum(square - mean * mean, 0))
+    return np.ascontiguousarray(np.dstack([grey, mean, varies.clip(0, 255)]).astype(np.uint8))

@@ -1,0 +1,119 @@
+"""Cameras that came with the capture: held against the photos, mended if asked for, moved to asset coordinates."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.artifacts import Camera, CameraSet, Capture, Located
+from pipeline.contract import Context
+from pipeline.errors import StageError
+from pipeline.transforms import inverse_rigid, matrix
+from pipeline.verdict import Finding
+from stages.poses.config import Config
+from stages.poses.epipolar_check import AGREE, FAR, IMPERFECT, check_cameras, features_of
+from stages.poses.judge import CONTRADICTED, contradicted, mirrored
+from stages.poses.mirrored import find_mirrored
+from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
+from stages.poses.photos import photos_of
+from stages.poses.progress import progress_of
+from stages.poses.scale import by_world, eyes_of
+from stages.poses.scale_source import find_faces, head_of, known_scale, some_of
+from stages.poses.write_cameras import camera_of, camera_set
+
+if TYPE_CHECKING:
+    from stages.poses.mapper import Model
+
+
+def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
+    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict. Where most
+    do, nobody knows which are right: all stay, and the finding says it.
+
+    Raises:
+        StageError: the photos share no point under them.
+    """
+    cameras = [
+        camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
+        for v, c in ((v, v.camera) for v in capture.artifact.views)
+        if c is not None
+    ]
+    # only FaceScape says what its numbers are: metres or millimetres; the others' worlds have any size
+    auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
+    unit: Unit = auto if config.unit == "auto" else config.unit
+    wrong, findings = _contradicted(capture, cameras, config, context) if config.check else ([], ())
+    names = tuple(cameras[i].name for i in wrong)
+    right = [i for i in range(len(cameras)) if i not in wrong]
+    cameras = [cameras[i] for i in right]
+    warnings_ = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
+            for n in names]  # fmt: skip
+    model = None
+    if config.given != "keep":
+        model, cameras, doubtful = _held_against_photos(capture, right, cameras, config, context)
+        if doubtful:
+            warnings_.append(
+                "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
+            )
+    faces = find_faces(capture, some_of(capture, cameras), context.check)
+    eyes = eyes_of([(c, face.pupils) for c, face in faces]) if config.pupils_mm else None
+    known = known_scale(capture, cameras, config, eyes, warnings_)
+    world, axes = capture.artifact.metres_from_world, None
+    if world is not None and config.unit == "auto":
+        published, axes = by_world(matrix(world))
+        known = published if known is None and config.scale == "auto" else known
+    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces))
+    warnings = (*warnings_, *found.warnings)
+    made = camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
+    return made.model_copy(update={"findings": findings})
+
+
+def _held_against_photos(
+    capture: Located[Capture], right: list[int], cameras: list[Camera], config: Config, context: Context
+) -> tuple[Model, list[Camera], list[str]]:
+    """Points triangulated from the given cameras `right` of the capture; the cameras, moved if asked for; names of
+    those that should have been and were not.
+
+    Raises:
+        StageError: the photos share no point under these cameras.
+    """
+    from stages.poses.sfm import (
+        triangulate_given,
+    )  # takes COLMAP, which cameras that stay as they are do not
+
+    photos = photos_of(capture)
+    centres, axes = viewing_rays(cameras)
+    distance = float(((centres - nearest_point(centres, axes)) ** 2).sum(1).mean() ** 0.5)
+    in_order = capture.artifact.kind == "video"
+    found = triangulate_given(
+        [photos[i] for i in right], cameras, config, in_order, context.scratch, progress_of(context),
+        refine=config.given == "refine", deviation=config.given_deviation * distance,
+    )  # fmt: skip
+    if found is None:
+        raise StageError("no point is seen by two photos", where="poses", value="0 points",
+                         limit="features that neighbouring photos share",
+                         remedy="set poses.given=keep to use the cameras as they are")  # fmt: skip
+    model, doubtful = found
+    names = [cameras[n].name for n in doubtful]
+    if config.given == "refine":
+        views, poses = [capture.artifact.views[i] for i in right], model.poses
+        cameras = [camera_of(v, poses[n].K, poses[n].world_from_cam, c.distortion)
+                   for n, (v, c) in enumerate(zip(views, cameras, strict=True))]  # fmt: skip
+    return model, cameras, names
+
+
+def _contradicted(
+    capture: Located[Capture], cameras: list[Camera], config: Config, context: Context
+) -> tuple[list[int], tuple[Finding, ...]]:  # fmt: skip
+    """Places of the views whose photos contradict their cameras, none if most do; and what follows from it."""
+    progress = progress_of(context)
+    photos = photos_of(capture)
+    features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
+    far = IMPERFECT if config.given == "refine" else FAR
+    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
+    right = [i for i in range(len(cameras)) if verdict.share[i] >= AGREE]
+    silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image matches nothing
+    flipped = find_mirrored(photos, [*verdict.wrong, *silent], right, config.seed)
+    findings = (contradicted([cameras[i].name for i in verdict.wrong], verdict.known, len(cameras)),
+                mirrored([cameras[i].name for i in flipped], len(cameras)))  # fmt: skip
+    most = len(verdict.wrong) > CONTRADICTED.usable * verdict.known
+    return ([] if most else verdict.wrong), findings

@@ -1,0 +1,122 @@
+"""Given cameras held against the photos: sparse points triangulated from them, and their own small errors mended.
+
+A rig's calibration is good and never perfect: a bumped camera is a few pixels off. Its centre is known far better than
+photos alone tell it, its direction hardly: so bundle adjustment holds the centres near the given ones (a Gaussian prior
+of the width `deviation`), leaves the lenses alone and moves the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.artifacts import Camera
+from pipeline.colmap import pycolmap
+from pipeline.transforms import F64, inverse_rigid, matrix
+from stages.poses.bundle_adjustment import settle_near
+from stages.poses.features import Features
+from stages.poses.mapper import GLOG_ERROR, Model, model_of, write_database
+from stages.poses.matching import Pair, Verified
+
+SIGHTINGS = 20  # a view with fewer says too little of its camera
+TURN = 0.05  # radians: no rig is that wrong; a view that is turned so far followed wrong matches
+ROUNDS = (12.0, 4.0)  # pixels: how far off a sighting may be before and after the cameras were moved once
+
+
+def triangulate(
+    scratch: Path, cameras: Sequence[Camera], features: Sequence[Features], verified: Mapping[Pair, Verified],
+    *, refine: bool, deviation: float, seed: int,
+) -> tuple[Model, list[int]] | None:  # fmt: skip
+    """Points (and with `refine` poses) from cameras in the capture's world, or None if the photos share no point.
+
+    Second: the views that were to be mended and stay as given, because the photos say too little of them. deviation: of
+    the given centres, in the world's unit. scratch: an empty folder.
+    """
+    pycolmap.logging.minloglevel = GLOG_ERROR
+    database = scratch / "matches.db"
+    lenses = [_lens(c) for c in cameras]
+    unskewed = [Features(_without_skew(f.uv, c), f.descriptors) for f, c in zip(features, cameras, strict=True)]
+    numbers = write_database(database, lenses, range(len(cameras)), unskewed, verified)
+    found = _with_poses(database, [inverse_rigid(matrix(c.world_from_cam)) for c in cameras])
+    centres = {n: np.asarray(i.projection_center(), np.float64) for n, i in found.images.items()}
+    turns = {n: np.asarray(i.cam_from_world().matrix()[:, :3], np.float64) for n, i in found.images.items()}
+    for limit in ROUNDS if refine else ROUNDS[-1:]:
+        found = pycolmap.triangulate_points(found, database, scratch, scratch, options=_options(limit, seed))
+        if not found.num_points3D():
+            return None
+        if refine:
+            settle_near(found, centres, deviation)
+            _turn_back(found, turns)
+    model, given = model_of(found, numbers), [matrix(c.world_from_cam) for c in cameras]
+    seen = {numbers[i.name]: i.num_points3D for i in found.images.values()}
+    doubtful = [n for n, p in model.poses.items()
+                if refine and (seen[n] < SIGHTINGS or _turn(given[n], p.world_from_cam) > TURN)]  # fmt: skip
+    poses = {n: replace(p, K=matrix(cameras[n].K), world_from_cam=given[n] if n in doubtful else p.world_from_cam)
+             for n, p in model.poses.items()}  # fmt: skip
+    return replace(model, poses=poses), doubtful
+
+
+def _turn_back(found: Any, turns: Mapping[int, F64]) -> None:
+    """The whole world turned about the cameras' middle so that they look where the given ones did. In place.
+
+    Centres in a row leave a turn about the row open, and flat rings say little of it; the given rotations don't.
+    turns: cam_from_world (3, 3) by image id. Least sum of distances, by reweighting, so that a lost view has no say.
+    """
+    pairs = [(turns[n], np.asarray(i.cam_from_world().matrix()[:, :3])) for n, i in found.images.items()]
+    true_from_found = np.stack([given.T @ now for given, now in pairs])
+    weights, Q = np.ones(len(pairs)), np.eye(3)
+    for _ in range(10):
+        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, true_from_found))
+        Q = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+        weights = 1 / np.maximum(np.linalg.norm(true_from_found - Q, axis=(1, 2)), 1e-6)
+    middle = np.mean([i.projection_center() for i in found.images.values()], axis=0)
+    found.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(Q), middle - Q @ middle))
+
+
+def _turn(a: F64, b: F64) -> float:
+    """Angle in radians between two rigid poses (4, 4)."""
+    return float(np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1)))
+
+
+def _with_poses(database: Path, poses: Sequence[F64]) -> Any:
+    """COLMAP's reconstruction of photos at cam_from_world (4, 4), without points."""
+    found, opened = pycolmap.Reconstruction(), pycolmap.Database.open(database)
+    for camera in opened.read_all_cameras():
+        found.add_camera_with_trivial_rig(camera)
+    for image in opened.read_all_images():
+        pose = poses[int(image.name)]
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    opened.close()
+    return found
+
+
+def _options(limit: float, seed: int) -> Any:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options.extract_colors = False
+    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_principal_point = False
+    options.mapper.filter_max_reproj_error = limit
+    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = limit
+    return options
+
+
+def _lens(c: Camera) -> Any:
+    """fx fy cx cy k1 k2 p1 p2 k3 exactly; the skew is taken out of the positions."""
+    K = c.K
+    params = [K[0][0], K[1][1], K[0][2], K[1][2], *c.distortion[:4], c.distortion[4], 0.0, 0.0, 0.0]
+    return pycolmap.Camera(model="FULL_OPENCV", width=c.width, height=c.height, params=params)
+
+
+def _without_skew(uv: Any, c: Camera) -> Any:
+    """(N, 2) positions as a lens without skew would have them: u - s y, y = (v - cy) / fy."""
+    skew = c.K[0][1]
+    if skew == 0:
+        return uv
+    moved = np.array(uv)
+    moved[:, 0] -= skew * (moved[:, 1] - c.K[1][2]) / c.K[1][1]
+    return moved

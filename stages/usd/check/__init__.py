@@ -1,0 +1,1 @@
+"""`neuface validate`: is an exported asset what it says?"""

@@ -1,0 +1,62 @@
+"""Checks of texture coordinates that the USD library does not know: texels that belong to two places of the surface,
+and surface that has no texels or mirrored ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from pxr import UsdGeom
+
+from pipeline import raster
+from stages.usd.check.findings import Finding
+
+F64 = npt.NDArray[np.float64]
+RASTER = 1024  # texels along a side of a tile
+MAX_OVERLAP, SOME_OVERLAP = 0.01, 0.002  # of the covered texels: an error, worth a warning
+MAX_EMPTY = 0.005  # of the surface
+MAX_MIRRORED = 0.02
+FLAT = 1e-10  # of a tile, twice the area
+
+
+def chart_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
+    """st (N, 2): of the corners of all faces, in the order of the mesh's indices. Faces are taken as fans."""
+    where, counts = str(mesh.GetPath()), np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64)
+    corner = _fans(counts)
+    points = np.asarray(mesh.GetPointsAttr().Get(), np.float64)
+    index = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(), np.int64)
+    x, t = points[index[corner]], st[corner]
+    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
+    share = area / max(float(area.sum()), 1e-30)
+    flat = raster.doubled_areas(t)
+    out = []
+    empty, mirrored = float(share[np.abs(flat) < FLAT].sum()), float(share[flat < -FLAT].sum())
+    if empty > MAX_EMPTY:
+        out.append(Finding("error", "st", f"{empty:.2%} of the surface has no area in the texture", where))
+    if MAX_MIRRORED < mirrored < 1 - MAX_MIRRORED:
+        out.append(Finding("warning", "st", f"{mirrored:.1%} of the surface is mirrored in the texture", where))
+    twice = overlap(t)
+    if twice > SOME_OVERLAP:
+        level = "error" if twice > MAX_OVERLAP else "warning"
+        text = f"{twice:.2%} of the covered texels belong to two places of the surface, at most {MAX_OVERLAP:.0%} may"
+        out.append(Finding(level, "st_overlap", text, where))  # type: ignore[arg-type]
+    return out
+
+
+def overlap(triangles: F64) -> float:
+    """Share of the covered texels that lie under two triangles (F, 3, 2) or more; each tile is looked at by itself."""
+    tile = np.floor(triangles.mean(1)).astype(np.int64)
+    covered = twice = 0
+    for one in np.unique(tile, axis=0):
+        own = triangles[(tile == one).all(1)] - one
+        layers = raster.layers(raster.in_texels(own, RASTER), RASTER)
+        covered, twice = covered + int((layers > 0).sum()), twice + int((layers > 1).sum())
+    return twice / max(covered, 1)
+
+
+def _fans(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(F, 3) corners of the triangles of faces with so many corners each."""
+    start = np.cumsum(counts) - counts
+    triangles = counts - 2
+    first = np.repeat(start, triangles)
+    turn = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.stack([first, first + turn + 1, first + turn + 2], 1)

@@ -1,0 +1,283 @@
+"""Checks an asset as a client would: every validator of the USD library, and what those leave unseen.
+
+The library misses extents, face indices, primvar counts, dangling shader connections, absolute paths, kind, whether an
+image can be decoded, colour spaces, MaterialX networks, and all variants but the selected; these are checked here.
+Works on .usd, .usda, .usdc and .usdz alone, without the pipeline's manifests.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import tempfile
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
+
+from pipeline.errors import StageError
+from stages.usd.check import tile_checks
+from stages.usd.check.findings import Finding
+from stages.usd.check.geometry_checks import mesh_findings
+from stages.usd.check.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
+
+ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
+IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
+MISSING_ID = "MissingShaderIdInRegistry"
+UNRESOLVED = "NormalMapTextureValidator.InvalidFile"
+
+
+def validate(path: Path) -> list[Finding]:
+    """Every finding, errors first. StageError if the file is not there or is no USD file."""
+    stage = _open(path)
+    out: list[Finding] = []
+    for check in CHECKS:
+        out += check(stage, path)
+    unique = dict.fromkeys(out)  # the library's validators overlap
+    return sorted(unique, key=lambda f: ("error", "warning", "info").index(f.level))
+
+
+def checks_run() -> int:
+    """How many checks `validate` makes: the library's validators and our own."""
+    return len(_validators()) + len(CHECKS) - 1
+
+
+def found_in(path: Path) -> list[Finding]:
+    """As `validate`; a file that can't be opened is an error among the others."""
+    try:
+        return validate(path)
+    except StageError as e:
+        return [Finding("error", "open", f"{e.what}: {e.value}")]
+
+
+def _open(path: Path) -> Usd.Stage:
+    from pxr import Tf
+
+    value = f"{path.stat().st_size} bytes" if path.is_file() else "no such file"
+    if path.is_file():
+        try:
+            return Usd.Stage.Open(str(path), Usd.Stage.LoadAll)
+        except (Tf.ErrorException, RuntimeError) as e:
+            value = str(e).strip().splitlines()[-1]
+    raise StageError(
+        "the asset can't be opened",
+        where=path,
+        value=value,
+        limit="a .usd, .usda, .usdc or .usdz file",
+        remedy="check the path; run the usd stage again",
+    )
+
+
+# ------------------------------------------------------------------ the library's validators
+def _validators() -> list[object]:
+    found: list[object] = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    return found
+
+
+def library(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """UsdValidation. Shader ids of MaterialX are unknown to builds without its node definitions: info, not error. So is
+    a normal map in tiles, which has no single file: `textures` looks for the tiles."""
+    out = []
+    for e in UsdValidation.ValidationContext(_validators()).Validate(stage):
+        kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
+        message, name = " ".join(e.GetMessage().split()), e.GetIdentifier()
+        known = (MISSING_ID in name and "'ND_" in message) or (UNRESOLVED in name and tile_checks.is_tiled(message))
+        level = "info" if known or kind == "info" else "warning" if kind.startswith("warn") else "error"
+        where = ", ".join(str(s.GetPrim().GetPath()) for s in e.GetSites() if s.IsPrim())
+        out.append(Finding(level, name, message, where))  # type: ignore[arg-type]
+    return out
+
+
+# ------------------------------------------------------------------ layers
+def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """Default prim, kind, asset info; units and axis on every layer, so that each can be opened by itself."""
+    out = []
+    prim = stage.GetDefaultPrim()
+    if not prim:
+        out.append(Finding("error", "defaultPrim", "not set, or no such prim", path.name))
+    else:
+        model, where = Usd.ModelAPI(prim), str(prim.GetPath())
+        if model.GetKind() != "component":
+            out.append(Finding("error", "kind", f"'{model.GetKind()}' where component is expected", where))
+        if not model.GetAssetName():
+            out.append(Finding("warning", "assetInfo", "no name", where))
+        stray = [str(p.GetPath()) for p in stage.GetPseudoRoot().GetChildren() if p != prim and not p.IsAbstract()]
+        if stray:
+            out.append(Finding("warning", "defaultPrim", f"root prims that a reference would lose: {stray}", where))
+    for layer in stage.GetUsedLayers():
+        if layer.anonymous:
+            continue
+        name = Path(layer.realPath or layer.identifier).name
+        missing = [k for k in ("metersPerUnit", "upAxis") if not layer.pseudoRoot.HasInfo(k)]
+        out += [Finding("error", k, "not authored in this layer", name) for k in missing]
+        if "upAxis" not in missing and layer.pseudoRoot.GetInfo("upAxis") != "Y":
+            out.append(Finding("error", "upAxis", f"{layer.pseudoRoot.GetInfo('upAxis')} where Y is expected", name))
+        if "metersPerUnit" not in missing and layer.pseudoRoot.GetInfo("metersPerUnit") != 1:
+            value = layer.pseudoRoot.GetInfo("metersPerUnit")
+            out.append(Finding("error", "metersPerUnit", f"{value} where 1 is expected", name))
+    return out
+
+
+def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """Every path relative and inside the asset's folder; every file that is named there."""
+    layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(path), _but_tiles)
+    out = [Finding("error", "missing_file", "does not resolve", _shown(str(u), path)) for u in unresolved]
+    for layer in layers:
+        copy, name = Sdf.Layer.CreateAnonymous(), Path(layer.realPath or layer.identifier).name
+        copy.TransferContent(layer)
+        seen: list[str] = []
+        UsdUtils.ModifyAssetPaths(copy, lambda p, seen=seen: seen.append(p) or p)
+        for p in dict.fromkeys(seen):
+            if ABSOLUTE.match(p):
+                out.append(Finding("error", "absolute_path", p, name))
+            elif os.path.normpath(p).startswith(".."):
+                out.append(Finding("error", "path_outside", f"{p} leaves the asset's folder", name))
+    return out
+
+
+def _but_tiles(layer: Sdf.Layer, found: UsdUtils.DependencyInfo) -> UsdUtils.DependencyInfo:
+    """Rows of tiles are looked at by `textures`; the library would complain of each aloud, though it finds them."""
+    return UsdUtils.DependencyInfo() if tile_checks.is_tiled(found.assetPath) else found
+
+
+def _shown(text: str, path: Path) -> str:
+    """A path as the user knows it: from the asset's folder on."""
+    return text.removeprefix(f"{path.resolve().parent}/").removeprefix(f"{path.parent}/")
+
+
+# ------------------------------------------------------------------ geometry
+def meshes(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """Topology, extent, normals and primvars of every mesh."""
+    found = [UsdGeom.Mesh(p) for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+    if not found:
+        return [Finding("error", "mesh", "the asset has no mesh", path.name)]
+    return [f for m in found for f in mesh_findings(m)]
+
+
+# ------------------------------------------------------------------ materials
+def materials(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """Bindings, connections, colour spaces and MaterialX networks."""
+    return [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage)]
+
+
+def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """The same in every other variant of the default prim, as far as it differs. The stage is left as it was."""
+    prim, out = stage.GetDefaultPrim(), []
+    known = materialx_surfaces(stage)
+    for name in prim.GetVariantSets().GetNames() if prim else ():
+        selected = prim.GetVariantSet(name)
+        chosen = selected.GetVariantSelection()
+        for variant in selected.GetVariantNames():
+            if variant == chosen:
+                continue
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                selected.SetVariantSelection(variant)
+            found = [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage, known)]
+            if not any(p.IsA(UsdGeom.Mesh) for p in stage.Traverse()):
+                found.append(Finding("error", "mesh", "no mesh is left", path.name))
+            known |= materialx_surfaces(stage)
+            out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found if f.level != "info"]
+            with Usd.EditContext(stage, stage.GetSessionLayer()):
+                selected.ClearVariantSelection()
+    return out
+
+
+def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """Every image resolves, decodes and holds no NaN; of one in tiles, every tile that the meshes need."""
+    out: list[Finding] = []
+    done: set[str] = set()
+    wanted = tile_checks.needed(stage)
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        for attribute in prim.GetAttributes():
+            value = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
+            if value is None or not value.path.lower().endswith(IMAGES):
+                continue
+            where = str(attribute.GetPath())
+            if tile_checks.is_tiled(value.path):
+                if value.path not in done:
+                    done.add(value.path)
+                    out += _tiles(value.path, tile_checks.tile_files(value.path, stage, attribute), wanted, where)
+            elif not value.resolvedPath:
+                out.append(Finding("error", "missing_texture", f"{value.path} does not resolve", where))
+            elif value.resolvedPath not in done:
+                done.add(value.resolvedPath)
+                fault = _image_fault(value.resolvedPath)
+                if fault:
+                    out.append(Finding("error", "unreadable_texture", f"{value.path}: {fault}", where))
+    return out
+
+
+def _tiles(path: str, files: dict[str, str], wanted: set[str], where: str) -> list[Finding]:
+    """A texture in tiles: each decodes, none is missing, all are of one size."""
+    out, sizes = [], set()
+    for number, file in sorted(files.items()):
+        seen: list[tuple[int, ...]] = []
+        fault = _image_fault(file, seen)
+        sizes |= set(seen)
+        if fault:
+            named = tile_checks.named(path, number)
+            out.append(Finding("error", "unreadable_texture", f"{named}: {fault}", where))
+    return out + tile_checks.tile_findings(path, files, wanted, sizes, where)
+
+
+def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> str:
+    """What is wrong with an image, or "". Its size is added to `sizes`."""
+    import numpy as np
+
+    from pipeline.images import MAX_BYTES, read_encoded, read_exr
+
+    member = re.fullmatch(r"(.*\.usdz)\[(.*)\]", resolved)
+    try:
+        if member:
+            with zipfile.ZipFile(member[1]) as z, tempfile.TemporaryDirectory() as scratch:
+                if z.getinfo(member[2]).file_size > MAX_BYTES:  # a package from outside may hold a bomb
+                    return f"is larger than {MAX_BYTES / 1e9:.0f} GB"
+                copy = Path(scratch) / Path(member[2]).name
+                copy.write_bytes(z.read(member[2]))
+                return _image_fault(str(copy), sizes)
+        path = Path(resolved)
+        image = read_exr(path)[0] if path.suffix.lower() == ".exr" else read_encoded(path)
+    except StageError as e:
+        return str(e.value)
+    except (OSError, KeyError, RuntimeError, ValueError, zipfile.BadZipFile) as e:  # OpenEXR raises RuntimeError
+        return f"can't be decoded: {e}"
+    if sizes is not None:
+        sizes.append(image.shape[1::-1])
+    return "" if np.isfinite(image).all() else "holds values that are not finite"
+
+
+# ------------------------------------------------------------------ package
+def package(stage: Usd.Stage, path: Path) -> list[Finding]:
+    """A .usdz: layer first, nothing compressed, data at multiples of 64 bytes, no light (AR viewers refuse it)."""
+    if path.suffix.lower() != ".usdz":
+        return []
+    out = []
+    with zipfile.ZipFile(path) as z, path.open("rb") as f:
+        members = z.infolist()
+        if not members[0].filename.lower().endswith((".usd", ".usda", ".usdc")):
+            out.append(Finding("error", "usdz", "the first file is no USD layer", members[0].filename))
+        for m in members:
+            f.seek(m.header_offset + 26)
+            name, extra = struct.unpack("<HH", f.read(4))
+            if (m.header_offset + 30 + name + extra) % 64 or m.compress_type:
+                out.append(Finding("error", "usdz", "compressed, or not at a multiple of 64 bytes", m.filename))
+        broken = z.testzip()
+        if broken:
+            out.append(Finding("error", "usdz", "damaged", broken))
+    lights = [p for p in stage.Traverse() if "Light" in p.GetTypeName()]
+    return out + [Finding("error", "usdz", "a light in a preview package", str(p.GetPath())) for p in lights]
+
+
+CHECKS: tuple[Callable[[Usd.Stage, Path], list[Finding]], ...] = (
+    library,
+    metadata,
+    paths,
+    meshes,
+    materials,
+    textures,
+    variants,
+    package,
+)

@@ -1,0 +1,1 @@
+"""A CPU renderer of the exported files."""

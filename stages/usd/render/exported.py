@@ -1,0 +1,197 @@
+"""Reads an exported asset back: mesh from the USD file, maps and light from the files beside it.
+
+The renderer works on this, so that what it shows is what was handed out, not what an earlier stage held in memory.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline import tiles
+from pipeline.errors import StageError
+from pipeline.images import read_encoded, read_exr
+from stages.usd.render.camera import View
+from stages.usd.write.light import read_light
+from stages.usd.write.mesh import UvSurface, tile_count
+
+F32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedAsset:
+    """Everything that the model's equations need. Maps of several tiles lie side by side: W = tiles H.
+
+    albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) the share of the captured light that arrives, so that
+    albedo * occlusion is the fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
+    normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
+    light ((L + 1)^2, 3).
+    """
+
+    mesh: UvSurface
+    albedo: F32
+    coefficients: F32
+    inv_kappa: F32
+    normal: F32 | None
+    basis: F32
+    light: F32
+    attenuation: str
+    occlusion: F32 | None = None
+    tiles: int = 1
+
+
+def load_exported(root: Path) -> ExportedAsset:
+    """From NAME.usd (with payload.usdc, textures/ and light.json beside it). StageError names what is missing."""
+    import json
+
+    folder, name = root.parent, root.stem
+    light_file = folder / "light.json"
+    light = read_light(light_file)
+    attenuation = str(json.loads(light_file.read_text()).get("attenuation", "exponential"))
+    mesh = read_usd_mesh(root)
+    count = tile_count(mesh)
+    albedo, inv_kappa = (_map(folder, name, m, count) for m in ("albedo", "inv_kappa"))
+    coefficients = np.concatenate([numbered(f) for f in _files(folder, name, "specular_coefficients", count)], 1)
+    basis = numbered(_files(folder, name, "basis_lut")[0]).mean(0)
+    if coefficients.shape[2] != basis.shape[1]:
+        raise StageError(
+            "the specular maps do not fit each other",
+            where=f"{name}_specular_coefficients.exr",
+            value=f"{coefficients.shape[2]} coefficients",
+            limit=f"{basis.shape[1]} bases in basis_lut.exr",
+            remedy="run the bake stage again",
+        )
+    return ExportedAsset(
+        mesh,
+        albedo[..., :3],
+        coefficients,
+        inv_kappa[..., :1],
+        _normal(folder, name, count),
+        basis,
+        light,
+        attenuation,
+        _occlusion(folder, name, count),
+        count,
+    )
+
+
+def _map(folder: Path, name: str, which: str, count: int) -> F32:
+    read = [read_exr(f)[0] for f in _files(folder, name, which, count)]
+    return read[0] if count == 1 else np.concatenate(read, 1)
+
+
+def _files(folder: Path, name: str, which: str, count: int = 1) -> list[Path]:
+    """A map's file for each tile, all of them there."""
+    paths = _paths(folder, name, which, "exr", count)
+    for path in paths:
+        if not path.is_file():
+            raise StageError(
+                "a map of the asset is missing",
+                where=path.name,
+                value="no such file",
+                limit="the maps that the usd stage wrote",
+                remedy="keep the asset's folder together",
+            )
+    return paths
+
+
+def _paths(folder: Path, name: str, which: str, kind: str, count: int) -> list[Path]:
+    return [folder / "textures" / f"{name}_{which}.{tiles.form(kind, t, count)}" for t in range(count)]
+
+
+def numbered(path: Path) -> F32:
+    """A map whose channels are numbered, in the order of the numbers ("c10" after "c9")."""
+    values, names = read_exr(path)
+    if all(re.search(r"\d+$", n) for n in names):
+        values = values[..., np.argsort([int(re.findall(r"\d+", n)[-1]) for n in names])]
+    return values
+
+
+def _occlusion(folder: Path, name: str, count: int) -> F32 | None:
+    """What the export divided out of the albedo, or the same as the fit modelled it (pipeline.fields.shadowing)."""
+    for which in ("occlusion", "irradiance_ratio"):
+        if _paths(folder, name, which, "exr", count)[0].is_file():
+            return _map(folder, name, which, count)[..., :3]
+    return None
+
+
+def _normal(folder: Path, name: str, count: int) -> F32 | None:
+    """From the PNG that the shader network reads: stored as (n + 1) / 2."""
+    paths = _paths(folder, name, "normal", "png", count)
+    if not paths[0].is_file():
+        return None
+    stored = np.concatenate([read_encoded(p)[..., :3] for p in paths], 1)
+    n = stored.astype(np.float32) / (255 if stored.dtype == np.uint8 else 65535) * 2 - 1
+    return np.asarray(n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6), np.float32)
+
+
+def read_usd_mesh(path: Path) -> UvSurface:
+    """The mesh that is rendered (purpose default or render)."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if prim.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(prim).ComputePurpose() in ("default", "render"):
+            mesh, st = UsdGeom.Mesh(prim), UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
+            return UvSurface(
+                np.array(mesh.GetPointsAttr().Get(), np.float32),
+                np.array(mesh.GetNormalsAttr().Get(), np.float32),
+                np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32).reshape(-1, 3),
+                np.array(st.Get(), np.float32),
+                np.array(st.GetIndices(), np.int32).reshape(-1, 3),
+            )
+    raise StageError(
+        "the asset has no mesh to render",
+        where=path.name,
+        value="none of purpose default or render",
+        limit="one",
+        remedy="run the usd stage again",
+    )
+
+
+def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
+    """The captured cameras of lookdev.usda by their photos' index, and whether the photo was held out.
+
+    The inverse of stages.usd.write.lookdev: K from apertures and offsets, the lens distortion from the metadata.
+    """
+    from pxr import Usd, UsdGeom
+
+    from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM
+
+    if not lookdev.is_file():
+        raise StageError(
+            "the asset's cameras are missing",
+            where=lookdev.name,
+            value="no such file",
+            limit="lookdev.usda beside the asset",
+            remedy="keep the asset's folder together, or give --cameras params.json",
+        )
+    stage = Usd.Stage.Open(str(lookdev))
+    out = {}
+    for prim in stage.Traverse():
+        metadata = prim.GetCustomDataByKey("capture") or {}
+        if not prim.IsA(UsdGeom.Camera) or not prim.GetName().startswith("view_"):
+            continue
+        camera = UsdGeom.Camera(prim)
+        width, height = int(metadata["width"]), int(metadata["height"])
+        focal, across, down, shift_x, shift_y = (
+            float(a.Get())
+            for a in (
+                camera.GetFocalLengthAttr(),
+                camera.GetHorizontalApertureAttr(),
+                camera.GetVerticalApertureAttr(),
+                camera.GetHorizontalApertureOffsetAttr(),
+                camera.GetVerticalApertureOffsetAttr(),
+            )
+        )
+        fx, fy = width * focal / across, height * focal / down
+        K = np.array([[fx, 0, width / 2 - shift_x * fx / focal], [0, fy, height / 2 + shift_y * fy / focal], [0, 0, 1]])
+        pose = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
+        distortion = np.array([float(x) for x in metadata["distortion_k1_k2_p1_p2_k3"].split()])
+        view = View(K, pose @ USD_CAM_FROM_OPENCV_CAM, width, height, distortion)
+        out[int(prim.GetName().removeprefix("view_"))] = (view, bool(metadata["heldOut"]))
+    return out

@@ -1,0 +1,116 @@
+"""Pictures of the exported asset: the held-out views, and its shape and look from three sides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from pipeline.artifacts import UNCHANGED, Camera, CameraSet, FittedFace, HeldOutView
+from pipeline.colour import as_photographed, srgb_from_linear
+from pipeline.contract import Context
+from pipeline.images import write_exr, write_png
+from pipeline.transforms import matrix
+from stages.usd.render.camera import View, orbit_view
+from stages.usd.render.exported import load_exported
+from stages.usd.render.render import Renderer
+
+F32 = npt.NDArray[np.float32]
+FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side
+SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
+THUMBNAIL_SIDE, THUMBNAIL_TURN = 256, 25.0  # pixels, degrees
+GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
+"""A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape alone."""
+
+
+def view_of(camera: Camera) -> View:
+    """A manifest's camera for the renderer."""
+    return View(
+        matrix(camera.K),
+        matrix(camera.world_from_cam),
+        camera.width,
+        camera.height,
+        np.asarray(camera.distortion, np.float64),
+    )
+
+
+def render_held_out(
+    root: Path, cameras: CameraSet, face: FittedFace, samples: int, context: Context
+) -> tuple[HeldOutView, ...]:
+    """asset_views/I.exr and .png for each view that the fit predicted: at its scale, in the colours of its camera.
+
+    With no held-out view, of a few fitted ones instead, so that there is something to look at.
+    """
+    by_index = {c.index: c for c in cameras.cameras}
+    wanted = [(v.index, v.scale) for v in face.held_out if v.index in by_index]
+    wanted = wanted or [(i, factor_for(by_index[i])) for i in spread(face.fitted_views, FITTED_SHOWN) if i in by_index]
+    if not wanted:
+        return ()
+    renderer = Renderer(load_exported(root))
+    responses, out = {v.index: v.response for v in face.held_out}, []
+    for number, (index, scale) in enumerate(wanted):
+        context.check()
+        context.progress(number, len(wanted), f"asset view {index}")
+        response = responses.get(index, UNCHANGED)
+        rgba = as_photographed(renderer.render(view_of(by_index[index]), factor=scale, samples=samples), response)
+        exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
+        write_exr(exr, rgba)
+        write_rgba_png(png, rgba)
+        files = {"exr": context.file(exr), "png": context.file(png)}
+        out.append(HeldOutView(index=index, **files, scale=scale, response=response))
+    return tuple(out)
+
+
+def spread(items: tuple[int, ...], count: int) -> list[int]:
+    """At most `count` of the items, evenly spread."""
+    picks = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
+    return [items[i] for i in picks]
+
+
+def factor_for(camera: Camera) -> int:
+    """The smallest block of photo pixels that divides the photo and brings its longest side to FITTED_SIDE."""
+    longest = max(camera.width, camera.height)
+    fits = [
+        f
+        for f in range(1, longest + 1)
+        if camera.width % f == 0 and camera.height % f == 0 and longest <= f * FITTED_SIDE
+    ]
+    return fits[0] if fits and min(camera.width, camera.height) // fits[0] >= 64 else 1
+
+
+def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
+    """SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
+    renderer = Renderer(load_exported(root))
+    written = []
+    for side, degrees in SIDES.items():
+        view = framing(renderer, np.radians(degrees), size)
+        for name, options in ((side, {}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
+            check()
+            written.append(folder / f"{name}.png")
+            write_rgba_png(written[-1], renderer.render(view, **options))  # type: ignore[arg-type]
+    return written
+
+
+def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
+    """The head from slightly beside the front, under the captured light."""
+    check()
+    renderer = Renderer(load_exported(root))
+    view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
+    write_rgba_png(path.resolve(), renderer.render(view))
+    return path.resolve()
+
+
+def framing(renderer: Renderer, azimuth: float, size: int) -> View:
+    """A square view of the whole asset from `azimuth` (radians from +Z towards +X)."""
+    vertices = renderer.asset.mesh.vertices
+    centre = (vertices.min(0) + vertices.max(0)).astype(np.float64) / 2
+    return orbit_view(float(np.linalg.norm(vertices - centre, axis=1).max()), azimuth, size, centre)
+
+
+def write_rgba_png(path: Path, rgba: F32) -> None:
+    """8-bit sRGB with straight alpha, as PNG defines it, from linear premultiplied RGBA."""
+    alpha = rgba[..., 3:].clip(0, 1)
+    straight = np.where(alpha > 0, rgba[..., :3] / np.maximum(alpha, 1e-6), 0).clip(0, 1)
+    write_png(path, np.concatenate([srgb_from_linear(straight), alpha], -1))

@@ -1,0 +1,220 @@
+"""The component's layers: root, payload, and the single layer of the preview package.
+
+Structure (ASWF asset-structure guidelines): root = Xform of kind component with assetInfo and a class to inherit;
+payload = geo/render, geo/proxy and mtl; high.usdc = the dense mesh, loaded where asked for. One material has three
+ways to the same look (write/shading.py, write/materialx.py); the variant sets `look` and `lod` on the root choose
+among them, and among the meshes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
+
+from pipeline import tiles
+from stages.usd.write.materialx import materialx_networks
+from stages.usd.write.mesh import UvSurface, on_tile, tile_count
+from stages.usd.write.shading import MATERIAL, Look, preview_networks
+
+STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
+HIGH, RENDER, PROXY = "high", "render", "proxy"
+HIGH_FILE = "high.usdc"
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who and what the asset is. Only `name` and `version` are ours; the rest is what the user said, or nothing."""
+
+    name: str
+    version: str
+    author: str = ""
+    license: str = ""
+    subject_consent: str = ""
+
+    def stated(self) -> dict[str, str]:
+        """What the user said, by the names under which it is recorded."""
+        metadata = {"author": self.author, "license": self.license, "subjectConsent": self.subject_consent}
+        return {k: v for k, v in metadata.items() if v}
+
+
+def new_stage(comment: str, default: str) -> Usd.Stage:
+    """A stage in memory with units, axis and default prim authored on its root layer. Nothing is loaded into it."""
+    stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, f"/{default}").GetPrim())
+    stage.GetRootLayer().documentation = comment
+    return stage
+
+
+def detached(stage: Usd.Stage) -> Sdf.Layer:
+    """The root layer's content as a layer that outlives the stage and composes nothing."""
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.TransferContent(stage.GetRootLayer())
+    return layer
+
+
+def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
+    """Kind, asset info and the class that lets a scene restyle every instance at once."""
+    prim = stage.GetDefaultPrim()
+    stage.CreateClassPrim(f"/_class_{who.name}")
+    prim.GetInherits().AddInherit(f"/_class_{who.name}")
+    model = Usd.ModelAPI(prim)
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(who.name)
+    model.SetAssetVersion(who.version)
+    if who.stated():
+        prim.SetAssetInfoByKey("capture", who.stated())
+        stage.GetRootLayer().customLayerData = {"capture": who.stated()}
+    stage.GetRootLayer().comment = "Made by NeuFace Asset."
+    return prim
+
+
+def root_layer(
+    who: Identity, extents: list[Gf.Vec3f], look: Look, *, high: bool, proxy: bool, thumbnail: str | None
+) -> Sdf.Layer:
+    """NAME.usd: the file that others reference. `extents`: the box of each purpose present, for display unloaded."""
+    stage = new_stage(
+        "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
+    )
+    prim = _as_component(stage, who)
+    Usd.ModelAPI(prim).SetAssetIdentifier(Sdf.AssetPath(f"./{who.name}.usd"))
+    prim.GetPayloads().AddPayload("./payload.usdc")
+    UsdGeom.ModelAPI.Apply(prim).SetExtentsHint(Vt.Vec3fArray(extents))
+    if thumbnail:
+        previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
+        previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
+    _looks(stage, prim, look)
+    _levels(stage, prim, high=high, proxy=proxy)
+    return detached(stage)
+
+
+def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
+    """`look`: which network of the material is its surface. Each variant holds only what differs, so that the payload
+    alone is what the first one shows."""
+    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
+    outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
+    if not look.specular:
+        del outputs[SPECULAR]
+    if look.coefficients and look.inv_kappa and look.roughness:
+        outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
+    looks = prim.GetVariantSets().AddVariantSet("look")
+    for variant, connections in outputs.items():
+        looks.AddVariant(variant)
+        looks.SetVariantSelection(variant)
+        with looks.GetVariantEditContext():
+            for output, source in connections.items():
+                over = stage.OverridePrim(material)
+                attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
+                attribute.SetConnections([material.AppendPath(source)])
+    looks.SetVariantSelection(STANDARD)
+
+
+def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> None:
+    """`lod`: the mesh that is textured (with its proxy), the dense mesh alone, or the proxy alone."""
+    path = prim.GetPath()
+    lods = prim.GetVariantSets().AddVariantSet("lod")
+    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
+        if not made:
+            continue
+        lods.AddVariant(variant)
+        lods.SetVariantSelection(variant)
+        if variant == RENDER:
+            continue
+        with lods.GetVariantEditContext():
+            stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
+            if variant == HIGH:
+                if proxy:
+                    stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
+                dense = stage.OverridePrim(path.AppendPath("geo/high"))
+                dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
+                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
+                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
+            else:
+                shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
+                purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
+                purpose.Set(UsdGeom.Tokens.default_)
+    lods.SetVariantSelection(RENDER)
+
+
+def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
+    """payload.usdc: what is heavy. With a proxy the full mesh has purpose render, else it is shown always."""
+    stage = new_stage("Geometry and material of the captured head.", name)
+    _fill(stage, name, mesh, proxy, look)
+    return detached(stage)
+
+
+def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
+    """high.usdc: the dense mesh as /high. It is bound to the material where it is loaded."""
+    stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    made = _mesh(stage, "/high", mesh, None)
+    made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    stage.SetDefaultPrim(made.GetPrim())
+    stage.GetRootLayer().documentation = "The captured head's surface before decimation."
+    return detached(stage)
+
+
+def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
+    """The one layer of NAME.usdz. No proxy: viewers on phones show every purpose at once. Of several tiles each is a
+    mesh with a material of its own, its st in the unit square: those viewers know no <UDIM>."""
+    stage = new_stage("Preview of the captured head.", who.name)
+    _as_component(stage, who)
+    count = tile_count(mesh)
+    if count == 1:
+        _fill(stage, who.name, mesh, None, look)
+    else:
+        for folder in ("geo", "mtl"):
+            UsdGeom.Scope.Define(stage, f"/{who.name}/{folder}")
+        for t in range(count):
+            number = tiles.FIRST + t
+            material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
+            preview_networks(stage, material, look.on_tile(t))
+            _mesh(stage, f"/{who.name}/geo/render_{number}", on_tile(mesh, t, count), material)
+    return detached(stage)
+
+
+def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> None:
+    UsdGeom.Scope.Define(stage, f"/{name}/geo")
+    UsdGeom.Scope.Define(stage, f"/{name}/mtl")
+    material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
+    preview_networks(stage, material, look)
+    materialx_networks(stage, material, look)
+    render = _mesh(stage, f"/{name}/geo/render", mesh, material)
+    render.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    if proxy is not None:
+        stand_in = _mesh(stage, f"/{name}/geo/proxy", proxy, material)
+        stand_in.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+        stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
+        render.CreatePurposeAttr(UsdGeom.Tokens.render)
+        render.SetProxyPrim(stand_in)
+
+
+def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:
+    """A triangle mesh. Vertices without a face are left out; normals are made unit length."""
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    uv_used, uv_faces = np.unique(mesh.uv_faces, return_inverse=True)
+    points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices[used], np.float32))
+    normals = mesh.normals[used].astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    out = UsdGeom.Mesh.Define(stage, path)
+    out.CreatePointsAttr(points)
+    out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    out.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.ravel(), np.int32)))
+    out.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
+    out.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    out.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    out.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+    out.CreateDoubleSidedAttr(False)
+    out.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
+    st = UsdGeom.PrimvarsAPI(out).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
+    # xatlas may put a border vertex a rounding error outside of the square
+    kept = mesh.uvs[uv_used].clip(0, [tile_count(mesh), 1])
+    st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(kept, np.float32)))
+    st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))
+    if material is not None:
+        UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
+    return out

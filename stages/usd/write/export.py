@@ -1,0 +1,165 @@
+"""Writes every file of the asset into one folder."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from pxr import Gf, Sdf
+
+from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, Surface, TextureSet, UvMesh
+from pipeline.errors import StageError
+from pipeline.images import write_exr
+from stages.usd.config import Config
+from stages.usd.write import component
+from stages.usd.write.gltf import write_glb
+from stages.usd.write.light import environment, environment_figures, light_json, read_light
+from stages.usd.write.lookdev import lookdev_layer
+from stages.usd.write.maps import write_maps
+from stages.usd.write.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap
+from stages.usd.write.obj import write_obj
+from stages.usd.write.package import bounded_png, write_package
+from stages.usd.write.shading import Look
+
+NEAR_HIGH = 4  # triangles looked at for each of the dense mesh, which is finer than what it lies on
+THUMBNAIL = "./thumbnails/default.png"  # made by the stage once there is something to render
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """The files written, notes on what was left out, and for the report: figures, and what the user stated."""
+
+    written: list[Path]
+    notes: list[str]
+    figures: dict[str, float]
+    stated: dict[str, str]
+
+
+def export(
+    surface: Located[Surface],
+    uv: Located[UvMesh],
+    bake: Located[TextureSet],
+    face: Located[FittedFace],
+    poses: Located[CameraSet],
+    capture: Located[Capture],
+    config: Config,
+    folder: Path,
+    check: Callable[[], None],
+) -> Export:
+    """Write all but the thumbnail, which has to be rendered from what is written here."""
+    name = config.name
+    mesh = read_mesh(uv.path(uv.artifact.mesh))
+    proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
+    high, left_out = _high(surface, mesh) if config.high else (None, [])
+    notes += left_out
+    check()
+    light = read_light(face.path(face.artifact.light))
+    maps = write_maps(bake, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    written, look = maps.written, maps.look
+    who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
+    boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
+    hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
+    holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
+    cameras = tuple(sorted(poses.artifact.cameras, key=lambda c: c.index))
+    layers = {
+        f"{name}.usd": (
+            component.root_layer(who, hints, look, high=high is not None, proxy=proxy is not None, thumbnail=THUMBNAIL),
+            "usda",
+        ),
+        "payload.usdc": (component.payload_layer(name, mesh, proxy, look), "usdc"),
+        "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
+    }
+    if high is not None:
+        layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
+    for file, (layer, form) in layers.items():
+        write_layer(layer, folder / file, form)
+    dome = environment(light, config.environment_width)
+    write_exr(folder / "environment.exr", dome)
+    figures = maps.figures | environment_figures(light, dome)
+    (folder / "light.json").write_text(light_json(light, attenuation_of(face.artifact)))
+    written += [folder / f for f in (*layers, "environment.exr", "light.json")]
+    check()
+    if config.usdz:
+        # viewers on phones read no MaterialX, and some take any preview surface that they find
+        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
+        single = component.package_layer(who, mesh, plain)
+        written.append(_package(single, folder, name, plain, tile_count(mesh)))
+    if config.glb:
+        written.append(folder / f"{name}.glb")
+        write_glb(written[-1], name, mesh, look, folder, who.stated())
+    if config.obj:
+        written += write_obj(folder, name, mesh, look)
+    check()
+    return Export(written, notes, figures, who.stated())
+
+
+def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
+    """A layer as a file; form: "usda" or "usdc", for the extension .usd, which may hold either.
+
+    Raises:
+        StageError: it can't be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    args = {"format": form} if path.suffix == ".usd" else {}
+    if not layer.Export(str(path), args=args):
+        raise StageError(
+            "a USD layer can't be written",
+            where=path.name,
+            value="the USD library refused",
+            limit="a writable folder",
+            remedy="check the disk's space and permissions",
+        )
+
+
+def _corners(mesh: UvSurface) -> npt.NDArray[np.float64]:
+    points = mesh.vertices[np.unique(mesh.faces)]
+    return np.stack([points.min(0), points.max(0)]).astype(np.float64)
+
+
+def _hints(boxes: list[npt.NDArray[np.float64]]) -> list[npt.NDArray[np.float64]]:
+    """extentsHint holds a box for each purpose in the order default, render, proxy; an unused one is empty."""
+    empty = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
+    return [row for box in (empty, *boxes) for row in box]
+
+
+def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
+    """The coarse mesh with the full mesh's texture coordinates, unless they would be misleading."""
+    if uv.artifact.proxy is None:
+        return None, []
+    proxy = without_overlap(with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh))
+    fault = uv_fault(proxy, mesh)
+    return (None, [f"the proxy mesh was left out: {fault}"]) if fault else (proxy, [])
+
+
+def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
+    """The dense mesh with the textured mesh's coordinates. On seams its corners reach into the gutter."""
+    dense = read_mesh(surface.path(surface.artifact.mesh), with_uvs=False)
+    high = with_uvs_from(dense, mesh, NEAR_HIGH, half_gap(mesh))
+    fault = uv_fault(high, mesh)
+    return (None, [f"the dense mesh was left out: {fault}"]) if fault else (high, [])
+
+
+def attenuation_of(face: FittedFace) -> str:
+    """How the fit attenuated the light's bands; the paper's exponential where its model does not say."""
+    found = [v["attenuation"] for v in face.model.values() if "attenuation" in v]
+    return str(found[0]) if found else "exponential"
+
+
+# ------------------------------------------------------------------ package
+def _package(content: Sdf.Layer, folder: Path, name: str, look: Look, count: int) -> Path:
+    """NAME.usdz: one binary layer and the PNG textures that it reads, of `count` tiles."""
+    with tempfile.TemporaryDirectory() as scratch:
+        layer = Path(scratch) / f"{name}.usdc"
+        write_layer(content, layer, "usdc")
+        members = [(layer.name, layer.read_bytes())]
+    for one in (look.on_tile(t) for t in range(count)):
+        for file in (one.albedo, one.roughness, one.normal):
+            if file:
+                members.append((file.removeprefix("./"), bounded_png(folder / file)))
+    path = folder / f"{name}.usdz"
+    write_package(path, members)
+    return path

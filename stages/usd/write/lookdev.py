@@ -1,0 +1,100 @@
+"""lookdev.usda: the component under its captured light, seen by its captured cameras.
+
+The rig is added to the component's own prim in a stronger layer (the component is sublayered, not referenced), so
+that the file has one root prim and references cleanly, while NAME.usd itself stays free of lights and cameras.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender
+
+from pipeline.artifacts import Camera
+from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM, matrix
+from stages.usd.write.component import detached
+
+MAIN_CAMERA = "main_cam"
+SENSOR_WIDTH = (
+    0.36  # USD measures apertures in tenths of the scene's unit: 36 mm; only its ratio to focal length counts
+)
+
+
+def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int], radius: float) -> Sdf.Layer:
+    """`radius`: of the region of interest around the origin, for clipping ranges."""
+    stage = Usd.Stage.CreateInMemory()
+    layer = stage.GetRootLayer()
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    layer.defaultPrim = name
+    layer.documentation = (
+        "The captured head under its captured light, with the photos' cameras (without lens distortion)."
+    )
+    stage.OverridePrim(f"/{name}")
+    UsdGeom.Scope.Define(stage, f"/{name}/lookdev")
+    dome = UsdLux.DomeLight.Define(stage, f"/{name}/lookdev/captured_light")
+    dome.CreateTextureFileAttr(Sdf.AssetPath("./environment.exr"))
+    dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
+    dome.CreateIntensityAttr(1.0)
+    dome.CreateColorAttr(Gf.Vec3f(1, 1, 1))
+    UsdGeom.Scope.Define(stage, f"/{name}/lookdev/cameras")
+    for camera in cameras:
+        _camera(stage, f"/{name}/lookdev/cameras/view_{camera.index}", camera, camera.index in holdout, radius)
+    _shown_first(stage, name, cameras, holdout)
+    out = detached(stage)
+    out.subLayerPaths.append(f"./{name}.usd")  # only now: on a stage it would be looked for in the working folder
+    return out
+
+
+def _shown_first(stage: Usd.Stage, name: str, cameras: tuple[Camera, ...], holdout: frozenset[int]) -> None:
+    """What opens first: the held-out photo taken most from the front (with none held out, any photo).
+
+    Viewers disagree on how a file says so: usdview takes a camera called main_cam, others the layer's cameraSettings,
+    renderers the stage's render settings.
+    """
+    if not cameras:
+        return
+    of = [c for c in cameras if c.index in holdout] or list(cameras)
+    first = max(of, key=lambda c: c.world_from_cam[2][3] / np.linalg.norm(np.array(c.world_from_cam)[:3, 3]))
+    main = UsdGeom.Camera.Define(stage, f"/{name}/lookdev/cameras/{MAIN_CAMERA}")
+    main.GetPrim().GetReferences().AddInternalReference(f"/{name}/lookdev/cameras/view_{first.index}")
+    settings = UsdRender.Settings.Define(stage, f"/{name}/lookdev/render_settings")
+    settings.CreateCameraRel().SetTargets([main.GetPath()])
+    settings.CreateResolutionAttr(Gf.Vec2i(first.width, first.height))
+    stage.SetMetadata("renderSettingsPrimPath", str(settings.GetPath()))
+    stage.GetRootLayer().customLayerData = {"cameraSettings": {"boundCamera": str(main.GetPath())}}
+
+
+def _camera(stage: Usd.Stage, path: str, camera: Camera, held_out: bool, radius: float) -> None:
+    """A UsdGeomCamera whose frustum is that of K: fx, fy and principal point; the distortion goes along as metadata.
+
+        horizontalAperture / focalLength = width / fx,   horizontalApertureOffset / focalLength = (width / 2 - cx) / fx
+        verticalAperture / focalLength = height / fy,    verticalApertureOffset / focalLength = (cy - height / 2) / fy
+
+    The vertical signs differ because USD's camera has +y up and the image's rows run down.
+    """
+    K = matrix(camera.K)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    focal = SENSOR_WIDTH * fx / camera.width
+    out = UsdGeom.Camera.Define(stage, path)
+    out.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+    out.CreateFocalLengthAttr(focal)
+    out.CreateHorizontalApertureAttr(SENSOR_WIDTH)
+    out.CreateVerticalApertureAttr(focal * camera.height / fy)
+    out.CreateHorizontalApertureOffsetAttr(focal * (camera.width / 2 - cx) / fx)
+    out.CreateVerticalApertureOffsetAttr(focal * (cy - camera.height / 2) / fy)
+    world_from_cam = matrix(camera.world_from_cam)
+    distance = float(np.linalg.norm(world_from_cam[:3, 3]))
+    near = max(distance - 2 * radius, 0.02 * radius)
+    out.CreateClippingRangeAttr(Gf.Vec2f(near, distance + 4 * radius))
+    usd = world_from_cam @ np.linalg.inv(USD_CAM_FROM_OPENCV_CAM)
+    out.AddTransformOp().Set(Gf.Matrix4d(*usd.T.ravel().tolist()))  # USD multiplies row vectors from the left
+    out.GetPrim().SetCustomDataByKey(
+        "capture",
+        {
+            "photo": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "heldOut": held_out,
+            "distortion_k1_k2_p1_p2_k3": " ".join(f"{x:.9g}" for x in camera.distortion),
+        },
+    )

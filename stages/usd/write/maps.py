@@ -1,0 +1,263 @@
+"""The asset's textures: the baked maps, and what standard shaders need beside them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from pipeline import raster, tiles
+from pipeline.artifacts import Located, TextureSet
+from pipeline.colour import ACESCG, acescg_from_linear
+from pipeline.errors import StageError
+from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
+from pipeline.maths import sh
+from pipeline.meshes import Charts
+from pipeline.nearest import filled
+from stages.usd.render.exported import numbered
+from stages.usd.render.median_cut import lamps
+from stages.usd.render.render import bilinear
+from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
+from stages.usd.write.light import environment
+from stages.usd.write.mesh import UvSurface, on_tile
+from stages.usd.write.shading import Look, ior_from_f0
+from stages.usd.write.transport import BRIGHTEST_ALBEDO, Transport, occlusion
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
+SKIN_F0 = 0.028  # where no F0 was baked
+RAYS = 4_000_000  # about how many are spent on the lamps' visibility
+LAMPS = (96, 384)
+LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
+OCCLUSION_SIZE = 1024  # texels: it varies from vertex to vertex only
+
+
+@dataclass(frozen=True, slots=True)
+class Maps:
+    """Files written, what the material reads of them, and figures for the report."""
+
+    written: list[Path]
+    look: Look
+    figures: dict[str, float]
+
+
+def write_maps(
+    bake: Located[TextureSet],
+    mesh: UvSurface,
+    light: F32,
+    name: str,
+    asset: Path,
+    check: Callable[[], None],
+    *,
+    divide: bool,
+    acescg: bool = False,
+) -> Maps:
+    """Everything in textures/. `divide`: take shadows and bounced light out of the albedo. `acescg`: that albedo in
+    ACEScg too."""
+    folder = asset / "textures"
+    written = copy_maps(bake, name, folder)
+    figures: dict[str, float] = {}
+    if divide and not shadows_fitted(bake):
+        shown, found = divided_albedo(bake, mesh, light, name, folder, check)
+        written += shown
+        figures |= found
+    basis = numbered(bake.path(bake.artifact.maps["basis_lut"].files["exr"])).mean(0)
+    for i, picture in enumerate(in_groups(basis_table(basis))):
+        written.append(folder / f"{name}_basis_rgb{i}.exr")
+        write_exr(written[-1], picture, primaries=None)
+    fits = []
+    for tile in range(bake.artifact.tiles):
+        check()
+        shown, fit = _derived(bake, tile, name, folder, basis, acescg=acescg)
+        written += shown
+        fits += [] if fit is None else [fit]
+    check()
+    return Maps(written, look_of(bake, name, asset), figures | fit_figures(fits))
+
+
+def _derived(
+    bake: Located[TextureSet], tile: int, name: str, folder: Path, basis: F32, *, acescg: bool
+) -> tuple[list[Path], LobeFit | None]:
+    """One tile's maps that are made from others, and how well a GGX lobe serves there."""
+    exr, png = (tiles.form(k, tile, bake.artifact.tiles) for k in ("exr", "png"))
+    written = []
+    if acescg:
+        written.append(folder / f"{name}_albedo_acescg.{exr}")
+        albedo = read_exr(folder / f"{name}_albedo.{exr}")[0][..., :3]
+        write_exr(written[-1], acescg_from_linear(albedo), primaries=ACESCG)
+    coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]))
+    for i, picture in enumerate(in_groups(coefficients)):
+        written.append(folder / f"{name}_coefficients_rgb{i}.{exr}")
+        write_exr(written[-1], picture, primaries=None)
+    if "f0" not in bake.artifact.maps:
+        return written, None
+    f0 = _map(bake, "f0", tile)[..., 0]
+    written.append(folder / f"{name}_specular_color.{png}")
+    write_png_from_linear(written[-1], np.repeat(f0[..., None].clip(0, 1), 3, -1))
+    fit = lobe_fit(coefficients, _map(bake, "inv_kappa", tile)[..., 0], f0, basis, covered_texels(bake, tile))
+    written.append(folder / f"{name}_lobe_fit.{png}")
+    # red: the residual of the GGX lobe, 1 = 100 %; green: 1 where kappa can't be told; blue: nothing
+    write_png(written[-1], np.stack([fit.residual, fit.unresolved, np.zeros_like(fit.residual)], -1))
+    return written, fit
+
+
+def shadows_fitted(bake: Located[TextureSet]) -> bool:
+    """Whether the fit modelled shadows and bounces itself, so that its albedo is free of them."""
+    ratio = bake.artifact.maps.get("irradiance_ratio")
+    return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
+
+
+def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
+    """Every file of every map as NAME_map.format."""
+    count = bake.artifact.tiles
+    wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
+    wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
+    if wanted - {(m, k) for m, texture in bake.artifact.maps.items() for k in texture.files}:
+        raise StageError(
+            "maps are missing",
+            where="bake",
+            value=", ".join(sorted(bake.artifact.maps)) or "no maps",
+            limit=f"{', '.join(NEEDED)} as exr, albedo as png too",
+            remedy="run the bake stage again",
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for which, texture in sorted(bake.artifact.maps.items()):
+        for form, ref in sorted(texture.files.items()):
+            target = folder / f"{name}_{which}.{form}"
+            shutil.copyfile(bake.path(ref), target)
+            written.append(target)
+    return written
+
+
+def divided_albedo(
+    bake: Located[TextureSet], mesh: UvSurface, light: F32, name: str, folder: Path, check: Callable[[], None]
+) -> tuple[list[Path], dict[str, float]]:
+    """albedo without the light's shadows and bounces, over the baked one, and `occlusion`: albedo * occlusion = baked.
+
+    The closed form of the fit has neither, so that the photos' were fitted into the albedo. A path tracer has both:
+    with the albedo as fitted it would show them twice.
+    """
+    count = bake.artifact.tiles
+    share = vertex_occlusion(mesh, light, vertex_albedo(bake, mesh), check)
+    written, shown = [], []
+    for tile in range(count):
+        check()
+        fitted = _map(bake, "albedo", tile)[..., :3]
+        image = vertex_image(on_tile(mesh, tile, count), share, min(len(fitted), OCCLUSION_SIZE))
+        if len(image) != len(fitted):
+            import cv2
+
+            image = np.asarray(cv2.resize(image, fitted.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.float32)
+        albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
+        image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
+        exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
+        write_exr(folder / f"{name}_albedo.{exr}", albedo)
+        write_png_from_linear(folder / f"{name}_albedo.{png}", albedo)
+        written.append(folder / f"{name}_occlusion.{exr}")
+        write_exr(written[-1], image)
+        shown.append(image[covered_texels(bake, tile)][::count])  # as many in all as one tile would have
+    found = np.concatenate(shown)
+    figures = {
+        "occlusion_mean": round(float(found.mean(dtype=np.float64)), 5),
+        "occlusion_p05": round(float(np.percentile(found, 5)), 5),
+    }
+    return written, figures
+
+
+def vertex_albedo(bake: Located[TextureSet], mesh: UvSurface) -> F64:
+    """(V, 3) the baked albedo at the vertices; at a seam, of one of its sides."""
+    uv, count = np.zeros((len(mesh.vertices), 2), np.float32), bake.artifact.tiles
+    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
+    out = np.zeros((len(uv), 3))
+    for tile in range(count):
+        own = np.floor(uv[:, 0]).clip(0, count - 1) == tile
+        out[own] = bilinear(_map(bake, "albedo", tile)[..., :3], uv[own] - np.array([tile, 0], np.float32))
+    return out
+
+
+def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F64, check: Callable[[], None]) -> F64:
+    """(V, 3) see transport.occlusion; albedo (V, 3)."""
+    count = int(np.clip(RAYS // max(len(mesh.vertices), 1), *LAMPS))
+    transport = Transport(mesh.vertices, mesh.normals, mesh.faces)
+    normals = torch.from_numpy(transport.normals.astype(np.float32))
+    unblocked = sh.irradiance(torch.from_numpy(np.asarray(light, np.float32)), normals).numpy().astype(np.float64)
+    lit = lamps(environment(light, LIGHT_WIDTH), count)
+    return occlusion(transport, lit, unblocked, albedo, check)
+
+
+def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
+    """(size, size, C) values (V, C) of the vertices on the texture, every texel filled from the nearest chart."""
+    charts = Charts(mesh.uvs, mesh.uv_faces)
+    hits = raster.rasterise(raster.texel_corners(charts, size), size, 0, size)
+    image = np.zeros((size * size, values.shape[1]), np.float32)
+    corners = values[mesh.faces[hits.face]].astype(np.float32)
+    image[hits.texel] = np.einsum("nic,ni->nc", corners, hits.weights)
+    known = np.zeros(size * size, np.bool_)
+    known[hits.texel] = True
+    return filled(image.reshape(size, size, -1), known.reshape(size, size))
+
+
+# ------------------------------------------------------------------ what the material reads
+def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
+    """The networks' files, and the index of refraction of the mean F0 over covered texels."""
+
+    count = bake.artifact.tiles
+
+    def found(map_name: str, kind: str, of: int = count) -> str | None:
+        first = f"{name}_{map_name}.{tiles.form(kind, 0, of)}"
+        if not (asset / "textures" / first).is_file():
+            return None
+        return f"./textures/{first}" if of == 1 else f"./textures/{name}_{map_name}.{tiles.TOKEN}.{kind}"
+
+    def counted(map_name: str, of: int) -> tuple[str, ...]:
+        return tuple(f for i in range(99) if (f := found(f"{map_name}_rgb{i}", "exr", of)))
+
+    has_f0, texels = "f0" in bake.artifact.maps, 0
+    albedo, f0 = np.zeros(3), 0.0
+    for tile in range(count):
+        covered = covered_texels(bake, tile)
+        texels += int(covered.sum())
+        shown = read_exr(asset / "textures" / f"{name}_albedo.{tiles.form('exr', tile, count)}")[0][..., :3]
+        albedo += shown[covered].sum(0, dtype=np.float64)
+        f0 += float(_map(bake, "f0", tile)[covered].sum(dtype=np.float64)) if has_f0 else 0.0
+    red, green, blue = (round(float(x), 6) for x in albedo / texels)
+    return Look(
+        str(found("albedo", "png")),
+        found("roughness", "png"),
+        found("normal", "png"),
+        round(ior_from_f0(f0 / texels if has_f0 else SKIN_F0), 5),
+        (red, green, blue),
+        specular=found("specular_color", "png"),
+        f0=found("f0", "exr"),
+        inv_kappa=found("inv_kappa", "exr"),
+        coefficients=counted("coefficients", count),
+        basis=counted("basis", 1),
+    )
+
+
+def covered_texels(bake: Located[TextureSet], tile: int = 0) -> Mask:
+    """(H, W) texels that a chart touches, seen by a photo (1) or not (0.5); all where that was not baked."""
+    size, count = bake.artifact.size, bake.artifact.tiles
+    files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
+    exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
+    found: Mask | None = None
+    if exr in files:
+        found = np.asarray(read_exr(bake.path(files[exr]))[0][..., 0] > 0.25)
+    elif png in files:
+        found = np.asarray(read_alpha(bake.path(files[png])) > 0.25)
+    if found is None or found.shape != (size, size) or not found.any():
+        return np.ones((size, size), np.bool_)
+    return found
+
+
+def _map(bake: Located[TextureSet], which: str, tile: int = 0) -> F32:
+    return read_exr(bake.path(bake.artifact.maps[which].files[tiles.form("exr", tile, bake.artifact.tiles)]))[0]

@@ -1,0 +1,131 @@
+"""The material's two networks of stock MaterialX nodes, inline, because importers fail on definitions of our own.
+
+`openpbr`        OpenPBR with albedo, roughness, normal, and F0 as `specular_weight`
+`neuface_basis`  OpenPBR whose specular tint is the learned lobe itself:
+
+    tint = sum_j c_j(x) T_j(n.v, 1/kappa(x)),     T_j = B_j / R of the layer
+
+    viewdirection, normal -> facingratio -> combine2(n.v, 2/kappa) -> image T -> dotproduct(image c) -> specular_color
+
+View direction and normal are connected, not left to defaults: renderers differ in those.
+"""
+
+from __future__ import annotations
+
+from pxr import Sdf, Usd, UsdShade
+
+from pipeline import tiles
+from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0, REFERENCE_IOR
+from stages.usd.write.shading import Look, T, connect, shader
+
+SURFACE = "ND_open_pbr_surface_surfaceshader"
+CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
+SRGB, DATA = "srgb_texture", "raw"
+LARGEST_F0 = 0.16  # of `specular_weight` = 4: a fit gone wrong must not become a mirror
+
+
+class _Nodes:
+    """Authors nodes below one folder of the material, and shares the readers."""
+
+    def __init__(self, stage: Usd.Stage, path: str) -> None:
+        self.stage, self.path = stage, path
+        UsdShade.NodeGraph.Define(stage, path)
+        node = shader(stage, f"{path}/st", "ND_geompropvalue_vector2")
+        node.CreateInput("geomprop", T.String).Set("st")
+        self.st = node.CreateOutput("out", T.Float2)
+
+    def node(self, name: str, identifier: str, out: Sdf.ValueTypeName, **inputs: object) -> UsdShade.Output:
+        """A node; inputs are outputs of other nodes, or (type, value)."""
+        made = shader(self.stage, f"{self.path}/{name}", identifier)
+        for key, value in inputs.items():
+            key = key.rstrip("_")
+            if isinstance(value, UsdShade.Output):
+                connect(made.CreateInput(key, value.GetTypeName()), value)
+            elif isinstance(value, tuple):
+                made.CreateInput(key, value[0]).Set(value[1])
+        return made.CreateOutput("out", out)
+
+    def image(self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str) -> UsdShade.Output:
+        """A picture at st."""
+        return self.image_at(name, kind, out, file, space, self.st)
+
+    def image_at(
+        self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str, at: UsdShade.Output
+    ) -> UsdShade.Output:
+        """A picture at `at`, clamped if it is one and not a row of tiles."""
+        made = shader(self.stage, f"{self.path}/{name}", f"ND_image_{kind}")
+        picture = made.CreateInput("file", T.Asset)
+        picture.Set(Sdf.AssetPath(file))
+        picture.GetAttr().SetColorSpace(space)
+        connect(made.CreateInput("texcoord", T.Float2), at)
+        for axis in "uv" if tiles.TOKEN not in file else "":  # with tiles, clamped would be the whole row
+            made.CreateInput(f"{axis}addressmode", T.String).Set("clamp")
+        return made.CreateOutput("out", out)
+
+
+def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) -> list[str]:
+    """Author what the look's maps allow; the first becomes outputs:mtlx:surface. Hands back the networks' names."""
+    path, made = str(material.GetPath()), []
+    if look.roughness and look.f0:
+        made.append("openpbr")
+        _surface(stage, f"{path}/openpbr", look, basis=False)
+    if look.roughness and look.coefficients and look.inv_kappa:
+        made.append("neuface_basis")
+        _surface(stage, f"{path}/neuface_basis", look, basis=True)
+    if made:
+        prim = material.GetPrim()
+        prim.AddAppliedSchema(CONFIG_SCHEMA)  # no plugin of this schema in all builds: ApplyAPI would refuse
+        prim.CreateAttribute("config:mtlx:version", T.String, False, Sdf.VariabilityUniform).Set(VERSION)
+        output = UsdShade.Shader.Get(stage, f"{path}/{made[0]}/surface").ConnectableAPI()
+        material.CreateSurfaceOutput("mtlx").ConnectToSource(output, "out")
+    return made
+
+
+def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
+    nodes = _Nodes(stage, path)
+    surface = shader(stage, f"{path}/surface", SURFACE)
+    surface.CreateInput("base_weight", T.Float).Set(1.0)
+    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, look.albedo, SRGB))
+    roughness = nodes.image("roughness", "float", T.Float, str(look.roughness), DATA)
+    connect(surface.CreateInput("specular_roughness", T.Float), roughness)
+    surface.CreateInput("specular_ior", T.Float).Set(REFERENCE_IOR)
+    normal = _normal(nodes, look)
+    connect(surface.CreateInput("geometry_normal", T.Float3), normal)
+    if basis:
+        surface.CreateInput("specular_weight", T.Float).Set(1.0)
+        connect(surface.CreateInput("specular_color", T.Color3f), _tint(nodes, look, normal))
+    else:
+        f0 = nodes.image("f0", "float", T.Float, str(look.f0), DATA)
+        bounded = nodes.node("f0_bounded", "ND_clamp_float", T.Float, **{"in": f0, "high": (T.Float, LARGEST_F0)})
+        weight = nodes.node(
+            "weight", "ND_multiply_float", T.Float, in1=bounded, in2=(T.Float, round(1 / REFERENCE_F0, 6))
+        )
+        connect(surface.CreateInput("specular_weight", T.Float), weight)
+    surface.CreateOutput("out", T.Token)
+
+
+def _normal(nodes: _Nodes, look: Look) -> UsdShade.Output:
+    smooth = nodes.node("mesh_normal", "ND_normal_vector3", T.Float3, space=(T.String, "world"))
+    if not look.normal:
+        return smooth
+    stored = nodes.image("normal", "vector3", T.Float3, look.normal, DATA)
+    tangent = nodes.node("tangent", "ND_tangent_vector3", T.Float3, space=(T.String, "world"))
+    return nodes.node(
+        "bent_normal", "ND_normalmap_float", T.Float3, **{"in": stored, "normal": smooth, "tangent": tangent}
+    )
+
+
+def _tint(nodes: _Nodes, look: Look, normal: UsdShade.Output) -> UsdShade.Output:
+    view = nodes.node("view", "ND_viewdirection_vector3", T.Float3, space=(T.String, "world"))
+    cosine = nodes.node("cosine", "ND_facingratio_float", T.Float, viewdirection=view, normal=normal)
+    inv_kappa = nodes.image("inv_kappa", "float", T.Float, str(look.inv_kappa), DATA)
+    row = nodes.node("row", "ND_multiply_float", T.Float, in1=inv_kappa, in2=(T.Float, INV_KAPPA_SCALE))
+    at = nodes.node("place", "ND_combine2_vector2", T.Float2, in1=cosine, in2=row)
+    total: UsdShade.Output | None = None
+    for i, (c, b) in enumerate(zip(look.coefficients, look.basis, strict=True)):
+        coefficients = nodes.image(f"coefficients_{i}", "vector3", T.Float3, c, DATA)
+        table = nodes.image_at(f"basis_{i}", "vector3", T.Float3, b, DATA, at)
+        dot = nodes.node(f"dot_{i}", "ND_dotproduct_vector3", T.Float, in1=coefficients, in2=table)
+        total = dot if total is None else nodes.node(f"sum_{i}", "ND_add_float", T.Float, in1=total, in2=dot)
+    assert total is not None
+    return nodes.node("tint", "ND_convert_float_color3", T.Color3f, **{"in": total})

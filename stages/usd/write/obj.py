@@ -1,0 +1,57 @@
+"""NAME.obj and NAME.mtl: for tools without USD. The maps are those in textures/.
+
+The format knows no UDIM tiles: each becomes a material of its own, its texture coordinates in the unit square.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import tiles
+from pipeline.meshes import Charts
+from stages.usd.write.mesh import UvSurface, tile_count
+from stages.usd.write.shading import MATERIAL, Look
+
+
+def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path]:
+    """Metres, +Y up, as the asset. Indices count from 1; v, vt and vn have their own."""
+    normals = mesh.normals.astype(np.float64)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    vertex, uv, count = mesh.faces + 1, mesh.uv_faces + 1, tile_count(mesh)
+    tile = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces))
+    home = np.zeros((len(mesh.uvs), 2), np.float32)
+    home[mesh.uv_faces.ravel(), 0] = np.repeat(tile, 3)
+    lines = ["# Captured head, metres, +Y up. Made by NeuFace Asset.", f"mtllib {name}.mtl", f"o {name}"]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices.tolist()]
+    lines += [f"vt {u:.7g} {v:.7g}" for u, v in (mesh.uvs - home).clip(0, 1).tolist()]
+    lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]
+    materials = []
+    for t in range(count):
+        called = MATERIAL if count == 1 else f"{MATERIAL}_{tiles.FIRST + t}"
+        materials += _material(called, look.on_tile(t))
+        lines += [f"usemtl {called}", "s 1"]
+        lines += [
+            f"f {a}/{p}/{a} {b}/{q}/{b} {c}/{r}/{c}"
+            for (a, b, c), (p, q, r) in zip(vertex[tile == t].tolist(), uv[tile == t].tolist(), strict=True)
+        ]
+    obj, mtl = folder / f"{name}.obj", folder / f"{name}.mtl"
+    obj.write_text("\n".join(lines) + "\n")
+    mtl.write_text("\n".join(materials) + "\n")
+    return [obj, mtl]
+
+
+def _material(name: str, look: Look) -> list[str]:
+    """Kd and its map (sRGB), F0 as Ks and as Ni, and the PBR extension of MTL: roughness and normal map (raw)."""
+    f0 = ((look.ior - 1) / (look.ior + 1)) ** 2
+    maps = {"map_Kd": look.albedo, "map_Pr": look.roughness, "norm": look.normal}
+    return [
+        f"newmtl {name}",
+        "Kd 1 1 1",
+        f"Ks {f0:.5f} {f0:.5f} {f0:.5f}",
+        f"Ni {look.ior:.5f}",
+        "Pm 0",
+        "illum 2",
+        *(f"{key} {file.removeprefix('./')}" for key, file in maps.items() if file),
+    ]

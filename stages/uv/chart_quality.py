@@ -1,0 +1,123 @@
+"""How good the charts are.
+
+Symbols
+    J       2 x 3 -> the map from texture to surface of one triangle; columns S_u, S_v
+    L2      sqrt((S_u . S_u + S_v . S_v) / 2), root mean square stretch of a triangle [Sander 2001, section 3]
+    Linf    larger singular value of J, the most that any direction is stretched
+    front   where the normal is within 60 degrees of FRONT
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline import meshes, raster, tiles
+from pipeline.meshes import F64, Charts, Mesh
+from stages.uv.density import face_share
+from stages.uv.rough import FRAGMENT
+from stages.uv.segment import FRONT
+from stages.uv.unwrap import chart_of_face, evened, signed_areas
+
+RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
+FACING = 0.5
+STRETCHED = 4.0  # times that some direction of a face is longer on the surface than in the texture, against the mean
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """charts; fragments: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
+    chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
+    share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
+    tile_utilisation: of each tile; stretched: share of the area whose faces have a Linf above STRETCHED; face_share: of
+    the area under charts."""
+
+    charts: int
+    fragments: int
+    utilisation: float
+    overlap: float
+    stretch: float
+    stretch_max: float
+    flipped: float
+    empty: float
+    seam_front: float
+    tile_utilisation: tuple[float, ...]
+    stretched: float = 0.0
+    face_share: float | None = None
+
+
+def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Quality:
+    """Every figure of a finished unwrap. face: (F,) faces of the face; charts may then have different scales, which do
+    not count as stretch."""
+    uv_area = signed_areas(charts.uvs.astype(np.float64), charts.faces)
+    area = meshes.areas(mesh.vertices, mesh.faces)
+    share = area / area.sum()
+    label = chart_of_face(charts.faces, len(charts.uvs))
+    parts = (tiles.single_tile(mesh, charts, t)[1] for t in range(tiles.count(charts)))
+    layers = [raster.layers(raster.texel_corners(part, RASTER), RASTER) for part in parts]
+    covered = [int((layer > 0).sum()) for layer in layers]
+    flat = np.abs(uv_area) < 1e-12
+    alike = charts
+    if face is not None:
+        alike = Charts(evened(charts.uvs.astype(np.float64), charts.faces, area).astype(np.float32), charts.faces)
+    mean, most = stretch(mesh, alike, ~flat)
+    linf = _stretches(mesh, alike, ~flat)[1]
+    return Quality(
+        charts=int(label.max()) + 1,
+        fragments=int((np.bincount(label, share) < FRAGMENT).sum()),
+        utilisation=sum(covered) / (len(layers) * RASTER**2),
+        overlap=float(sum((layer > 1).sum() for layer in layers) / max(sum(covered), 1)),
+        stretch=mean,
+        stretch_max=most,
+        flipped=float(share[(uv_area < 0) & ~flat].sum()),
+        empty=float(share[flat].sum()),
+        seam_front=seam_length(mesh, charts),
+        tile_utilisation=tuple(c / RASTER**2 for c in covered),
+        stretched=float(share[~flat][linf > STRETCHED].sum() + share[flat].sum()),
+        face_share=None if face is None else face_share(charts, face),
+    )
+
+
+def seam_length(mesh: Mesh, charts: Charts) -> float:
+    """Length of the edges in front whose two faces do not share them in the texture."""
+    f, t = mesh.faces, charts.faces
+    low, high = (pick(f, np.roll(f, -1, 1)).T.ravel() for pick in (np.minimum, np.maximum))
+    order = np.lexsort((high, low))
+    first, second = order[:-1], order[1:]
+    pair = (low[first] == low[second]) & (high[first] == high[second])
+    first, second = first[pair], second[pair]
+    ends = [np.concatenate([t[:, i] for i in turn]) for turn in ((0, 1, 2), (1, 2, 0))]
+    joined = (ends[0][first] == ends[1][second]) & (ends[1][first] == ends[0][second])
+    x = mesh.vertices.astype(np.float64)
+    normal = meshes.vertex_normals(x, f).astype(np.float64)
+    a, b = low[first], high[first]
+    facing = 0.5 * (normal[a] + normal[b]) @ FRONT > FACING
+    return float(np.linalg.norm(x[a] - x[b], axis=1)[~joined & facing].sum())
+
+
+def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple[float, float]:
+    """Area-weighted L2 and largest Linf, with the texture scaled so that both areas agree; 1 for an isometry.
+
+    L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
+    """
+    keep = np.ones(len(mesh.faces), np.bool_) if use is None else use
+    square, larger, area = _stretches(mesh, charts, keep)
+    return float(np.sqrt((square * square * area).sum() / area.sum())), float(larger.max())
+
+
+def _stretches(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
+    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas agree, and their areas."""
+    x = mesh.vertices.astype(np.float64)[mesh.faces[keep]]
+    t = charts.uvs.astype(np.float64)[charts.faces[keep]]
+    e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
+    twice: F64 = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    s_u = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) / twice[:, None]
+    s_v = (e2 * d1[:, :1] - e1 * d2[:, :1]) / twice[:, None]
+    square = 0.5 * ((s_u * s_u).sum(1) + (s_v * s_v).sum(1))
+    area = 0.5 * np.linalg.norm(np.cross(e1, e2), axis=1)
+    scale = 0.5 * np.abs(twice).sum() / area.sum()
+    # singular values of J: those of J^T J by its trace and determinant
+    determinant = (s_u * s_u).sum(1) * (s_v * s_v).sum(1) - (s_u * s_v).sum(1) ** 2
+    larger = square + np.sqrt(np.maximum(square * square - determinant, 0))
+    return np.sqrt(square * scale), np.sqrt(larger * scale), area

@@ -1,0 +1,1 @@
+"""Many captures, each a run of its own."""

@@ -1,0 +1,1 @@
+"""`neuface bench`: measurements that repeat."""

@@ -1,0 +1,289 @@
+"""What each command of `neuface` does, given its parsed options. Prefect is imported only where it has a server."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import webbrowser
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import Cancelled, StageError
+from workflows.cli.console import Console
+from workflows.run import output_dirs
+from workflows.run.complete import complete
+from workflows.run.interrupt import interruptible
+from workflows.run.plan import RunRequest, make_plan, preview
+from workflows.run.runner import run_here
+from workflows.run.session import Session, session
+from workflows.run.verdict import exit_code, last_lines
+from workflows.server import environment
+
+# The demo: enough views and pixels to recognise the face, few enough for minutes on two cores.
+DEMO_VIEWS, DEMO_SIZE, DEMO_HOLDOUT = 40, 384, "every:5:2"
+
+
+def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, Any]:
+    """Plan, then run the stages: here, or as a flow of the Prefect server that PREFECT_API_URL names.
+
+    Hands back what run.json holds.
+
+    Raises:
+        StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C or another signal.
+    """
+    plan = make_plan(request)
+    if dry:
+        for step in preview(plan):
+            print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
+        return {}
+    watch = Session(console)
+    with session(watch):
+        if environment.has_server():
+            return _on_the_server(request)
+        with interruptible(watch.stop, console.note):
+            return complete(plan, run_here(plan))
+
+
+def _on_the_server(request: RunRequest) -> dict[str, Any]:
+    environment.defaults()
+    from workflows.flows import capture_to_asset
+
+    record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
+    return record
+
+
+# ------------------------------------------------------------------ commands
+def run_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface run"""
+    request = request_from(options)
+    try:
+        record = run(request, console, options.dry_run)
+    except Cancelled:
+        console.close()
+        console.note("stopped; the same command goes on where this one left off")
+        raise
+    if record:
+        _tell(record, Path(options.out))
+        _tell_verdict(record)
+    return exit_code(record)
+
+
+def demo_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface demo"""
+    from pipeline.demo.capture import write_demo_capture
+
+    out, capture = Path(options.out), Path(options.out) / "capture"
+    request = RunRequest(
+        capture=str(capture),
+        out=str(out),
+        preset=options.preset,
+        holdout=DEMO_HOLDOUT,
+        name="demo_head",
+        device=options.device,
+        store=options.store,
+    )
+    with output_dirs.writable(out, request.store_path):
+        console.started("demo photos", 0, 0)
+        try:
+            write_demo_capture(
+                capture,
+                views=options.views,
+                size=options.size,
+                progress=lambda done, total, what: console.progress(done, total, what),
+            )
+        except FileExistsError as e:
+            raise StageError(
+                "the folder for the demo's photos holds something else",
+                where=capture,
+                value=e,
+                limit="this demo's capture, or nothing",
+                remedy="choose another folder with --out",
+            ) from e
+        console.close()
+        record = run(request, console)
+    _tell(record, out)
+    if "asset" in record:
+        _against_truth(out, capture, record, request)
+    _tell_verdict(record)
+    return exit_code(record)
+
+
+def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest) -> None:
+    from pipeline.artifacts import Capture
+    from pipeline.store import Store
+    from workflows.evaluation.demo import measure
+
+    found = Store(request.store_path).load("capture", record["stages"]["capture"]["key"], Capture)
+    if found is None:
+        return
+    figures = measure(out, capture, found.artifact)
+    (out / "truth.json").write_text(json.dumps(dataclasses.asdict(figures), indent=1))
+    print("against the truth that the demo knows:")
+    for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact)]:
+        print(f"  {line}")
+
+
+def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], capture: Any) -> list[str]:
+    """Whether the split into diffuse and specular is right; figures and a picture into OUT/truth."""
+    from pipeline.artifacts import FittedFace
+    from pipeline.store import Store
+    from pipeline.transforms import matrix
+    from workflows.evaluation.demo_material import compare
+
+    store = Store(Path(record["store"]))
+    fitted = store.load("inverse_rendering", record["stages"]["inverse_rendering"]["key"], FittedFace)
+    if fitted is None:
+        return []
+    place = matrix(record["capture_from_asset"])
+    return compare(fitted.path(fitted.artifact.field), folder, capture, place, out / "truth").lines()
+
+
+def validate_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface validate"""
+    from stages.usd.check.validate import checks_run, validate
+
+    found = validate(Path(options.asset))
+    counts = {level: sum(f.level == level for f in found) for level in ("error", "warning", "info")}
+    if options.json:
+        content = {"asset": options.asset, "accepted": not counts["error"], "checks": checks_run(), "counts": counts}
+        text = json.dumps({**content, "findings": [f.json() for f in found]}, indent=1)
+        if options.json == "-":
+            print(text)
+            return 1 if counts["error"] else 0
+        Path(options.json).write_text(text + "\n")
+    for finding in found:
+        if finding.level != "info" or options.verbose:
+            print(finding)
+    print(f"{options.asset}: {checks_run()} checks, {counts['error']} faults, {counts['warning']} warnings")
+    return 1 if counts["error"] else 0
+
+
+def render_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface render"""
+    from workflows.cli.render import RenderRequest, render_pictures
+
+    request = RenderRequest(
+        folder=Path(options.folder),
+        out=Path(options.out),
+        light=options.env,
+        cameras=Path(options.cameras) if options.cameras else None,
+        views=options.views,
+        turntable=options.turntable,
+        width=options.width,
+        samples=options.samples,
+    )
+    for path, seconds in render_pictures(request):
+        print(f"{path} ({seconds:.1f} s)")
+    return 0
+
+
+def report_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface report"""
+    out = Path(options.folder)
+    record = read_record(out)
+    request = RunRequest(
+        **{**record["request"], "out": str(out), "store": record["store"], "from_stage": "report", "until": None}
+    )
+    record = run(request, console)
+    _tell(record, out)
+    _tell_verdict(record)
+    return exit_code(record)
+
+
+def view_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface view"""
+    page = (Path(options.folder) / "report" / "index.html").resolve()
+    if not page.is_file():
+        raise StageError(
+            "there is no report",
+            where=page,
+            value="no such file",
+            limit="a finished run",
+            remedy=f"make it with: neuface report {options.folder}",
+        )
+    print(page)
+    webbrowser.open(page.as_uri())
+    return 0
+
+
+def doctor_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface doctor"""
+    from workflows.cli.doctor import examine
+
+    found = examine(Path(options.out))
+    print("\n".join(str(f) for f in found))
+    return 1 if any(f.level == "fault" for f in found) else 0
+
+
+# ------------------------------------------------------------------ helpers
+def request_from(options: argparse.Namespace) -> RunRequest:
+    """The request that the options of `neuface run` make."""
+    from stages.presets import read_config_file
+
+    config = read_config_file(Path(options.config)) if options.config else {}
+    given = {"author": options.author, "license": options.license, "subject_consent": options.subject_consent}
+    stated = {k: v for k, v in given.items() if v is not None}
+    if stated:
+        config = {**config, "usd": {**config.get("usd", {}), **stated}}
+    return RunRequest(
+        capture=options.capture,
+        out=options.out,
+        preset=options.preset,
+        holdout=options.holdout,
+        name=options.name,
+        seed=options.seed,
+        device=options.device,
+        until=options.until,
+        from_stage=options.from_stage,
+        sets=tuple(options.set),
+        config=config,
+        store=options.store,
+        budget=options.budget,
+        stage_limit=options.stage_limit,
+        force=options.force,
+        strict=options.strict,
+    )
+
+
+def read_record(out: Path) -> dict[str, Any]:
+    """run.json of a folder that a run left.
+
+    Raises:
+        StageError: it is not there, or is not what a run writes.
+    """
+    path = out / "run.json"
+    try:
+        record = json.loads(path.read_text())
+        if not {"request", "store", "stages"} <= record.keys():
+            raise ValueError("it lacks request, store or stages")
+    except (OSError, ValueError, AttributeError) as e:
+        raise StageError(
+            "this folder holds no finished run",
+            where=path,
+            value=e,
+            limit="the run.json of a run",
+            remedy="name the folder that was given as --out",
+        ) from e
+    found: dict[str, Any] = record
+    return found
+
+
+def _tell(record: dict[str, Any], out: Path) -> None:
+    """On stdout, what a script would want to know."""
+    if "asset" in record:
+        print(f"asset  {out / record['asset']}")
+    page = out / "report" / "index.html"
+    if "report" in record["stages"] and page.is_file():
+        print(f"report {page}")
+    reused = sum(s["reused"] for s in record["stages"].values())
+    print(f"run    {out / 'run.json'} ({len(record['stages'])} stages, {reused} reused)")
+    sys.stdout.flush()
+
+
+def _tell_verdict(record: dict[str, Any]) -> None:
+    """The last lines on stdout: how good it is, and why."""
+    for line in last_lines(record):
+        print(line)
+    sys.stdout.flush()

@@ -1,0 +1,191 @@
+"""The command line `neuface`.
+
+Exit codes: 0 done and the result is good or usable, 1 failed, 2 wrong usage, 3 the result is unusable (with --strict:
+or only usable). Stopped with finished stages kept: 130 (Ctrl-C), 143 (SIGTERM), 129 (SIGHUP).
+"""
+
+if __name__ == "__main__":  # signals first: the imports take seconds
+    from workflows.run.interrupt import from_the_start  # isort: skip
+
+    from_the_start()
+
+import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+from pipeline.errors import NeufaceError, UsageError, stage_error_from_os_error
+from stages.presets import DEFAULT_PRESET
+from workflows.batch import commands as batch_commands
+from workflows.batch import schedule
+from workflows.bench import commands as bench_commands
+from workflows.cli import check, commands, settings
+from workflows.cli.console import Console
+from workflows.run.interrupt import Interrupted, as_exceptions, code_of
+from workflows.store import commands as store_commands
+
+EXAMPLES = """examples:
+  neuface demo                                        a made-up head, start to end, checked against the truth
+  neuface run photos/ --out runs/anna                 photos of a head -> asset and report
+  neuface check photos/                               are they good enough? seconds, no fit
+  neuface run photos/ --out runs/anna --preset draft --holdout every:5:2 --set bake.size=2048
+  neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """All commands and their options."""
+    p = argparse.ArgumentParser(
+        prog="neuface",
+        description="Photos of a head in, a relightable USD asset out.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("--verbose", action="store_true", help="also log what the stages say, and show tracebacks")
+    commands_of = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _run_options(commands_of.add_parser("run", help="one capture -> asset and report"))
+    check.add_options(commands_of.add_parser("check", help="are these photos good enough? no fit, seconds"))
+    demo = commands_of.add_parser("demo", help="the built-in demo capture -> asset, report, figures against the truth")
+    demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
+    demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
+    demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
+    demo.add_argument("--preset", default="draft", help="speed against accuracy (%(default)s)")
+    _where(demo)
+    demo.set_defaults(run=commands.demo_command)
+    validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
+    validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
+    validate.add_argument("--json", metavar="FILE", help="write every finding as JSON; - for standard output")
+    validate.set_defaults(run=commands.validate_command)
+    _render_options(commands_of.add_parser("render", help="render the exported asset: photos' views, or a turntable"))
+    for name, text, run in (
+        ("report", "(re)build the report of a run", commands.report_command),
+        ("view", "open the report of a run in a browser", commands.view_command),
+    ):
+        sub = commands_of.add_parser(name, help=text)
+        sub.add_argument("folder", metavar="DIR", help="the --out of that run")
+        sub.set_defaults(run=run)
+    bench_commands.add_commands(commands_of.add_parser("bench", help="measurements that repeat"))
+    batch_commands.add_commands(commands_of)
+    store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
+    schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
+    settings.add_options(commands_of.add_parser("settings", help="every setting: meaning, limits, presets"))
+    doctor = commands_of.add_parser("doctor", help="is this machine ready?")
+    doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
+    doctor.set_defaults(run=commands.doctor_command)
+    return p
+
+
+def _run_options(run: argparse.ArgumentParser) -> None:
+    run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
+    run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
+    run.add_argument(
+        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio, film; or paper (%(default)s)"
+    )
+    run.add_argument(
+        "--holdout",
+        metavar="RULE",
+        help="views kept from the fit and used for the metrics: every:5:2 "
+        "(index %% 5 == 2) or names:a.jpg,b.jpg; default none",
+    )
+    run.add_argument("--name", help="name of the asset")
+    run.add_argument("--author", help="who made the capture; recorded in the asset")
+    run.add_argument("--license", help="licence of the capture; recorded in the asset")
+    run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
+    run.add_argument("--seed", type=int, default=0, help="of every random draw (%(default)s)")
+    run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
+    run.add_argument("--until", metavar="S", help="stop after this stage")
+    run.add_argument(
+        "--budget",
+        type=batch_commands.a_time,
+        metavar="TIME",
+        help="time for the whole run, in place of a preset: 90s, 10m, 2h",
+    )
+    run.add_argument(
+        "--stage-limit", type=batch_commands.a_time, metavar="TIME", help="time that one stage may take: 90s, 30m, 2h"
+    )
+    run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")
+    batch_commands.add_verdict_options(run)
+    run.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
+    run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
+    _where(run)
+    run.set_defaults(run=commands.run_command)
+
+
+def _render_options(render: argparse.ArgumentParser) -> None:
+    render.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
+    render.add_argument("--out", required=True, metavar="OUT", help="folder for the pictures")
+    render.add_argument("--env", default="captured", help="captured, or a lat-long .hdr or .exr (%(default)s)")
+    render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
+    render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
+    render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
+    render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
+    render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
+    render.set_defaults(run=commands.render_command)
+
+
+def _where(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--device", default="auto", help="auto, cpu or cuda (%(default)s)")
+    sub.add_argument(
+        "--store",
+        metavar="DIR",
+        default=os.environ.get("NEUFACE_STORE"),
+        help="folder of finished stages ($NEUFACE_STORE, else DIR/.store)",
+    )
+
+
+def _unicode(options: argparse.Namespace) -> None:
+    """Raises UsageError where a path or a text is not UTF-8: no manifest, USD file or page could name it."""
+    for option, value in vars(options).items():
+        for text in value if isinstance(value, list) else [value]:
+            if isinstance(text, str) and text != text.encode("utf-8", "replace").decode():
+                raise UsageError(
+                    "a name is not UTF-8",
+                    where=f"--{option}" if option in ("out", "store", "name", "set", "config") else option,
+                    value=ascii(text),
+                    limit="text and paths in UTF-8",
+                    remedy="rename the file or folder, or write the text in UTF-8",
+                )
+
+
+class _at_least:  # noqa: N801  (used like a function)
+    """An integer with a lower limit, as argparse wants it."""
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+
+    def __call__(self, text: str) -> int:
+        if not text.isdecimal() or int(text) < self.limit:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {self.limit}")
+        return int(text)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; errors that a user can meet are printed without a traceback."""
+    options = parser().parse_args(arguments)
+    level = logging.INFO if options.verbose else logging.WARNING
+    logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
+    console = Console()
+    try:
+        _unicode(options)
+        with as_exceptions():
+            code: int = options.run(options, console)
+    except Interrupted as e:
+        code = code_of(e.number)
+        with suppress(OSError):
+            console.close()
+            print("stopped", file=sys.stderr)
+    except Exception as e:
+        console.close()
+        known = (
+            e if isinstance(e, NeufaceError) else stage_error_from_os_error(e, "") if isinstance(e, OSError) else None
+        )
+        if known is None or options.verbose:
+            raise
+        code = known.exit_code
+        with suppress(OSError):  # the terminal may be gone
+            print(f"error: {known}", file=sys.stderr)
+    return code

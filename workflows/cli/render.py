@@ -1,0 +1,165 @@
+"""`neuface render`: pictures of an exported asset, from any of a capture's cameras or around it, under any light."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.errors import StageError, UsageError
+
+if TYPE_CHECKING:
+    from stages.usd.render.camera import View
+    from stages.usd.render.render import Light, Renderer
+
+CAPTURED = "captured"
+TURNTABLE_SIDE = 1024  # pixels
+ENVIRONMENTS = (".exr", ".hdr")
+
+
+@dataclass(frozen=True, slots=True)
+class RenderRequest:
+    """What the options of the command say."""
+
+    folder: Path
+    out: Path
+    light: str = CAPTURED
+    cameras: Path | None = None
+    views: str | None = None
+    turntable: int | None = None
+    width: int | None = None
+    samples: int = 0
+
+
+def render_pictures(request: RenderRequest) -> Iterator[tuple[Path, float]]:
+    """NAME.exr (linear RGBA, premultiplied) and NAME.png for each view; yields the EXR and the seconds it took.
+
+    Raises:
+        StageError: something of the asset, the cameras or the light is missing or damaged. UsageError: no such view.
+    """
+    from pipeline.images import write_exr
+    from stages.usd.render.exported import load_exported
+    from stages.usd.render.previews import write_rgba_png
+    from stages.usd.render.render import Renderer
+
+    root = component_in(request.folder)
+    renderer = Renderer(load_exported(root))
+    views = _views(request, root, renderer)
+    light = _light(request.light, renderer)
+    for name, view in views.items():
+        start = time.perf_counter()
+        shown = view.scaled(request.width) if request.width else view
+        rgba = renderer.render(shown, samples=request.samples, light=light)
+        path = request.out / f"{name}.exr"
+        write_exr(path, rgba)
+        write_rgba_png(path.with_suffix(".png"), rgba)
+        yield path, time.perf_counter() - start
+
+
+def component_in(folder: Path) -> Path:
+    """NAME.usd of a run's folder, of its asset folder, or the file itself."""
+    if folder.is_file():
+        return folder
+    for place in (folder / "asset", folder):
+        found = sorted(p for p in place.glob("*.usd"))
+        if found:
+            return found[0]
+    raise StageError(
+        "there is no asset to render",
+        where=folder,
+        value="no .usd file",
+        limit="a run's folder, or its asset folder",
+        remedy="name the folder that was given as --out",
+    )
+
+
+def _light(name: str, renderer: Renderer) -> Light | None:
+    from pipeline.images import read_linear
+    from stages.usd.render.relight import Environment
+
+    if name == CAPTURED:
+        return None
+    path = Path(name)
+    if path.suffix.lower() not in ENVIRONMENTS or not path.is_file():
+        raise StageError(
+            "this light can't be read",
+            where=name,
+            value="no such file" if not path.is_file() else f"a {path.suffix or 'nameless'} file",
+            limit=f"{CAPTURED}, or a file {' or '.join(ENVIRONMENTS)}",
+            remedy="give --env an equirectangular picture",
+        )
+    return Environment(renderer, read_linear(path), path.name)
+
+
+def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, View]:
+    from stages.usd.render.exported import read_cameras
+    from stages.usd.render.previews import framing
+
+    if request.turntable is not None:
+        turns = 2 * np.pi * np.arange(request.turntable) / request.turntable
+        return {f"turn_{i:03d}": framing(renderer, float(t), TURNTABLE_SIDE) for i, t in enumerate(turns)}
+    if request.cameras is not None:
+        found = _given(request.cameras, request.folder)
+        chosen = list(found)
+    else:
+        captured = read_cameras(root.parent / "lookdev.usda")
+        found = {i: view for i, (view, _) in captured.items()}
+        chosen = [i for i, (_, held_out) in captured.items() if held_out] or list(found)
+    if request.views is not None:
+        chosen = _indices(request.views)
+    missing = [i for i in chosen if i not in found]
+    if missing:
+        raise UsageError(
+            "there is no such view",
+            where="--views",
+            value=", ".join(map(str, missing)),
+            limit=f"one of {', '.join(map(str, sorted(found)))}",
+            remedy="leave --views out to render all",
+        )
+    return {str(i): found[i] for i in chosen}
+
+
+def _indices(text: str) -> list[int]:
+    parts = [p.strip() for p in text.split(",") if p.strip()]
+    if not parts or not all(p.isdecimal() for p in parts):
+        raise UsageError(
+            "the views can't be read",
+            where="--views",
+            value=text,
+            limit="whole numbers with commas between",
+            remedy="for example --views 2,7",
+        )
+    return [int(p) for p in parts]
+
+
+def _given(params: Path, folder: Path) -> dict[int, View]:
+    """Cameras of a params.json, moved from the capture's world into the asset's by the run's own matrix."""
+    from pipeline.transforms import inverse_rigid, matrix, rescale_camera
+    from stages.capture.readers.facescape import given_view, is_valid, read_params, view_indices
+    from stages.usd.render.camera import View
+
+    record = folder / "run.json"
+    try:
+        capture_from_asset = matrix(json.loads(record.read_text())["capture_from_asset"]).reshape(4, 4)
+    except (OSError, ValueError, KeyError) as e:
+        raise StageError(
+            "where the capture lies in the asset's world is not known",
+            where=record,
+            value=e,
+            limit="the run.json of a finished run",
+            remedy="name a run's folder, or leave --cameras out to use the cameras in lookdev.usda",
+        ) from e
+    found = read_params(params)
+    out = {}
+    for index in view_indices(found):
+        if is_valid(found, index):
+            camera, (width, height) = given_view(found, index)
+            capture_from_cam = inverse_rigid(matrix(camera.cam_from_world))
+            pose = rescale_camera(matrix(np.linalg.inv(capture_from_asset)), capture_from_cam)
+            out[index] = View(matrix(camera.K), pose, width, height, np.array(camera.distortion, np.float64))
+    return out

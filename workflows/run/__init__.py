@@ -1,0 +1,1 @@
+"""One run on this machine: its plan, its stages in order, what it publishes."""

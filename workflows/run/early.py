@@ -1,0 +1,57 @@
+"""What is known before the fit, told before the fit: a summary, and the end of a run that can come to nothing.
+
+The stages before the fit take a minute or two, the fit and what follows it many. A run ends as soon as one of the
+first finds its result unusable. What is finished stays in the store: the same command with `--force` goes on from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.contract import Done
+from stages import registry
+from workflows.run import estimate
+from workflows.run.plan import Plan
+from workflows.run.session import current
+from workflows.run.verdict import headline, verdict_of_done
+
+PHOTOS_NAMED = 12  # in the line of photos to look at; run.json has all
+
+
+def early_stages() -> tuple[str, ...]:
+    """The stages before the fit, in order; none where there is no fit."""
+    names = [s.name for s in registry.REGISTRY]
+    return tuple(names[: names.index(registry.FIT)]) if registry.FIT in names else ()
+
+
+def ends_early(plan: Plan, done: Sequence[Done[Any]]) -> bool:
+    """Whether the run ends with the stage that was just done, before what it was asked to do is done.
+
+    Tells the summary after the last stage before the fit, and after an earlier one where the run ends.
+    """
+    early, name = early_stages(), done[-1].stage
+    if name not in early or len(done) == len(plan.stages):
+        return False
+    ends = verdict_of_done(done).level == "unusable" and not plan.request.force
+    if ends or name == early[-1]:
+        for line in summary(plan, done):
+            current().observer.note(line)
+    return ends
+
+
+def summary(plan: Plan, done: Sequence[Done[Any]]) -> list[str]:
+    """Lines: the verdict so far, each trouble with its remedy, photos to look at, and what comes next."""
+    verdict = verdict_of_done(done)
+    lines = [headline(verdict.level, verdict.stages, "verdict so far")]
+    lines += [f"  {reason}" for reason in verdict.reasons()]
+    photos = list(dict.fromkeys(name for _, f in verdict.troubles() for name in f.views))
+    if photos:
+        more = f" and {len(photos) - PHOTOS_NAMED} more" if len(photos) > PHOTOS_NAMED else ""
+        lines.append(f"  photos to look at or to take again: {', '.join(photos[:PHOTOS_NAMED])}{more}")
+    if verdict.level == "unusable" and not plan.request.force:
+        after = plan.stages[len(done)].name
+        return [*lines, f"  the run ends here, before {after}; what is finished is kept: --force goes on from it"]
+    if verdict.level == "unusable":
+        lines.append("  going on although it is unusable (--force)")
+    return [*lines, f"  {estimate.remaining_time(plan, done)}"]

@@ -1,0 +1,75 @@
+"""About how long the rest of a run takes: from earlier runs in the same store, else from a table of measured ones."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from pipeline.contract import Done, StageConfig
+from workflows.run.plan import Plan, preview
+from workflows.run.session import current
+
+# Seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: medians of four captures
+# of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
+# workflows/run/budget.py. For orders of magnitude: earlier runs on the same machine replace it stage by stage.
+SECONDS: dict[str, dict[str, float]] = {
+    "draft": {"inverse_rendering": 100, "surface": 10, "uv": 12, "bake": 20, "usd": 18, "report": 5},
+    "studio": {"inverse_rendering": 780, "surface": 15, "uv": 25, "bake": 60, "usd": 45, "report": 10},
+    "film": {"inverse_rendering": 1500, "surface": 60, "uv": 60, "bake": 300, "usd": 150, "report": 30},
+}
+NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subject_consent", "asset_version"})
+LOOKED_AT = 50  # earlier runs of a stage that are read, the latest first
+
+
+def remaining_time(plan: Plan, done: Sequence[Done[Any]]) -> str:
+    """A line for the user on the stages that are not done."""
+    rest = [s.name for s in plan.stages[len(done) :]]
+    which = rest[0] if len(rest) == 1 else f"{rest[0]} to {rest[-1]}"
+    if plan.request.budget is not None:
+        left = max(0.0, plan.request.budget - (time.monotonic() - current().begun))
+        return f"the rest ({which}) has what is left of the budget: about {_words(left)}"
+    stored = {step.stage for step in preview(plan) if step.action == "reused"}
+    found = {name: _of_stage(plan, name) for name in rest if name not in stored}
+    if not found:
+        return f"the rest ({which}) is in the store already"
+    if any(seconds is None for seconds, _ in found.values()):
+        return f"the rest ({which}): no time is known for the preset {plan.request.preset} on this machine"
+    total = sum(seconds or 0.0 for seconds, _ in found.values())
+    origins = {origin for _, origin in found.values()}
+    origin = "earlier runs here" if origins == {"runs"} else "measured on two cores"
+    return f"the rest ({which}) takes about {_words(total)} ({origin})"
+
+
+def _of_stage(plan: Plan, name: str) -> tuple[float | None, str]:
+    """Seconds of a stage and where they are from: "runs" or "table"."""
+    earlier = _earlier(plan, name, plan.configs[name])
+    if earlier:
+        return statistics.median(earlier), "runs"
+    return SECONDS.get(plan.request.preset, {}).get(name), "table"
+
+
+def _earlier(plan: Plan, name: str, config: StageConfig) -> list[float]:
+    """Seconds of this stage in earlier runs with the same settings, whatever they were of."""
+    wanted, found = _timed(config.model_dump(mode="json")), []
+    records = sorted(plan.store.root.glob(f"{name}/*/run.json"), key=lambda p: -p.stat().st_mtime)
+    for path in records[:LOOKED_AT]:
+        try:
+            run = json.loads(path.read_text())
+            if _timed(run["config"]) == wanted and run["device"] == plan.device:
+                found.append(float(run["seconds"]))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            continue  # a run that is being removed, or of a version that wrote something else
+    return found
+
+
+def _timed(config: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in config.items() if k not in NOT_OF_TIME}
+
+
+def _words(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(10, round(seconds, -1)):.0f} seconds"
+    return f"{seconds / 60:.0f} minutes" if seconds < 5400 else f"{seconds / 3600:.1f} hours"

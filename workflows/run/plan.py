@@ -1,0 +1,219 @@
+"""What a run will do: checked before anything is written. The same request makes the same plan everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.artifacts import Artifact, Located
+from pipeline.contract import Stage, StageConfig, inputs_from, key
+from pipeline.errors import StageError, UsageError
+from pipeline.store import MANIFEST, Store
+from stages import registry
+from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_sets
+from stages.registry import FIT
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+class RunRequest(BaseModel):
+    """A run as the user asks for it: plain data, the same from the command line and from a deployment.
+
+    The deployment's form is made of these fields (workflows/server/flow_signature.py).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    capture: str = Field(description="folder with the photos; absolute, as the worker sees it")
+    out: str = Field(description="folder for the results; made if it is not there")
+    preset: str = Field(default=DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
+    holdout: str | None = Field(
+        default=None, description='views kept from the fit and used for the metrics: "every:5:2" or "names:a.jpg,b.jpg"'
+    )
+    name: str | None = Field(default=None, description="name of the asset")
+    seed: int = Field(default=0, description="of every random draw")
+    device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
+    until: str | None = Field(default=None, description="last stage to run")
+    from_stage: str | None = Field(
+        default=None, description="this stage and those after it run even if the store has them"
+    )
+    sets: tuple[str, ...] = Field(default=(), description='single settings, "stage.key=value"')
+    config: dict[str, dict[str, Any]] = Field(default={}, description="settings by stage, then by key")
+    store: str | None = Field(default=None, description="folder of finished stages; OUT/.store by default")
+    budget: float | None = Field(
+        default=None,
+        gt=0,
+        description="seconds for the whole run: sizes and the length of the fit are planned on this machine",
+    )
+    stage_limit: float | None = Field(
+        default=None, gt=0, description="seconds that one stage may take; none by default"
+    )
+    fit_slots: str | None = Field(
+        default=None, description="name of a global concurrency limit; the fit holds one of its slots (a GPU, say)"
+    )
+    force: bool = Field(default=False, description="go on to the fit although photos, cameras or masks are unusable")
+    strict: bool = Field(default=False, description="a result that is only usable counts as refused; makes no other")
+
+    @property
+    def store_path(self) -> Path:
+        """Where finished artifacts are kept."""
+        return Path(self.store) if self.store else Path(self.out) / ".store"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The stages to run, in order, with their settings. `anew`: those that run even if the store has them."""
+
+    request: RunRequest
+    source: Located[Any]
+    out: Path
+    store: Store
+    stages: tuple[Stage[Any, Any, Any], ...]
+    configs: dict[str, StageConfig]
+    device: str
+    anew: frozenset[str]
+
+
+def make_plan(request: RunRequest) -> Plan:
+    """Check a request and read what the capture's folder holds. Nothing is written.
+
+    Raises:
+        UsageError: unknown names, or settings outside their limits.
+        StageError: the capture can't be used, or the device is not there.
+    """
+    from stages.capture.scan import scan_capture
+
+    chosen, anew = _choose(request.until, request.from_stage)
+    configs = check_settings(request)
+    _names_a_folder(request.out, "--out")
+    capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
+    source = scan_capture(capture)
+    if out.resolve() == capture.resolve():
+        raise UsageError(
+            "the results would land among the photos",
+            where="--out",
+            value=out,
+            limit="another folder than the capture's",
+            remedy=f"for example --out {out / 'asset_run'}",
+        )
+    needs_torch = any(s.name == "inverse_rendering" for s in chosen)
+    return Plan(
+        request,
+        source,
+        out,
+        Store(request.store_path),
+        chosen,
+        configs,
+        device_for(request.device) if needs_torch else "cpu",
+        anew,
+    )
+
+
+def check_settings(request: RunRequest, planned: Settings | None = None) -> dict[str, StageConfig]:
+    """The settings of every stage that a request makes, whatever its capture holds. planned: what its budget pays for.
+
+    Raises:
+        UsageError: unknown names, or settings outside their limits.
+    """
+    _choose(request.until, request.from_stage)
+    if request.budget is not None and request.preset != DEFAULT_PRESET:
+        raise UsageError(
+            "a budget and a preset both say how large the fit is",
+            where="--budget and --preset",
+            value=request.preset,
+            limit="one of the two",
+            remedy="leave --preset out, or the budget",
+        )
+    known(request.device, DEVICES, what="unknown device", where="--device")
+    return configs_for(
+        request.preset,
+        parse_sets(request.sets),
+        request.config,
+        holdout=request.holdout,
+        name=request.name,
+        seed=request.seed,
+        registry=registry.REGISTRY,
+        planned=planned,
+    )
+
+
+def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
+    names = [s.name for s in registry.REGISTRY]
+    for option, value in (("--until", until), ("--from-stage", from_stage)):
+        if value is not None:
+            known(value, names, what="unknown stage", where=option)
+    last = names.index(until) if until else len(names) - 1
+    first = names.index(from_stage) if from_stage else len(names)
+    if from_stage and first > last:
+        raise UsageError(
+            "nothing would run",
+            where="--from-stage and --until",
+            value=f"{from_stage} after {until}",
+            limit="a first stage that is not after the last",
+            remedy="swap them, or leave one out",
+        )
+    return tuple(registry.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
+
+
+def _names_a_folder(text: str, option: str) -> None:
+    if not text.strip():
+        raise UsageError("no folder is named", where=option, value=repr(text), limit="a path", remedy="name a folder")
+
+
+def device_for(wanted: str) -> str:
+    """The device that "auto" means here, or the wanted one if it is there."""
+    if wanted == "cpu":
+        return "cpu"
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if wanted == "cuda":
+        raise StageError(
+            "there is no CUDA device that torch can use",
+            where="--device",
+            value="cuda",
+            limit=f"a build of torch with CUDA and a GPU (this is torch {torch.__version__})",
+            remedy="run with --device cpu, or install a CUDA build of torch",
+        )
+    return "cpu"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What would happen to one stage: "reused", "made", or "made anew". `key` is None where it can't be known yet."""
+
+    stage: str
+    key: str | None
+    action: str
+
+
+def preview(plan: Plan) -> list[Step]:
+    """What `run` would do, from the manifests in the store; nothing is run, hashed or written."""
+    finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
+    steps: list[Step] = []
+    for stage in plan.stages:
+        unplanned = plan.request.budget is not None and stage.name == FIT  # its settings depend on the hour
+        if unplanned or not all(f in finished for f in stage.inputs.__dataclass_fields__):
+            steps.append(Step(stage.name, None, "made"))
+            continue
+        k = key(stage, inputs_from(stage, finished), plan.configs[stage.name])
+        manifest = plan.store.folder(stage.name, k) / MANIFEST
+        found = _stored(plan.store, stage, k) if stage.name not in plan.anew else None
+        if found is None:
+            steps.append(Step(stage.name, k, "made anew" if manifest.is_file() else "made"))
+            continue
+        finished[stage.name] = found
+        steps.append(Step(stage.name, k, "reused"))
+    return steps
+
+
+def _stored(store: Store, stage: Stage[Any, Any, Any], k: str) -> Located[Artifact] | None:
+    """What the store has of a key; None if it has nothing, or its manifest is damaged."""
+    try:
+        return Located(store.manifest(stage.name, k, stage.output), store.folder(stage.name, k))
+    except (OSError, ValidationError):
+        return None

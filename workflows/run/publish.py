@@ -1,0 +1,142 @@
+"""From the store into the folder that the user named. Nothing half-written is ever seen under its final name."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pipeline.artifacts import FileRef, Located
+from pipeline.contract import Done, versions
+from pipeline.errors import stage_error_from_os_error
+from workflows.run.plan import Plan
+from workflows.run.published import note_published, published, write_whole
+from workflows.run.replace import drop, prepare, put, tidy
+from workflows.run.report_timing import TIMED, with_seconds
+from workflows.run.verdict import verdict_of_done
+from workflows.store.roots import note_root
+
+Copies = dict[str, Path]  # path below the published folder -> file in the store
+
+
+def publish(plan: Plan, done: Iterable[Done[Any]], notify: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+    """Copy asset/ and report/ to `plan.out` and write run.json beside them. Hands back what run.json holds.
+
+    Files of the user's own in these folders stay. One whose name is needed, or that was published and then edited, is
+    renamed; `notify` is called, and run.json names it under "moved_aside".
+
+    Raises:
+        StageError: the disk is full or can't be written; what was there before is still there.
+    """
+    stages = {d.stage: d for d in done}
+    record = run_record(plan, stages)
+    try:
+        moved = _replace_folders(plan.out, stages, record["timing"])
+        for before, now in moved.items():
+            notify(f"{plan.out / before} is yours: kept as {plan.out / now}")
+        if moved:
+            record["moved_aside"] = moved
+        write_whole(plan.out / "run.json", json.dumps(record, indent=1))
+        note_root(plan.store, plan.out, {n: d.key for n, d in stages.items()})
+    except OSError as e:
+        raise stage_error_from_os_error(e, plan.out) or e from e
+    return record
+
+
+def _replace_folders(out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float]) -> dict[str, str]:
+    """asset/ and report/, whichever the stages made. Hands back the user's files that had to move: old path -> new."""
+    known = published(out)
+    moved: dict[str, str] = {}
+    for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
+        moved |= tidy(out, name, known)
+        if not copies:
+            continue
+        made = prepare(out, name, partial(_fill, name, copies, timing), known)
+        try:
+            both = {p: known.get(p, frozenset()) | {h} for p, h in made.hashes.items()}
+            note_published(out, {**known, **both})
+            put(made)
+        except BaseException:
+            drop(made)
+            raise
+        kept = {p: hashes for p, hashes in known.items() if not p.startswith(f"{name}/")}
+        known = {**kept, **{p: frozenset({h}) for p, h in made.hashes.items()}}
+        moved |= made.aside
+    note_published(out, known)
+    return moved
+
+
+def _fill(name: str, copies: Copies, timing: Mapping[str, float], folder: Path) -> None:
+    for path, source in copies.items():
+        target = folder / path
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if name == "report" and path in TIMED:
+            target.write_bytes(with_seconds(path, source.read_bytes(), timing))
+        else:
+            shutil.copyfile(source, target)
+
+
+def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
+    """asset/: everything that lies beside the file to open."""
+    if "usd" not in stages:
+        return {}
+    usd: Located[Any] = stages["usd"].located
+    top = usd.artifact.root.rpartition("/")[0]
+    inside = f"{top}/" if top else ""
+    return {f.path.removeprefix(inside): usd.path(f) for f in usd.artifact.files if f.path.startswith(inside)}
+
+
+def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
+    """report/: the page and its figures, and the held-out views of the model and of the exported asset."""
+    copies: Copies = {}
+    if "report" in stages:
+        copies |= {f.path: stages["report"].located.path(f) for f in stages["report"].located.artifact.files}
+    for stage, field, folder in (("inverse_rendering", "held_out", "views"), ("usd", "views", "asset_views")):
+        if stage not in stages:
+            continue
+        located = stages[stage].located
+        for view in getattr(located.artifact, field):
+            copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
+            copies[f"{folder}/{view.index}.png"] = located.path(view.png)
+    return copies
+
+
+def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
+    """What run.json holds. Figures that may differ from run to run live here, not in any manifest."""
+    taken = {n: float(d.run.get("seconds", 0.0)) for n, d in stages.items()}
+    record: dict[str, Any] = {
+        "verdict": verdict_of_done(stages.values()).record(),
+        "stages": {
+            n: {
+                "key": d.key,
+                "reused": d.reused,
+                "seconds": taken[n],
+                "peak_memory_mb": d.run.get("peak_memory_mb"),
+                "device": d.run.get("device"),
+                "warnings": list(getattr(d.located.artifact, "warnings", ())),
+            }
+            for n, d in stages.items()
+        },
+        "timing": {**taken, "total": round(sum(taken.values()), 3)},
+        "request": plan.request.model_dump(mode="json"),
+        "store": str(plan.store.root.resolve()),
+        "device": plan.device,
+        "seed": plan.request.seed,
+        "versions": versions(),
+    }
+    if "poses" in stages:
+        record["capture_from_asset"] = stages["poses"].located.artifact.capture_from_asset
+    if "usd" in stages:
+        record["asset"] = f"asset/{Path(stages['usd'].located.artifact.root).name}"
+        record["asset_hash"] = asset_hash(stages["usd"].located.artifact.files)
+    return record
+
+
+def asset_hash(files: Iterable[FileRef]) -> str:
+    """sha256 over the sorted (path, sha256) of the asset's files: equal hashes mean equal bytes."""
+    pairs = sorted((f.path, f.sha256) for f in files)
+    return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()

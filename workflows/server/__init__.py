@@ -1,0 +1,1 @@
+"""Prefect: the flows' parameters, stages as tasks, deployments, who may start what."""

@@ -1,0 +1,1 @@
+"""Clearing up a store of finished artifacts."""

@@ -1,0 +1,210 @@
+"""Clearing up a store: what nobody needs (gc), and all that came from one person's photos (purge)."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.store import LINEAGE, Store, lineage
+from stages.registry import SOURCE
+from workflows.batch.captures import RECORDS
+from workflows.batch.state import Entry
+from workflows.run.published import FOLDERS, LIST, published, split
+from workflows.run.run_lock import lock_is_free
+from workflows.store.roots import Root, forget_root, roots
+
+DAY = 86400.0
+_KEY = re.compile(r"([0-9a-f]{64})(\.scratch|\.partial-[0-9a-f]+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Something in a store that may go. why: for the user. size: bytes."""
+
+    path: Path
+    why: str
+    size: int
+
+
+# ------------------------------------------------------------------ gc
+def garbage(store: Store, older_than: float, now: float | None = None) -> list[Piece]:
+    """What no published folder names and nobody used for `older_than` seconds.
+
+    While a run is under way only what was not used for a day counts: the run has not named its artifacts yet.
+    """
+    now = time.time() if now is None else now
+    needed = {(stage, key) for root in roots(store) for stage, key in root.keys.items()}
+    limit = max(older_than, DAY) if _busy(store) else older_than
+    found = []
+    for stage, key, kind, path in _pieces(store):
+        if not lock_is_free(store.root / ".locks" / f"{stage}-{key}"):
+            continue
+        if kind.startswith(".partial"):
+            found.append(Piece(path, "left by a process that died", _size(path)))
+        elif now - path.stat().st_mtime < limit:
+            continue
+        elif kind == ".scratch":
+            found.append(Piece(path, "checkpoints of a fit that nobody goes on with", _size(path)))
+        elif (stage, key) not in needed:
+            found.append(Piece(path, "no published folder was made from it", _size(path)))
+    return found
+
+
+def remove(store: Store, pieces: Iterable[Piece]) -> None:
+    """Take pieces out of the store; one that a process took up meanwhile stays."""
+    for piece in pieces:
+        match = _KEY.fullmatch(piece.path.name)
+        if match is None or not lock_is_free(store.root / ".locks" / f"{piece.path.parent.name}-{match[1]}"):
+            continue
+        shutil.rmtree(piece.path, ignore_errors=True)
+        if match[2] is None:
+            (store.root / LINEAGE / f"{piece.path.parent.name}-{match[1]}.json").unlink(missing_ok=True)
+
+
+def _busy(store: Store) -> bool:
+    return any(not lock_is_free(p) for p in (store.root / ".locks").glob("run-*"))
+
+
+def _pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
+    """(stage, key, "" | ".scratch" | ".partial-...", folder)"""
+    for stage in sorted(p for p in store.root.iterdir() if p.is_dir() and not p.name.startswith(".")):
+        for path in sorted(stage.iterdir()):
+            match = _KEY.fullmatch(path.name)
+            if match is not None and path.is_dir() and not path.is_symlink():
+                yield stage.name, match[1], match[2] or "", path
+
+
+def _size(path: Path) -> int:
+    return sum(p.lstat().st_size for p in path.rglob("*") if p.is_file() and not p.is_symlink())
+
+
+# ------------------------------------------------------------------ purge
+@dataclass(frozen=True, slots=True)
+class Purge:
+    """All that a subject left: folders and files to remove, and the runs among them.
+
+    What stays: the photos, and users: files of the user's own, and edited ones, in the folders of results.
+    """
+
+    paths: tuple[Path, ...]
+    outs: tuple[Path, ...]
+    photos: tuple[Path, ...]
+    users: tuple[Path, ...]
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return sum(_size(p) if p.is_dir() else p.lstat().st_size for p in self.paths)
+
+
+def belongings(subject: str, out: Path, store: Store) -> Purge:
+    """Everything below `out` and in the store that was made from the subject's photos, finished or not."""
+    out = out.absolute()
+    runs = [r for r in _roots_of(out, store) if _is_of(subject, r, out)]
+    entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
+    photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
+    outs = {r.out for r in runs} | {out / e.name for _, e in entries}
+    paths, users = set(_made_from(photos, store)), set[Path]()
+    for o in (o for o in outs if o.is_dir()):
+        ours, theirs = _results(o)
+        users |= theirs
+        paths |= {o} if o != out and not theirs else ours  # the run's own folder: the store inside may serve others
+    for path, entry in entries:
+        log = out / RECORDS / "logs" / f"{entry.name.replace('/', '__')}.log"
+        paths |= {p for p in (path, log) if p.exists()}
+    if entries and (out / RECORDS).is_dir():  # the table names the subject; the next batch writes it anew
+        tables = ("summary.json", "summary.csv", "index.html")
+        paths |= {out / RECORDS / n for n in tables if (out / RECORDS / n).exists()}
+    for o in outs:  # the throw-away server of a run keeps its parameters
+        home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
+        paths |= {home} if home.is_dir() else set()
+    return Purge(tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+
+
+def _results(out: Path) -> tuple[set[Path], set[Path]]:
+    """What runs left in a folder of results, and what is the user's there: foreign files, and edited ones."""
+    known = published(out)
+    ours = {out / n for n in ("run.json", LIST, "truth", "truth.json") if (out / n).exists()}
+    for pattern in (".*.partial-*", ".probe-*"):
+        ours |= set(out.glob(pattern))
+    theirs = {p for p in out.iterdir() if p.name not in (*FOLDERS, ".store") and p not in ours}
+    for name in FOLDERS:
+        mine, users = split(out, name, known)
+        theirs |= {out / name / p for p in users}
+        if mine or not users:
+            ours |= {out / name / p for p in mine} if users else {p for p in (out / name,) if p.is_dir()}
+    return ours, theirs
+
+
+def purge(found: Purge, store: Store) -> list[Path]:
+    """Remove it. Hands back what is still there: a process works on it, or it can't be removed."""
+    for path in found.paths:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+    for out in found.outs:
+        forget_root(store, out)
+        for folder in [*(out / n for n in FOLDERS), out]:
+            _remove_empty(folder)
+        if out.parent.is_dir() and not any(out.parent.iterdir()):
+            out.parent.rmdir()
+    return [p for p in found.paths if p.exists()]
+
+
+def _remove_empty(folder: Path) -> None:
+    """A folder and those below it, as far as they hold nothing."""
+    if folder.is_dir() and not folder.is_symlink():
+        for child in list(folder.iterdir()):
+            _remove_empty(child)
+        if not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _roots_of(out: Path, store: Store) -> list[Root]:
+    return [r for r in roots(store) if r.out == out.resolve() or out.resolve() in r.out.resolve().parents]
+
+
+def _is_of(subject: str, root: Root, out: Path) -> bool:
+    """The run's folder is OUT/SUBJECT or lies in it; or OUT is a single run of a capture of that name."""
+    inside = root.out.resolve().relative_to(out.resolve()).parts
+    return inside[:1] == (subject,) if inside else Path(root.capture).name == subject
+
+
+def _photos_of(root: Root, store: Store) -> Iterator[Path]:
+    """The folders that a run's first stage read; run.json may name them relative to a folder that nobody knows now."""
+    for stage, key in root.keys.items():
+        yield from (Path(p) for p in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(SOURCE, ()))
+
+
+def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:
+    for path in sorted((out / RECORDS / "captures").glob("*.json")):
+        try:
+            yield path, Entry.model_validate_json(path.read_bytes())
+        except ValueError:
+            continue
+
+
+def _made_from(photos: set[Path], store: Store) -> Iterator[Path]:
+    """Every folder of the store that comes, over any number of stages, from one of these folders; and its lineage."""
+    folder = store.root / LINEAGE
+    known = {p: {x for names in lineage(p).values() for x in names} for p in sorted(folder.glob("*.json"))}
+    reached, grown = {str(p) for p in photos}, True
+    taken: set[Path] = set()
+    while grown:
+        grown = False
+        for path, origins in known.items():
+            if path not in taken and origins & reached:
+                stage, _, key = path.stem.rpartition("-")
+                taken.add(path)
+                reached.add(f"{stage}/{key}")
+                grown = True
+    for path in taken:
+        stage, _, key = path.stem.rpartition("-")
+        yield path
+        yield from (store.root / stage).glob(f"{key}*")
