@@ -15,17 +15,23 @@ from prefect.states import Completed
 
 from pipeline.errors import Cancelled
 from workflows.batch.request import BatchRequest
-from workflows.run.complete import complete
 from workflows.run.interrupt import PARENT, end_with, interruptible
-from workflows.run.plan import RunRequest, make_plan
-from workflows.run.session import Session, given, session
+from workflows.run.plan import make_plan
+from workflows.run.publish import publish
+from workflows.run.request import RunRequest
+from workflows.run.run_lock import exclusive_run
+from workflows.run.runner import run_stages
+from workflows.run.session import Session
 from workflows.run.verdict import last_lines, level_in, state_name
 from workflows.server.access import check_folders
-from workflows.server.adapter import as_tasks, publish_result, report_batch
+from workflows.server.adapter import publish_result, report_batch, task_executor, with_slot
 from workflows.server.flow_signature import takes
 
+CAPTURE_FLOW: dict[str, Any] = {"name": "capture-to-asset", "flow_run_name": "{capture} -> {out}", "retries": 0,
+                                "persist_result": False}  # fmt: skip
 
-@flow(name="capture-to-asset", flow_run_name="{capture} -> {out}", retries=0, persist_result=False)
+
+@flow(**CAPTURE_FLOW)
 @takes(RunRequest)
 def capture_to_asset(**asked: Any) -> Any:
     """Run the stages on one capture and publish asset/, report/ and run.json in `out`.
@@ -33,10 +39,28 @@ def capture_to_asset(**asked: Any) -> Any:
     It ends Completed where the result is good, else in a completed state named Usable or Unusable: the run did its
     work, and nothing that tries failed runs again should do it twice. Called as a function it hands back run.json.
     """
+    return _run_capture(asked, None)
+
+
+def run_with_session(request: RunRequest, watch: Session) -> dict[str, Any]:
+    """The same flow, in a command of this process: `watch` shows its progress and can stop it. Returns run.json."""
+
+    @flow(**CAPTURE_FLOW)
+    @takes(RunRequest)
+    def capture_to_asset(**asked: Any) -> Any:
+        return _run_capture(asked, watch)
+
+    record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
+    return record
+
+
+def _run_capture(asked: Mapping[str, Any], watch: Session | None) -> Any:
     request = RunRequest(**asked)
-    with _watched(asked):
-        plan = make_plan(request)
-        record = complete(plan, as_tasks(plan))
+    with _watched(asked, watch) as watched:
+        plan, note = make_plan(request), watched.observer.note
+        with exclusive_run(plan.store.root, plan.out, watched.stopped, note):
+            done = run_stages(plan, watched, task_executor(), with_slot(plan, watched.stopped))
+            record = publish(plan, done, note)
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))
     return record if name is None else Completed(name=name, message="\n".join(last_lines(record)), data=record)
@@ -66,19 +90,18 @@ def facescape_batch(**asked: Any) -> Any:
 
 
 @contextmanager
-def _watched(asked: Mapping[str, Any]) -> Iterator[Session]:
-    """The session of this flow: the command's, or a new one. Signals stop it at a checkpoint, and not at any place, as
-    Prefect's own handler would.
+def _watched(asked: Mapping[str, Any], known: Session | None = None) -> Iterator[Session]:
+    """The session of this flow: that of the command (`known`), or a new one. Signals stop it at a checkpoint,
+    and not at any place, as Prefect's own handler would.
 
     A run that a server started may use the allowed folders alone, and ends with the worker that started it.
     """
-    known = given()
     from_server = known is None and FlowRunContext.get() is not None
     if from_server:
         end_with(int(os.environ.get(PARENT, os.getppid())))
         check_folders(asked)
     watch = known or Session()
-    with session(watch), interruptible(watch.stop, watch.observer.note) as caught:
+    with interruptible(watch.stop, watch.observer.note) as caught:
         try:
             yield watch
             return

@@ -20,7 +20,7 @@ import pytest
 
 from tests.support.facescape_tree import write_tree
 from tests.support.points import PATIENCE, hold, read_until, wait_for
-from workflows.run.plan import RunRequest
+from workflows.run.request import RunRequest
 
 pytestmark = pytest.mark.slow
 SUPPORT = Path(__file__).parents[1] / "support"

@@ -16,8 +16,9 @@ import pytest
 from pipeline.artifacts import CameraSet, Capture, FittedFace, MaskSet
 from pipeline.demo.capture import write_demo_capture
 from pipeline.images import read_exr, read_linear
-from workflows.run.plan import RunRequest, make_plan
-from workflows.run.runner import run_here, run_plan
+from workflows.run.plan import make_plan
+from workflows.run.request import RunRequest
+from workflows.run.runner import run_stages
 
 pytestmark = pytest.mark.slow
 
@@ -63,7 +64,7 @@ def fit(capture: Path, truth: Path, out: Path) -> Fitted:
     plan = make_plan(
         RunRequest(capture=str(capture), out=str(out), holdout="every:5:2", until="inverse_rendering", sets=SMALL)
     )
-    done = {d.stage: d.located for d in run_plan(plan, run_here(plan))}
+    done = {d.stage: d.located for d in run_stages(plan)}
     face, photos = done["inverse_rendering"], done["capture"].artifact
     assert isinstance(face.artifact, FittedFace) and isinstance(photos, Capture)
     assert isinstance(done["masks"].artifact, MaskSet) and isinstance(done["poses"].artifact, CameraSet)

@@ -16,7 +16,8 @@ from stages.presets import read_config_file
 from tests.support.fuzzing import bounded, fuzzed
 from tests.support.mutations import WORDS, as_json, damaged, damages, nonsense, replaced, reworded, swaps
 from workflows.batch.captures import find
-from workflows.run.plan import RunRequest, check_settings
+from workflows.run.plan import check_settings
+from workflows.run.request import RunRequest
 
 SETTINGS = {"bake": {"size": 2048}, "poses": {"check": True, "given": "refine", "given_deviation": 0.01},
             "capture": {"holdout": "every:5:2", "min_views": 4}, "usd": {"name": "anna", "author": "A"}}  # fmt: skip

@@ -14,7 +14,7 @@ from prefect.exceptions import TerminationSignal
 from pipeline.errors import Cancelled, UsageError
 from stages.registry import REGISTRY
 from workflows import flows
-from workflows.run.session import Session, session
+from workflows.run.session import Session
 from workflows.server import access
 from workflows.server.access import CLIENT_LOGIN, CSRF, FILE_SETTINGS, ORIGINS, ROOTS, SERVER_LOGIN
 
@@ -111,7 +111,7 @@ def test_a_run_from_a_server_is_bound_to_folders_and_to_its_worker(tmp_path: Pat
     with pytest.raises(UsageError, match="may not use this path"):
         flows.capture_to_asset.fn(**asked)
     assert from_server == [os.getppid()] and not (tmp_path / "o").exists()
-    with session(Session()), flows._watched(asked):  # `neuface run` on a server: the user's own process
+    with flows._watched(asked, Session()):  # `neuface run` on a server: the user's own process
         pass
     assert len(from_server) == 1
 

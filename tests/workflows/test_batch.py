@@ -17,13 +17,13 @@ from pipeline.errors import Cancelled, DiskError, StageError, TimeLimitError, Us
 from pipeline.verdict import Level
 from workflows.batch import captures, failures
 from workflows.batch.captures import NAME, find, ranges
-from workflows.batch.commands import seconds
 from workflows.batch.failures import Failure, failure_in, failure_of, smaller
 from workflows.batch.loop import Ended, run_batch
 from workflows.batch.page import ODD, Row, ranked, write_page
 from workflows.batch.request import BatchRequest, asset_name
 from workflows.batch.state import BatchState, Entry, Summary, fingerprint, idempotency_key
-from workflows.run.plan import RunRequest
+from workflows.cli.options import seconds
+from workflows.run.request import RunRequest
 
 
 @pytest.fixture

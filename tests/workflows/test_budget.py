@@ -11,12 +11,13 @@ from pipeline.errors import UsageError
 from pipeline.store import Store
 from stages.presets import configs_for
 from stages.registry import FIT
-from workflows.cli.commands import request_from
 from workflows.cli.main import parser
+from workflows.cli.options import request_from
 from workflows.run import budget
 from workflows.run.budget import DRAFT_RATE, MIN_FIT, RUNGS, BudgetPlan, choose
-from workflows.run.plan import RunRequest, check_settings, make_plan, preview
-from workflows.run.runner import run_here, run_plan
+from workflows.run.plan import check_settings, make_plan, preview
+from workflows.run.request import RunRequest
+from workflows.run.runner import run_stages
 
 NAMES = [r.name for r in RUNGS]
 
@@ -82,7 +83,7 @@ def test_budget_and_preset_exclude_each_other(photos: Path, toys: None) -> None:
 
 def test_the_command_line_takes_times(tmp_path: Path) -> None:
     options = parser().parse_args(["run", "c", "--out", str(tmp_path), "--budget", "10m"])
-    assert request_from(options).budget == 600.0
+    assert request_from(options, RunRequest).budget == 600.0
     with pytest.raises(SystemExit):
         parser().parse_args(["run", "c", "--out", str(tmp_path), "--budget", "soon"])
 
@@ -107,6 +108,6 @@ def test_the_run_plans_before_the_fit_alone(
     monkeypatch.setattr(BudgetPlan, "describe", lambda self, budget: "planned")
     plan = make_plan(RunRequest(capture=str(photos), out=str(tmp_path / "out"), budget=60.0))
     assert [s.key is None for s in preview(plan)] == [False, True, True]
-    done = run_plan(plan, run_here(plan))
+    done = run_stages(plan)
     assert asked[0][0] == [done[0].key] and 0 < asked[0][1] < 60.0 and len(asked) == 1
     assert [s.key is None for s in preview(plan)] == [False, True, True]

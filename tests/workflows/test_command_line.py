@@ -1,17 +1,22 @@
-"""`neuface` as a user has it: exit codes, messages, stopping, resuming. Runs go through the Prefect flow."""
+"""`neuface` as a user has it: exit codes, messages, stopping, resuming."""
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from stages import registry
 from tests.support.points import PATIENCE, hold, read_until
+from tests.support.toy_stages import TOYS
 from workflows.cli.main import main, parser
 
 TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
@@ -200,3 +205,19 @@ def test_a_second_ctrl_c_stops_at_once(photos: Path, child_environment: dict[str
     child.send_signal(signal.SIGINT)
     child.communicate(timeout=PATIENCE)
     assert child.returncode == 130
+
+
+def test_the_way_from_main_to_the_first_stage_is_short(
+    photos: Path, toys: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five calls, as docs/architecture.md shows them."""
+    first, *rest = TOYS
+    stack: list[str] = []
+
+    def noted(*arguments: Any) -> Any:
+        stack.extend(f.function for f in inspect.stack(0))
+        return first.run(*arguments)
+
+    monkeypatch.setattr(registry, "REGISTRY", [dataclasses.replace(first, run=noted), *rest])
+    assert main(["run", str(photos), "--out", str(tmp_path / "out")]) == 0
+    assert stack[: stack.index("main")] == ["noted", "execute", "run_stages", "run", "run_command"]

@@ -21,7 +21,7 @@ from tests.support.facescape_tree import write_tree
 from tests.support.points import PATIENCE, wait_for
 from tests.support.servers import LOGIN, ask, descendants, free_port, guarded, login_headers, wait_healthy
 from workflows.batch.request import BatchRequest
-from workflows.run.plan import RunRequest
+from workflows.run.request import RunRequest
 
 PREFECT = Path(sys.executable).parent / "prefect"
 CLOSED = {"job_configuration": {"namespace": "x"}, "variables": {"properties": {}, "additionalProperties": False}}

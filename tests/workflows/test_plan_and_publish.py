@@ -11,15 +11,16 @@ from typing import Any
 import pytest
 
 from pipeline.artifacts import Artifact, FileRef, HeldOutView, Located, UsdAsset
-from pipeline.contract import Done
+from pipeline.contract import Done, execute
 from pipeline.errors import Cancelled, StageError, UsageError
 from workflows.run.output_dirs import writable
-from workflows.run.plan import RunRequest, make_plan, preview
+from workflows.run.plan import make_plan, preview
 from workflows.run.publish import asset_hash, publish
 from workflows.run.published import LIST
 from workflows.run.replace import swap
-from workflows.run.runner import run_here, run_plan
-from workflows.run.session import Session, session
+from workflows.run.request import RunRequest
+from workflows.run.runner import run_stages
+from workflows.run.session import Session
 
 pytestmark = pytest.mark.usefixtures("toys")
 
@@ -30,7 +31,7 @@ def request(photos: Path, **changes: Any) -> RunRequest:
 
 def run(photos: Path, **changes: Any) -> list[Done[Any]]:
     plan = make_plan(request(photos, **changes))
-    return run_plan(plan, run_here(plan))
+    return run_stages(plan)
 
 
 # ------------------------------------------------------------------ plans
@@ -86,23 +87,23 @@ def test_a_stopped_run_goes_on_where_it_left_off(photos: Path) -> None:
     watch = Session()
     plan = make_plan(request(photos))
 
-    def stop_after_first(*args: Any) -> Any:
-        done = run_here(plan)(*args)
+    def stop_after_first(*args: Any, **options: Any) -> Any:
+        done = execute(*args, **options)
         watch.stop.set()
         return done
 
-    with session(watch), pytest.raises(Cancelled):
-        run_plan(plan, stop_after_first)
+    with pytest.raises(Cancelled):
+        run_stages(plan, watch, stop_after_first)
     assert [d.reused for d in run(photos)] == [True, False, False]
 
 
 def test_relative_paths(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(photos.parent)
     plan = make_plan(RunRequest(capture="photos", out="deep/out"))
-    assert [d.reused for d in run_plan(plan, run_here(plan))] == [False] * 3
+    assert [d.reused for d in run_stages(plan)] == [False] * 3
     assert plan.out == photos.parent / "deep/out"
     absolute = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "deep/out")))
-    assert [d.reused for d in run_plan(absolute, run_here(absolute))] == [True] * 3
+    assert [d.reused for d in run_stages(absolute)] == [True] * 3
 
 
 # ------------------------------------------------------------------ folders

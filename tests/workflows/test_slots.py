@@ -18,8 +18,9 @@ from pipeline.contract import inputs_from, key
 from pipeline.errors import Cancelled, StageError
 from tests.support.points import wait_for
 from tests.support.toy_stages import TOYS, source
-from workflows.run.plan import RunRequest, make_plan
-from workflows.run.session import Session, session
+from workflows.run import runner
+from workflows.run.plan import make_plan
+from workflows.run.request import RunRequest
 from workflows.server import adapter, concurrency
 
 
@@ -135,19 +136,19 @@ def test_the_fit_holds_a_slot_and_nothing_else_does(photos: Path, monkeypatch: p
     request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), fit_slots="gpus")
     plan = make_plan(request)
     inputs = inputs_from(TOYS[0], {"source": source(photos)})
-    work = adapter._Sealed(TOYS[0], inputs, plan.configs["first"], plan)
-    with adapter._slot(work):
+    around, config = adapter.with_slot(plan, lambda: False), plan.configs["first"]
+    with around(TOYS[0], inputs, config):
         assert held == ["gpus"]
     stored = plan.store.folder("first", key(TOYS[0], inputs, plan.configs["first"]))
     stored.mkdir(parents=True)
     (stored / "manifest.json").write_text("{}")
-    with adapter._slot(work):  # nothing will be computed
+    with around(TOYS[0], inputs, config):  # nothing will be computed
         assert len(held) == 1
-    for other in (adapter._Sealed(TOYS[1], inputs, plan.configs["second"], plan),
-                  adapter._Sealed(TOYS[0], inputs, plan.configs["first"], replace(plan, request=request.model_copy(
-                      update={"fit_slots": None})))):  # fmt: skip
-        with adapter._slot(other):
-            assert len(held) == 1
+    with around(TOYS[1], inputs, plan.configs["second"]):
+        assert len(held) == 1
+    without = replace(plan, request=request.model_copy(update={"fit_slots": None}))
+    with adapter.with_slot(without, lambda: False)(TOYS[0], inputs, config):
+        assert len(held) == 1
 
 
 @pytest.mark.usefixtures("toys")
@@ -161,12 +162,9 @@ def test_the_wait_for_a_slot_does_not_count_as_a_hang(photos: Path, monkeypatch:
         yield
 
     monkeypatch.setattr(adapter, "slot", noted)
-    monkeypatch.setattr(adapter, "time_limit", noted)
+    monkeypatch.setattr(runner, "time_limit", noted)
     monkeypatch.setattr(adapter, "FIT", "first")
-    monkeypatch.setattr(adapter, "get_run_logger", lambda: adapter.log)
     request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), fit_slots="gpus", stage_limit=60)
     plan = make_plan(request)
-    inputs = inputs_from(TOYS[0], {"source": source(photos)})
-    with session(Session()):
-        assert not adapter._execute(adapter._Sealed(TOYS[0], inputs, plan.configs["first"], plan)).reused
-    assert order == ["gpus", "first"]
+    assert not any(d.reused for d in runner.run_stages(plan, around=adapter.with_slot(plan, lambda: False)))
+    assert order == ["gpus", "first", "second", "third"]

@@ -13,11 +13,12 @@ from pipeline.artifacts import sha256_of
 from pipeline.store import LINEAGE, Store, lineage
 from workflows.batch.state import BatchState, Entry
 from workflows.cli.main import main
-from workflows.run.plan import RunRequest, make_plan
+from workflows.run.plan import make_plan
 from workflows.run.publish import publish
 from workflows.run.published import note_published
+from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
-from workflows.run.runner import run_here, run_plan
+from workflows.run.runner import run_stages
 from workflows.store.gc import belongings, garbage, purge, remove
 
 pytestmark = pytest.mark.usefixtures("toys")
@@ -26,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("toys")
 def run(photos: Path, out: Path, store: Path, **changes: Any) -> None:
     plan = make_plan(RunRequest(capture=str(photos), out=str(out), store=str(store), **changes))
     plan.out.mkdir(parents=True, exist_ok=True)
-    publish(plan, run_plan(plan, run_here(plan)))
+    publish(plan, run_stages(plan))
 
 
 def age(store: Path, days: float = 30) -> None:
@@ -131,7 +132,7 @@ def two_subjects(tmp_path: Path) -> Path:
         until = "second" if name == "4/2_smile" else None
         plan = make_plan(RunRequest(capture=str(photos), out=str(out / name), store=str(out / ".store"), until=until))
         plan.out.mkdir(parents=True)
-        done = run_plan(plan, run_here(plan))
+        done = run_stages(plan)
         if until is None:
             publish(plan, done)
         BatchState(out / "batch").write(Entry(name=name, capture=str(photos)))

@@ -16,9 +16,10 @@ from pipeline.artifacts import FileRef, HeldOutView, Located, UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import StageError
 from workflows.run import replace
-from workflows.run.plan import Plan, RunRequest, make_plan
+from workflows.run.plan import Plan, make_plan
 from workflows.run.publish import publish
 from workflows.run.published import LIST
+from workflows.run.request import RunRequest
 
 pytestmark = pytest.mark.usefixtures("toys")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,11 @@ from tests.support.toy_stages import finding
 from workflows.cli.console import Console
 from workflows.cli.main import main
 from workflows.run import estimate
-from workflows.run.plan import RunRequest, make_plan
+from workflows.run.plan import make_plan
 from workflows.run.publish import publish
-from workflows.run.runner import run_here, run_plan
-from workflows.run.session import Session, Silent, session
+from workflows.run.request import RunRequest
+from workflows.run.runner import run_stages
+from workflows.run.session import Session, Silent
 from workflows.run.verdict import exit_code, is_refused, last_lines, level_in, level_of_state, state_name
 
 pytestmark = pytest.mark.usefixtures("toys", "fit")
@@ -51,8 +53,7 @@ def run(photos: Path, *levels: tuple[str, Level], **changes: Any) -> tuple[list[
     request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), sets=judged(*levels), **changes)
     plan, notes = make_plan(request), Notes()
     plan.out.mkdir(exist_ok=True)
-    with session(Session(notes)):
-        done = run_plan(plan, run_here(plan))
+    done = run_stages(plan, Session(notes))
     publish(plan, done)
     return done, json.loads((plan.out / "run.json").read_text()), notes.lines
 
@@ -177,7 +178,7 @@ def test_the_rest_is_estimated_from_earlier_runs_with_the_same_settings(
 def test_a_budget_is_its_own_estimate(photos: Path) -> None:
     plan = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "out"), budget=600))
     assert (
-        estimate.remaining_time(plan, [])
+        estimate.remaining_time(plan, [], time.monotonic())
         == "the rest (first to third) has what is left of the budget: about 10 minutes"
     )
 

@@ -16,11 +16,13 @@ from typing import Any
 
 from pipeline.contract import Done
 from workflows.batch.failures import failure_of
-from workflows.run.complete import complete
 from workflows.run.interrupt import end_with, interruptible
-from workflows.run.plan import Plan, RunRequest, make_plan
-from workflows.run.runner import run_here
-from workflows.run.session import Session, session
+from workflows.run.plan import Plan, make_plan
+from workflows.run.publish import publish
+from workflows.run.request import RunRequest
+from workflows.run.run_lock import exclusive_run
+from workflows.run.runner import run_stages
+from workflows.run.session import Session
 from workflows.run.verdict import exit_code, level_in
 
 
@@ -62,10 +64,11 @@ def main(arguments: list[str]) -> int:
     request = RunRequest.model_validate_json(sys.stdin.buffer.readline())
     threading.Thread(target=_stop_at_the_end_of_stdin, args=(watch,), daemon=True).start()
     try:
-        with session(watch), interruptible(watch.stop, events.note):  # it has a session of its own: no Ctrl-C
+        with interruptible(watch.stop, events.note):  # its process group is its own: no Ctrl-C reaches it
             plan = make_plan(request)
             events.tell(event="plan", batch=rays_a_step(plan))
-            record = complete(plan, run_here(plan))
+            with exclusive_run(plan.store.root, plan.out, watch.stopped, events.note):
+                record = publish(plan, run_stages(plan, watch), events.note)
     except Exception as e:
         fault = failure_of(e, events.stage)
         events.tell(event="failed", fault=fault.model_dump())

@@ -20,7 +20,7 @@ from workflows.batch.failures import Failure
 from workflows.batch.loop import Ended
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import Entry
-from workflows.run.plan import RunRequest
+from workflows.run.request import RunRequest
 from workflows.run.watchdog import grace
 
 CHILD = (sys.executable, "-m", "workflows.batch.child")

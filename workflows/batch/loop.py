@@ -23,7 +23,8 @@ from workflows.batch.page import write_page
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import ENDED, BatchState, Entry, Summary, fingerprint
 from workflows.run.output_dirs import writable
-from workflows.run.plan import RunRequest, check_settings
+from workflows.run.plan import check_settings
+from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
 
 PAGE_EVERY = 20.0  # seconds between two updates of the page while the batch runs

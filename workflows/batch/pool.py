@@ -29,7 +29,8 @@ from workflows.batch.failures import Failure, failure_in
 from workflows.batch.loop import Ended
 from workflows.batch.request import PRIORITIES, BatchRequest
 from workflows.batch.state import Entry, idempotency_key
-from workflows.run.plan import RunRequest, make_plan
+from workflows.run.plan import make_plan
+from workflows.run.request import RunRequest
 from workflows.run.run_lock import is_held
 from workflows.run.verdict import level_of_state
 from workflows.server.environment import SLOTS_ON_DISK

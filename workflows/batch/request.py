@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from stages.presets import DEFAULT_PRESET
-from workflows.run.plan import RunRequest
+from workflows.run.request import RunRequest
 
 PRIORITIES = ("high", "normal", "low")
 DEPLOYMENT = "capture-to-asset/local"
@@ -24,24 +24,26 @@ class BatchRequest(BaseModel):
     subjects: str | None = Field(None, description="only these: 1-40 or 1,7,20-29; all by default")
     expressions: str | None = Field(None, description="only these numbers: 1,2; all by default")
     preset: str = Field(DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
-    holdout: str | None = Field(None, description='views kept from the fit: "every:5:2"; none by default')
-    seed: int = Field(0, ge=0, description="of every random draw")
+    holdout: str | None = Field(
+        None, description="views that are not fitted but used for the metrics, as in neuface run; none by default"
+    )
+    seed: int = Field(0, ge=0, description="seed of every random draw")
     device: str = Field("auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(None, description="last stage to run")
-    sets: tuple[str, ...] = Field((), description='single settings, "stage.key=value"')
+    sets: tuple[str, ...] = Field((), description="one setting, stage.key=value; repeatable")
     config: dict[str, dict[str, Any]] = Field({}, description="settings by stage, then by key")
     store: str | None = Field(None, description="folder of finished stages; OUT/.store by default")
-    stage_limit: float | None = Field(6 * 3600.0, gt=0, description="seconds that one stage may take")
-    force: bool = Field(False, description="go on to the fit although photos, cameras or masks are unusable")
-    strict: bool = Field(False, description="results that are only usable count as refused; makes no other")
-    attempts: int = Field(3, ge=1, le=20, description="times that a capture is tried whose fault may pass")
+    stage_limit: float | None = Field(6 * 3600.0, gt=0, description="time that one stage may take")
+    force: bool = Field(False, description="go on to the fit although the photos, cameras or masks are unusable")
+    strict: bool = Field(False, description="results that are only usable also count as refused: exit code 3")
+    attempts: int = Field(3, ge=1, le=20, description="attempts at a capture whose failure may pass")
     deployment: str = Field(DEPLOYMENT, description="flow/name of the deployment that runs one capture")
     chunk: int = Field(50, ge=1, le=200, description="runs on the server at a time that are not finished")
     priority: Literal["high", "normal", "low"] | None = Field(
         None, description="work queue of the pool; made if it is not there. None: the deployment's own"
     )
     gpus: int | None = Field(None, ge=1, description="fits at a time in the whole pool; no limit by default")
-    lost_after: float = Field(60.0, ge=1, description="seconds without a living process after which a run is lost")
+    lost_after: float = Field(60.0, ge=1, description="time without a living process after which a run is lost")
 
     @property
     def store_path(self) -> Path:
@@ -59,7 +61,7 @@ class BatchRequest(BaseModel):
         return None if self.gpus is None else "neuface-fits"
 
     def run_request(self, capture: Path, name: str, sets: tuple[str, ...], own: dict[str, Any]) -> RunRequest:
-        """One capture's run. `own`: what a list says of this capture alone; `sets`: what earlier attempts taught."""
+        """One capture's run. `own`: settings of this capture from a list; `sets`: what earlier attempts changed."""
         of_all = {"preset", "holdout", "seed", "device", "until", "config", "stage_limit", "force", "strict"}
         shared = self.model_dump(include=of_all)
         return RunRequest(

@@ -17,7 +17,7 @@ from pipeline.verdict import Level
 from stages import registry
 from workflows.batch.captures import Item
 from workflows.batch.failures import Failure
-from workflows.run.plan import RunRequest
+from workflows.run.request import RunRequest
 from workflows.run.verdict import is_refused
 
 State = Literal["waiting", "submitted", "done", "unusable", "failed"]

@@ -159,12 +159,11 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
 
 def measure(row: Row, given: argparse.Namespace, console: Console) -> Result:
     """Run a row, or take it from the store, and score it."""
-    from workflows.run.runner import run_here, run_plan
-    from workflows.run.session import Session, session
+    from workflows.run.runner import run_stages
+    from workflows.run.session import Session
 
     plan = plan_of(given, settings_of(row, given))
-    with session(Session(console)):
-        done = {d.stage: d for d in run_plan(plan, run_here(plan))}
+    done = {d.stage: d for d in run_stages(plan, Session(console))}
     found: dict[str, Located[Any]] = {name: d.located for name, d in done.items()}
     views = [scores_of(v, found) for v in found["capture"].artifact.views if v.holdout]
     mean = np.nanmean(np.array(views, np.float64), axis=0) if views else np.full(4, np.nan)

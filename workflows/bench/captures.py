@@ -38,7 +38,7 @@ SKIPPED = "skipped"
 
 def options(sub: argparse.ArgumentParser) -> None:
     """The command line's options."""
-    from workflows.batch.commands import a_time
+    from workflows.cli.options import a_time
 
     sub.add_argument("--root", metavar="DIR", help="folder of captures (../shared/captures beside the project)")
     sub.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these; other rows stay as they are")

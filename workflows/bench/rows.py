@@ -10,7 +10,8 @@ from typing import Any, Protocol, TypeVar
 
 from pipeline.errors import UsageError
 from stages.presets import DEFAULT_PRESET
-from workflows.run.plan import Plan, RunRequest, make_plan
+from workflows.run.plan import Plan, make_plan
+from workflows.run.request import RunRequest
 
 
 class Named(Protocol):

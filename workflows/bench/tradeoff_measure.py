@@ -70,10 +70,10 @@ def measure(knob: Knob, given: argparse.Namespace) -> Measured:
     from pipeline.fields.face import load_model
     from workflows.bench.ablations import chamfer
     from workflows.bench.rows import plan_of
-    from workflows.run.runner import run_here, run_plan
+    from workflows.run.runner import run_stages
 
     plan = plan_of(given, settings_of(knob, given), knob.preset or DEFAULT_PRESET)
-    done = {d.stage: d for d in run_plan(plan, run_here(plan))}
+    done = {d.stage: d for d in run_stages(plan)}
     found: dict[str, Any] = {name: d.located for name, d in done.items()}
     fit = done["inverse_rendering"].run
     model = load_model(found["inverse_rendering"].path(found["inverse_rendering"].artifact.field))

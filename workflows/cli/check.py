@@ -17,14 +17,15 @@ from typing import Any
 from pipeline.contract import Done
 from pipeline.errors import StageError
 from pipeline.verdict import Finding, Verdict
-from stages.presets import DEFAULT_PRESET
 from workflows.cli.console import Console
+from workflows.cli.options import add_request_options
 from workflows.run import output_dirs
 from workflows.run.early import early_stages
 from workflows.run.interrupt import interruptible
-from workflows.run.plan import RunRequest, make_plan
-from workflows.run.runner import run_here, run_plan
-from workflows.run.session import Session, session
+from workflows.run.plan import make_plan
+from workflows.run.request import RunRequest
+from workflows.run.runner import run_stages
+from workflows.run.session import Session
 from workflows.run.verdict import REFUSED, headline, verdict_of_done
 
 NEXT = {
@@ -41,8 +42,7 @@ def add_options(check: argparse.ArgumentParser) -> None:
     check.add_argument("--solve", action="store_true", help="photos without cameras: solve and judge them; minutes")
     check.add_argument("--json", metavar="FILE", help="write the verdict and every finding; - for standard output")
     check.add_argument("--store", metavar="DIR", help="keep what is found for neuface run --store DIR; none by default")
-    check.add_argument("--preset", default=DEFAULT_PRESET, help="as for the run that follows (%(default)s)")
-    check.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
+    add_request_options(check, RunRequest, only=("preset", "sets"))
     check.set_defaults(run=check_command)
 
 
@@ -55,15 +55,14 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
         store = Path(options.store).absolute() if options.store else scratch / ".store"
         stack.enter_context(output_dirs.writable(scratch, store))
         watch = Session(console)
-        stack.enter_context(session(watch))
         stack.enter_context(interruptible(watch.stop, console.note))
         for until in _untils(early_stages()):
             if until is None:
                 break
             request = RunRequest(capture=options.capture, out=str(scratch), store=str(store), until=until,
-                                 preset=options.preset, sets=tuple(options.set), force=True)  # fmt: skip
+                                 preset=options.preset, sets=tuple(options.sets), force=True)  # fmt: skip
             try:
-                done = _run(request)
+                done = run_stages(make_plan(request), watch)
             except StageError as e:
                 if not done:
                     raise
@@ -86,11 +85,6 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
 def _untils(early: Sequence[str]) -> list[str | None]:
     """First the photos alone; then, where it makes sense, all that comes before the fit."""
     return [early[0], *([early[-1]] if len(early) > 1 else [])] if early else [None]
-
-
-def _run(request: RunRequest) -> list[Done[Any]]:
-    plan = make_plan(request)
-    return run_plan(plan, run_here(plan))
 
 
 def _has_cameras(done: Sequence[Done[Any]]) -> bool:

@@ -12,12 +12,15 @@ from typing import Any
 
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
+from workflows.cli.options import request_from, with_provenance
 from workflows.run import output_dirs
-from workflows.run.complete import complete
 from workflows.run.interrupt import interruptible
-from workflows.run.plan import RunRequest, make_plan, preview
-from workflows.run.runner import run_here
-from workflows.run.session import Session, session
+from workflows.run.plan import make_plan, preview
+from workflows.run.publish import publish
+from workflows.run.request import RunRequest
+from workflows.run.run_lock import exclusive_run
+from workflows.run.runner import run_stages
+from workflows.run.session import Session
 from workflows.run.verdict import exit_code, last_lines
 from workflows.server import environment
 
@@ -25,48 +28,44 @@ from workflows.server import environment
 DEMO_VIEWS, DEMO_SIZE, DEMO_HOLDOUT = 40, 384, "every:5:2"
 
 
-def run(request: RunRequest, console: Console, dry: bool = False) -> dict[str, Any]:
+def run(request: RunRequest, console: Console) -> dict[str, Any]:
     """Plan, then run the stages: here, or as a flow of the Prefect server that PREFECT_API_URL names.
 
-    Hands back what run.json holds.
+    Returns what run.json holds.
 
     Raises:
         StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C or another signal.
     """
-    plan = make_plan(request)
-    if dry:
-        for step in preview(plan):
-            print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
-        return {}
-    watch = Session(console)
-    with session(watch):
-        if environment.has_server():
-            return _on_the_server(request)
-        with interruptible(watch.stop, console.note):
-            return complete(plan, run_here(plan))
+    plan, watch = make_plan(request), Session(console)
+    if environment.has_server():
+        environment.defaults()
+        from workflows.flows import run_with_session
 
-
-def _on_the_server(request: RunRequest) -> dict[str, Any]:
-    environment.defaults()
-    from workflows.flows import capture_to_asset
-
-    record: dict[str, Any] = capture_to_asset(**{**request.model_dump(), "sets": list(request.sets)})
-    return record
+        return run_with_session(request, watch)
+    with (
+        interruptible(watch.stop, console.note),
+        exclusive_run(plan.store.root, plan.out, watch.stopped, console.note),
+    ):
+        return publish(plan, run_stages(plan, watch), console.note)
 
 
 # ------------------------------------------------------------------ commands
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """neuface run"""
-    request = request_from(options)
+    request = request_from(options, RunRequest)
+    request = request.model_copy(update={"config": with_provenance(options, request.config)})
+    if options.dry_run:
+        for step in preview(make_plan(request)):
+            print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
+        return 0
     try:
-        record = run(request, console, options.dry_run)
+        record = run(request, console)
     except Cancelled:
         console.close()
         console.note("stopped; the same command goes on where this one left off")
         raise
-    if record:
-        _tell(record, Path(options.out))
-        _tell_verdict(record)
+    _tell(record, Path(options.out))
+    _tell_verdict(record)
     return exit_code(record)
 
 
@@ -218,35 +217,6 @@ def doctor_command(options: argparse.Namespace, console: Console) -> int:
 
 
 # ------------------------------------------------------------------ helpers
-def request_from(options: argparse.Namespace) -> RunRequest:
-    """The request that the options of `neuface run` make."""
-    from stages.presets import read_config_file
-
-    config = read_config_file(Path(options.config)) if options.config else {}
-    given = {"author": options.author, "license": options.license, "subject_consent": options.subject_consent}
-    stated = {k: v for k, v in given.items() if v is not None}
-    if stated:
-        config = {**config, "usd": {**config.get("usd", {}), **stated}}
-    return RunRequest(
-        capture=options.capture,
-        out=options.out,
-        preset=options.preset,
-        holdout=options.holdout,
-        name=options.name,
-        seed=options.seed,
-        device=options.device,
-        until=options.until,
-        from_stage=options.from_stage,
-        sets=tuple(options.set),
-        config=config,
-        store=options.store,
-        budget=options.budget,
-        stage_limit=options.stage_limit,
-        force=options.force,
-        strict=options.strict,
-    )
-
-
 def read_record(out: Path) -> dict[str, Any]:
     """run.json of a folder that a run left.
 

@@ -13,19 +13,19 @@ import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads 
 
 import argparse
 import logging
-import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
 from pipeline.errors import NeufaceError, UsageError, stage_error_from_os_error
-from stages.presets import DEFAULT_PRESET
 from workflows.batch import commands as batch_commands
 from workflows.batch import schedule
 from workflows.bench import commands as bench_commands
 from workflows.cli import check, commands, settings
 from workflows.cli.console import Console
+from workflows.cli.options import add_request_options
 from workflows.run.interrupt import Interrupted, as_exceptions, code_of
+from workflows.run.request import RunRequest
 from workflows.store import commands as store_commands
 
 EXAMPLES = """examples:
@@ -53,8 +53,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
     demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
     demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
-    demo.add_argument("--preset", default="draft", help="speed against accuracy (%(default)s)")
-    _where(demo)
+    add_request_options(demo, RunRequest, only=("preset", "device", "store"))
     demo.set_defaults(run=commands.demo_command)
     validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
     validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
@@ -80,38 +79,11 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _run_options(run: argparse.ArgumentParser) -> None:
-    run.add_argument("capture", metavar="CAPTURE", help="folder with the photos, or a FaceScape capture")
-    run.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
-    run.add_argument(
-        "--preset", default=DEFAULT_PRESET, help="speed against accuracy: draft, studio, film; or paper (%(default)s)"
-    )
-    run.add_argument(
-        "--holdout",
-        metavar="RULE",
-        help="views kept from the fit and used for the metrics: every:5:2 "
-        "(index %% 5 == 2) or names:a.jpg,b.jpg; default none",
-    )
-    run.add_argument("--name", help="name of the asset")
+    add_request_options(run, RunRequest, without=("fit_slots",))
     run.add_argument("--author", help="who made the capture; recorded in the asset")
     run.add_argument("--license", help="licence of the capture; recorded in the asset")
     run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
-    run.add_argument("--seed", type=int, default=0, help="of every random draw (%(default)s)")
-    run.add_argument("--from-stage", metavar="S", help="run this stage and those after it anew")
-    run.add_argument("--until", metavar="S", help="stop after this stage")
-    run.add_argument(
-        "--budget",
-        type=batch_commands.a_time,
-        metavar="TIME",
-        help="time for the whole run, in place of a preset: 90s, 10m, 2h",
-    )
-    run.add_argument(
-        "--stage-limit", type=batch_commands.a_time, metavar="TIME", help="time that one stage may take: 90s, 30m, 2h"
-    )
-    run.add_argument("--dry-run", action="store_true", help="say what would be run and what reused, then stop")
-    batch_commands.add_verdict_options(run)
-    run.add_argument("--set", action="append", default=[], metavar="STAGE.KEY=VALUE", help="one setting; repeatable")
-    run.add_argument("--config", metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
-    _where(run)
+    run.add_argument("--dry-run", action="store_true", help="print what would be run and what reused, then stop")
     run.set_defaults(run=commands.run_command)
 
 
@@ -127,24 +99,15 @@ def _render_options(render: argparse.ArgumentParser) -> None:
     render.set_defaults(run=commands.render_command)
 
 
-def _where(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--device", default="auto", help="auto, cpu or cuda (%(default)s)")
-    sub.add_argument(
-        "--store",
-        metavar="DIR",
-        default=os.environ.get("NEUFACE_STORE"),
-        help="folder of finished stages ($NEUFACE_STORE, else DIR/.store)",
-    )
-
-
 def _unicode(options: argparse.Namespace) -> None:
     """Raises UsageError where a path or a text is not UTF-8: no manifest, USD file or page could name it."""
+    flags = {"out": "--out", "store": "--store", "name": "--name", "config": "--config", "sets": "--set"}
     for option, value in vars(options).items():
         for text in value if isinstance(value, list) else [value]:
             if isinstance(text, str) and text != text.encode("utf-8", "replace").decode():
                 raise UsageError(
                     "a name is not UTF-8",
-                    where=f"--{option}" if option in ("out", "store", "name", "set", "config") else option,
+                    where=flags.get(option, option),
                     value=ascii(text),
                     limit="text and paths in UTF-8",
                     remedy="rename the file or folder, or write the text in UTF-8",

@@ -13,7 +13,7 @@ from pipeline.contract import Done
 from stages import registry
 from workflows.run import estimate
 from workflows.run.plan import Plan
-from workflows.run.session import current
+from workflows.run.session import Session
 from workflows.run.verdict import headline, verdict_of_done
 
 PHOTOS_NAMED = 12  # in the line of photos to look at; run.json has all
@@ -25,7 +25,7 @@ def early_stages() -> tuple[str, ...]:
     return tuple(names[: names.index(registry.FIT)]) if registry.FIT in names else ()
 
 
-def ends_early(plan: Plan, done: Sequence[Done[Any]]) -> bool:
+def ends_early(plan: Plan, done: Sequence[Done[Any]], watch: Session) -> bool:
     """Whether the run ends with the stage that was just done, before what it was asked to do is done.
 
     Tells the summary after the last stage before the fit, and after an earlier one where the run ends.
@@ -35,13 +35,14 @@ def ends_early(plan: Plan, done: Sequence[Done[Any]]) -> bool:
         return False
     ends = verdict_of_done(done).level == "unusable" and not plan.request.force
     if ends or name == early[-1]:
-        for line in summary(plan, done):
-            current().observer.note(line)
+        for line in summary(plan, done, watch.begun):
+            watch.observer.note(line)
     return ends
 
 
-def summary(plan: Plan, done: Sequence[Done[Any]]) -> list[str]:
-    """Lines: the verdict so far, each trouble with its remedy, photos to look at, and what comes next."""
+def summary(plan: Plan, done: Sequence[Done[Any]], begun: float) -> list[str]:
+    """Lines: the verdict so far, each trouble with its remedy, photos to look at, and what comes next. begun: of the
+    run, by time.monotonic()."""
     verdict = verdict_of_done(done)
     lines = [headline(verdict.level, verdict.stages, "verdict so far")]
     lines += [f"  {reason}" for reason in verdict.reasons()]
@@ -54,4 +55,4 @@ def summary(plan: Plan, done: Sequence[Done[Any]]) -> list[str]:
         return [*lines, f"  the run ends here, before {after}; what is finished is kept: --force goes on from it"]
     if verdict.level == "unusable":
         lines.append("  going on although it is unusable (--force)")
-    return [*lines, f"  {estimate.remaining_time(plan, done)}"]
+    return [*lines, f"  {estimate.remaining_time(plan, done, begun)}"]

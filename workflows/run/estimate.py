@@ -10,7 +10,6 @@ from typing import Any
 
 from pipeline.contract import Done, StageConfig
 from workflows.run.plan import Plan, preview
-from workflows.run.session import current
 
 # Seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: medians of four captures
 # of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
@@ -24,12 +23,12 @@ NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subjec
 LOOKED_AT = 50  # earlier runs of a stage that are read, the latest first
 
 
-def remaining_time(plan: Plan, done: Sequence[Done[Any]]) -> str:
-    """A line for the user on the stages that are not done."""
+def remaining_time(plan: Plan, done: Sequence[Done[Any]], begun: float) -> str:
+    """A line for the user on the stages that are not done. begun: of the run, by time.monotonic()."""
     rest = [s.name for s in plan.stages[len(done) :]]
     which = rest[0] if len(rest) == 1 else f"{rest[0]} to {rest[-1]}"
     if plan.request.budget is not None:
-        left = max(0.0, plan.request.budget - (time.monotonic() - current().begun))
+        left = max(0.0, plan.request.budget - (time.monotonic() - begun))
         return f"the rest ({which}) has what is left of the budget: about {_words(left)}"
     stored = {step.stage for step in preview(plan) if step.action == "reused"}
     found = {name: _of_stage(plan, name) for name in rest if name not in stored}

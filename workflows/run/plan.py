@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.contract import Stage, StageConfig, inputs_from, key
@@ -15,52 +15,9 @@ from pipeline.store import MANIFEST, Store
 from stages import registry
 from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_sets
 from stages.registry import FIT
+from workflows.run.request import RunRequest
 
 DEVICES = ("auto", "cpu", "cuda")
-
-
-class RunRequest(BaseModel):
-    """A run as the user asks for it: plain data, the same from the command line and from a deployment.
-
-    The deployment's form is made of these fields (workflows/server/flow_signature.py).
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    capture: str = Field(description="folder with the photos; absolute, as the worker sees it")
-    out: str = Field(description="folder for the results; made if it is not there")
-    preset: str = Field(default=DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
-    holdout: str | None = Field(
-        default=None, description='views kept from the fit and used for the metrics: "every:5:2" or "names:a.jpg,b.jpg"'
-    )
-    name: str | None = Field(default=None, description="name of the asset")
-    seed: int = Field(default=0, description="of every random draw")
-    device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
-    until: str | None = Field(default=None, description="last stage to run")
-    from_stage: str | None = Field(
-        default=None, description="this stage and those after it run even if the store has them"
-    )
-    sets: tuple[str, ...] = Field(default=(), description='single settings, "stage.key=value"')
-    config: dict[str, dict[str, Any]] = Field(default={}, description="settings by stage, then by key")
-    store: str | None = Field(default=None, description="folder of finished stages; OUT/.store by default")
-    budget: float | None = Field(
-        default=None,
-        gt=0,
-        description="seconds for the whole run: sizes and the length of the fit are planned on this machine",
-    )
-    stage_limit: float | None = Field(
-        default=None, gt=0, description="seconds that one stage may take; none by default"
-    )
-    fit_slots: str | None = Field(
-        default=None, description="name of a global concurrency limit; the fit holds one of its slots (a GPU, say)"
-    )
-    force: bool = Field(default=False, description="go on to the fit although photos, cameras or masks are unusable")
-    strict: bool = Field(default=False, description="a result that is only usable counts as refused; makes no other")
-
-    @property
-    def store_path(self) -> Path:
-        """Where finished artifacts are kept."""
-        return Path(self.store) if self.store else Path(self.out) / ".store"
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,17 +16,24 @@ from pathlib import Path
 from typing import IO
 
 from pipeline.errors import Cancelled, stage_error_from_os_error
+from workflows.run.output_dirs import writable
 
 POLL = 0.2  # seconds between two attempts
 
 
 @contextmanager
 def exclusive_run(store: Path, out: Path, stopped: Callable[[], bool], notify: Callable[[str], None]) -> Iterator[None]:
-    """Wait until no other run writes to `out`, then hold it.
+    """Check that `out` and the store can be written, wait until no other run writes to `out`, then hold its lock.
 
     Raises:
-        Cancelled: stopped by the user while waiting. StageError: the store can't be written.
+        Cancelled: stopped by the user while waiting. StageError: one of the folders can't be written.
     """
+    with writable(out, store), _locked(store, out, stopped, notify):
+        yield
+
+
+@contextmanager
+def _locked(store: Path, out: Path, stopped: Callable[[], bool], notify: Callable[[str], None]) -> Iterator[None]:
     path = _path(store, out)
     handle, notified = _take(path), False
     while handle is None:

@@ -1,12 +1,9 @@
-"""Who watches a run, and who may stop it. Flow parameters have to be plain data, so this travels beside them."""
+"""Who watches a run, and what stops it."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -14,7 +11,7 @@ from pipeline.contract import Done
 
 
 class Observer(Protocol):
-    """Told what a run does."""
+    """Is informed of what a run does."""
 
     def started(self, stage: str, number: int, of: int) -> None:
         """A stage begins; `number` counts from 1."""
@@ -25,11 +22,11 @@ class Observer(Protocol):
         ...
 
     def finished(self, done: Done[Any]) -> None:
-        """The stage is done, or its result was found."""
+        """The stage is done, or its result was found in the store."""
         ...
 
     def note(self, text: str) -> None:
-        """Something worth a line."""
+        """A message for the user."""
         ...
 
 
@@ -44,9 +41,9 @@ class Silent:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One run's watcher and its stop flags.
+    """One run's observer and its stop flags.
 
-    stop: the user's. late: the time limit's, of the stage at work. begun: when, by time.monotonic().
+    stop: set by the user. late: set by the time limit of the running stage. begun: start, by time.monotonic().
     """
 
     observer: Observer = field(default_factory=Silent)
@@ -55,28 +52,5 @@ class Session:
     begun: float = field(default_factory=time.monotonic)
 
     def stopped(self) -> bool:
-        """Whether the stage at work has to end: the user said so, or its time is over."""
+        """Whether the running stage has to end: the user stopped it, or its time is over."""
         return self.stop.is_set() or self.late.is_set()
-
-
-_SESSION: ContextVar[Session | None] = ContextVar("neuface_session", default=None)
-
-
-def given() -> Session | None:
-    """The session that a command of this process made, if one did."""
-    return _SESSION.get()
-
-
-def current() -> Session:
-    """The session around this code, or one that is silent and never stopped."""
-    return _SESSION.get() or Session()
-
-
-@contextmanager
-def session(value: Session) -> Iterator[Session]:
-    """Make `value` the current session."""
-    token = _SESSION.set(value)
-    try:
-        yield value
-    finally:
-        _SESSION.reset(token)

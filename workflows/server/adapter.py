@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, cast
 from uuid import UUID
@@ -28,20 +28,18 @@ from pipeline.contract import Done, Stage, StageConfig, execute, key
 from pipeline.store import MANIFEST
 from stages.registry import FIT
 from workflows.run.plan import Plan
-from workflows.run.runner import RunStage
-from workflows.run.session import current
+from workflows.run.runner import Around, ExecuteStage
 from workflows.run.verdict import last_lines
-from workflows.run.watchdog import time_limit
 from workflows.server.concurrency import slot
 
 log = logging.getLogger(__name__)
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
 
 
-def as_tasks(plan: Plan) -> RunStage:
-    """Run each stage of the plan as a Prefect task."""
+def task_executor() -> ExecuteStage:
+    """Executes a stage as a Prefect task, in place of pipeline.contract.execute."""
 
-    def run_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> Done[Any]:
+    def execute_as_task(stage: Stage[Any, Any, Any], *arguments: Any, **options: Any) -> Done[Any]:
         as_task = task(
             name=stage.name,
             task_run_name=stage.name,
@@ -51,41 +49,30 @@ def as_tasks(plan: Plan) -> RunStage:
             cache_policy=NO_CACHE,
             persist_result=False,
         )
-        run: Callable[[_Sealed], Done[Any]] = as_task(_execute)
-        return run(_Sealed(stage, inputs, config, plan))
+        run: Callable[[_Call], Done[Any]] = as_task(_execute)
+        return run(_Call(stage, arguments, options))
 
-    return run_stage
+    return execute_as_task
 
 
-class _Sealed:
+class _Call:
     """A task's parameters as one object: Prefect would otherwise walk through every manifest in search of futures."""
 
-    def __init__(self, stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig, plan: Plan) -> None:
-        self.stage, self.inputs, self.config, self.plan = stage, inputs, config, plan
+    def __init__(self, stage: Stage[Any, Any, Any], arguments: tuple[Any, ...], options: dict[str, Any]) -> None:
+        self.stage, self.arguments, self.options = stage, arguments, options
 
     def __repr__(self) -> str:
-        return f"{self.stage.name} v{self.stage.version}, {self.config!r}"
+        return f"{self.stage.name} v{self.stage.version}, {self.arguments[1]!r}"
 
 
-def _execute(work: _Sealed) -> Done[Any]:
-    watch, run_log = current(), get_run_logger()
-    shown = _Published(work.stage.name)
+def _execute(call: _Call) -> Done[Any]:
+    run_log, shown = get_run_logger(), _Published(call.stage.name)
 
     def progress(done: int, total: int, message: str = "", **figures: float) -> None:
-        watch.observer.progress(done, total, message, **figures)
+        call.options["progress"](done, total, message, **figures)
         shown(done, total, message, figures)
 
-    plan = work.plan
-    with _slot(work), time_limit(work.stage.name, plan.request.stage_limit, watch.late):  # a wait for a slot is no hang
-        done = execute(
-            work.stage,
-            work.inputs,
-            work.config,
-            plan.store,
-            device=plan.device,
-            progress=progress,
-            cancelled=watch.stopped,
-        )
+    done = execute(call.stage, *call.arguments, **{**call.options, "progress": progress})
     run_log.info("%s: %s, %s", done.stage, "reused" if done.reused else f"{done.run['seconds']} s", done.key[:12])
     for warning in getattr(done.located.artifact, "warnings", ()):
         run_log.warning("%s: %s", done.stage, warning)
@@ -93,20 +80,15 @@ def _execute(work: _Sealed) -> Done[Any]:
     return done
 
 
-@contextmanager
-def _slot(work: _Sealed) -> Iterator[None]:
-    """Hold a slot of the limit that the request names while the fit runs; a fit that the store has needs none."""
-    limit = work.plan.request.fit_slots
-    if limit is None or work.stage.name != FIT or _is_stored(work):
-        yield
-        return
-    with slot(limit, current().stopped):
-        yield
+def with_slot(plan: Plan, stopped: Callable[[], bool]) -> Around:
+    """Holds a slot of the limit that the request names while the fit runs; a fit that the store has needs none."""
 
+    def around(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> AbstractContextManager[None]:
+        limit = plan.request.fit_slots
+        stored = (plan.store.folder(stage.name, key(stage, inputs, config)) / MANIFEST).is_file()
+        return nullcontext() if limit is None or stage.name != FIT or stored else slot(limit, stopped)
 
-def _is_stored(work: _Sealed) -> bool:
-    folder = work.plan.store.folder(work.stage.name, key(work.stage, work.inputs, work.config))
-    return (folder / MANIFEST).is_file()
+    return around
 
 
 class _Published:

@@ -13,7 +13,7 @@ from workflows.run.run_lock import is_held
 
 def add_commands(parser: argparse.ArgumentParser) -> None:
     """The sub-commands and their options."""
-    from workflows.batch.commands import a_time
+    from workflows.cli.options import a_time
 
     of = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
     gc = of.add_parser("gc", help="remove what no published folder needs; it is made anew when it is asked for")
