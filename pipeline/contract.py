@@ -15,7 +15,8 @@ import platform
 import resource
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
@@ -151,53 +152,51 @@ def execute(
         Cancelled: the user stopped it; checkpoints in scratch stay.
     """
     k = key(stage, inputs, config)
-    with store.lock(stage.name, k):
-        try:
-            store.trace(stage.name, k, {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)})  # type: ignore[arg-type]
-        except OSError as e:
-            raise stage_error_from_os_error(e, store.root) or e from e
+    with store.lock(stage.name, k), _disk_faults(store.root):
+        store.trace(stage.name, k, {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)})  # type: ignore[arg-type]
         found = store.load(stage.name, k, stage.output)
         if found is not None:
             log.info("%s: reused %s", stage.name, k[:12])
             return Done(stage.name, k, found, True, store.load_run(stage.name, k))
-        try:
-            return _run(stage, inputs, config, store, k, device, progress, cancelled)
-        except OSError as e:
-            raise stage_error_from_os_error(e, store.root) or e from e
+        start = time.perf_counter()
+        with _folders(store, stage.name, k) as (partial, scratch):
+            context = Context(partial, scratch, device, progress, cancelled, logging.getLogger(f"neuface.{stage.name}"))
+            context.check()
+            artifact = stage.run(inputs, config, context)
+            run: dict[str, Any] = {
+                "seconds": round(time.perf_counter() - start, 3),
+                "peak_memory_mb": peak_memory_mb(),
+                "device": device,
+                "config": config.model_dump(mode="json"),
+                "versions": versions(),
+            }
+            located = store.finish(stage.name, k, partial, artifact, run)
+    log.info("%s: done in %.1f s, %s", stage.name, run["seconds"], k[:12])
+    return Done(stage.name, k, located, False, run)
 
 
-def _run(
-    stage: Stage[I, C, O],
-    inputs: I,
-    config: C,
-    store: Store,
-    k: str,
-    device: str,
-    progress: Progress,
-    cancelled: Callable[[], bool],
-) -> Done[O]:
-    partial, scratch = store.begin(stage.name, k), store.scratch(stage.name, k)
-    scratch.mkdir(parents=True, exist_ok=True)
-    context = Context(partial, scratch, device, progress, cancelled, logging.getLogger(f"neuface.{stage.name}"))
-    start = time.perf_counter()
+@contextmanager
+def _disk_faults(root: Path) -> Iterator[None]:
+    """Turns a disk fault into an error with a remedy."""
     try:
-        context.check()
-        artifact = stage.run(inputs, config, context)
-        run: dict[str, Any] = {
-            "seconds": round(time.perf_counter() - start, 3),
-            "peak_memory_mb": peak_memory_mb(),
-            "device": device,
-            "config": config.model_dump(mode="json"),
-            "versions": versions(),
-        }
-        located = store.finish(stage.name, k, partial, artifact, run)
+        yield
+    except OSError as e:
+        raise stage_error_from_os_error(e, root) or e from e
+
+
+@contextmanager
+def _folders(store: Store, stage: str, k: str) -> Iterator[tuple[Path, Path]]:
+    """A new partial folder and the scratch folder of a key. On any failure the partial one is removed, and the scratch
+    one if it is empty."""
+    partial, scratch = store.begin(stage, k), store.scratch(stage, k)
+    scratch.mkdir(parents=True, exist_ok=True)
+    try:
+        yield partial, scratch
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         if scratch.is_dir() and not any(scratch.iterdir()):
             scratch.rmdir()
         raise
-    log.info("%s: done in %.1f s, %s", stage.name, run["seconds"], k[:12])
-    return Done(stage.name, k, located, False, run)
 
 
 def peak_memory_mb() -> float:
