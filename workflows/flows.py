@@ -37,7 +37,7 @@ def capture_to_asset(**asked: Any) -> Any:
     """Run the stages on one capture and publish asset/, report/ and run.json in `out`.
 
     It ends Completed where the result is good, else in a completed state named Usable or Unusable: the run did its
-    work, and nothing that tries failed runs again should do it twice. Called as a function it hands back run.json.
+    work, and no retry of failed runs should repeat it. Called as a function it returns run.json.
     """
     return _run_capture(asked, None)
 
@@ -94,7 +94,7 @@ def _watched(asked: Mapping[str, Any], known: Session | None = None) -> Iterator
     """The session of this flow: that of the command (`known`), or a new one. Signals stop it at a checkpoint,
     and not at any place, as Prefect's own handler would.
 
-    A run that a server started may use the allowed folders alone, and ends with the worker that started it.
+    A run that a server started may only use the allowed folders, and ends with the worker that started it.
     """
     from_server = known is None and FlowRunContext.get() is not None
     if from_server:

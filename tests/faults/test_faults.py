@@ -70,7 +70,7 @@ def tally(tree: Path) -> Counter[str]:
 def test_one_captures_process_killed_costs_one_attempt(tree: Path, environment: dict[str, str]) -> None:
     code, said = finish(start(environment, *batch(tree, "--set", "work.fault=killed once", "--workers", "2")))
     assert code == 0, said
-    assert "trying again (lost): the process ended without a word (signal 9)" in said
+    assert "trying again (lost): the process ended without a message (signal 9)" in said
     assert {c["attempts"] for c in summary(tree).values()} == {2}
     assert set(tally(tree).values()) == {1}
 
@@ -123,7 +123,7 @@ def test_ctrl_c_stops_at_a_checkpoint_and_twice_at_once(tree: Path, environment:
     child.send_signal(signal.SIGINT)
     code, said = finish(child)  # the captures' processes are never released: they go on when they hear of it
     assert code == 130, said
-    assert "the same command goes on" in said
+    assert "the same command resumes" in said
     assert list((tree.parent / "out/.store/work").glob("*.scratch/step.txt"))
     never = hold("work.hangs", tree.parent / "more signs")
     hangs = start({**environment, **never.environment()}, *batch(tree, "--set", "work.fault=hangs", *slow(1)))

@@ -204,7 +204,7 @@ def test_the_last_error_is_kept() -> None:
         "second (found: 3)"
     )
     assert child.last_error(["Traceback", "ValueError: 3", ""]) == "ValueError: 3"
-    assert child.last_error([]) == "it said nothing"
+    assert child.last_error([]) == "no message"
 
 
 # ------------------------------------------------------------------ the table

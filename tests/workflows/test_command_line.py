@@ -158,7 +158,7 @@ def test_verdicts_and_their_exit_codes_through_the_flow(photos: Path, child_envi
     bad = ("run", photos, "--out", out, "--set", "second.level=unusable")
     code, stdout, err = neuface(child_environment, *bad)
     assert code == 3, err
-    assert "--force goes on" in err and "Traceback" not in err
+    assert "--force continues" in err and "Traceback" not in err
     assert stdout.splitlines()[-2].startswith("verdict: unusable (second unusable")
     assert "take the broken toys again" in stdout.splitlines()[-1]
     assert list(json.loads((out / "run.json").read_text())["stages"]) == ["first", "second"]
@@ -184,7 +184,7 @@ def test_ctrl_c_keeps_what_is_finished_and_the_run_goes_on(
     err += child.communicate(timeout=PATIENCE)[1]
     assert child.returncode == 130, err
     assert "stopping at the next checkpoint" in err
-    assert "goes on where this one left off" in err
+    assert "run the same command again to resume" in err
     assert "Traceback" not in err
     assert len([p for p in (out / ".store/first").iterdir() if "." not in p.name]) == 1
     assert not list((out / ".store").glob("second/*.partial-*"))

@@ -59,7 +59,7 @@ def test_each_signal_stops_a_run_at_its_checkpoint(
     child.send_signal(number)
     _, err = child.communicate(timeout=120)
     assert child.returncode == 128 + number, err
-    assert "goes on where this one left off" in err and "Traceback" not in err
+    assert "run the same command again to resume" in err and "Traceback" not in err
     assert not (out / "run.json").exists() and not list((out / ".store").glob("second/*.partial-*"))
     assert list((out / ".store").glob("second/*.scratch/step.txt"))
 

@@ -115,10 +115,10 @@ def test_an_unusable_early_stage_ends_the_run_without_an_asset_and_nothing_is_lo
     assert [d.stage for d in done] == ["first", "second"]
     assert "asset" not in record and list(record["stages"]) == ["first", "second"]
     assert record["verdict"]["level"] == "unusable" and exit_code(record) == 3
-    remaining_time = "\n".join(notes)
-    assert "20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again." in remaining_time
-    assert "photos to look at or to take again: a.jpg, b.jpg" in remaining_time
-    assert "the run ends here, before third" in remaining_time and "--force goes on" in remaining_time
+    text = "\n".join(notes)
+    assert "20 % of the toys are whole (a.jpg, b.jpg). What to do: take the broken toys again." in text
+    assert "photos to look at or to take again: a.jpg, b.jpg" in text
+    assert "the run ends here, before third" in text and "--force continues" in text
     done, record, notes = run(photos, ("second", "unusable"), force=True)
     assert [d.reused for d in done] == [True, True, False]
     assert exit_code(record) == 3  # forced, and still unusable
@@ -246,10 +246,10 @@ def test_check_keeps_what_it_found_where_a_store_is_named(photos: Path) -> None:
 def test_check_tells_what_it_knows_before_an_error(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--solve", "--json", "-", "--set", "first.level=usable", "--set", "second.fault=stage"]
     assert check(photos, *options) == 1
-    remaining_time = capsys.readouterr()
-    content = json.loads(remaining_time.out)
+    text = capsys.readouterr()
+    content = json.loads(text.out)
     assert "the toy is broken" in content["error"] and content["level"] == "usable"
-    assert "the toy is broken" in remaining_time.err
+    assert "the toy is broken" in text.err
     assert check(photos, *[o for o in options if o not in ("--json", "-")]) == 1
     assert "take the broken toys again" in capsys.readouterr().out
 

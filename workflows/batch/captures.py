@@ -84,7 +84,7 @@ def find(root: Path, subjects: str | None = None, expressions: str | None = None
 
 # ------------------------------------------------------------------ a tree
 def _tree(root: Path) -> Iterator[Item]:
-    """ID/EXPRESSION. A folder of photos without params.json is a fault to be told, not one to be passed over."""
+    """ID/EXPRESSION. A folder of photos without params.json is reported, not skipped."""
     for subject in _folders(root):
         for folder in _folders(subject):
             name = f"{subject.name}/{folder.name}"

@@ -46,10 +46,10 @@ class Events:
         self.tell(event="stage", stage=stage, number=number, of=of)
 
     def progress(self, done: int, total: int, message: str = "", **figures: float) -> None:
-        """Not told: a batch shows captures, not steps."""
+        """Not shown: a batch shows captures, not steps."""
 
     def finished(self, done: Done[Any]) -> None:
-        """Not told: run.json has it."""
+        """Not shown: run.json has it."""
 
     def note(self, text: str) -> None:
         """Into the capture's log."""
@@ -57,7 +57,7 @@ class Events:
 
 
 def main(arguments: list[str]) -> int:
-    """Exit code as in `neuface`; the last event says how it ended."""
+    """Exit code as in `neuface`; the last event is how it ended."""
     end_with(int(arguments[1]))
     events = Events(int(arguments[0]))
     watch = Session(events)

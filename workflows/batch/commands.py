@@ -63,7 +63,7 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
             with interruptible(stop, console.note, runner.kill):
                 summary = run_batch(request, runner, stopped=stop.is_set, notify=console.note)
     except Cancelled:
-        console.note("stopped; the same command goes on where this one left off")
+        console.note("stopped; run the same command again to resume")
         raise
     for state, count in summary.counts().items():
         print(f"{state:10} {count}")

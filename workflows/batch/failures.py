@@ -1,8 +1,8 @@
 """Why a capture failed, and whether trying again can help.
 
-A fault of the capture will be there again: once is enough. A process that was lost (killed, machine gone, server away)
+A fault of the capture will be there again: one attempt is enough. A lost process (killed, machine gone, server away)
 is tried again; so is a fit that ran out of memory, with half the rays a step. A disk that is full would fail every
-capture after this one too: the batch stops, and the same command goes on when there is space.
+capture after this one too: the batch stops; run the same command again when there is space.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Failure(BaseModel):
 
 
 def failure_of(error: BaseException, stage: str | None = None) -> Failure:
-    """The fault that an exception tells of."""
+    """The failure behind an exception."""
     if isinstance(error, NeufaceError):
         kind: Kind = "capture"
         for of, named in ((DiskError, "disk"), (TimeLimitError, "limit"), (Cancelled, "stopped")):
@@ -60,7 +60,7 @@ def failure_of(error: BaseException, stage: str | None = None) -> Failure:
 
 
 def failure_in(text: str, stage: str | None = None) -> Failure:
-    """The fault that a text tells of in which an exception's type is named, as a flow run's state has it."""
+    """The failure behind a message that names an exception's type, such as the state of a flow run."""
     for pattern, kind in _KINDS:
         if re.search(pattern, text):
             return Failure(kind=kind, message=text, stage=stage)

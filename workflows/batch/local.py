@@ -76,7 +76,7 @@ class Processes:
             process.stdin.write(request.model_dump_json().encode() + b"\n")
             process.stdin.flush()
         except BrokenPipeError:
-            pass  # it died at once: its end of the events says so
+            pass  # it died at once: the end of its events shows that
         limit, now = request.stage_limit, time.monotonic()
         self._children[entry.name] = _Child(entry.name, process, limit, now, _oom_kills())
         threading.Thread(target=self._listen, args=(entry.name, read_end), daemon=True).start()
@@ -111,7 +111,7 @@ class Processes:
         for child in list(self._children.values()):
             _kill(child)
 
-    # ---------------------------------------------------------------- what a child says
+    # ---------------------------------------------------------------- events of a child
     def _listen(self, name: str, descriptor: int) -> None:
         with os.fdopen(descriptor, "rb") as events:
             for line in events:
@@ -158,7 +158,7 @@ def _silent_end(child: _Child, code: int, now: float) -> Failure:
     if code == -signal.SIGKILL and _oom_kills() > child.oom_kills:
         return Failure(kind="memory", message="the kernel ended the process: out of memory", stage=child.stage)
     how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    return Failure(kind="lost", message=f"the process ended without a word ({how}); see its log", stage=child.stage)
+    return Failure(kind="lost", message=f"the process ended without a message ({how}); see its log", stage=child.stage)
 
 
 def _close_stdin(child: _Child) -> None:
@@ -178,7 +178,7 @@ def _kill(child: _Child) -> None:
 
 
 def _environment(slots: int) -> dict[str, str]:
-    """Several fits at a time share the cores; alone, a fit takes them all."""
+    """Several fits at a time share the cores; a single fit uses them all."""
     environment = dict(os.environ)
     here = str(Path(__file__).resolve().parents[1])
     environment["PYTHONPATH"] = os.pathsep.join(p for p in (here, environment.get("PYTHONPATH", "")) if p)
@@ -190,7 +190,7 @@ def _environment(slots: int) -> dict[str, str]:
 
 
 def _oom_kills() -> int:
-    """Processes that the kernel ended for lack of memory since it started; 0 where it does not say."""
+    """Processes that the kernel ended for lack of memory since it started; 0 where that is not known."""
     try:
         lines = Path("/proc/vmstat").read_text().splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith("oom_kill "))

@@ -1,8 +1,8 @@
-"""A batch: many captures, each a run of its own, so that one that fails or is lost costs no other.
+"""A batch: many captures, each a run of its own. One failure does not affect the rest.
 
-The loop here knows neither processes nor Prefect: a `Runner` starts runs and tells how they ended
-(workflows/batch/local.py, workflows/batch/pool.py). What is known is on disk after every change, so that the same
-command goes on after anything.
+The loop here uses neither processes nor Prefect: a `Runner` starts runs and reports how they ended
+(workflows/batch/local.py, workflows/batch/pool.py). The state is on disk after every change: run the same
+command again to resume.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Ended:
 
 
 class Runner(Protocol):
-    """Starts runs and tells how they end."""
+    """Starts runs and reports how they end."""
 
     slots: int  # runs that may be under way at a time
 
@@ -83,7 +83,7 @@ def run_batch(
     items = captures.find(Path(request.root), request.subjects, request.expressions)
     out, store, state = Path(request.out).absolute(), request.store_path, BatchState(request.folder)
     _not_inside(out, Path(request.root))
-    for item in {str(i.own): i for i in items}.values():  # a wrong word is told at once, not by every capture in turn
+    for item in {str(i.own): i for i in items}.values():  # a wrong setting is reported once, not by each capture
         check_settings(request.run_request(item.capture, item.name, (), item.own))
     with writable(out, store), exclusive_run(store, request.folder, stopped, notify):
         works = [_prepared(i, state, request) for i in items]
@@ -149,7 +149,7 @@ def _loop(
         take(runner.poll())
     take(runner.close(stopped()))
     if stopped():
-        raise Cancelled("stopped by the user; what is finished is kept, and the same command goes on")
+        raise Cancelled("stopped by the user; finished captures are kept, and the same command resumes")
 
 
 def _start(work: Work, request: BatchRequest, runner: Runner, state: BatchState) -> None:

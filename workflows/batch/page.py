@@ -34,7 +34,7 @@ FIGURES: dict[str, tuple[str, ...]] = {
 }
 ODD = 3.5  # robust z-score from which a figure is called odd (Iglewicz and Hoaglin's limit)
 MAD = 0.6745  # quartile of the normal distribution: makes a median of deviations comparable to a standard deviation
-ENOUGH = 5  # captures below which nobody can say what is odd
+ENOUGH = 5  # captures below which outliers are not marked
 FIRST_LINE = 300  # characters of a fault that the table shows
 
 

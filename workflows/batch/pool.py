@@ -40,7 +40,7 @@ T = TypeVar("T")
 POLL = 2.0  # seconds between two looks at the runs
 AWAY = 900.0  # seconds that the server may be away
 SLOW_START = 10.0  # a run that a worker took may need this many times `lost_after` until its process works
-AT_A_TIME = 200  # runs that the server tells of in one answer
+AT_A_TIME = 200  # runs in one answer of the server
 
 
 @dataclass(slots=True)
@@ -143,7 +143,7 @@ class Pool:
             deployment = self._patiently(lambda c: c.read_deployment_by_name(self.request.deployment))
         except ObjectNotFound as e:
             raise StageError(
-                "the server does not know this deployment",
+                "the server has no such deployment",
                 where="--deployment",
                 value=self.request.deployment,
                 limit="a deployment of the flow capture-to-asset",
@@ -175,7 +175,7 @@ class Pool:
             )
 
     def _patiently(self, ask: Callable[[SyncPrefectClient], T]) -> T:
-        """Ask the server; while it is away (restarting, say), ask again."""
+        """Ask the server; repeat while it does not answer (during a restart, say)."""
         end, pause = time.monotonic() + AWAY, 1.0
         while True:
             try:
@@ -216,7 +216,7 @@ def _away(e: Exception) -> StageError:
         where=str(get_current_settings().api.url),
         value=f"{type(e).__name__}: {e}",
         limit=f"an answer within {AWAY:.0f} s",
-        remedy="start it; the same command goes on with the runs that were submitted",
+        remedy="start it, then run the same command again: it continues with the submitted runs",
     )
 
 

@@ -1,4 +1,4 @@
-"""What a batch is asked to do: plain data, the same from the command line and from the deployment's form."""
+"""One batch, as plain data: the same from the command line and from the deployment's form."""
 
 from __future__ import annotations
 

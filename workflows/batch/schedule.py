@@ -2,8 +2,8 @@
 
 A model of what a pool does, event by event: a worker takes a capture and keeps it to its end; it reads the photos and
 writes the results over a link that all share; the fit waits for one of the GPUs. The order is first come, first
-served. Times spread around the measured ones as much as asked. A capture whose worker is lost repeats the stage that
-it was in. Nothing is said here that was not put in: the stage times are the measured ones of one kind of machine.
+served. Times vary around the measured ones by `spread`. A capture whose worker is lost repeats the stage that
+it was in. The stage times are measured ones of one kind of machine.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Forecast:
 
 @dataclass(slots=True)
 class _Resource:
-    """Places that are taken in the order in which they are asked for. used: seconds times places."""
+    """Places that are taken in the order of the requests. used: seconds times places."""
 
     places: int
     free: int = 0

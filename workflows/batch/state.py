@@ -1,4 +1,4 @@
-"""What is known of each capture of a batch, on disk after every change: a batch that was killed goes on from here."""
+"""The state of each capture of a batch, on disk after every change: a batch that was killed resumes from here."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Entry(BaseModel):
 
     attempt: counts every try, over all commands; it is in the key that keeps a server from running one try twice.
     level: how good the result is, where that is known.
-    sets: settings that earlier attempts taught (a smaller batch). fingerprint: of what was asked and what it was of.
+    sets: settings changed by earlier attempts (a smaller batch). fingerprint: of request and capture files.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -55,7 +55,7 @@ class Summary:
 
     @property
     def total(self) -> int:
-        """Captures asked for."""
+        """Number of captures."""
         return len(self.entries)
 
     @property

@@ -133,7 +133,7 @@ def unique(tables: Iterable[Table]) -> list[Row]:
 
 
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
-    """What `--set` would say for a row: the budget, the paper's model where the fast one adds to it, the row's own."""
+    """Settings as for `--set`: the budget, the paper's model where the fast one adds to it, the row's own."""
     base = {
         "steps": given.steps,
         "image_side": given.side,
@@ -241,7 +241,9 @@ def report(budget: dict[str, Any], results: dict[str, Result]) -> list[str]:
     ]
     if FULL.name in results and SEED.name in results:
         noise = abs(results[FULL.name].psnr - results[SEED.name].psnr)
-        lines.append(f"Two seeds of the same system differ by {noise:.2f} dB: differences of that size say nothing.")
+        lines.append(
+            f"Two seeds of the same system differ by {noise:.2f} dB: differences of that size are not significant."
+        )
     for table in TABLES:
         rows = [r for r in table.rows if r.name in results]
         if not rows:

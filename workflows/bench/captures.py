@@ -1,6 +1,6 @@
 """`neuface bench captures`: every capture of a folder run with its split, and one table of what came out.
 
-Each capture is a process of its own with a time limit. All share a store, so that the same command goes on where it
+Each capture is a process of its own with a time limit. All share a store, so that the same command resumes where it
 was stopped. The table is written after each capture; rows of captures that were not run again stay as they are.
 """
 
@@ -47,7 +47,7 @@ def options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", default="out/captures", metavar="DIR", help="folder for runs, logs, store (%(default)s)")
     sub.add_argument("--table", metavar="FILE", help="the table as JSON, with Markdown beside it (docs/benchmarks/"
                      "captures.json for the usual captures, preset and splits, else OUT/captures.json)")  # fmt: skip
-    sub.add_argument("--against", metavar="FILE", help="a table as JSON: say what got better and worse since")
+    sub.add_argument("--against", metavar="FILE", help="a table as JSON: print what got better and worse since")
     sub.add_argument(
         "--limit", type=a_time, default=60 * LIMIT, metavar="TIME", help="for each capture: 90s, 40m (40m)"
     )
@@ -101,7 +101,7 @@ def row_of(capture: Found, given: argparse.Namespace, out: Path, made: dict[str,
         with terminable():
             child = run_child(arguments, out / "logs" / f"{capture.name}.log", given.limit, command)
     except KeyboardInterrupt:
-        raise Cancelled(f"stopped at {capture.name}; the same command goes on there") from None
+        raise Cancelled(f"stopped at {capture.name}; run the same command again to resume there") from None
     written = child.exit_code in (0, 3) and _changed(folder / "run.json") != before
     return (
         row | _ended(child, [capture.folder, folder]) | measured(read_run(folder) if written else None, capture, child)
@@ -126,7 +126,7 @@ def terminable() -> Iterator[None]:
 
 
 def measured(run: Run | None, capture: Found, child: Ended) -> dict[str, Any]:
-    """Verdict, seconds, figures, materials and labels of a run; a fault of the measuring is told and keeps the rest."""
+    """Verdict, seconds, figures, materials and labels of a run; a failed measurement is reported and keeps the rest."""
     out: dict[str, Any] = {"verdict": verdict_of(run), "seconds": child.stages, "figures": {}}
     if run is None:
         return out
@@ -159,7 +159,7 @@ def finite(value: Any) -> Any:
 
 
 def _ended(child: Ended, private: Sequence[Path]) -> dict[str, Any]:
-    """How the child ended. private: folders of this machine, of which a table says the last name only."""
+    """How the child ended. private: folders of this machine, of which a table has the last name only."""
     error = child.error
     for path in private:
         error = error.replace(str(path), path.name)

@@ -64,7 +64,7 @@ def run_child(arguments: Sequence[str], log: Path, limit: float, command: Sequen
 
 
 def _stop(process: subprocess.Popen[bytes]) -> None:
-    """Ctrl-C first: the run keeps its checkpoint, so that the next one goes on from there."""
+    """Ctrl-C first: the run keeps its checkpoint, so that the next one resumes there."""
     _signal(process.pid, signal.SIGINT)
     try:
         process.wait(GRACE)
@@ -86,7 +86,7 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": paths}
 
 
-# ------------------------------------------------------------------ what the log says
+# ------------------------------------------------------------------ the end of the log
 def _ended(code: int | None, how: Literal["by itself", "time limit"], seconds: float, lines: list[str]) -> Ended:
     stages, stage = {}, ""
     for line in lines:
@@ -117,4 +117,4 @@ def last_error(lines: Sequence[str]) -> str:
             found = next((x.removeprefix("found: ") for x in details if x.startswith("found: ")), "")
             text = lines[at].removeprefix("error: ")
             return (f"{text} (found: {found})" if found else text)[:LONGEST]
-    return next((x.strip() for x in reversed(lines) if x.strip()), "it said nothing")[:LONGEST]
+    return next((x.strip() for x in reversed(lines) if x.strip()), "no message")[:LONGEST]

@@ -1,6 +1,6 @@
 """Which captures lie in a folder, what is run of each, and which of its photos are held out.
 
-A folder's own `truth/` is for scoring alone: it is never named to a run, and no reader of captures looks into it.
+A folder's own `truth/` is only for scoring: no run gets its path, and no reader of captures opens it.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def gathered(capture: Found, place: Path) -> Path:
 
 
 def _readable(folder: Path) -> bool:
-    """Whether a run would know what to do with it; nothing is decoded or hashed."""
+    """Whether it is a capture that a run can read; nothing is decoded or hashed."""
     from stages.capture.readers import find_reader
     from stages.capture.readers.described import PHOTO_SUFFIXES
     from stages.capture.scan import FILM_SUFFIXES

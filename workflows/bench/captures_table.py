@@ -8,7 +8,7 @@ from typing import Any
 
 Row = Mapping[str, Any]
 NOTHING = "-"
-# The three ways to end that are told apart: everything else is a failure.
+# The three endings that are distinguished; everything else is a failure.
 ENDINGS = {0: "0", 3: "3 (unusable)"}
 
 
@@ -153,12 +153,12 @@ def _head(rows: Mapping[str, Row]) -> str:
     commits = {str(r["commit"]) for r in rows.values()}
     mixed = ""
     if len(commits) > 1:
-        mixed = " The rows are not all of one commit: the last table says which is of which."
+        mixed = " The rows are not all of one commit: the last table shows the commit of each."
     return (
         "# Captures\n\n"
         f"Made by `neuface bench captures`, preset {', '.join(presets)}; {len(rows)} captures, each with the photos of "
         f"its split held out of the fit.{mixed} A dash: not measured, because the run ended before it, or there is no "
-        "truth or no label. Truth is used for scoring alone."
+        "truth or no label. Truth is only used for scoring."
     )
 
 
@@ -240,7 +240,7 @@ def _made(rows: Mapping[str, Row]) -> str:
     ]
     explained = {
         "machine": "; ".join(f"{i}: {m}" for i, m in enumerate(machines, 1)),
-        "commit": "a + says that files differed from it",
+        "commit": "a + means that files differed from it",
     }
     return _section("How it was made", ["capture", "machine", "commit", "date", "command"], lines, explained)
 

@@ -117,5 +117,7 @@ def report(about: dict[str, Any], budget: dict[str, Any], found: dict[str, Measu
     lines += ["", "Bold: on the Pareto front of seconds against PSNR."]
     pair = [found[k].psnr for k in (MIDDLE.name, "another seed") if k in found]
     if len(pair) == 2:
-        lines.append(f"Two seeds differ by {abs(pair[0] - pair[1]):.2f} dB: differences of that size say nothing.")
+        lines.append(
+            f"Two seeds differ by {abs(pair[0] - pair[1]):.2f} dB: differences of that size are not significant."
+        )
     return lines

@@ -44,7 +44,7 @@ class Measured:
 
 
 def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
-    """What `--set` would say: the budget, the whole model, and the knob; nothing for a preset."""
+    """Settings as for `--set`: the budget, the whole model, and the knob; none for a preset."""
     if knob.preset:
         return ()
     values: dict[str, Any] = {

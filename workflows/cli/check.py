@@ -30,8 +30,8 @@ from workflows.run.verdict import REFUSED, headline, verdict_of_done
 
 NEXT = {
     "good": "go on: neuface run {capture} --out DIR",
-    "usable": "it can be used as it is (neuface run {capture} --out DIR); what is said above makes it better",
-    "unusable": "do what is said above first; neuface run ends before the fit with these photos, but for --force",
+    "usable": "it can be used as it is (neuface run {capture} --out DIR); the remedies above make it better",
+    "unusable": "apply the remedies above first; with these photos neuface run ends before the fit, unless --force",
 }
 NOT_SOLVED = "only the photos were judged: cameras and masks are not known yet; --solve finds and judges them (minutes)"
 
@@ -83,7 +83,7 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
 
 
 def _untils(early: Sequence[str]) -> list[str | None]:
-    """First the photos alone; then, where it makes sense, all that comes before the fit."""
+    """First only the photos; then, where it makes sense, all stages before the fit."""
     return [early[0], *([early[-1]] if len(early) > 1 else [])] if early else [None]
 
 

@@ -62,7 +62,7 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         record = run(request, console)
     except Cancelled:
         console.close()
-        console.note("stopped; the same command goes on where this one left off")
+        console.note("stopped; run the same command again to resume")
         raise
     _tell(record, Path(options.out))
     _tell_verdict(record)
@@ -119,7 +119,7 @@ def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: Ru
         return
     figures = measure(out, capture, found.artifact)
     (out / "truth.json").write_text(json.dumps(dataclasses.asdict(figures), indent=1))
-    print("against the truth that the demo knows:")
+    print("against the demo's ground truth:")
     for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact)]:
         print(f"  {line}")
 
@@ -241,7 +241,7 @@ def read_record(out: Path) -> dict[str, Any]:
 
 
 def _tell(record: dict[str, Any], out: Path) -> None:
-    """On stdout, what a script would want to know."""
+    """The paths of the results, on stdout."""
     if "asset" in record:
         print(f"asset  {out / record['asset']}")
     page = out / "report" / "index.html"

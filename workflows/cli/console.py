@@ -85,6 +85,6 @@ class Console:
                 bar.close()
 
     def _lost(self) -> None:
-        """The terminal is gone, or who read the pipe: the run goes on, or stops, in silence."""
+        """The terminal or the reader of the pipe is gone: the run continues, or stops, without output."""
         self.bar, self.bars = None, False
         self.stream = Path(os.devnull).open("w")  # noqa: SIM115  (as long as the program)

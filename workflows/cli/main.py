@@ -45,7 +45,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--verbose", action="store_true", help="also log what the stages say, and show tracebacks")
+    p.add_argument("--verbose", action="store_true", help="also show the log of the stages, and tracebacks")
     commands_of = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_options(commands_of.add_parser("run", help="one capture -> asset and report"))
     check.add_options(commands_of.add_parser("check", help="are these photos good enough? no fit, seconds"))

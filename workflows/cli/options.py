@@ -75,7 +75,7 @@ def _add(parser: Any, name: str, field: FieldInfo, positional: bool) -> None:
 
 
 def _value(name: str, field: FieldInfo, description: str) -> dict[str, Any]:
-    """What argparse has to know of an option with a value."""
+    """The arguments of argparse for an option with a value."""
     default = None if field.is_required() else field.default
     shown = "" if default is None else f" ({default})"
     out: dict[str, Any] = {"default": default}

@@ -24,7 +24,7 @@ ENVIRONMENTS = (".exr", ".hdr")
 
 @dataclass(frozen=True, slots=True)
 class RenderRequest:
-    """What the options of the command say."""
+    """The options of the command."""
 
     folder: Path
     out: Path

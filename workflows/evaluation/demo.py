@@ -1,4 +1,4 @@
-"""The demo's result against what the demo knows to be true: pictures, surface and albedo.
+"""The demo's result against its ground truth: pictures, surface and albedo.
 
 Everything is measured on the published files (USD, maps, predicted views), brought into the capture's world by
 run.json's capture_from_asset. Distances are in millimetres, colours as PSNR of sRGB-encoded values in dB.

@@ -1,7 +1,7 @@
-"""Did the fit tell skin's colour from its shine? The fitted material and light against what the demo knows.
+"""Did the fit separate diffuse from specular? The fitted material and light against the demo's ground truth.
 
 At every pixel of the held-out views the true surface point is known, and with it the true albedo, F0 and roughness,
-and by the demo's own renderer the diffuse and the specular part of its radiance. The model is asked at the nearest
+and by the demo's own renderer the diffuse and the specular part of its radiance. The model is evaluated at the nearest
 point of its own surface, towards the same camera.
 
 Gauge: albedo and light share one free gain. It is fixed by the gain that brings the albedo nearest to the truth, and

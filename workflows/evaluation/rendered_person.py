@@ -4,7 +4,7 @@
     truth/cameras.json    photos: name, K (centre of the first pixel at 0), distortion, world_to_camera, head_motion,
                           so that world_to_camera @ head_motion leads from the head's frame to the camera
     truth/labels/STEM.png 0 background, 1 skin, 2 hair, 3 eyes, 4 cloth
-    truth/landmarks.json  points; `eye_*` and `mouth_*` say where the face is
+    truth/landmarks.json  points; `eye_*` and `mouth_*` give the place of the face
     truth/albedo/STEM.exr linear albedo of the skin, alpha: share of the pixel that is skin
 
 The asset comes into the head's frame by the similarity that takes the run's camera centres to the true ones

@@ -5,7 +5,7 @@ of the budget by then, less what the stages after the fit will take, is the fit'
 time fills with rays is chosen. The fit then ends by the clock, so that an estimate that was wrong costs accuracy and
 not the deadline.
 
-A plan is kept in the store beside what it is for: an interrupted run goes on with it.
+A plan is kept in the store beside what it is for: an interrupted run uses it again.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def calibrate(device: str) -> float:
 
 
 def planned(store: Store, purpose: Mapping[str, Any], left: float, device: str) -> BudgetPlan:
-    """The plan kept for this purpose (what the run was asked, and the keys of what it is for), else a new one."""
+    """The stored plan of the same request and the same earlier stages, else a new one."""
     path = _path(store, purpose)
     try:
         return BudgetPlan(**json.loads(path.read_text()))

@@ -1,7 +1,7 @@
-"""What is known before the fit, told before the fit: a summary, and the end of a run that can come to nothing.
+"""A summary before the fit, and the early end of a run whose photos, cameras or masks are unusable.
 
 The stages before the fit take a minute or two, the fit and what follows it many. A run ends as soon as one of the
-first finds its result unusable. What is finished stays in the store: the same command with `--force` goes on from it.
+first finds its result unusable. Finished stages stay in the store: the same command with `--force` continues.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def early_stages() -> tuple[str, ...]:
 
 
 def ends_early(plan: Plan, done: Sequence[Done[Any]], watch: Session) -> bool:
-    """Whether the run ends with the stage that was just done, before what it was asked to do is done.
+    """Whether the run ends early, with the stage that was just done.
 
     Tells the summary after the last stage before the fit, and after an earlier one where the run ends.
     """
@@ -52,7 +52,7 @@ def summary(plan: Plan, done: Sequence[Done[Any]], begun: float) -> list[str]:
         lines.append(f"  photos to look at or to take again: {', '.join(photos[:PHOTOS_NAMED])}{more}")
     if verdict.level == "unusable" and not plan.request.force:
         after = plan.stages[len(done)].name
-        return [*lines, f"  the run ends here, before {after}; what is finished is kept: --force goes on from it"]
+        return [*lines, f"  the run ends here, before {after}; finished stages are kept: --force continues from them"]
     if verdict.level == "unusable":
         lines.append("  going on although it is unusable (--force)")
     return [*lines, f"  {estimate.remaining_time(plan, done, begun)}"]

@@ -120,7 +120,7 @@ def leave(number: int) -> None:
 
 
 def end_with(parent: int) -> None:
-    """Have the kernel kill this process when its parent dies, in whatever way; leave if that has happened already.
+    """Have the kernel kill this process when its parent dies; exit if the parent is already dead.
 
     Raises:
         OSError: the kernel refuses.
@@ -128,12 +128,12 @@ def end_with(parent: int) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl")
-    if os.getppid() != parent:  # it died before the kernel was asked
+    if os.getppid() != parent:  # it died before the kernel was set to
         leave(signal.SIGKILL)
 
 
 def _heeded() -> tuple[signal.Signals, ...]:
-    """All three; not SIGHUP where the user said to ignore it (nohup)."""
+    """All three; not SIGHUP where the user chose to ignore it (nohup)."""
     return tuple(n for n in SIGNALS if n != signal.SIGHUP or signal.getsignal(n) is not signal.SIG_IGN)
 
 

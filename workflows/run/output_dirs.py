@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.errors import StageError, stage_error_from_os_error
 
-OWN = (".locks", ".prefect", ".lineage", ".roots")  # in the store, but nobody's result
+OWN = (".locks", ".prefect", ".lineage", ".roots")  # in the store, but not results
 
 
 @contextmanager

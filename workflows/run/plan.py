@@ -1,4 +1,4 @@
-"""What a run will do: checked before anything is written. The same request makes the same plan everywhere."""
+"""The plan of a run, checked before anything is written. The same request makes the same plan everywhere."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
     _choose(request.until, request.from_stage)
     if request.budget is not None and request.preset != DEFAULT_PRESET:
         raise UsageError(
-            "a budget and a preset both say how large the fit is",
+            "a budget and a preset both set the size of the fit",
             where="--budget and --preset",
             value=request.preset,
             limit="one of the two",
@@ -141,7 +141,7 @@ def device_for(wanted: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What would happen to one stage: "reused", "made", or "made anew". `key` is None where it can't be known yet."""
+    """What would happen to one stage: "reused", "made", or "made anew". `key` is None where it is not known yet."""
 
     stage: str
     key: str | None

@@ -24,7 +24,7 @@ Copies = dict[str, Path]  # path below the published folder -> file in the store
 
 
 def publish(plan: Plan, done: Iterable[Done[Any]], notify: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Copy asset/ and report/ to `plan.out` and write run.json beside them. Hands back what run.json holds.
+    """Copy asset/ and report/ to `plan.out` and write run.json beside them. Returns what run.json holds.
 
     Files of the user's own in these folders stay. One whose name is needed, or that was published and then edited, is
     renamed; `notify` is called, and run.json names it under "moved_aside".
@@ -48,7 +48,7 @@ def publish(plan: Plan, done: Iterable[Done[Any]], notify: Callable[[str], None]
 
 
 def _replace_folders(out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float]) -> dict[str, str]:
-    """asset/ and report/, whichever the stages made. Hands back the user's files that had to move: old path -> new."""
+    """asset/ and report/, whichever the stages made. Returns the user's files that had to move: old path -> new."""
     known = published(out)
     moved: dict[str, str] = {}
     for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
@@ -106,7 +106,7 @@ def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
 
 
 def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
-    """What run.json holds. Figures that may differ from run to run live here, not in any manifest."""
+    """What run.json holds. Figures that may differ from run to run are here, not in any manifest."""
     taken = {n: float(d.run.get("seconds", 0.0)) for n, d in stages.items()}
     record: dict[str, Any] = {
         "verdict": verdict_of_done(stages.values()).record(),

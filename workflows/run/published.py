@@ -23,7 +23,7 @@ Known = dict[str, frozenset[str]]  # path below OUT -> sha256 of each content th
 
 
 def published(out: Path) -> Known:
-    """What runs published in `out`. Without a list (of an older version), what run.json names and the store knows."""
+    """What runs published in `out`. Without a list (of an older version), what run.json names and the store has."""
     found = _json(out / LIST).get("files")
     if not isinstance(found, dict):
         return _of_an_older_run(out)
@@ -82,7 +82,7 @@ def split(out: Path, name: str, known: Known) -> tuple[list[str], list[str]]:
 
 # ------------------------------------------------------------------ before there was a list
 def _of_an_older_run(out: Path) -> Known:
-    """From run.json and the manifests in its store. What neither knows is taken for the user's and kept."""
+    """From run.json and the manifests in its store. Files in neither are taken for the user's and kept."""
     record = _json(out / "run.json")
     stages, timing = record.get("stages"), record.get("timing")
     if not isinstance(stages, dict) or not isinstance(timing, dict):

@@ -139,7 +139,7 @@ def drop(made: Replacement) -> None:
 
 
 def swap(new: Path, final: Path) -> Path | None:
-    """Put `new` under the name `final`. Hands back where the folder is that had this name before, if one had.
+    """Put `new` under the name `final`. Returns where the folder is that had this name before, if one had.
 
     Raises:
         OSError: it did not work, and `final` is what it was.
@@ -184,7 +184,7 @@ def _retire(old: Path, final: Path, made: Replacement) -> dict[str, str]:
 
 
 def tidy(out: Path, name: str, known: Known) -> dict[str, str]:
-    """Remove what killed runs left beside OUT/NAME. Hands back the user's files that were found and put aside."""
+    """Remove what killed runs left beside OUT/NAME. Returns the user's files that were found and put aside."""
     final = out / name
     found: dict[str, str] = {}
     left = [*out.glob(f".{name}.swap-*"), *out.glob(f".{name}.old-*")]

@@ -1,7 +1,7 @@
-"""One run at a time into one folder, and a way to see from outside whether that run still lives.
+"""One run at a time into one folder, and a way to see from outside whether that run is still alive.
 
-A run holds a lock in the store, named after its `out`. The kernel lets go of it when the process dies, however it
-dies; no clock and no heartbeat is involved. Whoever else can take the lock knows that nobody works there.
+A run holds a lock in the store, named after its `out`. The kernel releases it when the process ends, in
+whatever way; no clock and no heartbeat is involved. If the lock can be taken, no run is active there.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ def verdict_of_done(done: Iterable[Done[Any]]) -> Verdict:
 
 
 def level_in(record: Mapping[str, Any]) -> Level | None:
-    """The level that a run.json tells of; None where it has none."""
+    """The level in a run.json; None where it has none."""
     verdict = record.get("verdict")
     level = verdict.get("level") if isinstance(verdict, Mapping) else None
     return level if level in LEVELS else None
@@ -44,12 +44,12 @@ def state_name(level: Level | None) -> str | None:
 
 
 def level_of_state(name: str | None) -> Level:
-    """The level that the name of a completed state tells."""
+    """The level that belongs to the name of a completed state."""
     return next((x for x in LEVELS if state_name(x) == name), "good")
 
 
 def last_lines(record: Mapping[str, Any]) -> list[str]:
-    """What the end of a run tells: the verdict, the stages that it is from, and the worst reasons."""
+    """The last lines of a run: the verdict, the stages that it is from, and the worst reasons."""
     verdict = record.get("verdict")
     if not isinstance(verdict, Mapping):
         return []

@@ -45,7 +45,7 @@ def time_limit(stage: str, seconds: float | None, late: threading.Event) -> Iter
             where=stage,
             value=f"not done after {seconds:g} s",
             limit=f"{seconds:g} s for one stage",
-            remedy="raise --stage-limit; the stage goes on from its last checkpoint",
+            remedy="raise --stage-limit; the stage resumes from its last checkpoint",
         ) from e
     finally:
         faulthandler.cancel_dump_traceback_later()

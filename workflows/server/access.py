@@ -24,12 +24,12 @@ FILE_SETTINGS = {"masks": ("model", "hair_model"), "inverse_rendering": ("prior_
 
 # ------------------------------------------------------------------ the server
 def login_file(home: Path) -> Path:
-    """Where the login of a server is kept, for its owner alone."""
+    """File with the login of a server, readable only by its owner."""
     return home / "login"
 
 
 def lock_server(home: Path, addresses: Iterable[str]) -> Path | None:
-    """Set the environment so that a server and its clients use a login. Hands back its file; None: the user set one.
+    """Set the environment so that a server and its clients use a login. Returns its file; None: the user set one.
 
     addresses: of the server's own page, such as http://127.0.0.1:4200.
     """
@@ -62,7 +62,7 @@ def _login(path: Path) -> str:
 
 # ------------------------------------------------------------------ its runs
 def set_roots(folders: Iterable[str]) -> None:
-    """Let runs from the server touch these folders; none named: what $NEUFACE_ROOTS says, else the current folder."""
+    """Let runs from the server touch these folders; none named: $NEUFACE_ROOTS, else the current folder."""
     named = [str(Path(f).expanduser().resolve()) for f in folders]
     if named or not os.environ.get(ROOTS):
         os.environ[ROOTS] = os.pathsep.join(named or [str(Path.cwd())])

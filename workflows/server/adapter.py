@@ -115,7 +115,7 @@ class _Published:
                 self.artifact = cast(UUID, create_progress_artifact(percent, key=self.key, description=text))
             else:
                 update_progress_artifact(self.artifact, percent, description=text)
-        except Exception as e:  # decoration: a server that is away, however it says so, must not cost the stage
+        except Exception as e:  # only for display: an error of the server must not fail the stage
             log.debug("progress not shown: %s", e)
 
 

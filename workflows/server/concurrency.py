@@ -2,7 +2,7 @@
 
 The server lends the slot for a time that is renewed, so that the slot of a process that died comes back. Prefect's own
 `concurrency` stops renewing for good after a few seconds without the server, and fails the run when the server is away
-at the fit's end; here both are asked again until the server is back.
+at the fit's end; here both are repeated until the server is back.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _keep(lease: UUID, over: threading.Event) -> None:
             pause = RENEW
         except httpx.HTTPError as e:
             if not _away(e):
-                log.warning("the server took the slot back, the fit goes on without: %s", e)
+                log.warning("the server revoked the slot; the fit continues without it: %s", e)
                 return
             pause = ASK
 
@@ -107,5 +107,5 @@ def _taken(e: httpx.HTTPError) -> bool:
 
 
 def _away(e: httpx.HTTPError) -> bool:
-    """Whether the server did not answer, or said that it can't now."""
+    """Whether the server did not answer, or answered that it is busy."""
     return not isinstance(e, httpx.HTTPStatusError) or e.response.status_code >= 500

@@ -64,9 +64,9 @@ def _serve(limit: int, notify: Callable[[str], None]) -> int:
 
 @contextmanager
 def _server(host: str, port: int, home: Path) -> Iterator[Path | None]:
-    """A Prefect server as a child, behind a login: hands back the login's file.
+    """A Prefect server as a child process, behind a login. Returns the file of the login.
 
-    It listens on this machine alone unless another address is asked for, and ends with this process.
+    It listens on this machine only, unless `host` is another address, and ends with this process.
     """
     home.mkdir(parents=True, exist_ok=True, mode=0o700)
     os.environ.setdefault("PREFECT_HOME", str(home))

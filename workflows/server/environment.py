@@ -17,7 +17,7 @@ SLOTS_ON_DISK = ("PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE", "prefect.server.con
 
 
 def defaults() -> None:
-    """Quiet and offline, unless the user says otherwise."""
+    """Quiet and offline, unless the user set it."""
     for name, value in OFFLINE.items():
         os.environ.setdefault(name, value)
 

@@ -1,4 +1,4 @@
-"""Start a program that ends when the process that asked for it ends, in whatever way.
+"""Start a program that ends when the process that started it ends, in whatever way.
 
 python -m workflows.server.kept_child PARENT ARGUMENTS...    runs `python ARGUMENTS...`; PARENT: the asking process's id
 """

@@ -16,18 +16,18 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
     from workflows.cli.options import a_time
 
     of = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
-    gc = of.add_parser("gc", help="remove what no published folder needs; it is made anew when it is asked for")
+    gc = of.add_parser("gc", help="remove what no published folder needs; a later run makes it again")
     gc.add_argument("store", metavar="STORE", help="the store: OUT/.store, or what --store named")
     gc.add_argument(
         "--older-than", type=a_time, default="7d", metavar="TIME", help="unused for so long: 12h, 30d (%(default)s)"
     )
-    gc.add_argument("--dry-run", action="store_true", help="say what would go, and remove nothing")
+    gc.add_argument("--dry-run", action="store_true", help="print what would be removed, and remove nothing")
     gc.set_defaults(run=gc_command)
     purge = of.add_parser("purge", help="remove all that was made from one person's photos (docs/privacy.md)")
     purge.add_argument("subject", metavar="SUBJECT", help="the subject's folder in a batch, or a single run's capture")
     purge.add_argument("--out", required=True, metavar="DIR", help="the --out of that batch or run")
     purge.add_argument("--store", metavar="STORE", help="its store (DIR/.store)")
-    purge.add_argument("--dry-run", action="store_true", help="say what would go, and remove nothing")
+    purge.add_argument("--dry-run", action="store_true", help="print what would be removed, and remove nothing")
     purge.set_defaults(run=purge_command)
 
 

@@ -1,4 +1,4 @@
-"""Clearing up a store: what nobody needs (gc), and all that came from one person's photos (purge)."""
+"""Clearing up a store: unused results (gc), and everything made from one person's photos (purge)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Piece:
 
 # ------------------------------------------------------------------ gc
 def garbage(store: Store, older_than: float, now: float | None = None) -> list[Piece]:
-    """What no published folder names and nobody used for `older_than` seconds.
+    """Results that no published folder names and that were not used for `older_than` seconds.
 
     While a run is under way only what was not used for a day counts: the run has not named its artifacts yet.
     """
@@ -49,7 +49,7 @@ def garbage(store: Store, older_than: float, now: float | None = None) -> list[P
         elif now - path.stat().st_mtime < limit:
             continue
         elif kind == ".scratch":
-            found.append(Piece(path, "checkpoints of a fit that nobody goes on with", _size(path)))
+            found.append(Piece(path, "checkpoints of an abandoned fit", _size(path)))
         elif (stage, key) not in needed:
             found.append(Piece(path, "no published folder was made from it", _size(path)))
     return found
@@ -142,7 +142,7 @@ def _results(out: Path) -> tuple[set[Path], set[Path]]:
 
 
 def purge(found: Purge, store: Store) -> list[Path]:
-    """Remove it. Hands back what is still there: a process works on it, or it can't be removed."""
+    """Remove it. Returns what is still there: a process works on it, or it can't be removed."""
     for path in found.paths:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
@@ -177,7 +177,7 @@ def _is_of(subject: str, root: Root, out: Path) -> bool:
 
 
 def _photos_of(root: Root, store: Store) -> Iterator[Path]:
-    """The folders that a run's first stage read; run.json may name them relative to a folder that nobody knows now."""
+    """The folders that a run's first stage read; run.json may name them relative to an unknown folder."""
     for stage, key in root.keys.items():
         yield from (Path(p) for p in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(SOURCE, ()))
 

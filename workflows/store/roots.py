@@ -17,7 +17,7 @@ ROOTS = ".roots"
 
 @dataclass(frozen=True, slots=True)
 class Root:
-    """A published run: its folder, its capture's folder as it was asked for, and the keys of its stages."""
+    """A published run: its folder, its capture's folder as requested, and the keys of its stages."""
 
     out: Path
     capture: str
@@ -39,7 +39,7 @@ def forget_root(store: Store, out: Path) -> None:
 
 
 def roots(store: Store) -> Iterator[Root]:
-    """Every published folder that still stands. What run.json says counts: a later run may have replaced it."""
+    """Every published folder that still exists, by its run.json: a later run may have replaced it."""
     folders = {_out_of(p) for p in sorted((store.root / ROOTS).glob("*.json"))}
     beside = store.root.parent  # OUT/.store: the run, or the batch's captures, in OUT
     if store.root.name == ".store":
