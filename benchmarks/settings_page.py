@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from benchmarks.generated import print_or_write
 from stages.registry import REGISTRY
 from stages.settings import Setting, all_settings, value_in_words
 
@@ -42,16 +43,5 @@ def _lines() -> Iterator[str]:
             yield "\n".join([HEAD, *map(row, own)])
 
 
-def main(arguments: list[str]) -> int:
-    """Print the tables, or write them into the page."""
-    if "--write" not in arguments:
-        print(tables())
-        return 0
-    text = PAGE.read_text()
-    before, rest = text.split(BEGIN)
-    PAGE.write_text(before + tables() + rest.split(END)[1])
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(print_or_write(sys.argv[1:], PAGE, tables()))

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.generated import print_or_write
 from pipeline.verdict import Limits
 from stages.registry import REGISTRY
 
@@ -136,16 +137,5 @@ def _merged(a: Check, b: Check) -> Check:
     return Check(a.stage, a.name, limits, tuple(dict.fromkeys((*a.remedies, *b.remedies))))
 
 
-def main(arguments: list[str]) -> int:
-    """Print the table, or write it into the page."""
-    if "--write" not in arguments:
-        print(table())
-        return 0
-    text = PAGE.read_text()
-    before, rest = text.split(BEGIN)
-    PAGE.write_text(before + table() + rest.split(END)[1])
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(print_or_write(sys.argv[1:], PAGE, table()))
