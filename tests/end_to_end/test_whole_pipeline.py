@@ -7,7 +7,9 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from pipeline.artifacts import Capture, Located
@@ -29,6 +31,7 @@ SMALL = {
     "bake.size": 256,
     "usd.preview_size": 128,
 }
+SHOWN = 40  # differences that a failure lists
 STAGES = ["capture", "poses", "masks", "inverse_rendering", "surface", "uv", "bake", "usd", "report"]
 
 
@@ -143,10 +146,56 @@ def killed(capture: Path, child_environment: dict[str, str], tmp_path_factory: p
     return out
 
 
+def folder(record: Path, out: Path, stage: str) -> Path:
+    """Where a run left the result of a stage."""
+    key = json.loads(record.read_text())["stages"][stage]["key"]
+    return out / ".store" / stage / key
+
+
 def manifest(record: Path, out: Path, stage: str) -> str:
     """The manifest that a run left of a stage."""
-    key = json.loads(record.read_text())["stages"][stage]["key"]
-    return (out / ".store" / stage / key / "manifest.json").read_text()
+    return (folder(record, out, stage) / "manifest.json").read_text()
+
+
+def leaves(value: Any, name: str = "") -> dict[str, Any]:
+    """The single values of nested JSON, by their paths."""
+    if not isinstance(value, dict | list):
+        return {name: value}
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    return {k: v for key, item in items for k, v in leaves(item, f"{name}/{key}").items()}
+
+
+def changed(before: str, after: str) -> list[str]:
+    """The values of two manifests that differ, those that are no file's hash first."""
+    was, now = leaves(json.loads(before)), leaves(json.loads(after))
+    names = [k for k in {**was, **now} if was.get(k) != now.get(k)]
+    return [f"{k}: {was.get(k)} -> {now.get(k)}" for k in sorted(names, key=lambda k: (k.endswith("/sha256"), k))]
+
+
+def changed_arrays(before: Path, after: Path) -> list[str]:
+    """The arrays of two folders' npz files that differ, and by how much at most."""
+    out = []
+    for file in sorted(before.glob("*.npz")):
+        with np.load(file) as was, np.load(after / file.name) as now:
+            for name in was.files:
+                a, b = was[name], now[name]
+                if a.shape != b.shape:
+                    out.append(f"{file.name} {name}: {a.shape} -> {b.shape}")
+                elif a.tobytes() != b.tobytes():
+                    most = np.abs(a.astype(np.float64) - b.astype(np.float64)).max()
+                    out.append(f"{file.name} {name}: {int((a != b).sum())} of {a.size} differ, by {most:.3g} at most")
+    return out
+
+
+def test_what_differs_is_told(tmp_path: Path) -> None:
+    """A difference as it was never kept: of a value, of a file and in the last digit of an array."""
+    old, new = ({"a": [1, {"sha256": h}], "psnr": p} for h, p in (("x", 30.0), ("y", 30.5)))
+    assert changed(json.dumps(old), json.dumps(new)) == ["/psnr: 30.0 -> 30.5", "/a/1/sha256: x -> y"]
+    for name, values in (("before", [1.0, 2.0]), ("after", [1.0, 2.0 + 2**-20])):
+        (tmp_path / name).mkdir()
+        np.savez(tmp_path / name / "field.npz", same=np.ones(3), table=np.array(values))
+    told = changed_arrays(tmp_path / "before", tmp_path / "after")
+    assert told == ["field.npz table: 1 of 2 differ, by 9.54e-07 at most"]
 
 
 def test_a_run_killed_three_times_ends_in_a_valid_asset(done: Path, killed: Path) -> None:
@@ -157,7 +206,12 @@ def test_a_run_killed_three_times_ends_in_a_valid_asset(done: Path, killed: Path
 
 
 def test_a_run_killed_three_times_has_the_same_asset(done: Path, killed: Path) -> None:
-    """Every stage from the photos to the asset, bit by bit."""
+    """Every stage from the photos to the asset, bit by bit. Where one differs, what differs is told: by its last digits
+    a sum in another order is known, by more a state that was not kept."""
     for stage in STAGES[:-1]:
-        before = manifest(done.parent / "undisturbed.json", done, stage)
-        assert before == manifest(killed / "run.json", killed, stage), stage
+        pair = [(done.parent / "undisturbed.json", done, stage), (killed / "run.json", killed, stage)]
+        before, after = (manifest(*one) for one in pair)
+        if before == after:
+            continue
+        told = [*changed(before, after), *changed_arrays(*(folder(*one) for one in pair))]
+        pytest.fail(f"{stage} is the first stage that differs:\n" + "\n".join(told[:SHOWN]), pytrace=False)
