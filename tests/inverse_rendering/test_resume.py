@@ -12,16 +12,16 @@ import torch
 
 from pipeline.transforms import F64
 from stages.inverse_rendering import fit
-from stages.inverse_rendering.begin import new_trainer
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.initialise import new_trainer
 from tests.support.balls import Ball, gloss, start
 
 pytestmark = pytest.mark.slow
 
 STEPS, BAND_EVERY, TOGETHER = 60, 25, 2
 SMALL = Config(  # what a draft leaves to the evidence is left to it here; steps are few, so that all can be tried
-    relief="on",
+    refine_geometry="on",
     image_side=96,
     steps=STEPS,
     batch=256,
@@ -65,7 +65,7 @@ def everything(t: Trainer) -> dict[str, Any]:
     band = {"m": grid.m, "v": grid.v, "sink": grid.sink.view(-1)[grid.active], "moves": grid.values.requires_grad}
     rates = [group["lr"] for group in t.optimiser.param_groups]
     found = {"parts": t.parts(), "counted": counted, "band": band, "rates": rates, "history": t.history}
-    return dict(leaves({**found, "even": t.model.even, "spec": repr(t.model.spec)}))
+    return dict(leaves({**found, "uniform_albedo": t.model.uniform_albedo, "spec": repr(t.model.spec)}))
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,13 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[in
             t.save(folder / f"{t.step}.pt")
             states[t.step] = everything(t)
     choices = t.choices
-    assert choices is not None and choices.lit and choices.specular and choices.calibrated and choices.relief
+    assert (
+        choices is not None
+        and choices.light_known
+        and choices.specular
+        and choices.calibrated
+        and choices.refine_geometry
+    )
     assert t.shadows_solved == 3 and t.level == 1 and not t.guard.dropped
     return folder, states
 
