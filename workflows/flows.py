@@ -27,8 +27,12 @@ from workflows.server.access import check_folders
 from workflows.server.adapter import publish_result, report_batch, task_executor, with_slot
 from workflows.server.flow_signature import takes
 
-CAPTURE_FLOW: dict[str, Any] = {"name": "capture-to-asset", "flow_run_name": "{capture} -> {out}", "retries": 0,
-                                "persist_result": False}  # fmt: skip
+CAPTURE_FLOW: dict[str, Any] = {
+    "name": "capture-to-asset",
+    "flow_run_name": "{capture} -> {out}",
+    "retries": 0,
+    "persist_result": False,
+}
 
 
 @flow(**CAPTURE_FLOW)

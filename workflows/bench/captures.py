@@ -45,8 +45,12 @@ def options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--preset", default=DEFAULT_PRESET, help="of every run (%(default)s)")
     sub.add_argument("--holdout", metavar="RULE", help="for all, in place of each capture's own rule")
     sub.add_argument("--out", default="out/captures", metavar="DIR", help="folder for runs, logs, store (%(default)s)")
-    sub.add_argument("--table", metavar="FILE", help="the table as JSON, with Markdown beside it (docs/benchmarks/"
-                     "captures.json for the usual captures, preset and splits, else OUT/captures.json)")  # fmt: skip
+    sub.add_argument(
+        "--table",
+        metavar="FILE",
+        help="the table as JSON, with Markdown beside it (docs/benchmarks/"
+        "captures.json for the usual captures, preset and splits, else OUT/captures.json)",
+    )
     sub.add_argument("--against", metavar="FILE", help="a table as JSON: print what got better and worse since")
     sub.add_argument(
         "--limit", type=a_time, default=60 * LIMIT, metavar="TIME", help="for each capture: 90s, 40m (40m)"
@@ -74,8 +78,14 @@ def run(given: argparse.Namespace, console: Console, command: Sequence[str] = CH
     print(f"table  {path.with_suffix('.md')}")
     if old is not None:
         mine = {c.name for c in found}
-        print("\n".join(compare(old if not given.only else {n: r for n, r in old.items() if n in mine},
-                                {n: r for n, r in rows.items() if n in mine})))  # fmt: skip
+        print(
+            "\n".join(
+                compare(
+                    old if not given.only else {n: r for n, r in old.items() if n in mine},
+                    {n: r for n, r in rows.items() if n in mine},
+                )
+            )
+        )
     return 0
 
 
@@ -94,8 +104,18 @@ def row_of(capture: Found, given: argparse.Namespace, out: Path, made: dict[str,
         return row | {"ended": ended, "verdict": verdict_of(None), "seconds": {}, "figures": {}}
     folder = (out / capture.name).absolute()
     photos = captures.gathered(capture, (out / "gathered" / capture.name).absolute())
-    arguments = ["run", str(photos), "--out", str(folder), "--store", str((out / "store").absolute()),
-                 "--preset", given.preset, "--holdout", capture.holdout]  # fmt: skip
+    arguments = [
+        "run",
+        str(photos),
+        "--out",
+        str(folder),
+        "--store",
+        str((out / "store").absolute()),
+        "--preset",
+        given.preset,
+        "--holdout",
+        capture.holdout,
+    ]
     before = _changed(folder / "run.json")
     try:
         with terminable():
@@ -163,8 +183,15 @@ def _ended(child: Ended, private: Sequence[Path]) -> dict[str, Any]:
     error = child.error
     for path in private:
         error = error.replace(str(path), path.name)
-    return {"ended": {"exit_code": child.exit_code, "how": child.how, "error": error, "stage": child.stage,
-                      "wall": child.seconds}}  # fmt: skip
+    return {
+        "ended": {
+            "exit_code": child.exit_code,
+            "how": child.how,
+            "error": error,
+            "stage": child.stage,
+            "wall": child.seconds,
+        }
+    }
 
 
 def _changed(path: Path) -> int | None:

@@ -116,9 +116,7 @@ def measure(views: int, side: int, cells: int, batch: int, least: float, device:
     begun = time.perf_counter() - begun
     each = host_info.seconds_each(lambda: _steps(t, device), least, 5) / STEPS
     added = peak_memory_mb() - before
-    return Point(
-        views, side, cells, round(1e3 * each, 2), round(batch / each), round(begun, 3), round(added, 1)
-    )  # fmt: skip
+    return Point(views, side, cells, round(1e3 * each, 2), round(batch / each), round(begun, 3), round(added, 1))
 
 
 STEPS = 3

@@ -59,8 +59,15 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
         for until in _untils(early_stages()):
             if until is None:
                 break
-            request = RunRequest(capture=options.capture, out=str(scratch), store=str(store), until=until,
-                                 preset=options.preset, sets=tuple(options.sets), force=True)  # fmt: skip
+            request = RunRequest(
+                capture=options.capture,
+                out=str(scratch),
+                store=str(store),
+                until=until,
+                preset=options.preset,
+                sets=tuple(options.sets),
+                force=True,
+            )
             try:
                 done = run_stages(make_plan(request), watch)
             except StageError as e:

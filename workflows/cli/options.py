@@ -23,8 +23,17 @@ M = TypeVar("M", bound=BaseModel)
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 TIMES = ("budget", "stage_limit", "lost_after")
-METAVARS = {"out": "DIR", "store": "DIR", "holdout": "RULE", "until": "STAGE", "from_stage": "STAGE",
-            "subjects": "LIST", "expressions": "LIST", "deployment": "F/N", "gpus": "N"}  # fmt: skip
+METAVARS = {
+    "out": "DIR",
+    "store": "DIR",
+    "holdout": "RULE",
+    "until": "STAGE",
+    "from_stage": "STAGE",
+    "subjects": "LIST",
+    "expressions": "LIST",
+    "deployment": "F/N",
+    "gpus": "N",
+}
 
 
 def seconds(text: str) -> float:
@@ -64,8 +73,9 @@ def _add(parser: Any, name: str, field: FieldInfo, positional: bool) -> None:
         return
     flag = f"--{name.replace('_', '-')}"
     if name == "sets":
-        parser.add_argument("--set", dest="sets", action="append", default=[], metavar="STAGE.KEY=VALUE",
-                            help=description)  # fmt: skip
+        parser.add_argument(
+            "--set", dest="sets", action="append", default=[], metavar="STAGE.KEY=VALUE", help=description
+        )
     elif name == "config":
         parser.add_argument(flag, metavar="FILE", help="settings from a .toml or .json file, a table for each stage")
     elif field.annotation is bool:

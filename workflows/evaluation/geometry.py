@@ -60,9 +60,7 @@ def of_view(view: CaptureView) -> Camera:
     cam_from_world = np.eye(4)
     cam_from_world[:3] = matrix(view.camera.cam_from_world)[:3]
     distortion = np.pad(np.array(view.camera.distortion, np.float64), (0, 5))[:5]
-    return Camera(
-        view.name, matrix(view.camera.K), inverse_rigid(cam_from_world), view.width, view.height, distortion
-    )  # fmt: skip
+    return Camera(view.name, matrix(view.camera.K), inverse_rigid(cam_from_world), view.width, view.height, distortion)
 
 
 # ------------------------------------------------------------------ a run's surface
