@@ -1,1 +1,1 @@
-"""Checks the user's photos and gathers what takes part in one place."""
+"""Checks the user's photos and copies the ones that are used into one folder."""

@@ -1,4 +1,4 @@
-"""Which photos of the user's folder may take part, with what belongs to each, and what is told of the others."""
+"""Which photos of the user's folder may be used, with the files of each, and the warnings about the others."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A photo that may take part."""
+    """A photo that may be used. size: (width, height) in pixels. serial: the camera body. plate: the clean plate."""
 
     index: int
     name: str
@@ -30,8 +30,8 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """Photos that may take part; notes on those that don't, with their names; warnings."""
+class Selection:
+    """candidates: photos that may be used. left_out: a note on each of the others; absent: their names."""
 
     candidates: list[Candidate]
     left_out: list[str]
@@ -39,22 +39,22 @@ class Found:
     warnings: list[str]
 
     def leave_out(self, candidate: Candidate, why: str) -> None:
-        """One that takes no part after all: a photo that is of no use is told as a warning too."""
+        """Exclude a candidate after all, with a note and a warning."""
         self.left_out.append(f"{candidate.name}: {why}")
         self.absent.append(candidate.name)
         self.warnings.append(f"{candidate.name} is left out: {why}")
 
 
-def candidates_of(source: Located[CaptureSource]) -> Found:
-    """All that the folder, or its description of cameras, names, in order of their numbers."""
+def candidates_of(source: Located[CaptureSource]) -> Selection:
+    """All photos that the folder, or its cameras' file, lists, in the order of their numbers."""
     photos = source.artifact.photos
     by_stem, plates = ({PurePath(f.path).stem: f for f in files}
                        for files in (source.artifact.masks, source.artifact.plates))  # fmt: skip
     if not source.artifact.cameras:
         names = [PurePath(p.path).name for p in photos]
-        found = [Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
+        candidates = [Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
                  for i, n, p in zip(indices_of(names), names, photos, strict=True)]  # fmt: skip
-        return Found(sorted(found, key=lambda c: c.index), [], [], [])
+        return Selection(sorted(candidates, key=lambda c: c.index), [], [], [])
     described = describe(source.artifact.kind, source.folder, [source.path(c) for c in source.artifact.cameras])
     refs, masks = ({f.path: f for f in files} for files in (photos, source.artifact.masks))
     out = []
@@ -65,45 +65,47 @@ def candidates_of(source: Located[CaptureSource]) -> Found:
         own = masks.get(v.mask.relative_to(source.folder).as_posix()) if v.mask is not None else None
         out.append(Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, own or _of(by_stem, v.name),
                               _of(plates, v.name)))  # fmt: skip
-    return Found(
+    return Selection(
         sorted(out, key=lambda c: c.index), list(described.left_out), list(described.absent), list(described.warnings)
     )
 
 
 def _of(by_stem: dict[str, FileRef], name: str) -> FileRef | None:
-    """The file beside a photo: `a.png` or `a.jpg.png` for a.jpg."""
+    """The mask or clean plate of a photo: `a.png` or `a.jpg.png` for a.jpg."""
     return by_stem.get(PurePath(name).stem) or by_stem.get(name)
 
 
-def without_doubles(found: Found, given: bool) -> list[Candidate]:
-    """Photos whose bytes another one has too are left out; of ones with cameras it is only told, for one camera is
-    wrong and the file does not say which."""
+def without_duplicates(selection: Selection, given: bool) -> list[Candidate]:
+    """The candidates without duplicate files. Duplicates with given cameras are kept, with a warning: one of the
+    cameras is wrong, and it is unknown which."""
     first: dict[str, str] = {}
     kept = []
-    for c in found.candidates:
+    for c in selection.candidates:
         other = first.setdefault(c.ref.sha256, c.name)
         if other == c.name:
             kept.append(c)
         elif given:
             kept.append(c)
-            found.warnings.append(f"{c.name} is the same file as {other}, with another camera; take one of them out")
+            selection.warnings.append(
+                f"{c.name} is the same file as {other}, but has another camera; remove one of them"
+            )
         else:
-            found.leave_out(c, f"it is the same file as {other}; put the photo there that was meant, or remove it")
+            selection.leave_out(c, f"it is the same file as {other}; replace it by the correct photo, or remove it")
     return kept
 
 
 def useful(
-    candidates: list[Candidate], photos: list[ImportedPhoto], found: Found, drop_blurred: bool
+    candidates: list[Candidate], photos: list[ImportedPhoto], selection: Selection, drop_blurred: bool
 ) -> tuple[list[Candidate], list[ImportedPhoto]]:
-    """Without blank and blurred photos, whose copies are removed."""
+    """Candidates and photos without the blank and the blurred ones, whose copies are deleted."""
     seen = [p.detail for p in photos if p.detail is not None]
     soft = iter(blurred(seen) if drop_blurred and seen else [False] * len(seen))
     kept = []
     for candidate, photo in zip(candidates, photos, strict=True):
         if photo.detail is None:
-            found.leave_out(candidate, "it is blank (one level all over); take the photo again")
+            selection.leave_out(candidate, "it is blank (all pixels are equal); take the photo again")
         elif next(soft):
-            found.leave_out(candidate, "it is blurred far beyond the others; take the photo again, or set "
+            selection.leave_out(candidate, "it is far more blurred than the others; take the photo again, or set "
                             "capture.drop_blurred=false")  # fmt: skip
         else:
             kept.append((candidate, photo))
@@ -113,7 +115,7 @@ def useful(
 
 
 def _remove(photo: ImportedPhoto) -> None:
-    """A photo that takes no part after all leaves nothing behind."""
+    """Delete the copied files of a photo that is not used after all."""
     photo.image.unlink()
     if photo.clipped is not None:
         photo.clipped.unlink()

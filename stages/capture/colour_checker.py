@@ -1,8 +1,8 @@
-"""A classic colour chart (24 patches) in a photo: where it is, and the linear colours of its patches.
+"""Detection of a classic colour checker (24 patches) in a photo, and the linear colours of its patches.
 
-Frames: corners are pixels of the photo, the first pixel's centre at (0.5, 0.5); (x, y) on the chart run from (-1, -1)
-beyond the outer corner of the first patch, dark skin, to (1, 1) beyond that of the last, black, by half the gap between
-patches, so that patches are 1/3 apart in x and 1/2 in y.
+Frames: corners are pixels of the photo, the first pixel's centre at (0.5, 0.5). Chart coordinates (x, y) run from
+(-1, -1) at the first patch, dark skin, to (1, 1) at the last, black; both points lie half the gap between patches
+outside of the patch's outer corner. So patches are 1/3 apart in x and 1/2 in y.
 """
 
 from __future__ import annotations
@@ -20,22 +20,24 @@ from stages.capture.photometry import clipped
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
-WORKING = 1000  # pixels, longest edge, at which it is looked for
+WORKING = 1000  # pixels, longest edge of the picture that is searched
 THUMBNAIL, DIM, HUE, HUE_PIXELS = 250, 0.03, 0.04, 6  # pixels; sum of a pixel's channels; cell of chromaticity; pixels
-HUES = 24  # cells from which a chart is looked for: drawn ones have 35 to 110, a head before black 11 to 20
-STEP = 48  # pixels between the detector's threshold windows: its own 16 finds hardly more and takes three times as long
+HUES = 24  # fewest cells for a search: rendered charts have 35 to 110, a head on black 11 to 20
+STEP = (
+    48  # pixels between the detector's threshold windows: the default 16 detects hardly more, in three times the time
+)
 COLUMNS, ROWS = 6, 4
 PATCHES = COLUMNS * ROWS
 CORNERS: F64 = np.array([[-1.0, -1.0], [1, -1], [1, 1], [-1, 1]])
-MIDDLE = 0.5  # of the distance between patches, that is measured of each
-CELL, ROUNDS = 48, 3  # pixels between patches of the chart laid flat, and how often that is done
-SMALLEST, LARGEST = 0.4, 1.1  # edges of a patch, of the distance between patches
-LIKE = 16  # levels: pixels that differ less are of one patch
-MIN_PIXELS = 9  # of a patch's middle
-CLIPPED = 0.02  # share of a patch's pixels at the end of the range from which its colour is not known
+MEASURED = 0.5  # edge of the measured part of a patch, as a share of the distance between patches
+CELL, ROUNDS = 48, 3  # pixels between patches of the rectified chart; number of rectifications
+SMALLEST, LARGEST = 0.4, 1.1  # edge of a patch, as a share of the distance between patches
+LIKE = 16  # levels: pixels that differ less belong to one patch
+MIN_PIXELS = 9  # of the measured part of a patch
+CLIPPED = 0.02  # largest share of a patch's pixels that may be clipped
 
 # Linear Rec.709 of the patches where a perfect white is (1, 1, 1): the maker's CIE L*a*b* (D50, charts before November
-# 2014), brought to D65 by Bradford's matrix. By rows: dark skin to bluish green, orange to orange yellow, blue to cyan,
+# 2014), adapted to D65 by Bradford's matrix. By rows: dark skin to bluish green, orange to orange yellow, blue to cyan,
 # white to black. Cyan lies outside the gamut.
 REFLECTANCES: F64 = np.array([
     [0.1730, 0.0821, 0.0567], [0.5682, 0.2927, 0.2184], [0.1036, 0.1959, 0.3314],
@@ -51,8 +53,8 @@ REFLECTANCES: F64 = np.array([
 
 @dataclass(frozen=True, slots=True)
 class Patches:
-    """A chart in a photo. corners: (4, 2), around the chart from the first patch's. colours: (24, 3) mean linear values
-    of the patches' middles. usable: (24,) patches that are large enough and not clipped."""
+    """A chart in a photo. corners: (4, 2) pixels, in order around the chart, the first patch's first. colours: (24, 3)
+    mean linear values of the patches' centres. usable: (24,) patches that are large enough and not clipped."""
 
     corners: F64
     colours: F64
@@ -60,15 +62,16 @@ class Patches:
 
 
 def places() -> F64:
-    """(24, 2) middles of the patches on the chart."""
+    """(24, 2) centres of the patches in chart coordinates."""
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) * 2 / COLUMNS - 1, (np.arange(ROWS) + 0.5) * 2 / ROWS - 1)
     return np.stack([x.ravel(), y.ravel()], 1)
 
 
 def find_chart(image: npt.NDArray[np.generic]) -> Patches | None:
-    """The chart in a decoded photo (H, W, C), 8 or 16 bit sRGB or linear float; None without one, or without colours.
+    """The chart in a decoded photo (H, W, C), 8 or 16 bit sRGB or linear float; None if there is none, or in a grey
+    photo.
 
-    The search is OpenCV's (`cv2.mcc`), by contours and not by its network, which the wheel does not hold.
+    The detector is OpenCV's `cv2.mcc`, by contours: the wheel does not contain its network.
     """
     if image.shape[2] < 3 or hues(_shown(image, min(1.0, THUMBNAIL / max(image.shape[:2])))) < HUES:
         return None
@@ -92,8 +95,8 @@ def find_chart(image: npt.NDArray[np.generic]) -> Patches | None:
 
 
 def hues(small: npt.NDArray[Any]) -> int:
-    """How many chromaticities there are in a small picture, 8-bit sRGB. Any one light moves them all, and leaves a
-    chart with more of them than most heads and walls have: whatever has fewer need not be searched."""
+    """Number of chromaticities in a small picture (h, w, 3), 8-bit sRGB. Under any one light a chart has more of them
+    than most heads and walls, so a picture with fewer need not be searched."""
     linear = np.asarray(linear_from_srgb(np.arange(256) / 255), np.float32)[small].reshape(-1, 3)
     total = linear.sum(1)
     shown = total > DIM
@@ -103,10 +106,10 @@ def hues(small: npt.NDArray[Any]) -> int:
 
 
 def _settled(small: npt.NDArray[Any], corners: F64) -> F64:
-    """The corners moved to where the patches are: the detector's are off by up to a third of a patch.
+    """Corners (4, 2), refined from the patches: the detector's are off by up to a third of a patch.
 
-    The chart is laid out flat with a margin of a cell; what hangs together with a cell's middle in colour is its patch,
-    unless it is too large or too small for one, and its own middle says where the cell should have been.
+    The chart is rectified with a margin of one cell. The connected area with the colour of a cell's centre is its
+    patch, unless it is too large or too small. The centres of these patches give the corrected homography.
     """
     for _ in range(ROUNDS):
         half_x, half_y = COLUMNS * CELL / 2, ROWS * CELL / 2
@@ -131,7 +134,7 @@ def _settled(small: npt.NDArray[Any], corners: F64) -> F64:
 
 
 def _patch(flat: npt.NDArray[Any], seed: tuple[int, int]) -> tuple[float, float] | None:
-    """The middle of what is of one colour around a place of the flat chart, if that is as large as a patch."""
+    """Centre of the area of one colour around a pixel of the rectified chart, if it has the size of a patch."""
     inside = np.zeros((flat.shape[0] + 2, flat.shape[1] + 2), np.uint8)
     how = 4 | (255 << 8) | cv2.FLOODFILL_FIXED_RANGE | cv2.FLOODFILL_MASK_ONLY
     _, _, _, (x, y, w, h) = cv2.floodFill(flat, inside, seed, 0, (LIKE,) * 3, (LIKE,) * 3, how)
@@ -141,7 +144,7 @@ def _patch(flat: npt.NDArray[Any], seed: tuple[int, int]) -> tuple[float, float]
 
 
 def _homography(corners: F64) -> F64:
-    """(3, 3) from places on the chart to OpenCV's pixels."""
+    """(3, 3) from chart coordinates to OpenCV's pixels."""
     return np.asarray(cv2.getPerspectiveTransform(CORNERS.astype(np.float32), corners.astype(np.float32)), np.float64)
 
 
@@ -151,7 +154,7 @@ def _mapped(homography: F64, at: F64) -> F64:
 
 
 def _shown(image: npt.NDArray[np.generic], scale: float) -> npt.NDArray[Any]:
-    """The photo as the detector wants it: small, 8-bit sRGB, blue first."""
+    """The photo as the detector reads it: (h, w, 3), reduced by `scale`, 8-bit sRGB, BGR."""
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     plane: Any = np.ascontiguousarray(image[..., 2::-1])
     small: Any = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
@@ -164,11 +167,11 @@ def _shown(image: npt.NDArray[np.generic], scale: float) -> npt.NDArray[Any]:
 
 
 def _measured(image: npt.NDArray[np.generic], corners: F64) -> Patches | None:
-    """The patches' colours at the photo's own size. corners: (4, 2) pixels, the first pixel's centre at (0.5, 0.5)."""
+    """The patches' colours at full resolution. corners: (4, 2) pixels, the first pixel's centre at (0.5, 0.5)."""
     colours, usable = np.zeros((PATCHES, 3)), np.zeros(PATCHES, bool)
     to_photo = _homography(corners)
     for i, middle in enumerate(places()):
-        outline = _mapped(to_photo, middle + MIDDLE * CORNERS / [COLUMNS, ROWS])
+        outline = _mapped(to_photo, middle + MEASURED * CORNERS / [COLUMNS, ROWS])
         low = np.floor(outline.min(0)).astype(int).clip(0)
         high = np.ceil(outline.max(0)).astype(int).clip(None, image.shape[1::-1])
         part = image[low[1] : high[1], low[0] : high[0]]

@@ -1,8 +1,8 @@
-"""A capture in whose photos a colour chart was found: all photos brought to the chart's white, and how.
+"""Colour correction of all photos of a capture by the colour checker that some of them show.
 
 Symbols: c linear colour of a photo, e its exposure, M its camera's map to reflectances (stages.capture.colour_matrix).
-Stored is k M c, with the largest k up to 1 at which every colour of every photo is within a file's range; k is the
-chart's `level`: a perfect white at its place has k e in a stored photo. e stays what EXIF says of it.
+Stored is k M c, with the largest k up to 1 at which every colour of every photo is within a file's range. k is the
+chart's `level`: a perfect white at its place has k e in a stored photo. e is unchanged, from EXIF.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from stages.capture.colour_matrix import ColourMatrix, colour_matrix_of
 
 @dataclass(frozen=True, slots=True)
 class ChartReading:
-    """What the charts said. warnings: on those of no use."""
+    """The colour correction, None without a usable chart. warnings: about charts that can't be used."""
 
     chart: ColourChart | None
     warnings: list[str]
 
 
 def read_charts(views: Sequence[CaptureView], found: Sequence[Patches | None], wanted: bool) -> ChartReading:
-    """The chart that fits best of each camera's photos. found: of each view.
+    """For each camera, the chart with the smallest error. found: the detected chart of each view, or None.
 
     Raises:
-        StageError: wanted, and no photo shows one that is of use.
+        StageError: `wanted`, and no photo shows a usable chart.
     """
     best: dict[str, tuple[ColourMatrix, CaptureView, Patches]] = {}
     seen, warnings = [], []
@@ -43,17 +43,17 @@ def read_charts(views: Sequence[CaptureView], found: Sequence[Patches | None], w
             continue
         correction = colour_matrix_of(_unexposed(patches, view.exposure))
         if isinstance(correction, str):
-            warnings.append(f"{view.name}: the colour chart {correction}; it is not used")
+            warnings.append(f"{view.name}: the colour checker {correction}; it is not used")
             continue
         seen.append(view.name)
         other = best.get(view.camera_group)
         if other is None or correction.error < other[0].error:
             best[view.camera_group] = (correction, view, patches)
     if wanted and not best:
-        raise StageError("no colour chart is found", where="capture.colour_checker=on",
-                         value="; ".join(warnings[:3]) or "none seen",
-                         limit="a classic chart of 24 patches, whole, flat and at least a fifth of a photo's longer "
-                         "edge wide", remedy="photograph it close to the face in the same light, or set "
+        raise StageError("no colour checker is found", where="capture.colour_checker=on",
+                         value="; ".join(warnings[:3]) or "none detected",
+                         limit="a classic colour checker of 24 patches, complete, flat, and at least a fifth of a "
+                         "photo's longer edge wide", remedy="photograph it close to the face in the same light, or set "
                          "capture.colour_checker=auto")  # fmt: skip
     if not best:
         return ChartReading(None, warnings)
@@ -74,11 +74,11 @@ def _fit(correction: ColourMatrix, view: CaptureView, patches: Patches) -> Chart
                       white=(float(white[0]), float(white[1]), float(white[2])))  # fmt: skip
 
 
-def bring_to(
+def correct_colours(
     chart: ColourChart, views: Sequence[CaptureView], folder: Path, tick: Callable[[int, str], None]
 ) -> list[CaptureView]:
-    """The views with photos (and clean plates) in the chart's colours, whose files take the place of the copies in
-    `folder`. Cameras that saw no chart get the mean of the others' maps. tick: done, name."""
+    """The views with corrected photos and clean plates, which replace the copies in `folder`. Cameras whose photos show
+    no chart get the mean of the other cameras' matrices. tick: done, name."""
     of = {f.camera_group: chart.level * matrix(f.matrix) for f in chart.fits}
     mean = np.asarray(np.mean(list(of.values()), axis=0), np.float64)
     out = []
@@ -93,8 +93,8 @@ def bring_to(
 
 
 def recoloured(path: Path, m: F64) -> Path:
-    """Write m c in the place of a photo, as 16-bit PNG, or EXR of a float file; the new file. Colours that no Rec.709
-    light has are clamped at 0."""
+    """Replace a photo by m c and return the new file: 16-bit PNG, or EXR for a float file. m: (3, 3). Negative Rec.709
+    values are clamped at 0."""
     image = read_encoded(path)
     colours = np.asarray((read_linear(path) @ m.T.astype(np.float32)).clip(0), np.float32)
     path.unlink()

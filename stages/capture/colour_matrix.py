@@ -1,17 +1,17 @@
-"""The linear map that takes a photo's colours to the reflectances of the chart in it.
+"""The linear colour correction from a photo's colours to the reflectances of the chart in it.
 
 Symbols: c_i linear colour of patch i in the photo, r_i its reflectance, (x_i, y_i) its place on the chart; M (3, 3), or
-a diagonal of three gains. Light that is uneven over the chart brightens its patches by 1 + a x + b y; then
+a diagonal of three gains. Uneven light on the chart is modelled as a factor 1 + a x + b y of its patches; then
 
     M c_i = r_i (1 + a x_i + b y_i)
 
 is linear in M, a and b, and is solved with weights 1 / (Y_i + 0.1), Y_i the patch's luminance: relative errors count,
-absolute ones in the dark. Every figure of quality is from patches that were left out of their own solution.
+absolute ones for dark patches. The error is a leave-one-out error: each patch is predicted without itself.
 
-What this fixes is white balance, and the unit: M c = 1 is what a perfect white sends from the chart's place. It can't
-fix the scale of the albedo, because how much light falls on the head and how much on the chart are two numbers.
+The correction fixes the white balance and the unit: M c = 1 is a perfect white at the chart's place. It can't fix the
+scale of the albedo, because the irradiance of the head and that of the chart differ.
 
-Differs: the paper's captures have one camera response each, and its colours no white but that of its losses.
+Differs: in the paper each capture has one camera response, and only the losses define its white.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ from pipeline.colour import LUMA
 from stages.capture.colour_checker import F64, PATCHES, REFLECTANCES, Bool, Patches, places
 
 DARK = 0.1
-FEWEST = 14  # patches: less than that many can't be told from noise
-WRONG = 0.15  # weighted error from which it is no such chart, or unusable: patches taken for others are 0.2 to 1.2 off
-SIMPLER = 0.8  # nine numbers must leave at most this share of three's error
-EVEN = 0.8  # |a| + |b| from which the light on the chart changes too much
+FEWEST = 14  # patches: fewer do not separate the correction from noise
+WRONG = 0.15  # largest weighted error of a usable chart: permuted patches have errors of 0.2 to 1.2
+SIMPLER = 0.8  # the 3 x 3 matrix is used if its error is at most this share of that of the gains
+EVEN = 0.8  # largest |a| + |b|: beyond it the light on the chart changes too much
 
 
 @dataclass(frozen=True, slots=True)
 class ColourMatrix:
-    """matrix: reflectance of the chart from the photo's linear colours. way: what it was given. error: see above."""
+    """matrix: (3, 3), reflectance from the photo's linear colours. way: its form. error: weighted RMS, leave-one-out.
+    patches: number of patches used."""
 
     matrix: F64
     way: Literal["gains", "matrix"]
@@ -42,14 +43,14 @@ class ColourMatrix:
 
 
 def colour_matrix_of(found: Patches) -> ColourMatrix | str:
-    """M of a chart, or why it is of no use, in words that go behind 'the colour chart'."""
+    """M of a chart; or why it can't be used, as the end of a sentence that begins 'the colour checker'."""
     if found.usable.sum() < FEWEST:
         return f"has {int(found.usable.sum())} patches of {PATCHES} that are large enough and not clipped"
     three, nine = (_left_out(found, diagonal) for diagonal in (True, False))
     diagonal = nine > SIMPLER * three
     error = three if diagonal else nine
     if error > WRONG:
-        return f"does not show the colours of a classic chart of 24 patches (they are {error:.0%} off)"
+        return f"does not have the colours of a classic checker of 24 patches (error {error:.0%})"
     matrix, slope = _solved(found, found.usable, diagonal)
     if np.abs(slope).sum() > EVEN or np.linalg.det(matrix) <= 0 or (np.diag(matrix) <= 0).any():
         return "is lit too unevenly"
@@ -76,7 +77,7 @@ def _solved(found: Patches, used: Bool, diagonal: bool) -> tuple[F64, F64]:
 
 
 def _left_out(found: Patches, diagonal: bool) -> float:
-    """Root mean square of the weighted errors of patches that their solution did not see."""
+    """RMS of the weighted leave-one-out errors."""
     weight, at = _weights(), places()
     errors = []
     for i in np.flatnonzero(found.usable):

@@ -1,8 +1,7 @@
-"""What a photo says of the camera that took it: a minimal reader of TIFF tags, which EXIF is made of.
+"""A minimal EXIF reader: the TIFF tags that the pipeline uses.
 
-Only what the pipeline uses: orientation, focal length, make, model, lens, exposure, white balance, place. A file with
-damaged or no metadata gives an empty `Exif`, never an error: metadata is a help, not a condition. Source: EXIF 2.32
-(CIPA DC-008), TIFF 6.0.
+These are orientation, focal length, make, model, lens, exposure, white balance and GPS position. A file with damaged or
+no metadata gives an empty `Exif`, never an error: metadata is optional. Source: EXIF 2.32 (CIPA DC-008), TIFF 6.0.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE = 0x829A, 0x829D, 0x8827, 0xA403
 WHITE_BALANCES: dict[tuple[float, ...], str] = {(0,): "auto", (1,): "manual"}
 EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
-FOCAL = (0.05, 100.0)  # of the longest edge: what is beyond is no lens, but damaged metadata
+FOCAL = (0.05, 100.0)  # of the longest edge: values outside come from damaged metadata
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8)}
 _MAX_TAGS, _MAX_VALUES = 1000, 1_000_000
@@ -52,15 +51,15 @@ _WANTED = {
     279,
     324,
     325,
-}  # fmt: skip  (the last four: where a TIFF's strips and tiles lie)
+}  # fmt: skip  (the last four: offsets and sizes of a TIFF's strips and tiles)
 
 
 @dataclass(frozen=True, slots=True)
 class Exif:
     """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
 
-    exposure: seconds x ISO / f-number^2, what a grey's linear value is proportional to; None if not all are known.
-    white_balance: auto, or manual, or "" if it is not said. place: degrees north, degrees east, metres up.
+    exposure: seconds x ISO / f-number^2, to which the linear value of a grey is proportional; None if one is missing.
+    white_balance: auto, manual, or "" if unknown. place: degrees north, degrees east, metres up.
     """
 
     orientation: int = 1
@@ -79,14 +78,14 @@ class Exif:
         if self.focal_35mm:
             found = self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
         elif self.focal_mm and self.pixels_per_mm and self.recorded_width:
-            # the resolution is that of the frame as recorded; a copy scaled down since has fewer pixels a millimetre
+            # the resolution is that of the recorded frame; a copy that was scaled down has fewer pixels per millimetre
             found = self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_width
         low, high = FOCAL
         return found if found is not None and low <= found / max(width, height) <= high else None
 
 
 def read_exif(data: bytes) -> Exif:
-    """Metadata of a JPEG, PNG (eXIf) or TIFF file, given its bytes."""
+    """Metadata of a JPEG, PNG (eXIf) or TIFF file from its bytes."""
     block = _exif_block(data)
     if block is None:
         return Exif()
@@ -130,7 +129,7 @@ def _exposure(tags: Tags) -> float | None:
 
 
 def _place(gps: Tags) -> tuple[float, float, float] | None:
-    """Degrees north and east, metres up; None without both angles, or if they are none of this world."""
+    """Degrees north and east, metres up; None if an angle is missing or out of range."""
     angles = []
     for tag, ref, negative, limit in ((LAT, LAT_REF, "S", 90), (LON, LON_REF, "W", 180)):
         dms = _values_of(gps, tag)
@@ -146,7 +145,7 @@ def _place(gps: Tags) -> tuple[float, float, float] | None:
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """(marker, first byte, end) of each segment of a JPEG's header, up to and with the first SOS (0xDA)."""
+    """(marker, first byte, end) of each segment of a JPEG's header, up to the first SOS (0xDA), which is included."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
@@ -190,7 +189,7 @@ def _order(block: bytes) -> str:
 
 
 def _ifd(block: bytes, offset: int) -> Tags:
-    """One directory. Entries that point outside the block are left out."""
+    """The tags of one directory, without entries that point outside the block."""
     order, tags = _order(block), Tags()
     if offset + 2 > len(block):
         return tags

@@ -1,6 +1,6 @@
-"""Which views are kept from every fit: the rule's grammar and its meaning.
+"""Which views are held out, that is, never fitted: grammar and meaning of the rule.
 
-none              nothing
+none              no view
 every:N:K         views with index % N == K
 names:a.jpg,b     views by file name or stem
 """
@@ -15,7 +15,7 @@ from pipeline.errors import UsageError
 
 
 def check_rule(rule: str) -> str:
-    """The rule itself if its grammar holds. Raises UsageError otherwise."""
+    """The rule itself if its grammar is right. Raises UsageError otherwise."""
     every = re.fullmatch(r"every:(\d+):(\d+)", rule)
     if rule == "none" or (every and 0 <= int(every[2]) < int(every[1])):
         return rule
@@ -26,14 +26,14 @@ def check_rule(rule: str) -> str:
         where="holdout",
         value=rule,
         limit="none | every:N:K with K < N | names:a.jpg,b.jpg",
-        remedy="write for example every:5:2, which keeps views 2, 7, 12, ... from the fit",
+        remedy="write for example every:5:2, which holds out views 2, 7, 12, ...",
     )
 
 
 def held_out(rule: str, views: Sequence[tuple[int, str]], absent: Sequence[str] = ()) -> frozenset[int]:
     """Indices of held-out views.
 
-    views: (index, file name) of every view that takes part. absent: names that are known but take no part.
+    views: (index, file name) of every view that is used. absent: names of photos that are left out.
     Raises UsageError for a name that is not in the capture.
     """
     check_rule(rule)
@@ -53,6 +53,6 @@ def held_out(rule: str, views: Sequence[tuple[int, str]], absent: Sequence[str] 
             where="holdout",
             value=", ".join(unknown),
             limit=f"one of {names[0]} ... {names[-1]} ({len(names)} views)",
-            remedy="write the photo's file name or its stem, as it is in the folder",
+            remedy="write the photo's file name as it is in the folder, with or without its suffix",
         )
     return frozenset(by_name[n] for n in wanted if n in by_name)

@@ -1,4 +1,4 @@
-"""The colour profile that a photo carries: its name, to tell when a photo's colours are not sRGB's.
+"""Name of a photo's embedded ICC profile, to detect photos whose colours are not sRGB.
 
 Source: ICC.1:2022, sections 7.2 (header), 7.3 (tag table), 10.15 (multiLocalizedUnicodeType); ICC.1:2001-04 for the
 older textDescriptionType. In JPEG the profile is in APP2 segments, in PNG in an iCCP chunk, compressed.
@@ -16,7 +16,7 @@ _MARK = b"ICC_PROFILE\0"
 
 
 def profile_name(data: bytes) -> str | None:
-    """The profile's description, None if the JPEG or PNG file carries none or it is damaged."""
+    """The profile's description; None if the JPEG or PNG file has none, or a damaged one."""
     block = _profile(data)
     if block is None or len(block) < HEADER + 4:
         return None
@@ -32,7 +32,7 @@ def profile_name(data: bytes) -> str | None:
 
 
 def is_srgb(name: str | None) -> bool:
-    """Whether a photo with this profile has sRGB's colours; one without a profile is taken to."""
+    """Whether a photo with this profile is sRGB; without a profile sRGB is assumed."""
     return name is None or "srgb" in name.lower().replace(" ", "")
 
 

@@ -1,7 +1,7 @@
-"""Checks photos and masks one by one and puts what takes part into one folder.
+"""Checks one photo or mask and copies it.
 
-A photo's bytes are copied as they are. Only a photo whose EXIF orientation is not 1 is turned upright once and written
-as PNG, because everything behind this stage reads stored pixels and knows nothing of EXIF.
+A photo's bytes are copied unchanged. Only a photo whose EXIF orientation is not 1 is rotated upright and written as
+PNG, because later stages read the stored pixels and ignore EXIF.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from stages.capture.colour_checker import Patches, find_chart
 from stages.capture.exif import Exif, read_exif
 from stages.capture.icc_profile import profile_name
 from stages.capture.integrity import fault_of
-from stages.capture.photo_figures import Look, look_at
+from stages.capture.photo_figures import PhotoFigures, measure_photo
 from stages.capture.photometry import clipped, mean_light
 from stages.capture.quality import is_blank, small_grey
 
 Image = npt.NDArray[np.generic]
-MIN_EDGE = 64  # pixels: below it neither features nor a fit have anything to hold on to
+MIN_EDGE = 64  # pixels: smaller photos have too little detail for features and for the fit
 _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True), 5: (3, True), 7: (1, True)}
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedPhoto:
-    """A checked photo in the artifact. width, height: of the copy. turned: written upright, so anew. detail: see
-    stages.capture.quality, None if the photo is blank. profile: the name of its colour profile, None without one.
-    clipped: picture of the pixels at the end of their range, None if there are none. light: mean linear luminance.
-    chart: a colour chart in it, where one was looked for and seen. look: its figures, None if it is blank."""
+    """A checked photo in the artifact. width, height: of the copy, pixels. turned: rotated upright and written as PNG.
+    detail: see stages.capture.quality, None if the photo is blank. profile: name of its ICC profile, None without one.
+    clipped: picture of the clipped pixels, None if there are none. light: mean linear luminance. chart: its colour
+    checker, None if not searched or not found. look: its quality figures, None if it is blank."""
 
     image: Path
     width: int
@@ -47,25 +47,25 @@ class ImportedPhoto:
     clipped: Path | None = None
     light: float = 0.0
     chart: Patches | None = None
-    look: Look | None = None
+    look: PhotoFigures | None = None
 
 
 def turn_upright(image: Image, orientation: int) -> Image:
-    """The picture as it is meant to be seen. (H, W, C) -> (H, W, C) or (W, H, C); orientation 1..8 as in EXIF."""
+    """The picture rotated upright. (H, W, C) -> (H, W, C) or (W, H, C); orientation 1..8 as in EXIF."""
     quarter, mirrored = _TURNS.get(orientation, (0, False))
-    turned = np.rot90(image, quarter)  # rot90 turns anticlockwise; 6 asks for a quarter clockwise, so three of them
+    turned = np.rot90(image, quarter)  # rot90 is anticlockwise; 6 means a quarter turn clockwise, so three of them
     return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)
 
 
 def import_photo(
     path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False
 ) -> ImportedPhoto:
-    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be turned).
+    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated).
 
-    chart: look for a colour chart.
-    declared: (width, height) that the camera's description gives, or None. A given camera belongs to the
-    stored pixels if their size is the declared one; then nothing is turned, whatever EXIF says.
-    Raises StageError if the file is not whole, too small or large, not finite, or not of the declared size.
+    chart: search for a colour checker.
+    declared: (width, height) from the camera's description, or None. If the stored pixels have this size, the given
+    camera belongs to them, and the photo is not rotated, whatever its EXIF orientation.
+    Raises StageError if the file is incomplete, too small or large, not finite, or not of the declared size.
     """
     data = _read(path, ref)
     image = _decode(path, data)
@@ -80,7 +80,7 @@ def import_photo(
             where=path.name,
             value=f"{size[0]} x {size[1]}",
             limit=f"{declared[0]} x {declared[1]}",
-            remedy="use the photos that were calibrated, at their own size; or correct width, height and K together",
+            remedy="use the photos that were calibrated, at their original size; or correct width, height and K",
         )
     if min(size) < MIN_EDGE:
         raise StageError(
@@ -101,11 +101,11 @@ def import_photo(
     blank, ends = is_blank(grey), clipped(image)
     return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile_name(data),
                     _write_clipped(ends, target), mean_light(grey), find_chart(image) if chart else None,
-                    None if blank else look_at(image, grey, ends))  # fmt: skip
+                    None if blank else measure_photo(image, grey, ends))  # fmt: skip
 
 
 def _write_clipped(where: npt.NDArray[np.bool_], photo: Path) -> Path | None:
-    """The picture of a photo's clipped pixels (255) in clipped/ beside its folder, or None if there are none."""
+    """Write a photo's clipped pixels (255) to clipped/ beside its folder; None if there are none."""
     if not where.any():
         return None
     path = photo.parent.parent / "clipped" / f"{photo.stem}.png"
@@ -115,18 +115,18 @@ def _write_clipped(where: npt.NDArray[np.bool_], photo: Path) -> Path | None:
 
 
 def import_mask(path: Path, ref: FileRef, target: Path, photo: ImportedPhoto) -> str | None:
-    """Check one mask against its photo and copy it to `target`; or say why it is of no use, and copy nothing.
+    """Check one mask against its photo and copy it to `target`; or return why it can't be used, and copy nothing.
 
-    A mask of the upright size is taken as upright; one that only fits the stored pixels is turned with its photo.
-    Raises StageError if the file is not whole.
+    A mask of the upright size is taken as upright; one that has only the stored size is rotated with its photo.
+    Raises StageError if the file is incomplete.
     """
     data = _read(path, ref)
     image = _decode(path, data)
     size = (image.shape[1], image.shape[0])
     turn = photo.turned and size != (photo.width, photo.height) and size == (photo.height, photo.width)
     if size != (photo.width, photo.height) and not turn:
-        sizes = f"{size[0]} x {size[1]} and its photo {photo.width} x {photo.height}"
-        return f"the mask {path.name} is {sizes}; export it at the photo's size"
+        sizes = f"{size[0]} x {size[1]} pixels, its photo {photo.width} x {photo.height}"
+        return f"the mask {path.name} has {sizes}; export it at the photo's size"
     plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
     peak = float(np.iinfo(plane.dtype.name).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
     inside = float((plane.astype(np.float64) > peak / 2).mean())
@@ -142,14 +142,14 @@ def import_mask(path: Path, ref: FileRef, target: Path, photo: ImportedPhoto) ->
 
 
 def _read(path: Path, ref: FileRef) -> bytes:
-    """The file's bytes, if they still are those that were hashed."""
+    """The file's bytes. Raises StageError if they changed since they were hashed."""
     if not path.is_file() or path.stat().st_size != ref.size or sha256_of(path) != ref.sha256:
         raise StageError(
             "a file changed while the capture was read",
             where=path.name,
-            value="other bytes than at the start" if path.is_file() else "it is gone",
-            limit="the same content throughout",
-            remedy="let the copying finish, then run again",
+            value="its content is different now" if path.is_file() else "it no longer exists",
+            limit="files that do not change during a run",
+            remedy="wait until all files are copied, then run again",
         )
     return path.read_bytes()
 
@@ -163,7 +163,7 @@ def _decode(path: Path, data: bytes) -> Image:
             limit="a complete image file",
             remedy="copy the file again from the camera, or take it out of the folder",
         )
-    refuse_bombs(path, len(data))  # before `fault_of`, which decodes what says it is a JPEG
+    refuse_bombs(path, len(data))  # before `fault_of`, which decodes JPEG files
     fault = fault_of(data)
     if fault is not None:
         raise StageError(
@@ -186,7 +186,7 @@ def _decode(path: Path, data: bytes) -> Image:
 
 
 def _write_png(path: Path, image: Image) -> None:
-    """Stored values as they are, RGB order; the fastest compression, for photos hardly shrink further."""
+    """Write stored values unchanged, RGB order, with the fastest compression: photos hardly shrink further."""
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
     ok, buffer = cv2.imencode(".png", np.ascontiguousarray(image[..., order]), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:

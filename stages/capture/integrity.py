@@ -1,7 +1,7 @@
-"""Is a picture's file whole? Decoders fill what is missing with grey or black, and then nobody notices.
+"""Is a picture file complete? Decoders fill missing data with grey or black without an error.
 
-JPEG: the end marker after the last scan, and no decoder's grey where the data ran out. PNG: every chunk's CRC up to
-IEND. TIFF: every strip and tile inside the file. EXR: the reader itself refuses a cut-off file.
+JPEG: the end marker after the last scan, and no grey fill of the decoder at the end. PNG: every chunk's CRC up to
+IEND. TIFF: every strip and tile inside the file. EXR: the reader itself rejects a truncated file.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from stages.capture.exif import first_ifd, jpeg_segments, png_chunks
 _STRIPS, _TILES = (273, 279), (324, 325)  # TIFF tags: offsets, byte counts
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # in a scan, FF 00 is a data byte and FF D0..D7 are restarts
 GREY, GREY_ROWS = 128, 32  # libjpeg's fill; two rows of its largest blocks
-CUT = 8  # bytes: far fewer blocks than two rows of them
-BASELINE = (0xC0, 0xC1)  # a progressive file that is cut off gets blurred and not grey
+CUT = 8  # bytes: far less than two rows of blocks
+BASELINE = (0xC0, 0xC1)  # a truncated progressive file becomes blurred, not grey
 
 
 def fault_of(data: bytes) -> str | None:
-    """What is missing from a JPEG, PNG or TIFF file, or None if it is whole (or of another kind)."""
+    """What is missing from a JPEG, PNG or TIFF file; None if it is complete (or of another format)."""
     if data[:2] == b"\xff\xd8":
         return _jpeg_fault(data)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
@@ -34,16 +34,16 @@ def fault_of(data: bytes) -> str | None:
 def _jpeg_fault(data: bytes) -> str | None:
     scan = next((end for marker, _, end in jpeg_segments(data) if marker == 0xDA), None)
     if scan is None:
-        return "cut off in the header"
+        return "truncated in the header"
     end = _end_of_image(data, scan)
     if end is None:
-        return "cut off: the JPEG has no end marker"
+        return "truncated: the JPEG has no end marker"
     baseline = any(marker in BASELINE for marker, _, _ in jpeg_segments(data))
-    return "the JPEG's data ends before the picture does" if baseline and _ends_in_grey(data[:end]) else None
+    return "truncated: the JPEG's last rows are missing" if baseline and _ends_in_grey(data[:end]) else None
 
 
 def _end_of_image(data: bytes, scan: int) -> int | None:
-    """Offset of the EOI marker that closes the picture, scan by scan (progressive files have several)."""
+    """Offset of the picture's EOI marker, scan by scan (progressive files have several scans)."""
     at = scan
     while (found := _NEXT_MARKER.search(data, at)) is not None:
         if data[found.start() + 1] == 0xD9:
@@ -55,8 +55,8 @@ def _end_of_image(data: bytes, scan: int) -> int | None:
 def _ends_in_grey(data: bytes) -> bool:
     """True if the last rows are the decoder's fill. `data`: a file without its EOI marker.
 
-    A photo may well end in an exact mid grey. Then its last bytes encode that grey, and nothing above it changes
-    without them. Where the decoder filled in, the last bytes encode what lies above the grey.
+    A photo may end in an exact mid grey. Then its last bytes encode that grey, and without them nothing above it
+    changes. If the decoder filled the rows, the last bytes encode the pixels above the grey.
     """
     whole = _decode(data)
     if whole is None or not (whole[-GREY_ROWS:] == GREY).all():
@@ -74,12 +74,12 @@ def _decode(data: bytes) -> npt.NDArray[np.generic] | None:
 def _png_fault(data: bytes) -> str | None:
     for kind, start, end in png_chunks(data):
         if end + 4 > len(data):
-            return f"cut off in its {kind.decode('latin-1')} data"
+            return f"truncated in its {kind.decode('latin-1')} data"
         if zlib.crc32(data[start - 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             return f"its {kind.decode('latin-1')} data does not match its checksum"
         if kind == b"IEND":
             return None
-    return "cut off: the PNG has no end chunk"
+    return "truncated: the PNG has no end chunk"
 
 
 def _tiff_fault(data: bytes) -> str | None:
@@ -89,5 +89,5 @@ def _tiff_fault(data: bytes) -> str | None:
         if not isinstance(at, tuple) or not isinstance(size, tuple):
             continue
         if any(a + n > len(data) for a, n in zip(at, size, strict=False)):
-            return "cut off: image data lies beyond the end of the file"
+            return "truncated: image data lies beyond the end of the file"
     return None

@@ -1,6 +1,6 @@
-"""What one photo looks like, in figures: sharp, clipped, dark, how much structure, whose faces.
+"""Quality figures of one photo: sharpness, clipping, brightness, structure, faces.
 
-Nothing is known of the subject yet, so that figures are of the middle of the frame, where photographers put it: the
+The subject is not segmented yet, so the figures are measured in the centre of the frame, where it usually is: an
 ellipse with half the frame's width and height.
 """
 
@@ -19,21 +19,21 @@ from stages.capture.photometry import mean_light
 U8 = npt.NDArray[np.uint8]
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
-FACE_EDGE = 512  # pixels, longest edge in which faces are looked for: the networks take 128 and 192
-THUMB = 32  # edge of the picture by which photos are told apart
-SECOND_FACE = 0.5  # of the largest face's size: smaller ones are of people in the background, or on posters
-MIDDLE, BRIGHT = 0.5, 0.9  # of the frame's edges; quantile that stands for the lit part of the subject
+FACE_EDGE = 512  # pixels, longest edge of the picture in which faces are detected: the networks' inputs are 128 and 192
+THUMB = 32  # pixels, edge of the thumbnail by which photos are compared
+SECOND_FACE = 0.5  # of the largest face's size: smaller faces are people in the background, or posters
+CENTRE, BRIGHT = 0.5, 0.9  # share of the frame's edges; quantile that represents the lit part of the subject
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """Figures of one photo's middle.
+class PhotoFigures:
+    """Figures of one photo's centre. I: its levels; Gs: a Gaussian filter with a standard deviation of s pixels.
 
-    detail: E[(G1 I - G2 I)^2] / E[(G2 I - G8 I)^2], what blur takes away; unlike stages.capture.quality.detail it
-    hardly counts a sensor's noise, which differs between cameras. clipped: share of its pixels at the end of the file's
-    range. bright: level (0 to 255, encoded) that a tenth of it exceeds. structure: mean of |G1 I - G4 I| in levels,
-    what features need. light: mean linear luminance. face: whether a face with its landmarks is found. faces: number
-    of faces of similar size. thumb: (THUMB, THUMB) mean levels of the whole frame.
+    detail: E[(G1 I - G2 I)^2] / E[(G2 I - G8 I)^2], which blur reduces; unlike pipeline.sharpness.detail it hardly
+    depends on sensor noise, which differs between cameras. clipped: share of clipped pixels. bright: level (0 to 255,
+    encoded) that a tenth of the pixels exceed. structure: mean of |G1 I - G4 I| in levels, which features need. light:
+    mean linear luminance. face: whether a face with its landmarks is found. faces: number of faces of similar size.
+    thumb: (THUMB, THUMB) mean levels of the whole frame.
     """
 
     detail: float
@@ -46,18 +46,18 @@ class Look:
     thumb: F32
 
 
-def look_at(image: npt.NDArray[np.generic], grey: U8, clipped: Bool) -> Look:
-    """The figures of a decoded photo (H, W, C). grey: stages.capture.quality.small_grey of it. clipped: (H, W)."""
-    crop = grey[_middle(grey.shape)]
+def measure_photo(image: npt.NDArray[np.generic], grey: U8, clipped: Bool) -> PhotoFigures:
+    """Figures of a decoded photo (H, W, C). grey: (h, w), stages.capture.quality.small_grey of it. clipped: (H, W)."""
+    crop = grey[_centre(grey.shape)]
     inside = _ellipse(*crop.shape)
     smooth = crop.astype(np.float32)
     g1, g2, g4, g8 = (np.asarray(cv2.GaussianBlur(smooth, (0, 0), s), np.float32) for s in (1.0, 2.0, 4.0, 8.0))
-    where = clipped[_middle(clipped.shape)]
+    where = clipped[_centre(clipped.shape)]
     small = _small_colour(image)
     h, w = small.shape[:2]
     found = find_face(small, w / 2, h / 2, max(h, w) / 2)
     sizes = [size for _, size in face_boxes(small, w / 2, h / 2, max(h, w) / 2, SURE)]
-    return Look(
+    return PhotoFigures(
         detail=float(np.square(g1 - g2).mean() / max(float(np.square(g2 - g8).mean()), 1e-3)),
         clipped=float(where[_ellipse(*where.shape)].mean()),
         bright=float(np.quantile(crop[inside], BRIGHT)),
@@ -69,14 +69,14 @@ def look_at(image: npt.NDArray[np.generic], grey: U8, clipped: Bool) -> Look:
     )
 
 
-def _middle(shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The middle rectangle of an (H, W) picture, MIDDLE of each edge."""
-    h, w = (round((1 - MIDDLE) / 2 * n) for n in shape[:2])
+def _centre(shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """The central rectangle of an (H, W) picture, CENTRE of each edge."""
+    h, w = (round((1 - CENTRE) / 2 * n) for n in shape[:2])
     return slice(h, shape[0] - h), slice(w, shape[1] - w)
 
 
 def _ellipse(height: int, width: int) -> Bool:
-    """(H, W) pixels of the ellipse that touches all four edges."""
+    """(H, W) pixels of the inscribed ellipse."""
     y, x = np.ogrid[:height, :width]
     out: Bool = ((x + 0.5) / width * 2 - 1) ** 2 + ((y + 0.5) / height * 2 - 1) ** 2 <= 1
     return out

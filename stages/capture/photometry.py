@@ -1,7 +1,7 @@
-"""What photos and their metadata say of light: clipped pixels, exposure, white balance. Files are never changed.
+"""Clipped pixels and relative exposure of photos. Files are never changed.
 
-Symbols: e_n exposure of photo n, seconds x ISO / f-number^2, against the capture's middle one; b_n its mean linear
-luminance. Under one light a grey's linear value is proportional to e_n.
+Symbols: e_n exposure of photo n, seconds x ISO / f-number^2, relative to the capture's median; b_n its mean linear
+luminance. Under one light the linear value of a grey is proportional to e_n.
 """
 
 from __future__ import annotations
@@ -15,16 +15,15 @@ import numpy.typing as npt
 from pipeline.colour import linear_from_srgb
 
 CLIPPED = 0.99  # of an integer file's largest value: JPEG leaves clipped areas a level or two below it
-PLATEAU = 64  # pixels of a float file that share its largest value exactly: that is where the sensor ended
-EVEN = 1.02  # exposures that differ by less are equal: cameras round what they write
-MIDDLE = 0.5
-FARTHEST = 1e4  # times the middle exposure, 13 stops: beyond it the metadata are damaged
+PLATEAU = 64  # fewest pixels of a float file with exactly its largest value that count as clipped
+EQUAL = 1.02  # exposures that differ by a smaller factor are equal: cameras round the values that they write
+FARTHEST = 1e4  # times the median exposure, 13 stops: beyond it the metadata are damaged
 
 Bool = npt.NDArray[np.bool_]
 
 
 def clipped(image: npt.NDArray[np.generic]) -> Bool:
-    """(H, W) pixels of which a channel is at the end of its range, of a decoded file (H, W, C); alpha has no say."""
+    """(H, W) pixels with a clipped channel, of a decoded file (H, W, C); alpha is ignored."""
     plane = image[..., : 3 if image.shape[2] >= 3 else 1]
     brightest = np.asarray(reduce(np.maximum, np.moveaxis(plane, 2, 0)))  # 10 times as fast as max(axis=2)
     if np.issubdtype(image.dtype, np.integer):
@@ -34,21 +33,21 @@ def clipped(image: npt.NDArray[np.generic]) -> Bool:
 
 
 def mean_light(grey: npt.NDArray[np.uint8]) -> float:
-    """Mean linear luminance of a small grey picture, encoded as sRGB."""
+    """Mean linear luminance of a grey picture (h, w), encoded as sRGB."""
     table = linear_from_srgb(np.arange(256) / 255)
     return float(table[grey].mean())
 
 
 def exposures(written: Sequence[float | None], light: Sequence[float]) -> list[float] | None:
-    """e_n of each photo where the metadata of all say it and the photos bear it out, else None.
+    """e_n of each photo, if all have it in their metadata and the pixels confirm it; else None.
 
-    They bear it out if b_n / e_n vary less than b_n: a raw converter that evened the photos out, or a flash that lit
-    them all alike, leaves e_n without meaning.
+    The pixels confirm it if b_n / e_n vary less than b_n. After a raw converter that equalised the photos, or with a
+    flash that lit all of them alike, e_n has no meaning.
     """
     known = [e for e in written if e is not None]
-    if len(known) < len(written) or not known or max(known) <= EVEN * min(known):
+    if len(known) < len(written) or not known or max(known) <= EQUAL * min(known):
         return None
-    found = np.array(known) / float(np.quantile(known, MIDDLE, method="nearest"))
+    found = np.array(known) / float(np.quantile(known, 0.5, method="nearest"))
     if not 1 / FARTHEST <= found.min() <= found.max() <= FARTHEST:
         return None
     b = np.log(np.maximum(light, 1e-6))

@@ -1,4 +1,4 @@
-"""Photos that can't help: black or blank ones, and ones that are blurred far beyond the others."""
+"""Photos that can't be used: blank ones, and ones far more blurred than the others."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy.typing as npt
 from pipeline.colour import srgb_from_linear
 
 WORKING = 1000  # pixels, longest edge
-BLANK = 2.0  # levels of 255: spread below which nothing is to be seen (an 8-bit camera's noise in the dark is 1)
+BLANK = 2.0  # levels of 255, largest spread of a blank photo (an 8-bit camera's noise in the dark is 1)
 BLURRED = 0.2  # of the median detail
-MAX_BLURRED = 0.5  # of the photos: if more look blurred, 'blurred' is how this capture is
+MAX_BLURRED = 0.5  # of the photos: if more look blurred, blur is normal in this capture, and none is left out
 
 
 def small_grey(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
     """(h, w) 8-bit, encoded as sRGB, of a decoded file (H, W, C)."""
-    if image.dtype == np.uint8 and image.shape[2] >= 3:  # most photos: quick
+    if image.dtype == np.uint8 and image.shape[2] >= 3:  # most photos: fast
         plane: npt.NDArray[Any] = np.asarray(cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY))
     else:
         plane = np.asarray(image[..., :3], np.float32).mean(2)
@@ -33,13 +33,14 @@ def small_grey(image: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
 
 
 def is_blank(grey: npt.NDArray[np.uint8]) -> bool:
-    """Whether 99 of 100 pixels are of one level: a lens cap, a flash that did not fire, a failed export."""
+    """Whether 99 of 100 pixels have the same level: a lens cap, a flash that did not fire, a failed export. grey:
+    (h, w)."""
     low, high = np.quantile(grey[::4, ::4], [0.005, 0.995])
     return bool(high - low <= BLANK)
 
 
 def blurred(details: Sequence[float]) -> list[bool]:
-    """Which photos have far less detail than the middle one; none if that would be half of them."""
+    """Which photos have far less detail than the median; none if that would be half of them."""
     values = np.array(details)
     found = values < BLURRED * np.median(values)
     return [bool(f) for f in found] if found.mean() < MAX_BLURRED else [False] * len(details)

@@ -1,8 +1,8 @@
-"""Recognises what lies in the user's folder and hashes it; no picture is decoded here.
+"""Detects the format of the user's folder and hashes its files; no picture is decoded here.
 
-Understood: a folder with a description of cameras (`stages.capture.readers`), a plain folder of photos, a folder with
-one film. With photos, `mask/` or `masks/` may hold one file per photo, matched by stem, and `clean_plate/` the same
-views without the subject. Hidden files and other sub-folders are ignored.
+Supported: a folder with a cameras' file (`stages.capture.readers`), a plain folder of photos, a folder with one video.
+Beside photos, `mask/` or `masks/` may have one file per photo, matched by stem, and `clean_plate/` the same views
+without the subject. Hidden files and other sub-folders are ignored.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp",
                     ".jxl", ".jp2", ".jfif", ".rw2", ".orf", ".pef", ".srw")  # fmt: skip
 MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
-MIN_PHOTOS = 3  # two views leave depth along their common line open, and nothing to check it against
+MIN_PHOTOS = 3  # two views leave the depth along their common line undetermined, and nothing can check it
 
 
 def scan_capture(folder: Path) -> Located[CaptureSource]:
-    """What `folder` holds, by content. A film may be named itself.
+    """The files of `folder` with their hashes, and its format. `folder` may also be a video file.
 
     Raises:
         StageError: no such folder, no photos or too few of them, cameras that can't be read, two files for one view.
     """
     folder = Path(folder).absolute()
     if folder.is_file() and folder.suffix.lower() in FILM_SUFFIXES:
-        return _film(folder)
+        return _video(folder)
     if not folder.is_dir():
         kind = "a file" if folder.exists() else "nothing"
         raise StageError(
-            "the capture folder is not there",
+            "the capture folder does not exist",
             where=folder,
             value=kind,
             limit="a folder with photos",
-            remedy="check the path; name the folder that holds the photos, not a photo",
+            remedy="check the path; give the folder that contains the photos, not a photo",
         )
     found = find_reader(folder)
     if found is not None:
         return _described(folder, *found)
     photos = _pictures(folder)
-    films = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
-    if not photos and len(films) == 1:
-        return _film(films[0])
+    videos = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
+    if not photos and len(videos) == 1:
+        return _video(videos[0])
     if not photos:
-        raise _no_photos(folder, films)
+        raise _no_photos(folder, videos)
     _enough(folder, [p.name for p in photos])
     masks, plates = _beside(folder, photos, MASK_FOLDERS, "mask"), _beside(folder, photos, PLATE_FOLDERS, "plate")
     return Located(_source("photos", folder, photos, [], masks, plates), folder)
@@ -89,8 +89,8 @@ def _source(
 
 
 def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the pictures beside the photos whose format is not read; a raw file or HEIC of the same name as a photo
-    is that photo's original, and needs no word."""
+    """Names of the pictures beside the photos whose format is not supported. A raw or HEIC file with a photo's stem is
+    that photo's original, and is not listed."""
     read = {(p.parent, p.stem) for p in photos}
     beside = sorted({f for p in {q.parent for q in photos} for f in p.iterdir()}, key=lambda f: natural_key(f.name))
     foreign = (f for f in beside if f.suffix.lower() in FOREIGN_SUFFIXES and not f.name.startswith("."))
@@ -98,18 +98,18 @@ def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _can_be_written(path: Path) -> None:
-    """Raises StageError where a file's name is not UTF-8: no manifest could hold it."""
+    """Raises StageError for a file name that is not UTF-8: a manifest can't contain it."""
     if path.name != path.name.encode("utf-8", "replace").decode():
         raise StageError(
             "a file's name is not UTF-8",
             where=ascii(path.name),
-            value="bytes that are no letters",
+            value="bytes that are not characters",
             limit="names in UTF-8",
             remedy="rename the file; letters, digits, _ and - are safe everywhere",
         )
 
 
-def _film(path: Path) -> Located[CaptureSource]:
+def _video(path: Path) -> Located[CaptureSource]:
     return Located(CaptureSource(kind="video", photos=(FileRef.of(path.parent, path),)), path.parent)
 
 
@@ -120,23 +120,23 @@ def _enough(folder: Path, names: Sequence[str]) -> None:
             where=folder,
             value=f"{len(names)} ({', '.join(names)})",
             limit=f"at least {MIN_PHOTOS} views",
-            remedy="photograph the subject from more sides; 30 to 60 views all around serve best",
+            remedy="photograph the subject from more sides; 30 to 60 views all around are best",
         )
 
 
 def _once(views: Sequence[Declared]) -> None:
-    """Each view has a photo and a number of its own."""
+    """Raises StageError if two views have the same photo or the same number."""
     for what in ("photo", "number"):
         of: dict[object, str] = {}
         for view in views:
             mark = view.photo if what == "photo" else view.index
             if mark in of:
                 raise StageError(
-                    f"two views with one {what}",
+                    f"two views have the same {what}",
                     where=view.name,
                     value=f"{of[mark]} and {view.name}",
-                    limit=f"a {what} of its own for each view",
-                    remedy="take one of them out of the description",
+                    limit=f"a different {what} for each view",
+                    remedy="remove one of them from the cameras' file",
                 )
             of[mark] = view.name
 
@@ -148,7 +148,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: str) -> list[Path]:
-    """Files that belong to a photo each: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
+    """The photos' masks or clean plates: `STEM.png`, or the photo's whole name and a suffix (`a.jpg.png`)."""
     present = [folder / m for m in folders if (folder / m).is_dir()]
     if len(present) > 1:
         raise StageError(
@@ -168,7 +168,7 @@ def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: 
                 where=owner.name,
                 value=f"{found[owner].name} and {mask.name}",
                 limit=f"one {what} per photo",
-                remedy="take one of them out of the folder",
+                remedy="remove one of them from the folder",
             )
         if owner is not None:
             found[owner] = mask
@@ -178,30 +178,30 @@ def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: 
 def _none_named(folder: Path, description: Path, described: Described) -> StageError:
     foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
     value = described.warnings[0] if described.warnings else "; ".join(described.left_out[:3]) or "none"
-    remedy = "put the photos where the file says, or into images/; or remove the file to have the cameras solved"
+    remedy = "put the photos where the file expects them, or into images/; or remove the file to solve the cameras"
     if description.name == "params.json":
         remedy = "put 0.jpg, 1.jpg, ... beside params.json"
     if foreign:
-        remedy = f"convert {foreign[0]} and its like to JPEG, PNG, TIFF or EXR"
+        remedy = f"convert files such as {foreign[0]} to JPEG, PNG, TIFF or EXR"
     return StageError(
         "no photos in the capture folder",
         where=folder,
-        value=f"none that {description.name} names: {value}",
+        value=f"none of those that {description.name} lists: {value}",
         limit=f"at least {MIN_PHOTOS} of " + " ".join(s[1:] for s in PHOTO_SUFFIXES),
         remedy=remedy,
     )
 
 
-def _no_photos(folder: Path, films: Sequence[Path]) -> StageError:
+def _no_photos(folder: Path, videos: Sequence[Path]) -> StageError:
     foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
     deeper = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _pictures(p))
     value, remedy = "none", "put the photos directly into this folder"
     if foreign:
         value, remedy = f"{len(foreign)} files such as {foreign[0]}", "convert them to JPEG, PNG, TIFF or EXR"
-    elif films:
-        value, remedy = f"{len(films)} films", f"name one of them as the capture, such as {films[0].name}"
+    elif videos:
+        value, remedy = f"{len(videos)} videos", f"give one of them as the capture, such as {videos[0].name}"
     elif deeper:
-        value, remedy = f"none here, some in {deeper[0]}/", f"name {deeper[0]}/ as the capture, or move the photos up"
+        value, remedy = f"none here, some in {deeper[0]}/", f"give {deeper[0]}/ as the capture, or move the photos up"
     return StageError(
         "no photos in the capture folder",
         where=folder,

@@ -1,4 +1,4 @@
-"""capture: the user's folder in, checked photos with their cameras and masks out."""
+"""capture: reads the user's folder and writes checked photos with their given cameras and masks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stages.capture.holdout import check_rule, held_out
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """What `stages.capture.scan.scan_capture` found."""
+    """The result of `stages.capture.scan.scan_capture`."""
 
     source: Located[CaptureSource]
 
@@ -24,16 +24,16 @@ class Inputs:
 class Config(StageConfig):
     """Settings of the capture stage."""
 
-    holdout: str = Field("none", description="views kept from the fit: none | every:N:K | names:a.jpg,b.jpg")
-    min_views: Views = Field(3, ge=3, description="fewest views that must remain for the fit")
+    holdout: str = Field("none", description="held-out views, never fitted: none | every:N:K | names:a.jpg,b.jpg")
+    min_views: Views = Field(3, ge=3, description="fewest views for the fit; with fewer the stage fails")
     frames: Annotated[int, Unit("frames")] = Field(
-        60, ge=8, le=500, description="frames to take from a film, spread over the camera's way"
+        60, ge=8, le=500, description="frames to take from a video, spread over the camera's path"
     )
     drop_blurred: bool = Field(True, description="leave out photos with far less detail than the others")
     colour_checker: Literal["auto", "on", "off"] = Field(
         "auto",
-        description="a colour chart of 24 patches in some photos: off: not looked for; on: must be found; its white "
-        "becomes the photos' white and unit",
+        description="colour correction by a colour checker of 24 patches that some photos show; its white becomes the "
+        "photos' white and unit. auto: if it is found; on: an error if it is not found; off: no search",
     )
 
     @field_validator("holdout")
@@ -43,56 +43,59 @@ class Config(StageConfig):
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Capture:
-    """Check every photo, mask and given camera, and copy what takes part into the artifact.
+    """Check every photo, mask and given camera, and copy the ones that are used into the artifact.
 
-    Photos that can't help (blank, blurred far beyond the others, the same file twice) and masks of no use are left
-    out and named, as long as enough remains.
+    Photos that can't be used (blank, far more blurred than the others, duplicates) and unusable masks are left out with
+    a warning.
 
     Raises:
-        StageError: a file that is not whole or of the wrong size, a bad camera, too few views, no chart if one must be.
+        StageError: an incomplete file or one of the wrong size, a bad camera, too few views, a colour checker that is
+            required and not found.
     """
     from stages.capture import views as made
-    from stages.capture.candidates import candidates_of, useful, without_doubles
+    from stages.capture.candidates import candidates_of, useful, without_duplicates
     from stages.capture.judge import Photo, given_masks, judge
 
-    source = _photos_of_film(inputs.source, config, context)
-    found = candidates_of(source)
-    described = set(found.absent)
-    candidates = without_doubles(found, given=source.artifact.cameras != ())
+    source = _photos_of_video(inputs.source, config, context)
+    selection = candidates_of(source)
+    described = set(selection.absent)
+    candidates = without_duplicates(selection, given=source.artifact.cameras != ())
     look = config.colour_checker != "off"
     photos = [made.photo_of(source, c, (n, len(candidates)), look, context) for n, c in enumerate(candidates)]
-    candidates, photos = useful(candidates, photos, found, config.drop_blurred)
-    held = held_out(config.holdout, [(c.index, c.name) for c in candidates], found.absent)
+    candidates, photos = useful(candidates, photos, selection, config.drop_blurred)
+    held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
     if config.holdout != "none" and not held:
-        found.warnings.append(f"the hold-out rule {config.holdout} matches no view that takes part")
-    _enough(len(candidates) - len(held), len(held), found.left_out, config.min_views)
-    views = [made.view_of(source, c, p, c.index in held, found.warnings, context)
+        selection.warnings.append(f"the hold-out rule {config.holdout} matches no view that is used")
+    _enough(len(candidates) - len(held), len(held), selection.left_out, config.min_views)
+    views = [made.view_of(source, c, p, c.index in held, selection.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
-    views = made.with_exposures(made.with_places(views, photos), photos, found.warnings)
-    views, chart = made.with_chart(views, photos, found.warnings, config.colour_checker == "on", context)
+    views = made.with_exposures(made.with_places(views, photos), photos, selection.warnings)
+    views, chart = made.with_chart(views, photos, selection.warnings, config.colour_checker == "on", context)
     drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
     seen = [Photo(v.name, v.camera_group, v.width, v.height, v.exposure, v.holdout, p.look)
             for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
     useless = [c.name for c, v in zip(candidates, views, strict=True) if c.mask is not None and v.mask is None]
     masked = sum(v.mask is not None for v in views)
-    findings = (*judge(seen, [n for n in found.absent if n not in described], source.artifact.passed_over),
+    findings = (*judge(seen, [n for n in selection.absent if n not in described], source.artifact.passed_over),
                 *given_masks(masked, useless))  # fmt: skip
-    warnings = found.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
+    warnings = (
+        selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
+    )
     warnings += made.partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world,
-                   left_out=tuple(found.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip
+                   left_out=tuple(selection.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
-def _photos_of_film(source: Located[CaptureSource], config: Config, context: Context) -> Located[CaptureSource]:
-    """The source itself; of a film, its frames."""
+def _photos_of_video(source: Located[CaptureSource], config: Config, context: Context) -> Located[CaptureSource]:
+    """The source itself; for a video, its frames."""
     if source.artifact.kind != "video":
         return source
     from stages.capture.video import frames_of
 
     def tick(done: int, total: int) -> None:
         context.check()
-        context.progress(done, total, "looking through the film")
+        context.progress(done, total, "selecting frames of the video")
 
     frames = frames_of(source.path(source.artifact.photos[0]), context.scratch / "frames", config.frames, tick)
     photos = tuple(FileRef.of(context.scratch / "frames", f) for f in frames)

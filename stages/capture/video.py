@@ -1,7 +1,7 @@
-"""Photos out of a film: as many as asked for, spread over the camera's way, each the sharpest of its stretch.
+"""Frames of a video: the given number, spread over the camera's path, each the sharpest of its part of the path.
 
-Time is no measure of a new view: people rest and hurry. The way is the optical flow added up, so that equal stretches
-show equally much of the subject; within a stretch the frame with the strongest fine detail is taken.
+Equal times do not give equally different views, because the camera pauses and hurries. So the path is measured by the
+sum of optical flow and divided into equal parts. Of each part the frame with the strongest fine detail is taken.
 """
 
 from __future__ import annotations
@@ -18,39 +18,40 @@ from pipeline.images import write_png
 from pipeline.sharpness import detail
 
 F64 = npt.NDArray[np.float64]
-SMALL, FLOW = 480, 160  # pixels, longest edge: for sharpness, for motion
-MIN_FRAMES = 8  # fewer tell less than photos would
-STILL = 0.02  # of the small frame's longest edge: less motion than this in all is a film of one view
+SMALL, FLOW = 480, 160  # pixels, longest edge of the reduced frames: for sharpness, for motion
+MIN_FRAMES = 8  # fewer frames have less information than photos
+STILL = 0.02  # of the reduced frame's longest edge: a video with less motion in total shows one view only
 
 
-def frames_of(film: Path, folder: Path, count: int, tick: Callable[[int, int], None]) -> list[Path]:
-    """Write at most `count` frames of a film into `folder` as PNG, named by their number in it. tick: done, total.
+def frames_of(video: Path, folder: Path, count: int, tick: Callable[[int, int], None]) -> list[Path]:
+    """Write at most `count` frames of a video into `folder` as PNG, named by frame number. tick: done, total.
 
-    Raises StageError if the film can't be read, is too short, or does not move.
+    Raises StageError if the video can't be read, is too short, or shows no motion.
     """
     total = 0
     sharpness, motion = [], []
     before = None
-    for number, frame in _frames(film):
+    for number, frame in _frames(video):
         total = number + 1
-        tick(number, max(total, _length(film)))
+        tick(number, max(total, _length(video)))
         grey = _reduced(frame, SMALL)
         sharpness.append(detail(grey))
         flow = _reduced(grey, FLOW)
         motion.append(0.0 if before is None else _moved(before, flow))
         before = flow
     if total < MIN_FRAMES:
-        raise StageError("the film can't be read" if total == 0 else "the film is too short", where=film.name,
+        raise StageError("the video can't be read" if total == 0 else "the video is too short", where=video.name,
                          value=f"{total} frames", limit=f"at least {MIN_FRAMES}",
-                         remedy="film around the subject for half a minute, as MP4 (H.264)")  # fmt: skip
+                         remedy="record the subject from all around for half a minute, as MP4 (H.264)")  # fmt: skip
     if sum(motion) < STILL * FLOW:
-        raise StageError("the film does not move", where=film.name, value=f"{sum(motion):.2f} pixels of {FLOW}",
-                         limit="a camera that goes around the subject",
-                         remedy="walk around the subject while filming")  # fmt: skip
+        raise StageError("the camera does not move in the video", where=video.name,
+                         value=f"{sum(motion):.2f} pixels of {FLOW}",
+                         limit="a camera that moves around the subject",
+                         remedy="walk around the subject while recording")  # fmt: skip
     wanted = set(choose(np.array(sharpness), np.array(motion), count))
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for number, frame in _frames(film):
+    for number, frame in _frames(video):
         if number in wanted:
             written.append(folder / f"{number:06d}.png")
             write_png(written[-1], frame[..., ::-1].astype(np.float32) / 255)
@@ -58,18 +59,18 @@ def frames_of(film: Path, folder: Path, count: int, tick: Callable[[int, int], N
 
 
 def choose(sharpness: F64, motion: F64, count: int) -> list[int]:
-    """Numbers of the frames to take, ascending: the way in `count` equal stretches, of each the sharpest frame.
+    """Numbers of the frames to take, ascending: the sharpest frame of each of `count` equal parts of the path.
 
-    sharpness, motion: (N,); motion[i] is the way from frame i - 1 to i.
+    sharpness: (N,); motion: (N,) pixels, motion[i] is the path from frame i - 1 to i.
     """
-    way = np.cumsum(motion)
-    stretch = np.minimum((way / max(way[-1], 1e-12) * count).astype(int), count - 1)
-    return [int(m[np.argmax(sharpness[m])]) for s in np.unique(stretch) for m in [np.flatnonzero(stretch == s)]]
+    path = np.cumsum(motion)
+    part = np.minimum((path / max(path[-1], 1e-12) * count).astype(int), count - 1)
+    return [int(m[np.argmax(sharpness[m])]) for s in np.unique(part) for m in [np.flatnonzero(part == s)]]
 
 
-def _frames(film: Path) -> Iterator[tuple[int, npt.NDArray[np.uint8]]]:
-    """(number, (H, W, 3) BGR), turned upright as the film's metadata says."""
-    capture = cv2.VideoCapture(str(film), cv2.CAP_FFMPEG)
+def _frames(video: Path) -> Iterator[tuple[int, npt.NDArray[np.uint8]]]:
+    """(number, (H, W, 3) BGR), rotated upright by the video's metadata."""
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     try:
         number = 0
         while True:
@@ -82,8 +83,8 @@ def _frames(film: Path) -> Iterator[tuple[int, npt.NDArray[np.uint8]]]:
         capture.release()
 
 
-def _length(film: Path) -> int:
-    capture = cv2.VideoCapture(str(film), cv2.CAP_FFMPEG)
+def _length(video: Path) -> int:
+    capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     length = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     capture.release()
     return max(length, 0)

@@ -1,1 +1,1 @@
-"""Inverse rendering: photos, cameras and masks in, a fitted NeuFace field out. Start at stage.py, then fit.py."""
+"""Inverse rendering: fits a NeuFace model to photos, cameras and masks. Start reading at stage.py, then fit.py."""

@@ -1,17 +1,17 @@
-"""Nested models of what the photos show, judged on views that the fit has not seen: what does this scene require?
+"""Cross-validation of nested regression models of the photos on validation views.
 
     c_pv = g_v (D_p + L_s(p, v)),    L_s = w_pv sum_lm L_lm A_l(s_p) Y_lm(w_r)
 
-Symbols: c_pv (M, 3) colour of point p in view v; D_p whatever does not depend on the view, free for every point (all
-diffuse shading with all its shadows); g_v a view's gain a colour; L_lm light; w_r mirror direction; w, s = 1 / kappa
-the strength and width of the lobe as the fit has found them so far. D_p drops out when each point's mean over the
-training views is taken off, so that every model is a linear least-squares problem, solved in closed form.
+Symbols: c_pv (M, 3) colour of point p in view v; D_p everything that does not depend on the view, free for every point
+(all diffuse shading with its shadows); g_v gain of a view per colour channel; L_lm light; w_r mirror direction; w and
+s = 1 / kappa strength and width of the lobe at this time of the fit. D_p is eliminated by subtracting each point's mean
+over the training views. So every model is a linear least-squares problem with a closed-form solution.
 
-Held-out error: L and D_p come from the training views, the gain of a waiting view from every other point; the error is
-over the rest of that view's points. What a lobe leaves unexplained is added light and no gain: a gain has to do better
-than an offset a view, or gains alone better than a lobe alone. All errors are root mean squares in shares of the
-photos' mean radiance. A part of the model is wanted if the held-out error without it is larger, in quadrature,
-by more than a share `NEGLIGIBLE`.
+Validation error: L and D_p come from the training views, the gain of a validation view from every second of its points;
+the error is over its other points. The residual of a lobe is an additive light, not a gain. So gains must be better
+than one offset per view, or gains alone better than a lobe alone. All errors are RMS, as shares of the photos' mean
+radiance. A part of the model is kept if the validation error without it is larger, in quadrature, by more than
+`NEGLIGIBLE`.
 
 Source: fixed-effects regression and reduced-rank regression, textbook statistics; the criterion is ours.
 """
@@ -34,25 +34,25 @@ F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
 BOOL = npt.NDArray[np.bool_]
 
-NEGLIGIBLE = 0.005  # of the mean radiance: at middle grey an error of 52 dB, far below what any fit leaves
-MIN_TRAIN = 3  # training views that must see a point
-MIN_TEST = 100  # observations without which nothing can be said
+NEGLIGIBLE = 0.005  # of the mean radiance: at medium grey an error of 52 dB, far below the error of any fit
+MIN_TRAIN = 3  # fewest training views of a point
+MIN_TEST = 100  # fewest observations for a validation error
 RIDGE = 1e-9  # of the mean eigenvalue
 ROUNDS = 20
-COSINE_POWERS = 4  # functions of n . wo from which bases are made up
+COSINE_POWERS = 4  # number of powers of n . wo in a basis
 RANK_ROUNDS = 12
 RANK_RIDGE = 1e-4  # of the mean region's trace
-WORTH = 0.002  # of the error: what a further basis has to take off; little, because it costs hardly any time
-REGIONS = 5  # an axis: where coefficients may differ
+WORTH = 0.002  # of the error: smallest reduction by a further basis; small, because a basis costs hardly any time
+REGIONS = 5  # per axis: regions with their own coefficients
 
 
 @dataclass(slots=True)
 class ValidationSamples:
-    """Observations with their parts. point, view (M,); colour (M, 3) in units of the mean radiance; cosine (M,);
-    x (M, 3); counts (P,) how many training views see a point.
+    """Observations, divided into train, tune and test. point, view (M,); colour (M, 3) in units of the mean radiance;
+    cosine (M,) n . wo; x (M, 3) positions; counts (P,) number of training views of each point.
 
-    train: of views that the fit draws from; tune, test: of waiting views, points of even and of odd number.
-    features (M, (L + 1)^2): what L_s is linear in. inside: the same less their means; gram: their products over train.
+    train: (M,) of fitted views; tune, test: (M,) of validation views, points of even and of odd number. features
+    (M, (L + 1)^2): L_s is linear in them. inside: features minus their means; gram: their products over train.
     """
 
     point: I64
@@ -74,12 +74,13 @@ class ValidationSamples:
         self.gram = known.T @ known
 
     def within(self, y: F64) -> F64:
-        """y less its mean over the training views of the same point."""
+        """y (M, C) minus its mean over the training views of the same point."""
         return np.asarray(y - point_means(self.point[self.train], y[self.train], self.counts)[self.point], np.float64)
 
 
 def validation_samples(seen: Observations, validation: tuple[int, ...], model: FaceModel) -> ValidationSamples | None:
-    """What can be tested; None if too little is seen by enough views."""
+    """The samples for cross-validation; None if too few points are visible in enough views. validation: positions of
+    the validation views."""
     held = np.isin(seen.view, validation)
     counts = np.bincount(seen.point[~held], minlength=len(seen.x))
     keep = counts[seen.point] >= MIN_TRAIN
@@ -92,7 +93,7 @@ def validation_samples(seen: Observations, validation: tuple[int, ...], model: F
 def _of(
     seen: Observations, keep: BOOL, features: F64, counts: I64, parts: tuple[BOOL, BOOL, BOOL]
 ) -> ValidationSamples:
-    """The sightings that are kept (M of them, whose features are given), in their parts train, tune and test."""
+    """The kept observations with their features, divided into `parts`: train, tune and test."""
     point, colour = seen.point[keep], seen.colour[keep]
     train, tune, test = (part[keep] for part in parts)
     return ValidationSamples(
@@ -110,7 +111,7 @@ def _of(
 
 
 def lobe_features(model: FaceModel, seen: Observations, keep: BOOL) -> F64:
-    """w A_l(s) Y_lm(w_r) with the fit's own lobe, (M, (L + 1)^2): what L_s is linear in."""
+    """w A_l(s) Y_lm(w_r) with the fit's current lobe, (M, (L + 1)^2): L_s is linear in them."""
     order = model.spec.light_order
     with torch.no_grad():
         point = torch.from_numpy(seen.point[keep]).to(seen.x.device)
@@ -125,21 +126,21 @@ def lobe_features(model: FaceModel, seen: Observations, keep: BOOL) -> F64:
 # ------------------------------------------------------------------ solving
 @dataclass(slots=True)
 class Response:
-    """How each view's colours differ: c -> gain c + offset, (V, 3) each. Mean gain 1, mean offset 0."""
+    """Colour response of each view: c -> gain c + offset, (V, 3) each. Mean gain 1, mean offset 0."""
 
     gain: F64
     offset: F64
 
 
 def alike(t: ValidationSamples) -> Response:
-    """All views respond alike."""
+    """The response with gain 1 and offset 0 for all views."""
     count = int(t.view.max()) + 1
     return Response(np.ones((count, 3)), np.zeros((count, 3)))
 
 
 def lobe(t: ValidationSamples, order: int | None, r: Response) -> tuple[F64, F64]:
-    """L_s up to `order` (None: none) given the responses: what is left of the colours within points, and L_s there,
-    (M, 3) each, before the responses."""
+    """L_s up to SH `order` (None: no lobe), given the responses: the residual of the colours, and L_s, (M, 3) each,
+    before the responses are applied."""
     y = t.within((t.colour - r.offset[t.view]) / r.gain[t.view])
     if order is None:
         return y, np.zeros_like(y)
@@ -151,7 +152,7 @@ def lobe(t: ValidationSamples, order: int | None, r: Response) -> tuple[F64, F64
 
 
 def solve_response(t: ValidationSamples, order: int | None, *, gain: bool) -> Response:
-    """Gains of all views with the lobe of `order`; or offsets, which no camera has, as their control."""
+    """Gains of all views with the lobe of `order`; or offsets, which no camera has, as a control."""
     r = alike(t)
     rows = t.train | t.tune
     known = np.isin(np.arange(len(r.gain)), t.view[t.train])
@@ -173,7 +174,7 @@ def solve_response(t: ValidationSamples, order: int | None, *, gain: bool) -> Re
 
 
 def gains_of(seen: Observations) -> F64 | None:
-    """Gains of the views that see anything, (V, 3), while no lobe is known; None if no point is seen often enough."""
+    """Gains (V, 3) of the views with observations, without a lobe; None if no point is visible in enough views."""
     counts = np.bincount(seen.point, minlength=len(seen.x))
     keep = counts[seen.point] >= MIN_TRAIN
     if not keep.any():
@@ -183,7 +184,7 @@ def gains_of(seen: Observations) -> F64 | None:
 
 
 def validation_error(t: ValidationSamples, order: int | None, r: Response) -> float:
-    """Held-out error (root mean square, shares of the mean radiance)."""
+    """Validation error (RMS, as a share of the mean radiance)."""
     left, _ = lobe(t, order, r)
     return rms((left * r.gain[t.view])[t.test])
 
@@ -194,17 +195,17 @@ def rms(error: F64) -> float:
 
 
 def more(without: float, with_it: float) -> float:
-    """How much larger an error is without a part of the model: sqrt(e_0^2 - e_1^2), negative where it is smaller."""
+    """Increase of an error without a part of the model: sqrt(e_0^2 - e_1^2), negative if it decreases."""
     d = without * without - with_it * with_it
     return math.copysign(math.sqrt(abs(d)), d)
 
 
 # ------------------------------------------------------------------ the rank
 def by_rank(t: ValidationSamples, order: int, r: Response, most: int) -> list[float]:
-    """Held-out error with k = 1..most bases: L_s = q_pv sum_j c_rj B_j(n . wo), c free in each region r of space.
+    """Validation error with k = 1..most bases: L_s = q_pv sum_j c_rj B_j(n . wo), c free in each region r of space.
 
-    q is the lobe that one strength for all would have, then the one that fits the strengths found with it. B_j are
-    made up of powers of the cosine; c and B are found in turn, each by least squares (reduced-rank regression).
+    q is first the lobe with one strength for all, then the lobe for the strengths that were solved with it. B_j are
+    sums of powers of the cosine. c and B are solved alternately by least squares (reduced-rank regression).
     """
     shown = ((t.colour - r.offset[t.view]) / r.gain[t.view]).mean(1, keepdims=True)
     y = t.within(shown)
@@ -221,16 +222,16 @@ def by_rank(t: ValidationSamples, order: int, r: Response, most: int) -> list[fl
 
 
 def least_rank(errors: list[float]) -> int:
-    """The smallest k whose error is the best's, but for what is not worth another basis, or is negligible itself.
+    """The smallest k whose error is negligible, or within WORTH of the best.
 
-    Stricter than for other parts: on `head_a` a rank of 1, 1.2 % worse by this error, cost 0.3 dB (docs/model.md).
+    Stricter than for other parts: on `head_a` a rank of 1, with an error 1.2 % larger, cost 0.3 dB (docs/model.md).
     """
     best = min(errors)
     return next(k for k, e in enumerate(errors, 1) if e < NEGLIGIBLE or e < (1 + WORTH) * best)
 
 
 def _common_lobe(t: ValidationSamples, order: int, y: F64, strength: F64) -> F64:
-    """(M,) the light through the lobe, that times `strength` is nearest to y (M, 1) within points."""
+    """(M,) the lobe of the light that, times `strength` (M,), is the least-squares fit to y (M, 1) within points."""
     features = t.features[:, : sh.count(order)]
     f = t.within(features * strength[:, None])
     g = f[t.train].T @ f[t.train]
@@ -239,7 +240,7 @@ def _common_lobe(t: ValidationSamples, order: int, y: F64, strength: F64) -> F64
 
 
 def regions_of(t: ValidationSamples) -> I64:
-    """(M,) number of the box of space that a point lies in, REGIONS along the longest side; sparse boxes are one."""
+    """(M,) index of the box of space that contains a point, REGIONS along the longest side; sparse boxes are merged."""
     lo, hi = t.x.min(0), t.x.max(0)
     edge = float((hi - lo).max()) / REGIONS * 1.0001
     i = ((t.x - lo) / max(edge, 1e-12)).astype(np.int64)
@@ -269,7 +270,7 @@ def _low_rank(f: F64, y: F64, region: I64, train: BOOL, k: int) -> F64:
 
 
 def _strengths(gram: F64, right: F64, basis: F64) -> F64:
-    """(R, k) best coefficients of every region for given bases (k, J)."""
+    """(R, k) least-squares coefficients of every region for given bases (k, J)."""
     own = np.einsum("ki,rij,lj->rkl", basis, gram, basis)
     own += 1e-9 * np.maximum(np.trace(own, axis1=1, axis2=2), 1e-12)[:, None, None] * np.eye(len(basis))
     return np.asarray(np.linalg.solve(own, (right @ basis.T)[..., None])[..., 0], np.float64)

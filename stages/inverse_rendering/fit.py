@@ -1,8 +1,8 @@
-"""The fit itself: start, coarse to fine, checkpoints. Arrays in, a FaceModel out; needs torch, numpy, scipy and OpenCV.
+"""The training loop: coarse-to-fine schedule, steps and checkpoints. It needs torch, numpy, scipy and OpenCV.
 
-A fit repeats bit by bit for one seed on one machine: every random draw comes from a generator seeded by (seed, step),
-and a checkpoint holds everything else, so that an interrupted fit goes on as if nothing had happened. A fit by the
-clock (settings.seconds) goes on as well, but takes as many steps as its time allows.
+A fit is deterministic for one seed on one machine: every random number comes from a generator seeded by (seed, step),
+and a checkpoint has everything else, so an interrupted fit continues with the same result. A fit with a time limit
+(settings.seconds) continues too, but its number of steps depends on the time.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ from stages.inverse_rendering.ray_sampling import Batch, PhotoView, PixelTable
 OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
-UNIFORM_FROM = 0.3  # share of the fit after which only the light is found for a while
-OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are open at the start
-OPEN_UNTIL = 0.5  # share of the fit after which all of them are
-UNIFORM_LIGHT_ORDER = 3  # diffuse skin tells hardly more of a light
-UNIFORM_LIGHT_RATE = 10.0  # times the light's rate
-KNOWN_LIGHT_RATE = 0.1  # times the light's rate once it is known from the lobe
-SETTLING = 0.03  # share of the fit after it in which the surface rests
-SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved anew
-CHECKPOINT_SHARE = 0.02  # of the time since the last checkpoint that writing one may take
+UNIFORM_FROM = 0.3  # share of the fit at which the light-only phase with uniform albedo begins
+OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are active at the start
+OPEN_UNTIL = 0.5  # share of the fit after which all levels are active
+UNIFORM_LIGHT_ORDER = 3  # diffuse skin determines hardly more of a light
+UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
+KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
+SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
+SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
+CHECKPOINT_SHARE = 0.02  # largest share of the time for writing checkpoints
 COUNTED = ("step", "loss", "error", "shadows_solved", "allowance", "spent")  # plain numbers of a checkpoint
-SMOOTHING = 0.98  # of the running loss and error that are shown
-NOTED = 10  # times in a fit that the running PSNR is kept
+SMOOTHING = 0.98  # of the running loss and error
+NOTED = 10  # number of running PSNR values that are stored during a fit
 
 
 @dataclass(frozen=True, slots=True)
 class Hooks:
-    """How the fit talks to whoever runs it."""
+    """Callbacks of the fit: progress, cancellation, and the checkpoint's file."""
 
     progress: Callable[..., None]
     cancelled: Callable[[], bool]
@@ -64,7 +64,7 @@ class Hooks:
 
 @dataclass(slots=True)
 class Trainer:
-    """The state of a fit under way."""
+    """The state of a running fit."""
 
     views: list[PhotoView]
     settings: Config
@@ -91,40 +91,40 @@ class Trainer:
         self.validation = validation_views(len(self.views), self.settings)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
-        """Of everything that has not its own."""
+        """The optimiser of all parameters except the SDF grid, which has its own."""
         return make_optimiser(self.model, self.settings)
 
     @property
     def psnr(self) -> float:
-        """Running PSNR over whole subject pixels of the fitted views."""
+        """Running PSNR in dB over fully covered subject pixels of the fitted views."""
         return -10 * math.log10(max(self.error, 1e-10)) if math.isfinite(self.error) else float("nan")
 
     @property
     def grid(self) -> GridSdf:
-        """The surface, which has an optimiser of its own."""
+        """The SDF grid, which has its own optimiser."""
         return grid_of(self.model.geometry)
 
     @property
     def pixels(self) -> PixelTable:
-        """The photos' pixels at the present level."""
+        """The photos' pixels at the current level."""
         self.enter_level()
         assert self.table is not None
         return self.table
 
     # ---------------------------------------------------------------- schedule
     def share(self) -> float:
-        """How far the fit is, in [0, 1]: by the clock, or in steps."""
+        """Finished share of the fit, in [0, 1]: of the time limit, or of the steps."""
         done = self.spent / self.allowance if self.allowance else self.step / self.settings.steps
         return min(done, 1.0)
 
     def total(self) -> int:
-        """Steps of the whole fit; by the clock, as many as its pace so far promises."""
+        """Steps of the whole fit; with a time limit, an estimate from the speed so far."""
         if not self.allowance:
             return self.settings.steps
         return max(round(self.step / max(self.share(), 1e-6)), self.step + (self.share() < 1))
 
     def enter_level(self) -> None:
-        """Refine the grid and take larger photos when their time has come."""
+        """Refine the grid and use larger photos when the schedule requires it."""
         starts = LEVEL_STARTS[self.settings.levels]
         due = sum(self.share() >= s for s in starts) - 1
         while self.level < due:
@@ -135,26 +135,26 @@ class Trainer:
             side = self.settings.image_side
             side = max(side // 2 ** (len(starts) - 1 - self.level), min(side, 256))
             self.table = PixelTable(self.views, side, self.device)
-            self.table.wait(() if self.choices else self.validation)
+            self.table.exclude(() if self.choices else self.validation)
         if self.geometry_frozen:
             self.grid.values.requires_grad_(False)
 
     @property
     def geometry_frozen(self) -> bool:
-        """Whether the surface stays the prior that it began as."""
+        """Whether the surface is frozen at the prior."""
         return self.settings.refine_geometry == "off" or (self.choices is not None and not self.choices.refine_geometry)
 
     def select_model(self) -> None:
-        """Find out what the scene requires, and leave out the rest."""
+        """Select the model by cross-validation, and remove the other parts."""
         assert self.table is not None
         choices, estimate = select_model(self)
         self.take(choices)
         for parameter in apply_light(self.model, estimate) if estimate is not None else ():
             self.optimiser.state.pop(parameter, None)
-        self.table.wait(())
+        self.table.exclude(())
 
     def take(self, choices: Choices) -> None:
-        """Go on with the model that was chosen. What stays of a parameter keeps its momentum."""
+        """Continue with the selected model. The kept part of a parameter keeps its momentum."""
         swaps, known = take_over(self.model, choices), self.optimiser.state
         self.choices = choices
         if swaps:
@@ -171,16 +171,15 @@ class Trainer:
             self.grid.values.requires_grad_(False)
 
     def set_rates(self) -> float:
-        """Learning rates, beta and open encoding levels of this step; returns the SDF's rate in asset units.
+        """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
 
         Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
 
-        Between UNIFORM_FROM and `uniform_albedo_until` a light that is known from the lobe (light_estimate.py) is
-        frozen together with the surface, while the skin takes up what it leaves; then it moves slowly. Where the lobe
-        does not tell it, everything is frozen but the light, and the albedo is uniform: the light, which began as the
-        same from everywhere, explains what it can of the shading that the albedo had taken up until then. Any earlier,
-        and a surface that is still the hull bends to what is wrong.
+        Between UNIFORM_FROM and `uniform_albedo_until`, a light that is known from the lobe (light_estimate.py) is
+        frozen together with the surface, and the reflectance adapts to it; later it has a low rate. If the lobe does
+        not determine the light, everything except the light is frozen, and the albedo is uniform: the light, which was
+        uniform at the start, explains the shading that was in the albedo before. Earlier, the surface is still wrong.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
@@ -200,13 +199,13 @@ class Trainer:
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
         opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
         _hashed(self.model).encoding.open_levels(opened)
-        # skin takes up what the new light leaves, not the surface
+        # the reflectance adapts to the new light, not the surface
         still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
     def advance(self) -> None:
-        """One step, and the time that it took."""
+        """One step, with its time."""
         begun = time.monotonic()
         self._advance()
         self.spent += time.monotonic() - begun
@@ -214,7 +213,7 @@ class Trainer:
             self.history.append(self.psnr)
 
     def _advance(self) -> None:
-        """Draw, evaluate, move."""
+        """Draw a batch, evaluate the loss, update the parameters."""
         self.enter_level()
         assert self.table is not None
         if self.choices is None and self.share() >= SELECTION_AT:
@@ -229,7 +228,7 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         found = self._terms(batch, seed)
         loss, error = found.total, found.error
-        if loss.requires_grad:  # not so where the surface rests and no ray meets it
+        if loss.requires_grad:  # false if the surface is frozen and no ray hits it
             loss.backward()
         if not self._is_finite(loss):
             self._drop(batch, seed)
@@ -243,16 +242,16 @@ class Trainer:
         self._note(float(loss.detach()), error)
 
     def move(self, rate: float) -> None:
-        """Take the step."""
+        """Update the parameters. rate: of the SDF, asset units."""
         self.optimiser.step()
         self.grid.step(rate)
 
     def tend(self) -> None:
-        """What is due every BAND_EVERY steps."""
+        """Find the narrow band again, every BAND_EVERY steps."""
         self.grid.find_band()
 
     def finish(self) -> None:
-        """What is due after the last step."""
+        """Make the SDF a distance again, after the last step."""
         self.grid.redistance()
 
     def _terms(self, batch: Batch, seed: int) -> Terms:
@@ -260,18 +259,19 @@ class Trainer:
         return self.compute_terms(batch, generator)
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
-        """The parts of the loss. With bfloat16 the networks' products are short; the maths holds its own precision."""
+        """The parts of the loss. bfloat16 affects only the networks' matrix products."""
         kind, short = torch.device(self.device).type, self.settings.precision == "bfloat16"
         with torch.autocast(kind, torch.bfloat16, enabled=short):
             return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
 
     def weights(self) -> Config:
-        """The settings; once the light is known, skin need not be even: that would drive paint into the lobe."""
+        """The settings. If the light is known, without the sparse-albedo prior, which would move albedo into the
+        lobe."""
         light_known = self.choices is not None and self.choices.light_known
         return self.settings.changed(albedo_sparsity=0.0) if light_known else self.settings
 
     def geometry_is_finite(self) -> bool:
-        """Whether the gradients that the optimiser does not know of are finite."""
+        """Whether the gradients outside of the optimiser are finite."""
         return self.grid.gradient_is_finite()
 
     def _is_finite(self, loss: torch.Tensor) -> bool:
@@ -279,7 +279,7 @@ class Trainer:
         return finite and gradients_are_finite(self.optimiser)
 
     def _drop(self, batch: Batch, seed: int) -> None:
-        """Leave everything as it was before this step, say why, and go on with the next one."""
+        """Skip this step without an update, and record the cause."""
         parameters: list[tuple[str, torch.Tensor]] = [
             (n, p) for n, p in self.model.named_parameters() if n != "geometry.values"
         ]
@@ -290,7 +290,7 @@ class Trainer:
         self.guard.drop(self.step, cause)
 
     def forget(self) -> None:
-        """Drop gradients that the optimiser does not know of."""
+        """Drop the gradients outside of the optimiser."""
         self.grid.drop_gradient()
 
     def _note(self, loss: float, error: float) -> None:
@@ -301,7 +301,7 @@ class Trainer:
 
     # ---------------------------------------------------------------- checkpoints
     def save(self, path: Path) -> None:
-        """Write everything that the rest of the fit depends on; the old file stays until the new one is whole."""
+        """Write the state of the fit; the old file is kept until the new one is complete."""
         state = {
             "settings": repr(self.settings),
             "dropped": self.guard.causes,
@@ -313,10 +313,10 @@ class Trainer:
         path.with_suffix(".new").rename(path)
 
     def load(self, path: Path) -> bool:
-        """Go on from a checkpoint. False if there is none that can be read, or it is of other settings."""
+        """Continue from a checkpoint. False if it can't be read, or has other settings."""
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:  # a torn or foreign file: begin anew
+        except Exception:  # an incomplete or foreign file: start again
             return False
         if state["settings"] != repr(self.settings):
             return False
@@ -327,7 +327,7 @@ class Trainer:
         return True
 
     def parts(self) -> dict[str, Any]:
-        """Model, choices and optimisers, as a checkpoint holds them."""
+        """Model, choices and optimisers, for a checkpoint."""
         g = self.grid
         return {
             "level": self.level,
@@ -353,8 +353,8 @@ class Trainer:
 
 
 def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
-    """Adam over everything but the SDF, which has its own in the band. The table has no momentum to spare: eps is
-    small, because most of its entries see a gradient only now and then."""
+    """Adam over everything except the SDF, which has its own optimiser in the narrow band. eps is small, because most
+    entries of the hash table rarely have a gradient."""
     spatial = _hashed(model)
     groups = [
         {"params": [spatial.encoding.table], "start": settings.lr_appearance},
@@ -366,17 +366,17 @@ def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
 
 
 def _hashed(model: FaceModel) -> SpatialField:
-    """The Spatial MLP, whose table and levels are handled apart."""
+    """The Spatial MLP with its hash encoding."""
     assert isinstance(model.spatial, SpatialField)
     return model.spatial
 
 
 def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
-    """Train to the last step, or raise Cancelled after writing a checkpoint."""
+    """Train to the last step. Raises Cancelled after writing a checkpoint."""
     if hooks.checkpoint is not None and hooks.checkpoint.is_file():
         trainer.load(hooks.checkpoint)
     saved = shown = time.monotonic()
-    writing = 0.1  # seconds a checkpoint takes, until one was written
+    writing = 0.1  # seconds to write a checkpoint; measured later
     while trainer.share() < 1.0:
         try:
             trainer.advance()
@@ -388,7 +388,7 @@ def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
         if hooks.cancelled():
             if hooks.checkpoint is not None:
                 trainer.save(hooks.checkpoint)
-            raise Cancelled("stopped by the user; the fit goes on from its checkpoint next time")
+            raise Cancelled("stopped by the user; the next run continues from the checkpoint")
         if now - shown > 0.5:
             hooks.progress(trainer.step, trainer.total(), "fitting", loss=trainer.loss, psnr=trainer.psnr)
             shown = now

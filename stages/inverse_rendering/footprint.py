@@ -1,6 +1,6 @@
-"""How large a pixel is on the surface, and how fine a grid, an encoding and a texture the photos can fill.
+"""Size of a pixel on the surface, and the resolution of grid, encoding and texture that the photos support.
 
-The footprint of a pixel is that of pipeline.footprint, of the blocks of pixels that the fit takes as one.
+The footprint is that of pipeline.footprint, for the blocks of pixels that the fit averages.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
 
 F64 = npt.NDArray[np.float64]
-CELL_PIXELS = 1.0  # a cell of the grid holds at least so much of a pixel
-FINE_PIXELS = 0.5  # the encoding's finest cell: views overlap, so that half a pixel still has data
-UTILISATION = 0.65  # of a texture by its charts
+CELL_PIXELS = 1.0  # smallest cell of the grid, in pixels
+FINE_PIXELS = 0.5  # smallest cell of the encoding, in pixels: views overlap, so half a pixel still has data
+UTILISATION = 0.65  # share of a texture that its charts cover
 MAX_POINTS = 20_000
 
 
@@ -32,7 +32,7 @@ class Footprint:
 
     @property
     def texture(self) -> int:
-        """Side of a square texture with one texel a pixel, rounded up to a power of two."""
+        """Side of a square texture with one texel per pixel, rounded up to a power of two."""
         side = float(np.sqrt(self.area / UTILISATION) / self.pixel)
         return int(2 ** np.ceil(np.log2(max(side, 16))))
 
@@ -48,7 +48,7 @@ class Footprint:
 
 
 def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | None:
-    """Of photos that are fitted at `side` pixels, on the surface that the fit begins with; None if nothing faces it."""
+    """The footprint of photos fitted at `side` pixels on the initial geometry; None if no view faces the surface."""
     points, normals, area = _surface_of(start)
     best = np.full(len(points), np.inf)
     for view in views:
@@ -60,8 +60,8 @@ def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | No
 
 
 def _surface_of(start: Start) -> tuple[F64, F64, float]:
-    """Points on the start's zero set, their normals, and its area (faces of the voxels times 2 / 3, the mean over
-    directions of how much a staircase is longer than the slope)."""
+    """Points (N, 3) on the initial zero set, their normals (N, 3), and its area (voxel faces times 2 / 3, the mean
+    ratio over directions of a slope to its staircase)."""
     values = start.values
     inner = np.abs(values[1:-1, 1:-1, 1:-1]) < 0.75 * start.cell
     near = np.argwhere(inner) + 1
@@ -82,7 +82,7 @@ def _surface_of(start: Start) -> tuple[F64, F64, float]:
 
 
 def supported(settings: Config, looked: Footprint | None, start: Start) -> Config:
-    """The settings with a grid and an encoding that the photos can fill."""
+    """The settings with a grid and an encoding that the photos support."""
     if looked is None:
         return settings
     finest = start.cell / 2 ** (settings.levels - 1)

@@ -1,8 +1,7 @@
-"""What keeps a fit alive through a step that is not finite: the step is dropped and counted, its cause is told, and
-after a stated number of them the fit stops with what it had.
+"""Handling of steps with values that are not finite: such a step is dropped, counted and explained. After a given
+number of dropped steps the fit stops with an error.
 
-A step is dropped before anything moves, so that parameters, moments and checkpoints only ever hold what finite steps
-made of them.
+A step is dropped before any update, so parameters, optimiser state and checkpoints come from finite steps only.
 """
 
 from __future__ import annotations
@@ -19,12 +18,12 @@ from stages.inverse_rendering.objective import Terms
 from stages.inverse_rendering.ray_sampling import Batch
 
 log = logging.getLogger(__name__)
-SHOWN = 3  # rays that a report names
+SHOWN = 3  # rays in one message
 
 
 @dataclass(slots=True)
 class Guard:
-    """How many steps were dropped, and why."""
+    """The dropped steps with their causes. limit: number of dropped steps at which the fit stops."""
 
     limit: int
     causes: list[str] = field(default_factory=list)
@@ -44,22 +43,22 @@ class Guard:
                 where=f"inverse_rendering, step {step}",
                 value=f"{self.dropped} dropped steps; the last: {cause}",
                 limit=f"fewer than {self.limit} dropped steps (--set inverse_rendering.max_dropped)",
-                remedy="the checkpoint holds the last good state. Look at the views named above; lower "
-                "--set inverse_rendering.lr_sdf or lr_appearance by half",
+                remedy="the checkpoint has the last good state. Check the listed views; set "
+                "inverse_rendering.lr_sdf or inverse_rendering.lr_appearance to half",
             )
 
 
 def gradients_are_finite(optimiser: torch.optim.Optimizer) -> bool:
-    """Whether every gradient that the optimiser would use is finite: then so is their sum, which is quick to find."""
+    """Whether all gradients of the optimiser are finite. Their sum is tested, which is fast."""
     grads = [p.grad for group in optimiser.param_groups for p in group["params"] if p.grad is not None]
     return not grads or math.isfinite(float(torch.stack([g.sum() for g in grads]).sum()))
 
 
 def cause_of(found: Terms, batch: Batch, names: list[int], parameters: list[tuple[str, Tensor]]) -> str:
-    """Which term failed and on which rays. `names`: the photos' indices by their place in the fit; `parameters`: what
-    the terms are differentiated by if every value is finite.
+    """Which term is not finite, and on which rays. `names`: photo indices by position in the fit. `parameters`: for
+    gradients of the terms, if every value is finite.
 
-    The terms must still carry their graph.
+    The terms must still have their graph.
     """
     for name, scalar in found.scalars.items():
         if not math.isfinite(float(scalar.detach())):
@@ -78,7 +77,7 @@ def cause_of(found: Terms, batch: Batch, names: list[int], parameters: list[tupl
 def _rays_of(found: Terms, name: str, batch: Batch, names: list[int]) -> str:
     """Views and rays with values that are not finite."""
     if name not in found.values:
-        return " (it belongs to no single ray)"
+        return " (it is not a sum over rays)"
     values, rays = found.values[name]
     bad = torch.unique(rays[~torch.isfinite(values)])
     if not len(bad):

@@ -1,8 +1,8 @@
-"""The geometry's start: the visual hull of the masks as a signed distance on the coarsest grid.
+"""Initial geometry: the visual hull of the masks as a signed distance on the coarsest grid.
 
-A plain hull believes every mask: one that lacks the shirt cuts the body off at the collar in all views. So a hull that
-lets a few views be wrong comes first. Where it clearly shows the subject and a mask does not, that mask has no say;
-everywhere else all masks carve as they are, because a lenient hull is a thicker one.
+In a plain hull one wrong mask is enough: if it lacks the shirt, the body ends at the collar. So first a lenient hull is
+carved, which tolerates a few wrong views. Where it clearly shows the subject and a mask does not, that mask is ignored.
+Everywhere else all masks carve, because a lenient hull is too thick.
 """
 
 from __future__ import annotations
@@ -25,43 +25,43 @@ F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 CELLS = 64  # voxels along the cube in which masks are compared
 CUBE = 1.6  # its half-edge in radii of the region of interest
-WRONG, WRONG_SHARE = 2, 0.1  # views that may be wrong about a voxel, and their share of those that see it
-SIDE = 320  # pixels: masks are compared at this size
+WRONG, WRONG_SHARE = 2, 0.1  # views that may be wrong about a voxel, and their share of the views that see it
+SIDE = 320  # pixels: longest side at which masks are compared
 MARGIN = 1.0  # voxels by which the lenient hull may be too thick
 MISSING = (
-    0.02  # of the silhouette: one view may rightly carve a hollow; of a shoulder that took 1 % (head scan, measured)
+    0.02  # of the silhouette: a single view may correctly carve a concavity, 1 % at a shoulder (head scan, measured)
 )
 SPHERE = 0.6  # share of the region of interest's radius
-MARGIN_CELLS = 4  # room for the band and the spline's border around the hull
+MARGIN_CELLS = 4  # cells around the hull for the narrow band and the spline's border
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where the geometry begins: SDF samples (X, Y, Z) at lo + i cell, asset units."""
+    """The initial geometry: SDF samples (X, Y, Z) at lo + i cell, asset units. lo: (3,)."""
 
     values: F32
     lo: F32
     cell: float
 
     def surface(self, device: str) -> GridSdf:
-        """A copy of the samples that rays can meet."""
+        """A copy of the samples as an SDF that can be traced."""
         values, lo = (torch.from_numpy(a.astype(np.float32)) for a in (self.values, self.lo))
         return GridSdf(values, lo, self.cell).to(device)
 
 
 @dataclass(frozen=True, slots=True)
 class Agreed:
-    """Masks as they may carve. alphas: one a view, the same objects where nothing was wrong; doubtful: (h, w) by number
-    of the view, where its mask lacks what the other views show: neither subject nor background can be learned there."""
+    """Corrected masks. alphas: (h, w) per view, unchanged objects where nothing is wrong. doubtful: (h, w) by position
+    of the view, where its mask lacks a part that the other views show; these pixels are not fitted."""
 
     alphas: list[F32]
     doubtful: dict[int, Bool]
 
 
 def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agreed:
-    """The masks without what almost all other views contradict: a part of the subject that one mask lacks.
+    """Masks that do not carve where almost all other views show a part of the subject that they lack.
 
-    alphas: (H, W) each, in [0, 1]. Returns doubtful pixels at the size of that view's alpha.
+    alphas: (H, W) each, in [0, 1]. roi_radius: asset units. Doubtful pixels have the size of the view's alpha.
     """
     edge = CUBE * roi_radius
     cell = 2 * edge / CELLS
@@ -87,7 +87,7 @@ def _shrunk(alpha: F32) -> F32:
 
 
 def _lacks(lenient: Hull, camera: Camera, alpha: F32, cell: float) -> Bool | None:
-    """(h, w) where a mask clearly lacks what the lenient hull shows; None where it lacks nothing of weight."""
+    """(h, w) where a mask clearly lacks what the lenient hull shows; None if it lacks nothing significant."""
     h, w = alpha.shape
     shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5
     margin = max(1, round(MARGIN * _pixels_a_unit(camera) * cell * w / camera.width))
@@ -100,14 +100,14 @@ def _lacks(lenient: Hull, camera: Camera, alpha: F32, cell: float) -> Bool | Non
 
 
 def _pixels_a_unit(camera: Camera) -> float:
-    """Pixels of the photo that an asset unit at the origin spans."""
+    """Pixels of the photo per asset unit at the origin."""
     depth = abs(float(inverse_rigid(matrix(camera.world_from_cam))[2, 3]))
     K = matrix(camera.K)
     return float(np.sqrt(K[0, 0] * K[1, 1])) / max(depth, 1e-9)
 
 
 def _grown(mask: Bool, radius: int) -> Bool:
-    """Pixels with the mask within `radius`; beyond the frame there is none."""
+    """(h, w) dilation of a mask by `radius` pixels; there is no mask beyond the frame."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disc)) > 0
 
@@ -115,11 +115,12 @@ def _grown(mask: Bool, radius: int) -> Bool:
 def hull_start(
     cameras: list[Camera], alphas: list[F32], roi_radius: float, cells: int, levels: int, extent: Extent | None = None
 ) -> Start:
-    """SDF samples of the hull, at a spacing that `levels` - 1 halvings bring to 1 / `cells` of the hull's longest side.
+    """SDF samples of the hull, whose cell after `levels` - 1 halvings is 1 / `cells` of the hull's longest side.
 
-    extent: what of the hull is fitted; a little more of it is kept, so that the fit has no rim where the mesh ends.
+    alphas: (H, W) each. extent: the part of the hull that is fitted, kept with a margin, so that the fit has no border
+    where the mesh ends.
 
-    Raises StageError if the masks leave nothing.
+    Raises StageError if the hull is empty.
     """
 
     def kept(hull: Hull) -> Hull:
@@ -135,13 +136,14 @@ def hull_start(
             where="inverse_rendering",
             value="an empty visual hull",
             limit="at least one voxel inside every view's silhouette",
-            remedy="look at the masks and the cameras: one of them is wrong, or views show different subjects",
+            remedy="check the masks and the cameras: one of them is wrong, or the views show different subjects",
         )
     return Start(hull_sdf(hull).astype(np.float32), (hull.lo + 0.5 * cell).astype(np.float32), cell)
 
 
 def sphere_start(radius: float, cells: int, levels: int) -> Start:
-    """A sphere of SPHERE of the region of interest: what a fit starts from that knows nothing of the subject."""
+    """A sphere of SPHERE times `radius`, the region of interest's (asset units): an initial geometry without a
+    prior."""
     cell = 2 * radius / cells * 2 ** (levels - 1)
     n = int(np.ceil(radius / cell)) + MARGIN_CELLS
     axis = (np.arange(-n, n + 1) * cell).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A fit that has not begun: the model that settings, photos and a start ask for, and its trainer."""
+"""The initial model and its trainer, from settings, photos and initial geometry."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import own_parts, pretrain_basis
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 
-DERIVED = {"rank", "light_order", "specular", "hash_fine"}  # of a FaceSpec: what the settings say in part
-SAME = ({f.name for f in fields(FaceSpec)} & Config.model_fields.keys()) - DERIVED  # what they say by the same name
-ALBEDO_START = 0.4  # mean over the channels, whose ratios are the photos'
+DERIVED = {"rank", "light_order", "specular", "hash_fine"}  # fields of FaceSpec that are computed from settings
+SAME = ({f.name for f in fields(FaceSpec)} & Config.model_fields.keys()) - DERIVED  # fields copied from settings
+ALBEDO_START = 0.4  # mean over the channels; their ratios are those of the photos
 
 
 def new_trainer(
@@ -30,11 +30,11 @@ def new_trainer(
     device: str,
     prior: Start | None = None,
 ) -> Trainer:
-    """A fit that has not begun: geometry from the start, a uniform white light, grey skin. prior: the surface that any
-    relief is judged against, where the photos have already moved the start away from it."""
+    """A new trainer: geometry from `start`, a uniform white light, a uniform albedo. prior: the surface with which
+    refined geometry is compared, if stereo has already moved `start`."""
     torch.manual_seed(settings.seed)
     spec = spec_for(views, start, settings, calibrated, device)
-    values = torch.from_numpy(start.values.copy())  # a start that is the prior stays what it was
+    values = torch.from_numpy(start.values.copy())  # a copy, because the start may also be the prior
     grid = GridSdf(values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     model = FaceModel(spec, grid)
     if settings.judges and settings.basis_inputs == "cosine":
@@ -45,7 +45,7 @@ def new_trainer(
 
 
 def spec_for(views: list[PhotoView], start: Start, config: Config, calibrated: bool, device: str) -> FaceSpec:
-    """What the settings make of these photos and this start."""
+    """The specification of the model for these settings, photos and initial geometry."""
     colour = PixelTable(views, 256, device).mean_colour()
     grey = float(colour.mean().clamp(min=1e-4))
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell

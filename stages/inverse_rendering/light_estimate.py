@@ -1,17 +1,17 @@
-"""The light in closed form, from what changes with the view alone.
+"""Light estimation in closed form from view-dependent residuals.
 
     c_pv = D_p + w(n . wo) sum_lm A_l(1 / kappa) L_lm Y_lm(w_r)
 
-Symbols as in cross_validation.py; w(n . wo) = F0 A + B is what rough skin of index 1.42 reflects of a uniform light at
-that angle (split-sum table of a GGX lobe), so that L comes out in the photos' own units and no albedo enters: D_p is
-free for every point and drops out with its mean over the views. L_lm is then one linear least-squares problem. On two heads
-whose light is known its radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth, and its level
-is within 3 % (docs/model.md), where a fit from even light ends at 0.6 to 0.8.
+Symbols as in cross_validation.py; w(n . wo) = F0 A + B is the reflectance of rough skin of index 1.42 under a uniform
+light (split-sum table of a GGX lobe). So L has the units of the photos, and no albedo is needed: D_p is free for every
+point and is eliminated with its mean over the views. L_lm is then a linear least-squares problem. On two heads with
+known light, the radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99 with the truth, and its level is within
+3 % (docs/model.md); a fit that starts from a uniform light reaches 0.6 to 0.8.
 
-What changes least with the view, band 0 against all others, is told least well. So the bands from 1 on are scaled by
-the one factor for which the albedo pi D_p / E(n_p) is most even; their shape and band 0 stay.
+The ratio of band 0 to the others changes least with the view, so it is the least accurate. The bands from 1 on are
+scaled by the factor that makes the albedo pi D_p / E(n_p) most uniform; their shape and band 0 are unchanged.
 
-Differs: not in the paper, which learns light, albedo and lobe together from a white start.
+Differs: not in the paper, which learns light, albedo and lobe together from a white light.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ F64 = npt.NDArray[np.float64]
 RIDGE = 1e-3  # of the mean eigenvalue
 MIN_VIEWS = 3  # of a point
 MIN_POINTS = 200
-MIN_EXPLAINED = 0.15  # of what changes with the view: less is noise, not a lobe under a light
+MIN_EXPLAINED = 0.15  # smallest explained share of the view-dependent variance: less is noise
 SCALES = np.geomspace(0.4, 2.5, 61)  # of the bands from 1 on
-DARKEST = 0.02  # of the mean irradiance: no light leaves a side of the head darker
-LIT_SHARE = 0.9  # of the points that must be above that, and have a positive D
+DARKEST = 0.02  # of the mean irradiance: lower limit on all sides of the head
+LIT_SHARE = 0.9  # smallest share of points above that limit and with a positive D
 
 
 @dataclass(frozen=True, slots=True)
 class LightEstimate:
-    """coefficients ((L + 1)^2,) of a white light in the photos' units; explained: share of the variance within points
-    that it accounts for; scale: what even skin made of the bands from 1 on."""
+    """coefficients: ((L + 1)^2,) SH of a white light in the photos' units. explained: share of the view-dependent
+    variance that it explains. scale: factor of the bands from 1 on."""
 
     coefficients: F64
     explained: float
@@ -49,7 +49,7 @@ class LightEstimate:
 
 
 def reflectance(cosine: F64) -> F64:
-    """w(n . wo) (N,): share of an even light that skin's lobe sends to the eye, n . wo in [0, 1]."""
+    """w(n . wo) (N,): specular reflectance of skin under a uniform light, for n . wo (N,) in [0, 1]."""
     c = torch.from_numpy(np.asarray(cosine, np.float64))
     alpha = alpha_from_inv_kappa(torch.full_like(c, TYPICAL_INV_KAPPA))
     return np.asarray(
@@ -58,9 +58,9 @@ def reflectance(cosine: F64) -> F64:
 
 
 def light_from_lobe(seen: Observations, order: int, gain: F64, attenuation: str) -> LightEstimate | None:
-    """The light up to `order` from sightings of any number of points; None where too little changes with the view.
+    """The light up to SH `order` from observations; None if the view-dependent part is too small.
 
-    gain: (V, 3) of each view's camera, 1 where all are alike.
+    gain: (V, 3) of each view's camera, 1 if all are equal.
     """
     counts = np.bincount(seen.point, minlength=len(seen.x))
     often = counts >= MIN_VIEWS
@@ -92,8 +92,9 @@ def light_from_lobe(seen: Observations, order: int, gain: F64, attenuation: str)
 def _evenest(
     seen: Observations, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]
 ) -> float | None:
-    """The scale with the least spread of ln albedo. total, glow, even (P,): means over the views of the colour, of the
-    lobe's bands from 1 on, and of its band 0 per unit of L_00."""
+    """The scale with the least spread of ln albedo. b: ((L + 1)^2,) coefficients. total, glow, even (P,): means over
+    the views of the colour, of the lobe's bands from 1 on, and of its band 0 per unit of L_00. often: (P,) used
+    points."""
     light = np.zeros((len(b), 3))
     light[1:] = b[1:, None]
     sides = sh.irradiance(torch.from_numpy(light), seen.n.detach().cpu().double()).numpy()[:, 0]

@@ -1,4 +1,4 @@
-"""From artifacts to arrays: photos, masks and cameras as the fit takes them."""
+"""Loads photos, masks, labels and cameras as arrays for the fit."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from stages.inverse_rendering.residuals import U8
 def read_views(
     capture: Located[Capture], poses: CameraSet, masks: Located[MaskSet], indices: list[int], side: int
 ) -> list[PhotoView]:
-    """Photos, masks and cameras of some views, no larger than a whole number of blocks above `side`.
+    """Photos, masks and cameras of some views, reduced by `shrunk` to about `side` pixels.
 
-    Photos are divided by their exposures: the start of what the per-image calibration then refines.
+    Photos are divided by their exposures; per-image calibration refines this.
     """
     cameras = {c.index: c for c in poses.cameras}
     alphas = {m.index: m for m in masks.artifact.masks}
@@ -45,16 +45,16 @@ def read_views(
 
 
 def read_labels(masks: Located[MaskSet], indices: list[int]) -> list[U8 | None]:
-    """(H, W) codes of some views' labels, None where a view has none."""
+    """(H, W) label codes of some views, None for a view without labels."""
     files = {m.index: m.labels for m in masks.artifact.masks}
     found = (files.get(i) for i in indices)
     return [None if f is None else np.asarray(read_encoded(masks.path(f))[..., 0], np.uint8) for f in found]
 
 
 def shrunk(view: PhotoView, side: int) -> PhotoView:
-    """The view at the smallest whole-block size that still has `side` pixels, so that large photos fit in memory.
+    """The view averaged over blocks to at most `side` (at least 1024) pixels, so that large photos fit in memory.
 
-    Lens positions are kept exact: intrinsics scale with the image, distortion does not change.
+    Intrinsics scale with the image; distortion does not change.
     """
     f = factor_for(view.size, max(side, 1024))
     if f == 1:
@@ -76,7 +76,7 @@ def _asked(masks: Located[MaskSet], file: FileRef | None) -> F32 | None:
 
 
 def camera_only(c: Camera) -> PhotoView:
-    """A camera as a view without a photo: what a prediction may see of a held-out view."""
+    """A camera as a view without a photo: predictions do not read held-out photos."""
     empty = np.broadcast_to(np.zeros((), np.float32), (c.height, c.width, 3))
     return PhotoView(
         c.index,

@@ -1,10 +1,9 @@
-"""What the scene requires, decided once in mid-fit from the evidence, and taken over by the model. Settings that are
-not 'auto' are never overruled.
+"""Model selection, once during the fit, by cross-validation. Settings that are not 'auto' are never changed.
 
-The fit begins with the whole model. When `SELECTION_AT` of the steps are done, every part that the evidence does not
-call for is left out for the rest of the fit: a lobe that nothing shows, bases beyond the rank, bands of the light
-beyond the order, colour matrices of cameras that agree, a surface that the prior already is. Until then a few views
-(`waiting`) are kept from the fit; it is their error that decides. They join it afterwards.
+The fit begins with the whole model. When `SELECTION_AT` of the steps are done, every part that does not reduce the
+error on the validation views is removed for the rest of the fit: the specular lobe, bases beyond the rank, SH bands
+beyond the order, colour matrices, and refined geometry. Until then the validation views are not fitted; afterwards they
+are.
 """
 
 from __future__ import annotations
@@ -30,23 +29,26 @@ from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lo
 from stages.inverse_rendering.observations import observe, pictures, surface_points
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 
-SELECTION_AT = 0.3  # share of the steps: the surface is found to a millimetre, most of the work is still to come
+SELECTION_AT = 0.3  # share of the steps: the surface is accurate to a millimetre, and most steps are still to come
 RAYS = 1500
-MAX_ESTIMATE_ORDER = 6  # beyond, a lobe of skin's width lets nothing through
+MAX_ESTIMATE_ORDER = 6  # a lobe of skin's width passes no higher SH bands
 SEED = 715_517
-MIN_VIEWS = 8  # fewer can spare none
+MIN_VIEWS = 8  # fewest views for validation views
 VALIDATION_SHARE, MAX_VALIDATION = 0.12, 6
-DIFFUSE_ORDER = 3  # what diffuse skin tells of a light [NeuFace eq. 15]
-DIFFERENT = 0.02  # of the mean radiance: cameras that differ by less are not told from what the lobe leaves
-FAINT = 0.3  # of what stays unexplained: less than that is made up from it. Heads have 0.6 to 0.8, a dull stone one 0.2
-TELLING = 0.75  # of the lobe's own size: with a larger rest, bases are not told apart (docs/model.md)
-SILHOUETTE = 0.01  # share of the waiting views' rays that a prior may miss more of than the fitted surface
+DIFFUSE_ORDER = 3  # SH order that diffuse skin determines [NeuFace eq. 15]
+MIN_DIFFERENCE = (
+    0.02  # of the mean radiance: smaller differences of cameras can't be separated from the lobe's residual
+)
+MIN_SPECULAR = 0.3  # of the remaining error: smaller lobes are noise. Heads have 0.6 to 0.8, a matt stone one 0.2
+MAX_REST = 0.75  # of the lobe's size: with a larger remaining error, the rank can't be determined (docs/model.md)
+SILHOUETTE = 0.01  # share of the validation views' rays: allowed excess of the prior's silhouette error
 
+SELECTED = "cross-validation"  # reason of a decision, in the report
 Facts = dict[str, dict[str, str | float | bool]]
 
 
 class Fit(Protocol):
-    """What is read of a fit under way. waiting: positions of the views that it has not seen."""
+    """The parts of a running fit that the model selection reads. validation: positions of the validation views."""
 
     views: list[PhotoView]
     settings: Config
@@ -60,8 +62,8 @@ class Fit(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Choices:
-    """What is modelled from now on. columns: the bases that stay. facts: how each was decided, for the report. lit: the
-    light is known from the lobe (light_estimate.py)."""
+    """The selected model. columns: the bases that are kept. facts: the figures of each decision, for the report.
+    light_known: the light is known from view-dependent residuals (light_estimate.py)."""
 
     specular: bool
     light_order: int
@@ -77,7 +79,7 @@ class Choices:
         return len(self.columns)
 
     def plain(self) -> dict[str, Any]:
-        """As a checkpoint holds it."""
+        """As a dictionary, for a checkpoint."""
         return asdict(self)
 
 
@@ -87,12 +89,12 @@ def restored(plain: dict[str, Any]) -> Choices:
 
 
 def open_questions(s: Config) -> bool:
-    """Whether anything is left to the evidence."""
+    """Whether any setting is left to the model selection."""
     return s.judges and AUTO in (s.specular, s.rank, s.light_order, s.calibration, s.refine_geometry)
 
 
 def validation_views(count: int, settings: Config) -> tuple[int, ...]:
-    """Positions of the views that the fit does not see until the evidence is in: about one in eight, spread evenly."""
+    """Positions of the validation views among `count` views: about one in eight, evenly spaced."""
     if count < MIN_VIEWS or not open_questions(settings):
         return ()
     n = min(max(round(VALIDATION_SHARE * count), 2), MAX_VALIDATION)
@@ -101,7 +103,7 @@ def validation_views(count: int, settings: Config) -> tuple[int, ...]:
 
 # ------------------------------------------------------------------ deciding
 def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
-    """Judge what is open with the waiting views; and the light, if what changes with the view tells it."""
+    """Select the model on the validation views, and estimate the light from view-dependent residuals."""
     s, model = fit.settings, fit.model
     given = Choices(
         s.specular != "off",
@@ -112,7 +114,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
         {},
     )
     wanted = s.estimates_light and s.specular != "off"
-    why = "setting" if not open_questions(s) else f"fewer than {MIN_VIEWS} views: nothing to judge by"
+    why = "setting" if not open_questions(s) else f"fewer than {MIN_VIEWS} views: no validation views"
     out = replace(given, facts=_facts(given, s, why))
     if not fit.validation and not wanted:
         return out, None
@@ -128,7 +130,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
         if s.refine_geometry == AUTO and fit.prior is not None:
             out = _judge_refinement(out, fit, found, shots)
     elif fit.validation:
-        out = replace(given, facts=_facts(given, s, "too few points are seen by enough views: nothing to judge by"))
+        out = replace(given, facts=_facts(given, s, "too few points are visible in enough views"))
     estimate = None
     if wanted and out.specular:
         estimate = light_from_lobe(seen, min(out.light_order, MAX_ESTIMATE_ORDER), gain, model.spec.attenuation)
@@ -136,16 +138,16 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
 
 
 def _with_light_source(c: Choices, estimate: LightEstimate | None) -> Choices:
-    """The choices with where the light came from."""
-    light: dict[str, str | float | bool] = {"from": "even skin"}
+    """The choices with the source of the light."""
+    light: dict[str, str | float | bool] = {"from": "uniform albedo"}
     if estimate is not None:
-        told = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
-        light = {"from": "what changes with the view", **told}
+        figures = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
+        light = {"from": "view-dependent residuals", **figures}
     return replace(c, light_known=estimate is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
 
 
 def apply_light(model: FaceModel, estimate: LightEstimate) -> list[nn.Parameter]:
-    """Put the light into the model, and a lobe that is skin's usual one everywhere. Hands back what was overwritten."""
+    """Set the model's light, and skin's typical lobe everywhere. Returns the overwritten parameters."""
     spatial, basis, light = own_parts(model)
     last = spatial.net[-1]
     assert isinstance(last, nn.Linear)
@@ -160,14 +162,14 @@ def apply_light(model: FaceModel, estimate: LightEstimate) -> list[nn.Parameter]
 
 
 def own_parts(model: FaceModel) -> tuple[SpatialField, IntegratedBasis, ShLight]:
-    """Our own parts of a model. Others are never judged, and keep all that they began with."""
+    """The parts of a model that the model selection supports: hash encoding, integrated bases, SH light."""
     spatial, basis, light = model.spatial, model.basis, model.light
     assert isinstance(spatial, SpatialField) and isinstance(basis, IntegratedBasis) and isinstance(light, ShLight)
     return spatial, basis, light
 
 
 def pretrain_basis(basis: IntegratedBasis) -> None:
-    """Make the bases together reflect as rough skin does, where the strength is START_RHO and all c are 1."""
+    """Pre-train the bases so that their sum is the reflectance of rough skin, for strength START_RHO and all c = 1."""
     basis.learn(lambda cosine: torch.from_numpy(reflectance(cosine.cpu().numpy())).to(cosine) / START_RHO)
 
 
@@ -177,15 +179,15 @@ def _table(fit: Fit) -> PixelTable:
 
 
 def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceModel) -> Choices:
-    """Lobe, calibration, order and rank, each given what the others need."""
-    full, facts = model.spec.light_order, _facts(given, s, "not judged")
+    """Select lobe, calibration, order and rank, in an order in which each uses the previous results."""
+    full, facts = model.spec.light_order, _facts(given, s, "not tested")
     most = _best_order(t, full) if given.specular else None
     one, gains = cross_validation.alike(t), cross_validation.solve_response(t, most, gain=True)
     offsets = cross_validation.solve_response(t, most, gain=False)
     gains_alone = cross_validation.solve_response(t, None, gain=True)
     without, with_gains, control = (cross_validation.validation_error(t, most, r) for r in (one, gains, offsets))
     alone = cross_validation.validation_error(t, None, gains_alone)
-    differ = more(without, with_gains) > DIFFERENT and (with_gains < control or alone < without)
+    differ = more(without, with_gains) > MIN_DIFFERENCE and (with_gains < control or alone < without)
     calibrated = differ if s.calibration == AUTO else given.calibrated
     facts["calibration"] = _fact(calibrated, s.calibration, without, with_gains) | {
         "error_with_offsets": round(control, 5),
@@ -193,37 +195,37 @@ def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceM
     }
     used = gains if calibrated else one
     orders = [cross_validation.validation_error(t, order, used) for order in range(full + 1)]
-    dull = alone if calibrated else cross_validation.validation_error(t, None, one)
+    without_lobe = alone if calibrated else cross_validation.validation_error(t, None, one)
     best = min(orders)
-    clearly = more(dull, best) > max(NEGLIGIBLE, FAINT * best)
+    clearly = more(without_lobe, best) > max(NEGLIGIBLE, MIN_SPECULAR * best)
     specular = clearly if s.specular == AUTO else given.specular
-    facts["specular"] = _fact(specular, s.specular, dull, best)
+    facts["specular"] = _fact(specular, s.specular, without_lobe, best)
     order = given.light_order
     if s.light_order == AUTO:
         order = next(o for o in range(full + 1) if more(orders[o], best) < NEGLIGIBLE) if specular else 0
         order = max(order, DIFFUSE_ORDER)
-        facts["light"] = {"order": order, "why": "evidence", "error_of_order": _listed(orders)}
+        facts["light"] = {"order": order, "why": SELECTED, "error_of_order": _listed(orders)}
     columns = given.columns
     if s.rank == AUTO and not specular:
-        facts["rank"]["why"] = "no lobe, so that its bases are not used"
+        facts["rank"]["why"] = "no specular lobe, so its bases are not used"
     if s.rank == AUTO and specular:
         ranks = cross_validation.by_rank(t, order, used, given.rank)
-        clear = min(ranks) < TELLING * more(dull, best)
+        clear = min(ranks) < MAX_REST * more(without_lobe, best)
         k = cross_validation.least_rank(ranks) if clear else given.rank
         columns = strongest(model, t, k)
-        why = "evidence" if clear else "the rest is too large beside the lobe to tell; fewer would save no time"
+        why = SELECTED if clear else "the remaining error is too large; fewer bases would save no time"
         facts["rank"] = {"k": k, "why": why, "error_of_rank": _listed(ranks)}
     return Choices(specular, order, columns, calibrated, given.refine_geometry, facts)
 
 
 def _best_order(t: ValidationSamples, full: int) -> int:
-    """The order with the least held-out error while cameras count as alike: a higher one would fit noise."""
+    """The SH order with the least validation error if all cameras respond equally: a higher one would fit noise."""
     errors = [cross_validation.validation_error(t, order, cross_validation.alike(t)) for order in range(full + 1)]
     return int(np.argmin(errors))
 
 
 def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[Any]) -> Choices:
-    """Whether the fitted surface explains the waiting views better than the prior."""
+    """Whether the fitted surface explains the validation views better than the prior."""
     prior = prior_surface(fit)
     seen = observe(prior, shots, *surface_points(prior, _table(fit).draw(RAYS, 0.0, SEED + 1).rays))
     before = cross_validation.validation_samples(seen, fit.validation, fit.model)
@@ -231,11 +233,11 @@ def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[
     moved = theirs > own + SILHOUETTE
     fact: dict[str, str | float | bool] = {
         "modelled": moved,
-        "why": "evidence",
+        "why": SELECTED,
         "silhouette_error_of_prior": round(theirs, 5),
         "silhouette_error": round(own, 5),
     }
-    if before is not None:  # else the prior is so far off that hardly a point of it is seen as the subject
+    if before is not None:  # else the prior is so wrong that hardly any of its points is on the subject
         was, now = (_consistency(x, out.calibrated) for x in (before, t))
         moved = moved or more(was, now) > NEGLIGIBLE
         fact |= _fact(moved, AUTO, was, now)
@@ -243,13 +245,13 @@ def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[
 
 
 def _consistency(t: ValidationSamples, calibrated: bool) -> float:
-    """Held-out error of a surface alone: the waiting views from the mean of what the others show of each point."""
+    """Validation error of a surface without a lobe: each point is predicted by its mean over the fitted views."""
     response = cross_validation.solve_response(t, None, gain=True) if calibrated else cross_validation.alike(t)
     return cross_validation.validation_error(t, None, response)
 
 
 def silhouette_error(fit: Fit, geometry: Geometry) -> float:
-    """Share of the waiting views' rays that hit where the mask shows nothing, or pass where it shows the subject."""
+    """Share of the validation views' rays that hit the surface outside of the mask, or miss it inside."""
     batch = _table(fit).only(fit.validation).draw(RAYS, 0.5, SEED + 2)
     hit = _hits(geometry, batch.rays.o, batch.rays.d)
     return float((hit != (batch.alpha > 0.5)).double().mean())
@@ -264,7 +266,7 @@ def _hits(geometry: Geometry, o: Tensor, d: Tensor) -> Tensor:
 
 
 def prior_surface(fit: Fit) -> GridSdf:
-    """The prior's surface, on the present grid."""
+    """The prior's surface at the current grid resolution."""
     assert fit.prior is not None
     prior = fit.prior.surface("cpu")
     for _ in range(fit.level):
@@ -275,7 +277,7 @@ def prior_surface(fit: Fit) -> GridSdf:
 
 
 def strongest(model: FaceModel, t: ValidationSamples, k: int) -> tuple[int, ...]:
-    """The k bases that carry most of c . B on average, in their order."""
+    """Indices of the k bases with the largest mean share of c . B, ascending."""
     with torch.no_grad():
         x = torch.from_numpy(t.x[:: max(len(t.x) // 4096, 1)]).float().to(model.beta.device)
         c = model.spatial(x)[2]
@@ -285,7 +287,7 @@ def strongest(model: FaceModel, t: ValidationSamples, k: int) -> tuple[int, ...]
 
 
 def _facts(c: Choices, s: Config, why: str) -> Facts:
-    """Where nothing was tested."""
+    """The facts if nothing was tested."""
     return {
         "specular": {"modelled": c.specular, "why": "setting" if s.specular != AUTO else why},
         "light": {"order": c.light_order, "why": "setting" if s.light_order != AUTO else why},
@@ -298,7 +300,7 @@ def _facts(c: Choices, s: Config, why: str) -> Facts:
 def _fact(modelled: bool, setting: str, without: float, with_it: float) -> dict[str, str | float | bool]:
     return {
         "modelled": modelled,
-        "why": "evidence" if setting == AUTO else "setting",
+        "why": SELECTED if setting == AUTO else "setting",
         "error_without": round(without, 5),
         "error_with": round(with_it, 5),
     }
@@ -310,8 +312,8 @@ def _listed(errors: list[float]) -> str:
 
 # ------------------------------------------------------------------ taking over
 def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]]:
-    """Leave out of the model what is not wanted. Hands back, for every parameter that became smaller, the one that it
-    was and the rows of it that stay."""
+    """Remove the parts that were not selected from the model. Returns, for every parameter that became smaller, the old
+    parameter and the rows that are kept."""
     swaps: dict[nn.Parameter, tuple[nn.Parameter, slice | list[int]]] = {}
     spec = model.spec
     if c.rank < spec.rank:
@@ -334,13 +336,13 @@ def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Param
         light.coefficients = nn.Parameter(old.detach()[kept].clone())
         swaps[light.coefficients] = (old, kept)
     if not c.calibrated:
-        _still(model)
+        _reset_calibration(model)
     model.spec = replace(spec, rank=c.rank, light_order=c.light_order, specular=c.specular, calibrated=c.calibrated)
     return swaps
 
 
-def _still(model: FaceModel) -> None:
-    """Every colour matrix becomes the identity."""
+def _reset_calibration(model: FaceModel) -> None:
+    """Set every colour matrix to the identity."""
     last = model.calibration.net[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The compound objective: the one place where terms are weighed and summed. [NeuFace eq. 20]"""
+"""The loss: its terms are weighted and summed here. [NeuFace eq. 20]"""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from stages.inverse_rendering.render import sample_shell, shade_shell, solid_beh
 
 @dataclass(slots=True)
 class Terms:
-    """The loss in parts. scalars: weighted, by name, in the order in which they are summed. values: what single rays
-    gave, detached, with the rays' places in the batch, so that a fault can be traced. error: mean squared error over
-    whole subject pixels as people see it (sRGB), NaN where the batch has none."""
+    """The terms of the loss. scalars: weighted, by name, in the order of summation. values: detached values of single
+    rays with their indices in the batch, for error messages. error: mean squared error (sRGB) over fully covered
+    subject pixels, NaN if the batch has none."""
 
     scalars: dict[str, Tensor] = field(default_factory=dict)
     values: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     error: float = float("nan")
 
     def add(self, name: str, scalar: Tensor, values: Tensor | None = None, rays: Tensor | None = None) -> None:
-        """Take in a part of the loss."""
+        """Add a term of the loss."""
         self.scalars[name] = scalar
         if values is not None and rays is not None:
             self.values[name] = (values.detach(), rays)
@@ -45,7 +45,8 @@ class Terms:
 
 
 def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float) -> Terms:
-    """All parts of [NeuFace eq. 20]. A batch without rays near the subject gives zeros."""
+    """All terms of [NeuFace eq. 20]. A batch without rays near the subject gives zeros. smooth_scale: factor of the
+    smoothness term."""
     device = batch.alpha.device
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
@@ -75,9 +76,9 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     uneven = losses.albedo_sparsity(shaded.albedo)
     out.add("albedo_sparsity", settings.albedo_sparsity * uneven.mean(), uneven, rays)
     if model.spec.specular:
-        gauge = losses.shininess_prior(shaded.inv_kappa, TYPICAL_INV_KAPPA)
-        out.add("shininess_prior", settings.shininess_prior * gauge.mean(), gauge, rays)
-    if grid_of(model.geometry).values.requires_grad:  # a surface that rests is as smooth as it is
+        shininess = losses.shininess_prior(shaded.inv_kappa, TYPICAL_INV_KAPPA)
+        out.add("shininess_prior", settings.shininess_prior * shininess.mean(), shininess, rays)
+    if grid_of(model.geometry).values.requires_grad:  # not for a frozen surface
         out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
         out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
@@ -87,15 +88,15 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
 def calibrated_colours(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:
     """I_n = A_n I: (V, 3, 3), (N,), (N, 3) -> (N, 3). [NeuFace eq. 19]
 
-    The matrices are picked by a product with 0 and 1: the gradient of an indexed pick adds up in an order that depends
-    on timing, and a fit would no longer repeat bit by bit.
+    The matrices are selected by a product with one-hot vectors: the gradient of indexing is summed in an order that
+    depends on timing, and a fit would not be deterministic.
     """
     chosen = torch.nn.functional.one_hot(view, len(matrices)).to(colour) @ matrices.reshape(-1, 9)
     return torch.einsum("nij,nj->ni", chosen.reshape(-1, 3, 3), colour)
 
 
 def _smoothness(model: FaceModel, x: Tensor, generator: torch.Generator) -> Tensor:
-    """Mean normal change over a jitter of one cell."""
+    """Mean change of the normal between points x (N, 3) and copies displaced by a random step of about one cell."""
     step = torch.randn(x.shape, generator=generator).to(x) * model.geometry.cell
     _, g = model.geometry(torch.cat([x, x + step]))
     n, near = unit(g).chunk(2)

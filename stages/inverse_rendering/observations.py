@@ -1,8 +1,8 @@
-"""Surface points with what every photo shows of them: the raw material of the evidence (cross_validation.py).
+"""Observations: surface points with their colours in all photos, for cross-validation and light estimation.
 
 Symbols: P points x with normals n; an observation is one of M pairs (point, view) in which the view sees the point:
-c (M, 3) the photo's linear colour there, wo (M, 3) towards the camera. Points are where random rays of the photos meet
-the surface, so that they lie as dense as the photos look.
+c (M, 3) the photo's linear colour there, wo (M, 3) towards the camera. Points are the hits of random rays of the
+photos, so their density follows that of the views.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, Rays, factor
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-MIN_COSINE = 0.35  # flatter views smear a pixel over too much surface
-CLEARANCE_CELLS = 2.5  # how far before the point a ray may end and still count as having seen it
-SIDE = 256  # pixels: coarse enough for a surface that is a millimetre off
+MIN_COSINE = 0.35  # at grazing angles a pixel covers too much surface
+CLEARANCE_CELLS = 2.5  # tolerance of the occlusion test
+SIDE = 256  # pixels: coarse enough for a surface with an error of a millimetre
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A photo at the size at which colours are looked up, sRGB decoded; `view` its camera at the photo's own size."""
+    """A photo reduced by `factor`: rgb (h, w, 3) linear, alpha (h, w). view: photo and camera at the original size."""
 
     view: PhotoView
     factor: int
@@ -42,7 +42,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """x, n (P, 3); point, view (M,) into the points and the fit's views; colour, wo (M, 3)."""
+    """x, n: (P, 3) points and normals. point, view: (M,) indices of point and view. colour, wo: (M, 3)."""
 
     x: Tensor
     n: Tensor
@@ -53,7 +53,7 @@ class Observations:
 
     @property
     def normal(self) -> F64:
-        """(M, 3)."""
+        """n of each observation (M, 3)."""
         return np.asarray(self.n.double().cpu().numpy()[self.point], np.float64)
 
     @property
@@ -75,7 +75,7 @@ def point_means(point: I64, values: F64, counts: F64) -> F64:
 
 
 def lobe_basis(direction: F64, falls: F64) -> F64:
-    """A_l Y_lm (M, (L + 1)^2) at directions (M, 3); falls: A_l of each lobe, (M, L + 1), or of all, (1, L + 1)."""
+    """A_l Y_lm (M, (L + 1)^2) at directions (M, 3). falls: A_l of each lobe (M, L + 1), or of all lobes (1, L + 1)."""
     order = falls.shape[1] - 1
     spread = np.repeat(falls, 2 * np.arange(order + 1) + 1, axis=1)
     return np.asarray(sh.sh_basis(torch.from_numpy(direction), order).numpy() * spread, np.float64)
@@ -91,7 +91,7 @@ def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
 
 
 def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
-    """x and unit n (P, 3) where rays meet the surface; rays that meet nothing are left out."""
+    """x and unit n (P, 3) where rays hit the surface, without the rays that miss it."""
     with torch.no_grad():
         near, far = box_interval(rays.o, rays.d, *geometry.box())
         t, hit, _ = geometry.trace(rays.o, rays.d, near, far)
@@ -100,7 +100,8 @@ def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def observe(geometry: Geometry, shots: list[Picture], x: Tensor, n: Tensor) -> Observations:
-    """Every photo's look at the points: inside the frame and the mask, not too flat, nothing before it."""
+    """Observations of points x with normals n (P, 3) in all photos: inside frame and mask, not at a grazing angle, not
+    occluded."""
     points, normals = (a.detach().cpu().double().numpy() for a in (x, n))
     parts = [_seen_by(geometry, shot, points, normals, x) for shot in shots]
     view = np.concatenate([np.full(len(p[0]), i, np.int64) for i, p in enumerate(parts)])
@@ -141,7 +142,7 @@ def _look_up(shot: Picture, at: F64) -> tuple[F64, F64]:
 
 
 def _free(geometry: Geometry, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
-    """Whether rays from the camera reach the points."""
+    """(N,) whether the points are not occluded. centre: (3,) of the camera; wo (N, 3); distance (N,)."""
     d = torch.from_numpy(-wo).to(x)
     o = torch.from_numpy(centre).to(x).expand_as(d).contiguous()
     reach = torch.from_numpy(distance).to(x) - CLEARANCE_CELLS * geometry.cell

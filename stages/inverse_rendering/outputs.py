@@ -1,4 +1,4 @@
-"""From the fitted model to files: the light, the held-out views, and the facts that the report shows."""
+"""Outputs of the fit: the light, the held-out views, and the facts for the report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ F32 = npt.NDArray[np.float32]
 
 
 def write_light(model: FaceModel, context: Context) -> None:
-    """light.json: raw coefficients and the conventions that they need."""
+    """Write light.json: SH coefficients and their conventions."""
     coefficients = model.light().detach().cpu().double().numpy().round(7).tolist()
     (context.workdir / "light.json").write_text(
         json.dumps(
@@ -41,12 +41,11 @@ def write_light(model: FaceModel, context: Context) -> None:
 
 
 def held_out_responses(model: FaceModel, capture: Capture, fitted: Sequence[int]) -> dict[int, Matrix]:
-    """Rows of e_n A_g for every held-out view: its exposure, and the mean colour response of the fitted photos
-    (indices in the model's order) by the same kind of camera; the mean response, I, where there are none. [NeuFace
-    eq. 19]
+    """Rows (3, 3) of e_n A_g for every held-out view: its exposure times the mean colour response of the fitted photos
+    (indices in the model's order) of the same camera; the identity if there are none. [NeuFace eq. 19]
 
-    Differs: the paper has one kind of camera, and scores its test views after a 3 x 3 matrix of their own. What a kind
-    of camera does to colours is known from its fitted photos, without a look at the held-out ones.
+    Differs: the paper has one camera, and scores each test view after a 3 x 3 matrix fitted to that view. Here the
+    response of a camera comes from its fitted photos only.
     """
     group = {v.index: v.camera_group for v in capture.views}
     matrices = model.calibration().detach().cpu().double().numpy() if model.spec.calibrated else None
@@ -67,7 +66,7 @@ def predict_held_out(
     samples: int,
     context: Context,
 ) -> tuple[HeldOutView, ...]:
-    """EXR and PNG of every held-out view, in the photo's pixels or an integer factor smaller."""
+    """Write EXR and PNG of every held-out view, at the photo's size or an integer factor smaller."""
     responses = held_out_responses(model, capture, fitted)
     known = [c for c in poses.cameras if c.index in responses]
     out = []
@@ -87,7 +86,7 @@ def predict_held_out(
 
 
 def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, device: str) -> F32:
-    """(H / factor, W / factor, 4) linear RGBA, premultiplied; the lens's distortion is in the rays.
+    """(H / factor, W / factor, 4) linear RGBA, premultiplied, with the lens's distortion.
 
     No calibration is applied: the colours are those of the mean response, A = I.
     """
@@ -98,7 +97,7 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
 
 
 def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[str, str | float | bool]]:
-    """What was modelled, what was left out, and the evidence for it, for the report."""
+    """The selected model and the figures of each decision, for the report."""
     settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
@@ -106,7 +105,7 @@ def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[st
         "geometry": {
             "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
             "cell_mm": round(model.geometry.cell * 1e3, 4),
-            "why": "no licensed prior" if settings.prior == "hull" else "setting",
+            "why": "no face prior with a suitable licence" if settings.prior == "hull" else "setting",
         },
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
@@ -124,7 +123,7 @@ def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[st
 
 
 def _schedule(trainer: Trainer) -> dict[str, str | float | bool]:
-    """How long the fit was, and what set its length. Seconds are left out where they do not repeat."""
+    """Length of the fit, and what determined it. No measured seconds, because they are not repeatable."""
     if not trainer.settings.by_clock:
         return {"steps": trainer.step, "why": "setting"}
-    return {"steps": trainer.step, "seconds_of_the_stage": trainer.settings.seconds, "why": "ended by the clock"}
+    return {"steps": trainer.step, "seconds_of_the_stage": trainer.settings.seconds, "why": "ended by the time limit"}

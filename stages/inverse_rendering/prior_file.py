@@ -1,10 +1,10 @@
-"""The checkpoint of a prior, as settings name it. Importing this is light: settings are checked without torch."""
+"""Hash of a prior's checkpoint. This module does not import torch, so that settings are checked quickly."""
 
 from __future__ import annotations
 
 
 def prior_digest(path: str) -> str:
-    """sha256 of a prior's checkpoint, or "" where there is no such file (the loader then says so)."""
+    """sha256 of a prior's checkpoint; "" if the file does not exist (the loader then raises an error)."""
     from pipeline.fields.paper.imface_layout import digest
 
     return digest(path)

@@ -1,7 +1,7 @@
-"""Photos as tables of rays: which pixels take part, where they look, what they should show.
+"""Pixels of the photos as rays: selection, directions, target colours and random batches.
 
-Symbols: a view's pixel at image position uv looks along R (x, y, 1), with (x, y) its exactly undistorted position on
-the z = 1 plane. Photos are never resampled to remove distortion; a smaller size is a mean over whole blocks of pixels.
+Symbols: a view's pixel at image position uv has the ray direction R (x, y, 1), with (x, y) its exactly undistorted
+position on the z = 1 plane. Photos are never resampled to remove distortion; a smaller size is the mean over blocks.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from pipeline.images import shrink_whole
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
-NEAR_BAND = 0.05  # background pixels within this share of the image side of the subject are worth rays
-FAR_EVERY = 16  # of the background beyond, one pixel in so many keeps stray matter away
-DARKEST = 1e-4  # mean radiance that a light starts from at least
-WHOLE = 0.99  # alpha from which a pixel shows the subject alone
+NEAR_BAND = 0.05  # of the image side: all background pixels within this distance of the subject are used
+FAR_EVERY = 16  # of the other background pixels one in so many is used, against floating artefacts
+DARKEST = 1e-4  # smallest mean radiance for the initial light
+WHOLE = 0.99  # alpha of a fully covered pixel
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoView:
     """A photo with its camera: rgb (H, W, 3) linear, alpha (H, W) in [0, 1], at the photo's size.
 
-    clipped: (H, W) share of each pixel that is at the end of the camera's range, None if none is. doubtful: (H, W)
-    where the mask contradicts the other views: neither subject nor background is learned there; None if nowhere.
-    asked: (H, W) in [0, 1], below 1 where the subject lies beyond its extent: as doubtful; None if nowhere.
+    K: (3, 3) pixels; world_from_cam: (4, 4); distortion: k1 k2 p1 p2 k3. clipped: (H, W) clipped share of each pixel,
+    None if none is clipped. doubtful: (H, W) where the mask contradicts the other views; these pixels are not fitted;
+    None if nowhere. asked: (H, W) in [0, 1], below 1 where the subject is beyond its extent; only 1 is fitted; None if
+    all pixels count.
     """
 
     index: int
@@ -49,7 +50,7 @@ class PhotoView:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height."""
+        """(width, height) in pixels."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
 
@@ -63,10 +64,10 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Rays with what the photos show there: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit.
+    """Rays with their pixels: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit.
 
-    share: (N,) what a ray stands for in the mask's term, mean 1: inverse to how likely its pixel was to be drawn.
-    Without it the side that is drawn more often would push the silhouette, by beta ln(ratio).
+    share: (N,) weight of a ray in the mask term, mean 1: inverse to the probability of its pixel. Without it the side
+    that is drawn more often would shift the silhouette by beta ln(ratio).
     """
 
     rays: Rays
@@ -77,9 +78,9 @@ class Batch:
 
 
 def factor_for(size: tuple[int, int], side: int, *, exact: bool = False) -> int:
-    """The smallest block that brings the longest side to `side` or below.
+    """The smallest block size, in pixels, that reduces the longest side of (width, height) to at most `side`.
 
-    exact: the largest block up to that which divides the photo, for pictures that are compared with it.
+    exact: the largest block size up to that which divides the photo, for pictures that are compared with it.
     """
     f = max(-(-max(size) // side), 1)
     if exact:
@@ -96,7 +97,7 @@ def normalised_positions(view: PhotoView, factor: int) -> F32:
 
 
 class PixelTable:
-    """The pixels of all fitted views at one resolution, ready to be drawn from."""
+    """The pixels of all fitted views at one resolution, for random batches."""
 
     def __init__(self, views: list[PhotoView], side: int, device: str) -> None:
         parts: list[tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]] = []
@@ -111,28 +112,28 @@ class PixelTable:
         self.R = torch.from_numpy(np.stack([v.world_from_cam[:3, :3] for v in views]).astype(np.float32)).to(device)
         self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
 
-    def wait(self, views: tuple[int, ...]) -> None:
-        """Draw from all views but these (positions in the fit) from now on."""
+    def exclude(self, views: tuple[int, ...]) -> None:
+        """Draw from all views except these (positions in the fit) from now on."""
         out = torch.tensor(views, dtype=self.view.dtype, device=self.view.device)
         self.inside, self.outside = (p[~torch.isin(self.view[p], out)] if views else p for p in self._pools)
 
     def only(self, views: tuple[int, ...]) -> PixelTable:
-        """The same table drawing from these views alone."""
+        """The same table, restricted to these views."""
         out = copy.copy(self)
         these = torch.tensor(views, dtype=self.view.dtype, device=self.view.device)
         out.inside, out.outside = (p[torch.isin(self.view[p], these)] for p in self._pools)
         return out
 
     def mean_colour(self) -> Tensor:
-        """(3,) mean linear radiance of the subject over all photos, at least DARKEST: black photos still need a light
-        that can grow."""
+        """(3,) mean linear radiance of the subject over all photos, at least DARKEST, so that the initial light is not
+        zero."""
         if not len(self.inside):
             return torch.full((3,), DARKEST, device=self.target.device)
         s = self.target[self.inside[:: max(len(self.inside) // 100_000, 1)]].float()
         return (((s + 0.055) / 1.055).clamp(min=0) ** 2.4).mean(0).clamp(min=DARKEST)
 
     def draw(self, n: int, outside_share: float, seed: int) -> Batch:
-        """A random batch that depends on the seed alone."""
+        """A random batch of n rays that depends on the seed only. outside_share: share of background pixels."""
         generator = torch.Generator().manual_seed(seed)
         n_out = int(n * outside_share) if len(self.outside) else 0
         picks, shares = [], []
@@ -146,7 +147,7 @@ class PixelTable:
         return self.at(i, share / share.mean())
 
     def at(self, i: Tensor, share: Tensor | None = None) -> Batch:
-        """The pixels i (N,) of the table. share: see Batch; 1 where it is not told."""
+        """The batch of the pixels i (N,) of the table. share: see Batch; 1 if None."""
         view = self.view[i].long()
         share = torch.ones_like(self.alpha[i]) if share is None else share
         return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share)
@@ -170,7 +171,7 @@ def _pixels_of(
     far = np.zeros_like(near)
     far.reshape(-1)[n % FAR_EVERY :: FAR_EVERY] = True
     take = inside | near | far
-    if view.clipped is not None:  # what is clipped shows a lower bound; of the background it still shows that it is one
+    if view.clipped is not None:  # a clipped value is only a lower bound; clipped background is still background
         take &= ~(inside & (shrink_whole(view.clipped, factor) > 0))
     if view.doubtful is not None:
         take &= shrink_whole(view.doubtful.astype(np.float32), factor) == 0

@@ -1,11 +1,11 @@
-"""Rendering a batch of rays with the model: trace, sample a thin shell, weigh, shade. [NeuFace section 4.4]
+"""Rendering of a batch of rays: sphere tracing, samples in a thin shell, weights, shading. [NeuFace section 4.4]
 
-Symbols: t_0 hit or closest approach; samples at t_0 +- w, w so wide that the shell crosses the soft surface at any
+Symbols: t_0 hit or closest approach; samples at t_0 +- w, w wide enough that the shell crosses the soft surface at any
 angle; tau optical depth; x_s, n the point and normal averaged by the weights of [NeuFace eq. 18].
 
-Differs: shading is evaluated once a ray, at x_s, and not at every sample: over a shell of under a millimetre the
-radiance is close to linear, so that the mean of the values is the value at the mean. `volumetric` shades every sample
-and takes the mean, as the paper does; docs/benchmarks.md has what that costs and brings.
+Differs: shading is evaluated once per ray, at x_s, and not at every sample: over a shell of less than a millimetre the
+radiance is nearly linear, so the mean of the values is the value at the mean. `volumetric` shades every sample and
+averages, as the paper does; docs/benchmarks.md compares both.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from stages.inverse_rendering.ray_sampling import Rays
 SHELL_CELLS, SHELL_BETAS = 1.5, 4.0
 MIN_COSINE = 0.25
 LAYERS = 3
-REACH_BETAS = 12.0  # beyond this closest approach a ray's opacity is below e^-12 whatever its length in the shell
+REACH_BETAS = 12.0  # a ray with a larger closest approach has an opacity below e^-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class Shell:
 def sample_shell(
     model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None, keep: Tensor | None, start: Tensor | None = None
 ) -> Shell:
-    """Trace the rays and weigh samples around the surface. `jitter` (N, S) in [0, 1), default the middle of each
-    interval. `keep`: rays that are wanted even if they pass far from the surface. `start`: (N,) t to begin at."""
+    """Trace the rays and weight samples around the surface. `jitter` (N, S) in [0, 1), default the centre of each
+    interval. `keep`: (N,) rays that are kept even if they pass far from the surface. `start`: (N,) first t."""
     geometry = model.geometry
     near, far = box_interval(rays.o, rays.d, *geometry.box())
     near = near if start is None else torch.maximum(near, start)
@@ -80,14 +80,14 @@ def _weigh(model: FaceModel, s: Tensor, w: Tensor, hit: Tensor) -> tuple[Tensor,
 
 
 def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
-    """w (M,): wide enough that the SDF runs over +-(SHELL_CELLS cells, SHELL_BETAS beta) at this angle."""
+    """w (M,): wide enough that the SDF covers +-(SHELL_CELLS cells, SHELL_BETAS beta) at this angle."""
     with torch.no_grad():
         cosine = (unit(model.geometry(x)[1]) * d).sum(-1).abs().clamp(min=MIN_COSINE)
     return max(SHELL_CELLS * model.geometry.cell, SHELL_BETAS * float(model.beta)) / cosine
 
 
 def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Shaded:
-    """Radiance of some of a shell's rays (`pick` indexes the shell)."""
+    """Radiance (K, 3) of the rays `pick` (K,), indices into the shell."""
     wo = -rays.d[shell.kept[pick]]
     if not model.spec.volumetric:
         return model.shade(shell.x[pick], shell.n[pick], wo)
@@ -106,9 +106,9 @@ def _mean(values: Tensor, share: Tensor) -> Tensor:
 
 
 def solid_behind(model: FaceModel, shell: Shell, rays: Rays) -> Tensor:
-    """(M,) OPAQUE for rays that graze an edge and then hit what lies behind it (an ear before the head), else 0.
+    """(M,) OPAQUE for rays that graze an edge and then hit the surface behind it (an ear in front of the head), else 0.
 
-    Such a ray's mask says nothing about the edge; without this, every inner contour would be pushed outward.
+    The mask of such a ray does not constrain the edge; without this, every inner contour would move outwards.
     """
     out = torch.zeros_like(shell.tau)
     thin = torch.nonzero(shell.hit & (shell.tau.detach() < OPAQUE)).squeeze(-1)
@@ -138,7 +138,7 @@ def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536)
 
 
 def _render_chunk(model: FaceModel, rays: Rays, samples: int) -> tuple[Tensor, Tensor]:
-    """Layers front to back: where an edge is thin, what lies behind it shows through."""
+    """Composite layers front to back, so that the surface behind a thin edge is visible through it."""
     colour, opacity = torch.zeros_like(rays.d), torch.zeros_like(rays.d[:, 0])
     index, start = torch.arange(len(rays.d), device=rays.d.device), None
     with torch.no_grad():

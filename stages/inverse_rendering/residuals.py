@@ -1,8 +1,8 @@
-"""What the finished fit leaves unexplained of the photos that it was fitted to: a sample of each photo's pixels,
-rendered and compared. It draws from generators of its own and changes nothing of the fit.
+"""Errors of the finished fit in the fitted photos, on a sample of each photo's pixels. It has its own random generators
+and does not change the fit.
 
-Symbols: c the photo's colour, A_n I the rendered one with the photo's own colour response [NeuFace eq. 19], e the
-difference of both in sRGB.
+Symbols: c the photo's colour, A_n I the rendered one with the photo's colour response [NeuFace eq. 19], e their
+difference in sRGB.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from stages.inverse_rendering.systems import render_any
 
 U8 = npt.NDArray[np.uint8]
 PIXELS = 60_000  # of all photos' subjects together: about a second on two cores
-MAX_PIXELS, MIN_PIXELS = 2000, 300  # of one photo: its PSNR is then known to about 0.2 and 0.5 dB
+MAX_PIXELS, MIN_PIXELS = 2000, 300  # of one photo: its PSNR is then accurate to about 0.2 and 0.5 dB
 SEED = 40_961
 DARK = 1e-6  # mean radiance below which a photo is black
-HALF = 0.5  # opacity from which the field is taken to be there
+HALF = 0.5  # smallest opacity of a covered pixel
 
 
 @dataclass(frozen=True, slots=True)
 class LabelError:
-    """pixels: how many of one label were compared. square: their mean squared error, sRGB."""
+    """pixels: number of compared pixels of one label. square: their mean squared error, sRGB."""
 
     pixels: int
     square: float
@@ -42,11 +42,11 @@ class LabelError:
 
 @dataclass(frozen=True, slots=True)
 class ViewError:
-    """One photo. square: mean squared error over its subject's pixels, sRGB. covered: over those where the field
-    is not empty, so that a mask with a piece too much is not taken for a wrong photo. relative: root mean square of the
-    linear residual over the mean linear radiance. missing: share of the subject's pixels where the field is empty.
-    beyond: share of the background's pixels, near the subject, where it is not. noise: standard deviation of the
-    photo's own noise, sRGB, at the fit's size. labels: the same error by the label's name, where the photo has labels.
+    """Errors of one photo. square: mean squared error over its subject's pixels, sRGB. covered: the same over pixels
+    where the model is not empty, so that a mask that includes too much does not count as a wrong photo. relative: RMS
+    of the linear residual over the mean linear radiance. missing: share of the subject's pixels where the model is
+    empty. beyond: share of the background's pixels, near the subject, where it is not. noise: standard deviation of the
+    photo's noise, sRGB, at the fit's size. labels: errors by label name, if the photo has labels.
     """
 
     index: int
@@ -61,7 +61,7 @@ class ViewError:
 
     @property
     def psnr(self) -> float:
-        """Of the covered pixels; dB, at most 100."""
+        """PSNR of the covered pixels in dB, at most 100."""
         return decibels(self.covered)
 
 
@@ -79,8 +79,8 @@ def view_errors(
     labels: Sequence[U8 | None] = (),
     names: Sequence[str] = (),
 ) -> tuple[ViewError, ...]:
-    """The error of every view that has pixels of its subject in the table. table: all views at `side` pixels. labels:
-    (H, W) codes of each view at any size, None where there are none; names: what the codes mean."""
+    """The errors of every view with subject pixels in the table. table: all views at `side` pixels. labels: (H, W)
+    codes of each view at any size, or None; names: of the codes."""
     most = min(max(PIXELS // max(len(views), 1), MIN_PIXELS), MAX_PIXELS)
     inside = _sample(table, table.inside, len(views), most, SEED)
     inside = [pool[table.alpha[pool] > WHOLE] for pool in inside]
@@ -126,7 +126,7 @@ def photo_noise(view: PhotoView, side: int) -> float:
 
 
 def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Tensor]:
-    """Linear colour (N, 3) as the photos' own cameras answer to it, and opacity (N,)."""
+    """Linear colour (N, 3) with the photos' colour responses, and opacity (N,)."""
     with torch.no_grad():
         colour, opacity = render_any(model, batch.rays, samples)
         if model.spec.calibrated:
@@ -135,8 +135,8 @@ def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Ten
 
 
 def _sample(table: PixelTable, pool: Tensor, count: int, most: int, seed: int) -> list[Tensor]:
-    """At most so many of a pool's pixels, which lie view by view, for each of `count` views; at random with a
-    generator of its own."""
+    """At most `most` random pixels of a pool, which is sorted by view, for each of `count` views; with its own
+    generator."""
     generator = torch.Generator().manual_seed(seed)
     of = table.view[pool].long()
     ends = torch.searchsorted(of, torch.arange(count + 1, device=of.device)).tolist()
@@ -152,7 +152,7 @@ def _sample(table: PixelTable, pool: Tensor, count: int, most: int, seed: int) -
 def _by_label(
     view: PhotoView, xy: Tensor, square: Tensor, codes: U8 | None, names: Sequence[str]
 ) -> dict[str, LabelError]:
-    """Errors of a view's pixels by the name of the label under each; xy (N, 2) on the z = 1 plane."""
+    """Errors of a view's pixels by label name. xy: (N, 2) on the z = 1 plane; square: (N,) squared errors."""
     if codes is None:
         return {}
     positions = np.asarray(xy.cpu().numpy(), np.float64)

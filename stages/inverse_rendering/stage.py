@@ -1,4 +1,4 @@
-"""The stage: settings from a preset, photos from the store, a fitted field and its held-out views back."""
+"""The stage: fits the model to the photos and predicts the held-out views."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
             where="inverse_rendering",
             value=len(usable),
             limit=f"at least {MIN_VIEWS}",
-            remedy="add photos, or hold fewer back with --holdout",
+            remedy="add photos, or hold out fewer with --holdout",
         )
     context.progress(0, settings.steps, "reading photos")
     views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
@@ -103,7 +103,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
 
 
 def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_differ: Callable[[], bool]) -> bool:
-    """Whether per-image colour matrices are fitted: by the setting, else by metadata, cameras or the photos."""
+    """Whether per-image colour matrices are fitted at the start: by the setting, else by metadata, cameras or
+    photos."""
     if config.calibration != AUTO:
         return config.calibration == "on"
     capture = inputs.capture.artifact

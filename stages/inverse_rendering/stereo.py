@@ -1,8 +1,8 @@
-"""The geometry's start, moved from the visual hull to where the photos agree: a plane sweep along the hull's normals.
+"""Refinement of the initial geometry by plane-sweep stereo along the hull's normals.
 
-A hull fills every hollow that no silhouette shows: beside the neck, behind the ears, above the collar bones. Rendering
-losses pull only on what is near a surface, and stay with such a fill for ever. A patch of skin, carried inwards along
-the normal and compared between the photos that see it, finds the true depth at once (measured in docs/benchmarks.md).
+A hull fills concavities that no silhouette shows: beside the neck, behind the ears, above the collar bones. Rendering
+losses act only near the surface and can't remove such a fill. A sweep moves a patch inwards along the normal, compares
+it between the photos that see it, and so finds the true depth directly (measured in docs/benchmarks.md).
 
 Symbols: points P (N, 3) on the start's zero set with unit normals (N, 3), asset units; a sweep's offsets (J,) along the
 normals, positive outwards; scores (N, J) of pipeline.maths.correlation.agreement.
@@ -33,23 +33,24 @@ from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
-SIDE = 512  # pixels of the photos' longest side: a patch then spans some 4 mm of a head
-HALF, SPACING = 2, 2.0  # a patch is (2 HALF + 1)^2 samples, so many pixels apart
-BLUR = 0.7  # pixels: what lies between samples two apart goes, and most of the noise with it
-VIEWS = 6  # that look at a point most squarely are compared
-MIN_COSINE = 0.25  # between a normal and the way to a camera
-POINTS = 12_000  # of the surface that one sweep takes
-CERTAIN = 4e-3  # squared confidence, mean over what lies around, at which a point moves half way: noise reaches 6e-2
+SIDE = 512  # pixels of the photos' longest side: a patch then covers about 4 mm of a head
+HALF, SPACING = 2, 2.0  # a patch has (2 HALF + 1)^2 samples; SPACING: their distance in pixels
+BLUR = 0.7  # pixels: against aliasing of samples two pixels apart, and against noise
+VIEWS = 6  # number of views, those nearest to a point's normal, that are compared
+MIN_COSINE = 0.25  # between a normal and the direction to a camera
+POINTS = 12_000  # surface points of one sweep
+CERTAIN = 4e-3  # squared confidence, mean over the neighbours, at which a point moves half way: noise reaches 6e-2
 GREY = np.array([0.3, 0.6, 0.1], np.float32)
 LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-INSIDE, MIN_PIXELS = 0.99, 500  # alpha and number of the pixels that tell the noise
+INSIDE, MIN_PIXELS = 0.99, 500  # smallest alpha and number of pixels for the noise estimate
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Reach outwards and inwards as shares of the subject's longest side; a step in pixels; points that vote on one.
+    """Range outwards and inwards as shares of the subject's longest side; step in pixels; points that vote on an
+    offset.
 
-    inward_clean: inwards where the photos' noise is below FLOOR: of noisy skin the best of many depths is chance.
+    inward_clean: inwards if the photos' noise is below FLOOR: on noisy skin the best of many depths is random.
     """
 
     outward: float
@@ -68,9 +69,9 @@ SWEEPS = (
 
 @dataclass(frozen=True, slots=True)
 class Photos:
-    """Grey photos without distortion, one after the other in `grey`; `first`, `width` and `height` (V,) say where.
+    """Grey photos without distortion, concatenated in `grey`; `first` (V,) offsets, `width` and `height` (V,) pixels.
 
-    image_from_world (V, 3, 4); centre (V, 3). noise: standard deviation of what is left of the sensor's noise.
+    image_from_world (V, 3, 4); centre (V, 3). noise: standard deviation of the noise after the blur.
     """
 
     grey: Tensor
@@ -85,9 +86,9 @@ class Photos:
 def start_from_photos(
     hull: Start, views: list[PhotoView], device: str, check: Callable[[], None] = lambda: None
 ) -> Start:
-    """The hull's SDF moved to where the photos agree; unchanged where they do not tell, as on skin without a mark.
+    """The hull's SDF moved to where the photos agree; unchanged where they do not determine depth, as on smooth skin.
 
-    check is called every second or so: it raises where the user has stopped the run.
+    check: called about every second; it raises if the run was cancelled.
     """
     photos = photos_of(views, device)
     values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
@@ -109,7 +110,8 @@ def start_from_photos(
 
 
 def photos_of(views: list[PhotoView], device: str) -> Photos:
-    """Photos of at most SIDE pixels, encoded so that a step of brightness means as much in shade as in light."""
+    """Grey photos of at most SIDE pixels, gamma-encoded, so that equal steps are about equally visible in light and
+    shade."""
     grey, matrices, sizes, noise = [], [], [], []
     for view in views:
         f = factor_for(view.size, SIDE)
@@ -137,10 +139,11 @@ def photos_of(views: list[PhotoView], device: str) -> Photos:
 
 
 def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
-    """Standard deviation of a picture's noise (H, W) within `inside`, in its own unit; 0 where too little is inside.
+    """Standard deviation of the noise of a picture (H, W) within `inside` (H, W), in its unit; 0 if too little is
+    inside.
 
-    The median of a Laplacian's Laplacian, which smooth shading does not answer. Source: Immerkaer, Fast noise variance
-    estimation (1996), with the median absolute deviation in the place of the mean.
+    From a double Laplacian, which does not respond to smooth shading. Source: Immerkaer, Fast noise variance estimation
+    (1996), with the median absolute deviation instead of the mean.
     """
     inner = cv2.erode(inside.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
     if inner.sum() < MIN_PIXELS:
@@ -150,8 +153,8 @@ def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
 
 
 def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
-    """A photo (H, W) as a lens without distortion shows it, bilinear. Good enough to find a start with; the fit itself
-    reads the photos as they are."""
+    """A photo (H, W), undistorted by bilinear resampling. Only for the initial geometry; the fit uses the photos
+    without resampling."""
     if not np.any(distortion):
         return image
     h, w = image.shape
@@ -162,7 +165,8 @@ def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
 
 
 def surface_points(values: F32, lo: F32, cell: float) -> tuple[F64, F64]:
-    """Up to POINTS points of the zero set, evenly spread, and their normals, of the SDF smoothed over one cell."""
+    """Up to POINTS random points (N, 3) of the zero set of the SDF (X, Y, Z), smoothed over one cell, and their normals
+    (N, 3)."""
     smooth = ndimage.gaussian_filter(values, 1.0)
     node = np.argwhere(np.abs(smooth[1:-1, 1:-1, 1:-1]) < 0.6 * cell) + 1
     at = tuple(node.T)
@@ -183,8 +187,8 @@ def _difference(values: F32, at: tuple[npt.NDArray[np.intp], ...], axis: int) ->
 
 
 def best_views(points: F64, normals: F64, start: Start, photos: Photos) -> tuple[Tensor, Tensor, float]:
-    """Views (N, VIEWS) that look at each point most squarely and are not hidden from it, which of them do (N, VIEWS),
-    and a pixel's size on the surface (median)."""
+    """The VIEWS views nearest to each point's normal (N, VIEWS), which of them see the point (N, VIEWS), and the median
+    size of a pixel on the surface, asset units. points, normals: (N, 3)."""
     device = photos.grey.device
     p, n = (torch.from_numpy(x.astype(np.float32)).to(device) for x in (points, normals))
     geometry = start.surface(str(device))
@@ -210,7 +214,7 @@ def best_views(points: F64, normals: F64, start: Start, photos: Photos) -> tuple
 
 
 def _hidden(geometry: GridSdf, p: Tensor, distance: Tensor, centre: Tensor) -> Tensor:
-    """Whether a ray from the camera meets the surface more than two cells before it gets to the point."""
+    """(N,) whether a ray from the camera hits the surface more than two cells before the point."""
     d = (p - centre) / distance[:, None]
     o = centre.expand_as(d).contiguous()
     near, far = box_interval(o, d, *geometry.box())
@@ -228,7 +232,7 @@ def sweep_scores(
     photos: Photos,
     check: Callable[[], None] = lambda: None,
 ) -> F32:
-    """(N, J) how well the photos agree on the patch around each point, moved along its normal by each offset."""
+    """(N, J) agreement of the photos on the patch around each point, moved along its normal by each offset (J,)."""
     device = photos.grey.device
     n = torch.from_numpy(normals.astype(np.float32)).to(device)
     p = torch.from_numpy(points.astype(np.float32)).to(device)
@@ -250,7 +254,7 @@ def sweep_scores(
 
 
 def _tangents(n: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors (N, 3) across each unit normal."""
+    """Two unit vectors (N, 3) perpendicular to each unit normal."""
     helper = torch.zeros_like(n)
     helper.scatter_(1, n.abs().argmin(1, keepdim=True), 1.0)
     u = torch.nn.functional.normalize(torch.linalg.cross(n, helper), dim=-1)
@@ -258,10 +262,10 @@ def _tangents(n: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def vote(points: F64, normals: F64, scores: F32, offsets: F64, voters: int) -> tuple[F64, F64]:
-    """Offset (N,) on which a point and its neighbours that face the same way agree, and the confidence in it, >= 0.
+    """Offset (N,) from the scores of a point and its neighbours with similar normals, and its confidence (N,) >= 0.
 
-    A peak is refined by a parabola. One at either end of the sweep says only that the truth lies beyond: confidence 0.
-    So does a sweep of one or two offsets, which has ends alone: that of photos as coarse as the sweep is deep.
+    A peak is refined by a parabola. A peak at an end of the sweep means that the surface is beyond: confidence 0. A
+    sweep of one or two offsets has only ends, so its confidence is 0 too; it occurs with very coarse photos.
     """
     if len(offsets) < 3:
         return np.zeros(len(points)), np.zeros(len(points))
@@ -281,8 +285,8 @@ def vote(points: F64, normals: F64, scores: F32, offsets: F64, voters: int) -> t
 
 
 def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float) -> F32:
-    """The SDF with its zero set moved along the normals: its values grow by what nearby points say they lie too far
-    out, then are scaled to distances; far from the surface they are distances anew."""
+    """The SDF with its zero set moved along the normals: the weighted offsets of nearby points are subtracted from its
+    values, which are then made distances again. offset, confidence: (N,) of points (N, 3); reach: asset units."""
     cell = start.cell
     node = np.argwhere(np.abs(start.values) < reach + 3 * cell)
     distance, near = cKDTree(points).query(start.lo + cell * node, min(24, len(points)), workers=-1)
@@ -296,7 +300,8 @@ def moved(start: Start, points: F64, offset: F64, confidence: F64, reach: float)
 
 
 def distances(values: F64, lo: F32, cell: float) -> F32:
-    """The subject's pieces of the zero set as a signed distance: to first order nearby, by a transform further out."""
+    """The subject's components of the SDF (X, Y, Z) as a signed distance: to first order near the surface, by a
+    distance transform elsewhere."""
     slope = np.sqrt(sum(g**2 for g in np.gradient(ndimage.gaussian_filter(values, 1.0), cell)))
     near = values / np.clip(slope, 0.5, 2.0)
     solid = filled(subject_pieces(values < 0, lo, cell))

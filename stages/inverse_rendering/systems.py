@@ -1,5 +1,5 @@
-"""Whose method: ours, or the paper's own. The one door to stages.inverse_rendering.paper, which is loaded only where
-it is asked for. Importing this is light: settings are checked without torch."""
+"""Choice between method fast and method paper. Only this module imports stages.inverse_rendering.paper, and only when
+it is used. It does not import torch itself, so that settings are checked quickly."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def trainer_for(
     views: list[PhotoView], start: Start, settings: Config, calibrated: bool, device: str, prior: Start
 ) -> Trainer:
-    """A fit that has not begun, by the settings' method. prior: the surface that any relief is judged against."""
+    """A new trainer of the settings' method. prior: the surface with which refined geometry is compared."""
     if settings.method == "fast":
         from stages.inverse_rendering.initialise import new_trainer
 

@@ -1,5 +1,5 @@
-"""A fit by the clock: what is left for training once reading the photos before it and rendering the held-out views
-after it have had their share of the stage's time."""
+"""Time budget of a fit with a time limit: the time for training without that for reading photos and rendering held-out
+views."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from stages.inverse_rendering.load_views import camera_only
 from stages.inverse_rendering.ray_sampling import Rays, factor_for, image_rays
 from stages.inverse_rendering.render import render_rays
 
-MIN_TRAINING = 0.25  # share of the stage's seconds that training has in any case: a field must come out of it
+MIN_TRAINING = 0.25  # share of the stage's seconds that training always gets
 TRIED = 20_000  # rays of a held-out view that are timed
-FINER = 1.5  # times what a view takes on the coarse grid that the fit begins with
+FINER = 1.5  # ratio of the rendering times on the final grid and on the initial coarse grid
 
 
 class Clock:
-    """Seconds since it was made."""
+    """A stopwatch that starts when it is created."""
 
     def __init__(self) -> None:
         self.begun = time.monotonic()
 
     def elapsed(self) -> float:
-        """Seconds."""
+        """Seconds since the start."""
         return time.monotonic() - self.begun
 
 
 def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Config, device: str) -> float:
-    """What rendering the held-out views (cameras of the photos) will take, by timing some of their rays."""
+    """Estimated seconds for rendering the held-out views, by timing some of their rays. held: cameras of the photos."""
     if not held:
         return 0.0
     factors = [factor_for((c.width, c.height), settings.image_side, exact=True) for c in held]
@@ -41,7 +41,7 @@ def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Confi
     every = slice(None, None, max(len(rays.o) // TRIED, 1))
     some = Rays(rays.o[every].contiguous(), rays.d[every].contiguous())
     taken = []
-    for _ in range(2):  # the first call loads what the second then has at hand
+    for _ in range(2):  # the first call includes one-time loading
         clock = Clock()
         render_rays(model, some, settings.samples)
         if device == "cuda":

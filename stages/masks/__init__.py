@@ -1,1 +1,1 @@
-"""masks: photos and cameras in, one soft mask of the subject per view out."""
+"""masks: one soft alpha mask of the subject for each view."""

@@ -20,35 +20,39 @@ class Config(StageConfig):
 
     method: Method = Field(
         "auto",
-        description="given: the capture's masks; plate: its clean plates; key: uniform background; person: learned "
-        "segmentation of people; object: what the sparse points show to stand on a support; grabcut: colour statistics "
-        "around the region of interest; auto: the first of these that works",
+        description="given: the capture's masks; plate: its clean plates; key: uniform background; "
+        "person: network for people; object: silhouette of the sparse points above a support plane; grabcut: colour "
+        "models around the region of interest; auto: the first of these that works",
     )
-    model: str = Field("", description="a segmentation network of your own, an ONNX file: used where auto would guess")
-    model_sha256: ContentHash = Field("", description="sha256 of model: another content is another result")
+    model: str = Field(
+        "", description="your own segmentation network, an ONNX file; auto prefers it to the methods from key on"
+    )
+    model_sha256: ContentHash = Field("", description="sha256 of model, set automatically")
     model_side: Pixels = Field(320, ge=32, le=2048, description="edge of the square input of model")
     model_imagenet: bool = Field(
-        False, description="normalise the input of model as networks trained on ImageNet expect"
+        False, description="normalise the input of model by ImageNet's mean and standard deviation"
     )
-    threshold: Share = Field(0.5, gt=0, lt=1, description="probability from which a pixel counts as a person")
+    threshold: Share = Field(
+        0.5, gt=0, lt=1, description="smallest probability of a subject pixel in a network's output"
+    )
     hull_cells: Annotated[int, Unit("voxels")] = Field(
         64,
         ge=16,
         le=256,
-        description="voxels along each edge of the grid in which the masks are held against each other",
+        description="voxels along each edge of the visual hull with which the masks are compared",
     )
-    faces: bool = Field(True, description="label face and eyes in the photos that show them, and hair (hair_model)")
-    hair_model: str = Field("", description="a network of your own that knows hair, an ONNX file: hair gets a label")
-    hair_model_sha256: ContentHash = Field("", description="sha256 of hair_model: another content is another result")
+    faces: bool = Field(True, description="label face and eyes, and with hair_model hair, in the photos that show them")
+    hair_model: str = Field("", description="your own network that segments hair, an ONNX file; hair gets a label")
+    hair_model_sha256: ContentHash = Field("", description="sha256 of hair_model, set automatically")
     hair_model_side: Pixels = Field(512, ge=32, le=2048, description="edge of the square input of hair_model")
     hair_model_imagenet: bool = Field(
-        False, description="normalise the input of hair_model as networks trained on ImageNet expect"
+        False, description="normalise the input of hair_model by ImageNet's mean and standard deviation"
     )
     hair_model_class: int = Field(
-        -1, ge=-1, le=999, description="which class of hair_model is hair, counted from 0; -1: it knows nothing else"
+        -1, ge=-1, le=999, description="class of hair in the output of hair_model, counted from 0; -1: its only class"
     )
-    resegment: bool = Field(True, description="segment again where the other views contradict it")
-    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of every random choice")
+    resegment: bool = Field(True, description="segment a view again if its mask contradicts the other views")
+    seed: int = Field(0, ge=0, le=2**31 - 1, description="seed of all random numbers")
 
     @model_validator(mode="before")
     @classmethod
@@ -59,17 +63,17 @@ class Config(StageConfig):
 
 
 def _named(given: dict[str, Any], setting: str) -> dict[str, str]:
-    """A network's file with its absolute path and content; nothing where none is given.
+    """A network's absolute path and hash; empty if none is given.
 
     Raises:
-        UsageError: it is not there.
+        UsageError: the file does not exist.
     """
     if not given.get(setting):
         return {}
     path = Path(str(given[setting])).expanduser()
     if not path.is_file():
         raise UsageError(
-            "the network's file is not there",
+            "the network's file does not exist",
             where=f"masks.{setting}",
             value=given[setting],
             limit="an ONNX file",

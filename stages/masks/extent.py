@@ -1,9 +1,9 @@
-"""Which pixels show the subject inside its extent: the others are neither fitted nor scored.
+"""Which pixels count: background, and the subject inside its extent. The others are neither fitted nor scored.
 
-A pixel is asked where the first surface that its ray meets is inside, a little behind it too, and where the photo shows
-background. The surface is the hull of all masks, whose points are drawn nearest last at about one point a pixel. Where
-the subject is beside the hull (hair, a mask that others contradict) the nearest point of it tells, and far from any
-whether the ray meets the middle of the head: a head that the hull has lost must not fall out of the score.
+A subject pixel counts if the first surface on its ray is inside the extent, also at a short distance behind it. The
+surface is the visual hull of all masks; its points are drawn with a z-buffer, about one point per pixel. Where the
+subject is beside the hull (hair, a mask that others contradict), the hull's nearest point decides. Far from any point
+it is decided by whether the ray meets the centre of the head, so that a head that the hull lacks is still scored.
 """
 
 from __future__ import annotations
@@ -21,21 +21,24 @@ from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
 from stages.masks.region import F32, Bool
 
 CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head
-BEYOND = 1.25  # half-edge of that cube in radii of the extent: what is just beyond must be known as well
-POINT = 1.6  # cells a pixel of the picture that points are drawn into: no gaps
-THICK = 0.2  # h: so much is a hull thicker than the body where few photos see it: asked if inside so far along the ray
-COARSE = 48  # cells along the cube in which the subject is weighed against what lies beyond the extent
-BUST = 1.25  # volume beyond over that inside, up to which the subject stays whole (head scans .9, a seated man 1.8)
-NEAR = 0.15  # h: how far beside the hull its nearest point still tells
-FAINT = 0.01  # alpha below which a pixel is background
-NOTHING = 1e-3  # of the subject's pixels: where no more than that is left out, all is asked
+BEYOND = 1.25  # half-edge of that cube in radii of the extent, because the space just beyond is needed too
+POINT = 1.6  # cells per pixel of the picture that points are drawn into, so that there are no gaps
+THICK = 0.2  # h, the head's size: excess thickness of a hull where few photos see it; a second test this far behind
+COARSE = 48  # cells along the cube in which the volumes inside and beyond the extent are compared
+BUST = (
+    1.25  # largest volume beyond over volume inside of a subject that is kept whole (head scans .9, a seated man 1.8)
+)
+NEAR = 0.15  # h: largest distance beside the hull at which its nearest point decides
+MIN_ALPHA = 0.01  # alpha of background is below
+NOTHING = 1e-3  # of the subject's pixels: if fewer are left out, all pixels count
 
 
 def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent) -> Hull:
-    """The hull of all masks in and around the extent; a few may be wrong. alphas: (h, w) of the voting views.
+    """The visual hull of all masks in and around the extent; a few masks may be wrong. alphas: (h, w) of the voting
+    views.
 
-    A single view is enough to speak for a place: shoulders leave most frames, and without them what is beyond the cut
-    would pass for what is above it."""
+    A voxel needs only one view: shoulders are outside of most frames, and without them pixels beyond the cut would be
+    taken for pixels above it."""
     lo, hi = bounds(extent)
     middle, half = 0.5 * (lo + hi), 0.5 * BEYOND * float((hi - lo).max())
     return visual_hull(cameras, alphas, middle - half, middle + half, 2 * half / CELLS, min_views=1,
@@ -43,7 +46,7 @@ def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent)
 
 
 def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent, roi_radius: float) -> float:
-    """Volume of the masks' hull beyond the extent over that inside it, in the cube of the region of interest."""
+    """Volume of the hull of the masks (h, w) beyond the extent over that inside it, within CUBE `roi_radius`."""
     edge = CUBE * roi_radius
     hull = visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / COARSE, min_views=min(3, len(cameras)),
                        max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
@@ -52,24 +55,24 @@ def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Exten
 
 
 def asked(camera: Camera, alpha: F32, extent: Extent, points: F64) -> F32 | None:
-    """(H, W) in [0, 1], at the size of alpha: 1 where the photo is asked. None where it is all over.
+    """(H, W) in [0, 1], at the size of alpha (H, W): 1 for pixels that count. None if all do.
 
     points: (N, 3) on the surface of the hull."""
     depth = _inside(camera, extent, points)
     h, w = alpha.shape
     fine = np.asarray(cv2.resize(depth, (w, h), interpolation=cv2.INTER_LINEAR), np.float32)
-    subject = alpha > FAINT
+    subject = alpha > MIN_ALPHA
     out = np.where(subject, (fine + 0.5).clip(0, 1), np.float32(1)).astype(np.float32)
     return out if (out < 0.5).sum() > NOTHING * max(int((alpha >= 0.5).sum()), 1) else None
 
 
 def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
-    """How far inside the extent, in pixels of the photo, the first surface of each pixel of a small picture lies."""
+    """(h, w) a small picture: distance of the first surface inside the extent, in pixels of the photo."""
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
     uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, points)
     middle, radius = core(extent)
     away = float(np.linalg.norm(matrix(camera.world_from_cam)[:3, 3] - middle))
-    unit = away / float(np.sqrt(K[0, 0] * K[1, 1]))  # asset units a pixel of the photo, about
+    unit = away / float(np.sqrt(K[0, 0] * K[1, 1]))  # asset units per pixel of the photo, about
     factor = min(1.0, unit / (POINT * _spacing(extent)))
     w, h = max(2, round(camera.width * factor)), max(2, round(camera.height * factor))
     value = np.full((h, w), np.nan, np.float32)
@@ -84,18 +87,18 @@ def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
     meets = _meets(camera, w, h, middle, radius)
     high = np.zeros((h, w), bool)
     high[at[order, 1], at[order, 0]] = _above(extent, points[order])
-    value[meets & high] = extent.head  # the head itself, though its hull may have a gap through which its back is seen
+    value[meets & high] = extent.head  # the head itself: its hull may have a gap
     whole = _filled(value, meets, NEAR * extent.head * factor / unit)
-    return np.asarray(cv2.medianBlur(whole, 3) / np.float32(unit), np.float32)  # specks where points were left out
+    return np.asarray(cv2.medianBlur(whole, 3) / np.float32(unit), np.float32)  # removes specks of missing points
 
 
 def _spacing(extent: Extent) -> float:
-    """Edge of the hull's cells."""
+    """Edge of the hull's cells, asset units."""
     return 2 * BEYOND * max(extent.radii) / CELLS
 
 
 def _meets(camera: Camera, width: int, height: int, middle: F64, radius: float) -> Bool:
-    """(height, width) pixels whose ray passes through a ball."""
+    """(height, width) pixels whose ray passes through a ball with centre `middle` (3,)."""
     uv = pixel_centres(width, height) * (camera.width / width, camera.height / height)
     origin, direction = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv)
     along = direction @ (middle - origin)
@@ -104,7 +107,8 @@ def _meets(camera: Camera, width: int, height: int, middle: F64, radius: float) 
 
 
 def _filled(value: F32, meets: Bool, near: float) -> F32:
-    """Pixels that no point was drawn into (NaN): as the nearest that has one within `near` pixels, else by the ray."""
+    """Fill the pixels without a point (NaN): from the nearest pixel with one within `near` pixels, else from
+    `meets`."""
     known = np.isfinite(value)
     far = np.where(meets, np.float32(1), np.float32(-1))
     if not known.any():
@@ -117,8 +121,8 @@ def _filled(value: F32, meets: Bool, near: float) -> F32:
 
 
 def outline_points(hull: Hull, extent: Extent) -> F64:
-    """(N, 3) points on the hull's surface, but for those beside the ellipsoid and above the chin: in front of a face
-    that was photographed from one side a hull has tips that are air. Below are shoulders."""
+    """(N, 3) points on the hull's surface, without those above the chin and outside of the ellipsoid: in front of a
+    face that was photographed from one side, the hull has empty tips. Below the chin are shoulders."""
     points = np.asarray(surface_points(hull), np.float64)
     return points[
         ~_above(extent, points) | (signed(extent.model_copy(update={"cuts": ()}), points, -ASKED * extent.head) <= 0)

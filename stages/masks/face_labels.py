@@ -1,9 +1,9 @@
-"""Where the face, its eyes and the hair are in a photo: skin, and what the skin model does not know.
+"""Label pictures: face, eyes and hair in a photo.
 
-Labels are codes, LABELS their names. The face is the hull of its landmarks, the eyes are what lies between the lids
-(pipeline.faces). Closed eyes are labelled as open ones are: the landmarks hardly differ. Hair is what a network of the
-user's calls so, for none that may be passed on is at hand; without one it is subject, or face. Colour does not tell it:
-the stubble of shaved heads is as far from their skin as fair hair is from other skin.
+Labels are codes, LABELS their names. The face is the convex hull of its landmarks, the eyes are the areas between the
+lids (pipeline.faces). Closed eyes are labelled like open ones: the landmarks hardly differ. Hair is labelled only with
+the user's network, because no such network may be redistributed; without it hair is subject, or face. Colour does not
+separate it: the stubble of shaved heads is as different from their skin as fair hair from other skin.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from stages.masks.user_model import UserModel
 
 LABELS = ("background", "subject", "face", "eyes", "hair")
 SUBJECT, FACE, EYES, HAIR = 1, 2, 3, 4
-REACH = 1.2  # radii of the region of interest in which a face is looked for
-CROP, SURE = 1.3, 0.5  # half-edge of what the network for hair sees, in such radii; probability that counts
-INSIDE = 0.85  # share of its points that must lie on the subject: a picture on the wall is no face of theirs
+REACH = 1.2  # radii of the region of interest in which a face is searched
+CROP, SURE = 1.3, 0.5  # half-edge of the hair network's crop in such radii; smallest probability of hair
+INSIDE = 0.85  # smallest share of the landmarks on the subject: excludes faces in pictures on a wall
 
 
 def subjects_face(image: U8, alpha: F32, disc: Disc) -> Face | None:
-    """The face in the region of interest of a photo (H, W, 3) 8-bit sRGB, if it lies on the photo's mask (H, W)."""
+    """The face in the region of interest of a photo (H, W, 3) 8-bit sRGB, if it lies on the mask (H, W); else None."""
     face = find_face(image, disc.x, disc.y, REACH * disc.radius, disc.roll)
     return face if face is not None and on_subject(face, alpha) >= INSIDE else None
 
@@ -33,11 +33,11 @@ def subjects_face(image: U8, alpha: F32, disc: Disc) -> Face | None:
 def labels_with(face: Face | None, image: U8, alpha: F32, disc: Disc, hair: UserModel | None) -> U8 | None:
     """(H, W) labels of a photo (H, W, 3) 8-bit sRGB with its mask (H, W), or None without face and hair.
 
-    face: what `subjects_face` found. hair: the user's network, if there is one; it has the last word, but for the eyes.
+    face: from `subjects_face`. hair: the user's network, if any; its label replaces all others except the eyes.
     """
     out = (alpha >= 0.5).astype(np.uint8) * SUBJECT
     if face is not None:
-        # the hull and not the oval around the face, which runs through the nose where it is seen from the side
+        # not the oval around the face, which crosses the nose in side views
         hull = cv2.convexHull(face.points.astype(np.float32)).reshape(-1, 2)
         _fill(out, hull.astype(np.float64), FACE)
         for eye in (RIGHT_EYE, LEFT_EYE):
@@ -48,7 +48,8 @@ def labels_with(face: Face | None, image: U8, alpha: F32, disc: Disc, hair: User
 
 
 def _probability(image: U8, disc: Disc, model: UserModel) -> F32:
-    """(H, W) of hair: the network sees the upright square around the region of interest, its edges repeated."""
+    """(H, W) probability of hair. The network's input is the upright square around the region of interest, padded by
+    repeated edges."""
     h, w = image.shape[:2]
     scale = 2 * CROP * disc.radius / model.side
     c, s = np.cos(disc.roll) * scale, np.sin(disc.roll) * scale
@@ -63,7 +64,7 @@ def _probability(image: U8, disc: Disc, model: UserModel) -> F32:
 
 
 def on_subject(face: Face, alpha: F32) -> float:
-    """Share of the face's points that lie on the mask."""
+    """Share of the face's landmarks that lie on the mask (H, W)."""
     h, w = alpha.shape
     at = np.floor(face.points).astype(np.int64)
     within = (at >= 0).all(1) & (at[:, 0] < w) & (at[:, 1] < h)
@@ -71,7 +72,7 @@ def on_subject(face: Face, alpha: F32) -> float:
 
 
 def _fill(labels: npt.NDArray[np.uint8], outline: F64, value: int) -> None:
-    """The inside of an outline (N, 2), as far as it is on the subject and no edge pixel of it."""
+    """Set the label inside an outline (N, 2), except outside of the subject and on its edge pixels. In place."""
     drawn = np.zeros_like(labels)
     at = np.round((outline - 0.5) * 16).astype(np.int32)  # OpenCV's first pixel is at (0, 0)
     cv2.fillPoly(drawn, [at], 1, shift=4)

@@ -1,4 +1,4 @@
-"""Subject against background by colour statistics and contrast (grabCut), from a rough idea of where it is."""
+"""Segmentation by GrabCut (colour models and contrast) from a rough mask."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import numpy as np
 from stages.masks.region import U8, Bool, Disc, resized, working_size
 
 ROUNDS = 2
-ROOM = 40  # pixels around the undecided ones whose colours count
-INNER, OUTER = 0.45, 1.25  # radii of the region of interest: surely subject within, surely background beyond
+ROOM = 40  # pixels around the undecided ones whose colours are used
+INNER, OUTER = 0.45, 1.25  # radii of the region of interest: certainly subject within, certainly background beyond
 
 
 def cut(image: U8, trimap: U8, seed: int) -> Bool:
-    """Decide the probable pixels of a trimap (cv2.GC_*); (H, W, 3) 8-bit sRGB. Without both kinds of samples the
-    trimap's own opinion stands. Source: Rother, Kolmogorov, Blake, GrabCut (2004)."""
+    """Hard mask (H, W): decides the probable pixels of a trimap (H, W) of cv2.GC_* values. image: (H, W, 3) 8-bit sRGB.
+    Without samples of both subject and background the trimap decides. Source: Rother, Kolmogorov, Blake, GrabCut
+    (2004)."""
     unsure = (trimap == cv2.GC_PR_FGD) | (trimap == cv2.GC_PR_BGD)
     own: Bool = (trimap == cv2.GC_FGD) | (trimap == cv2.GC_PR_FGD)
     if not unsure.any():
@@ -25,7 +26,7 @@ def cut(image: U8, trimap: U8, seed: int) -> Bool:
     part = np.ascontiguousarray(trimap[window])
     if min(own[window].sum(), (~own[window]).sum()) < 50:
         return own
-    cv2.setRNGSeed(seed)  # its clusters start at random; the generator belongs to the thread
+    cv2.setRNGSeed(seed)  # its clusters start at random; the generator is per thread
     cv2.grabCut(
         np.ascontiguousarray(image[window]),
         part,
@@ -40,7 +41,7 @@ def cut(image: U8, trimap: U8, seed: int) -> Bool:
 
 
 def cut_by_region(image: U8, disc: Disc, longest: int, seed: int) -> Bool:
-    """Hard mask at the working size, knowing nothing but the region of interest."""
+    """Hard mask at the working size from the region of interest alone. image: (H, W, 3) 8-bit sRGB."""
     w, h = working_size(image.shape[1], image.shape[0], longest)
     small = np.asarray(resized(image, w, h), np.uint8)
     disc = disc.scaled(w / image.shape[1])

@@ -1,7 +1,7 @@
-"""Do the masks of all views show one and the same body? Each is held against the hull that all of them carve.
+"""Consistency of the masks: each is compared with the visual hull of all masks.
 
-A hull that lets a few views be wrong is built from the voting views. Where a mask and the hull's silhouette differ by
-more than the hull's own coarseness, the mask is wrong (or the camera is).
+The hull is carved by the voting views and tolerates a few wrong views. Where a mask and the hull's silhouette differ by
+more than the hull's resolution, the mask (or the camera) is wrong.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from pipeline.support import Support
 from stages.masks.region import F32, Bool, dilated, eroded, region
 
 CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
-POSSIBLE = 1.4  # radii within which 'no part of the subject can be there' is believed
-MARGIN = 1.0  # cells by which the hull may be off
-WRONG_SHARE = 0.1  # of the views that see a voxel may be wrong about it
-SPREADS = 6.0  # robust standard deviations below the median that make an outlier
+POSSIBLE = 1.4  # radii within which empty space of the hull is trusted
+MARGIN = 1.0  # cells of tolerance for the hull
+WRONG_SHARE = 0.1  # share of the views of a voxel that may be wrong
+SPREADS = 6.0  # robust standard deviations below the median for an outlier
 
 
 @dataclass(frozen=True, slots=True)
 class Opinion:
-    """What the views together say about one view, (h, w) at the size of its small alpha.
+    """The hull seen from one view, (h, w) at the size of its small alpha.
 
-    silhouette: where the hull is. possible: where the subject may be, space that few views see included. iou: of the
-    view's mask and the silhouette within the region of interest, None if that is not in the picture.
+    silhouette: of the hull. possible: where the subject may be, including space that few views see. here: the region of
+    interest. margin: tolerance in pixels. iou: of the view's mask and the silhouette within the region of interest,
+    None if that is outside of the picture.
     """
 
     silhouette: Bool
@@ -41,7 +42,7 @@ class Opinion:
 
 
 def tolerated(votes: int) -> int:
-    """How many of the voting views may be wrong about a voxel."""
+    """Number of voting views that may be wrong about a voxel."""
     return 0 if votes < 5 else max(1, votes // 40)
 
 
@@ -49,8 +50,8 @@ def opinions(
     cameras: Sequence[Camera], alphas: Sequence[F32], votes: Sequence[bool], roi_radius: float, cells: int,
     support: Support | None = None,
 ) -> list[Opinion]:  # fmt: skip
-    """One opinion per view. alphas: (h, w) each, small. votes: which views carve (held-out and dropped ones don't).
-    support: nothing of the subject is beneath it."""
+    """The hull seen from each view. alphas: (h, w) each, small. votes: which views carve the hull (not held-out and
+    dropped ones). roi_radius: asset units. cells: voxels per edge. support: the subject is above this plane."""
     voters = [(c, a) for c, a, v in zip(cameras, alphas, votes, strict=True) if v]
     lenient, edge = tolerated(len(voters)), CUBE * roi_radius
     cell = 2 * edge / cells
@@ -92,7 +93,8 @@ def _iou(a: Bool, b: Bool, where: Bool) -> float | None:
 
 
 def contradiction(inside: Bool, opinion: Opinion) -> float:
-    """Share of the mask's area that the hull contradicts beyond its coarseness: missing, or where nothing can be."""
+    """Area that the hull contradicts beyond its resolution (missing, or in empty space), as a share of the mask's.
+    inside: (h, w)."""
     missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here
     extra = inside & ~dilated(opinion.possible, opinion.margin)
     extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
@@ -100,24 +102,25 @@ def contradiction(inside: Bool, opinion: Opinion) -> float:
 
 
 def hole(inside: Bool, opinion: Opinion) -> float:
-    """Share of the mask's area that the mask encloses without having it, where the hull clearly is."""
+    """Area of the mask's holes where the hull clearly is, as a share of the mask's. inside: (h, w)."""
     enclosed = ndimage.binary_fill_holes(inside) & ~inside
     return float((enclosed & eroded(opinion.silhouette, opinion.margin)).sum()) / max(1, int(inside.sum()))
 
 
 def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:
-    """What grabCut may decide when a mask is mended: the hull's word where it is clear, else the mask's own."""
+    """Trimap (h, w) for GrabCut when a view is segmented again: from the hull where it is clear, else from the mask
+    `inside` (h, w)."""
     out = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     near = dilated(inside, opinion.margin) & ~eroded(inside, opinion.margin)
     out[eroded(inside, opinion.margin)] = cv2.GC_FGD
     out[~inside & ~near] = cv2.GC_BGD
     clear = eroded(opinion.silhouette, opinion.margin)
     empty = ~dilated(opinion.silhouette, opinion.margin)
-    # a mask that misses most of the subject has no say outside the region of interest either
+    # a mask without most of the subject is not used outside of the region of interest either
     lost = (inside & opinion.silhouette).sum() < 0.3 * opinion.silhouette.sum()
     here = np.ones_like(inside) if lost else opinion.here
     out[here & ~clear & ~empty] = np.where(opinion.silhouette, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
-    agreed = here & ~clear & ~empty & near  # both leave it open: the view's own contour is the better first guess
+    agreed = here & ~clear & ~empty & near  # undecided by both: the view's own contour is the better start
     out[agreed] = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[agreed]
     out[here & clear] = cv2.GC_FGD
     out[here & empty] = cv2.GC_BGD
@@ -126,14 +129,14 @@ def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:
 
 
 def outliers(ious: Sequence[float | None], least: float, deviation: float) -> list[bool]:
-    """Which views disagree with the rest: below `least`, or below the median by `deviation` and by SPREADS sigma.
+    """Which views are outliers: IoU below `least`, or below the median by `deviation` and by SPREADS sigma.
 
-    If the median itself is below `least` no view is an outlier: then cameras or all masks are at fault.
+    If the median itself is below `least`, no view is an outlier: then the cameras or all masks are wrong.
     """
     known = np.array([v for v in ious if v is not None])
     if not len(known) or np.median(known) < least:
         return [False] * len(ious)
-    middle = float(np.median(known))
-    spread = 1.4826 * float(np.median(np.abs(known - middle)))
-    limit = max(least, middle - max(deviation, SPREADS * spread))
+    median = float(np.median(known))
+    spread = 1.4826 * float(np.median(np.abs(known - median)))
+    limit = max(least, median - max(deviation, SPREADS * spread))
     return [v is not None and v < limit for v in ious]

@@ -1,7 +1,7 @@
-"""Subject against a known background (black, green ..., or a clean plate): what hangs together with the frame is it.
+"""Keying by a uniform background (black, green, ...) or a clean plate: background is what is connected to the border.
 
-Colour alone can't do it: brows, nostrils and beards are as black as a black background. They don't reach the frame,
-the background does.
+Colour alone is not enough: brows, nostrils and beards are as black as a black background. But they are not connected
+to the frame's border.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ import numpy as np
 from stages.masks.matting import largest_parts, soft_edge
 from stages.masks.region import F32, U8, Bool
 
-RING = 0.015  # of the shorter edge: width of the border that is looked at
-NEAR = 24  # 8-bit levels: first guess of what is background
+RING = 0.015  # of the shorter edge: width of the border
+NEAR = 24  # 8-bit levels: initial tolerance of background pixels
 SAMPLES = 4000  # border pixels per view
 MAX_SPREAD = 6.0  # levels, robust standard deviation: above it a background is not uniform
 MIN_SHARE, MIN_SHARE_ANY = 0.5, 0.25  # of all border pixels, and of one view's, that must be background
-HOLE = 0.005  # of the photo: an enclosed patch of background colour this large may be a hole
-UNCHANGED = 0.3  # share of a photo that its clean plate surely shows too
-PLATE_NOISE, PLATE_LEVELS = 6.0, (8.0, 32.0)  # tolerance against the plate: times the noise, within these levels
-EDGE = 3  # pixels: the threshold's contour is right to this
+HOLE = 0.005  # of the photo: smallest enclosed area of background colour that may be a hole
+UNCHANGED = 0.3  # share of a photo that is certainly background
+PLATE_NOISE, PLATE_LEVELS = 6.0, (8.0, 32.0)  # tolerance to the plate: multiple of the noise, limits in levels
+EDGE = 3  # pixels: accuracy of the threshold's contour
 
 
 @dataclass(frozen=True, slots=True)
 class Background:
-    """A uniform background: 8-bit sRGB colour, and how far a pixel may be from it (levels, largest channel)."""
+    """A uniform background: 8-bit sRGB colour, and tolerance in levels of the channel with the largest difference."""
 
     colour: tuple[float, float, float]
     tolerance: float
 
 
 def border_colours(image: U8) -> U8:
-    """(N, 3) pixels of the outermost ring, evenly thinned to at most SAMPLES."""
+    """(N, 3) pixels of the border of a photo (H, W, 3), evenly subsampled to at most SAMPLES."""
     h, w = image.shape[:2]
     width = max(2, round(RING * min(h, w)))
     ring = np.ones((h, w), bool)
@@ -45,7 +45,7 @@ def border_colours(image: U8) -> U8:
 
 
 def find_background(borders: Sequence[U8]) -> Background | None:
-    """The one colour around the subject in all views, or None if there is no such colour. borders: (N_i, 3) each."""
+    """The uniform background of all views, or None. borders: (N_i, 3) border pixels of each view."""
     if not borders:
         return None
     pooled = np.concatenate(borders).astype(np.float32)
@@ -72,30 +72,30 @@ def key_out(image: U8, background: Background) -> F32:
 
 
 def key_out_plate(image: U8, plate: U8) -> F32:
-    """Alpha (H, W) of what a photo has and its clean plate, taken with the same camera, has not; (H, W, 3) 8-bit sRGB.
+    """Alpha (H, W) of the subject, from a photo and its clean plate of the same camera, (H, W, 3) 8-bit sRGB.
 
-    Exposure may have drifted: the plate is brought to the photo by one gain, over pixels that differ least.
+    Exposure may have changed: the plate is scaled to the photo by one gain, over the pixels that differ least.
     """
     photo, empty = image.astype(np.float32), plate.astype(np.float32)
     like = np.abs(photo - empty).max(2)
     same = like <= np.quantile(like, UNCHANGED)
     gain = float(np.median((photo[same] + 1) / (empty[same] + 1)))
     away = np.abs(photo - empty * np.float32(gain)).max(2)
-    away = np.asarray(cv2.GaussianBlur(away, (0, 0), 1.0), np.float32)  # noise goes, a subject is larger
+    away = np.asarray(cv2.GaussianBlur(away, (0, 0), 1.0), np.float32)  # reduces noise
     tolerance = float(np.clip(PLATE_NOISE * np.median(away[same]), *PLATE_LEVELS))
     return soft_edge(image, _inside(away, tolerance), EDGE)
 
 
 def _inside(away: F32, tolerance: float) -> Bool:
-    """(H, W) of the subject, from the distance of each pixel from the background in levels."""
+    """(H, W) hard mask of the subject. away: (H, W) difference from the background in levels."""
     like = away <= tolerance
     count, label, stats, _ = cv2.connectedComponentsWithStats(like.astype(np.uint8), connectivity=4)
     frame = np.concatenate([label[0], label[-1], label[:, 0], label[:, -1]])
     outer = np.zeros(count, bool)
-    # a dark collar cut by the frame is a small patch there; the background is not
+    # a dark collar at the frame's border is a small area; the background is large
     outer[[i for i in np.unique(frame) if i and stats[i, cv2.CC_STAT_AREA] >= 1e-3 * like.size]] = True
     for i in np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= HOLE * like.size):
-        if i and not outer[i]:  # a hole is as flat as the background around; dark skin or cloth is not
+        if i and not outer[i]:  # a hole is as uniform as the background; dark skin or cloth is not
             outer[i] = bool(away[label == i].std() <= 0.25 * tolerance)
     inside = largest_parts(~outer[label], 0.02)
     opened = cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))

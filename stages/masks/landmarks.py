@@ -1,4 +1,4 @@
-"""The face's landmarks in space, from all fitted photos that show it, as a file of the masks' artifact."""
+"""3D landmarks of the face, from all fitted photos that show it, as a file of the masks' artifact."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FILE = "landmarks.npz"
 
 @dataclass(frozen=True, slots=True)
 class SeenFace:
-    """indices (N,) of the photos with a face, uv (N, 468, 2) pixels there, and the face that they agree on."""
+    """indices: (N,) photos with a face. uv: (N, 468, 2) landmarks in pixels. face: their triangulation."""
 
     indices: tuple[int, ...]
     uv: np.typing.NDArray[np.float64]
@@ -26,7 +26,7 @@ class SeenFace:
 
 
 def agreed(faces: Sequence[tuple[Camera, Face]]) -> SeenFace | None:
-    """The face that most of the photos show, or None if fewer than three agree on one."""
+    """The face in 3D, or None if fewer than three photos agree."""
     if not faces:
         return None
     uv = np.stack([f.points for _, f in faces])
@@ -35,7 +35,7 @@ def agreed(faces: Sequence[tuple[Camera, Face]]) -> SeenFace | None:
 
 
 def save_landmarks(seen: SeenFace, context: Context) -> FileRef:
-    """See pipeline.artifacts.MaskSet.landmarks."""
+    """Write the landmarks; see pipeline.artifacts.MaskSet.landmarks."""
     single: list[F32] = [a.astype(np.float32) for a in (seen.uv, seen.face.error_px)]
     np.savez(
         context.workdir / FILE,

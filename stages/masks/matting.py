@@ -1,8 +1,8 @@
-"""Soft edges: how much of an edge pixel is subject, from the colours on both sides of the edge.
+"""Matting: alpha of edge pixels from the colours on both sides of the edge.
 
     c = alpha F + (1 - alpha) B        linear light, F and B the mean colours just inside and just outside
 
-solved for alpha by least squares. Where F and B can't be told apart the blurred hard edge stands in.
+is solved for alpha by least squares. Where F and B hardly differ, the blurred hard edge is used.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ import numpy as np
 
 from stages.masks.region import F32, LINEAR, U8, Bool, eroded
 
-CONTRAST = 0.03  # difference of F and B, linear, at which colour and blurred edge count alike
-NOISE = 8.0  # weight of the colours' own variance against their difference
+CONTRAST = 0.03  # difference of F and B, linear, at which colour and blurred edge have equal weight
+NOISE = 8.0  # weight of the colours' variance relative to their difference
 SNAP = 0.04  # alphas this close to 0 or 1 are noise
 
 
 def soft_edge(image: U8, inside: Bool, radius: int) -> F32:
-    """Alpha (H, W) of a hard mask whose contour is right to `radius` pixels. image: (H, W, 3) 8-bit sRGB."""
+    """Alpha (H, W) of a hard mask (H, W) with a contour accurate to `radius` pixels. image: (H, W, 3) 8-bit sRGB."""
     alpha = inside.astype(np.float32)
     inner, outer = eroded(inside, radius), eroded(~inside, radius)
     band = ~(inner | outer)
@@ -52,7 +52,7 @@ def _dot(a: F32, b: F32) -> F32:
 
 
 def _near(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
-    """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` within `reach`, and whether there are any."""
+    """Mean colour (H, W, 3) and variance (H, W) of the pixels `where` (H, W) within `reach`, and whether any exist."""
     size = (2 * reach + 1, 2 * reach + 1)
     weight = where.astype(np.float32)
     square = _dot(colour, colour)
@@ -64,7 +64,7 @@ def _near(colour: F32, where: Bool, reach: int) -> tuple[F32, F32, Bool]:
 
 
 def largest_parts(inside: Bool, share: float) -> Bool:
-    """Pieces of a mask that are at least `share` of its largest piece."""
+    """The mask (H, W) without connected components smaller than `share` of its largest one."""
     count, label, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=8)
     if count <= 2:
         return inside

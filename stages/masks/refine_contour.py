@@ -1,19 +1,19 @@
-"""The contour of a cut-out drawn anew by what is right beside it.
+"""Contour refinement by a minimum cut with local colour models.
 
-Colours of the whole subject against those of the whole background (grabCut) take a highlight at the subject's edge for
-background: its colour is nowhere else in the subject, and somewhere in the background. Beside that edge, though, the
-background goes on as it was. So around the contour, from `REACH` outside it to a few pixels inside,
+GrabCut's colour models of the whole subject and the whole background take a highlight at the subject's edge for
+background: its colour is nowhere else in the subject, but somewhere in the background. The background next to the edge,
+however, does not change there. So in a strip from `REACH` outside the contour to a few pixels inside,
 
     background at x costs   min( 1/2 min( |c - b|^2 / (s^2 + k v), d_out^2 ), MAX_COST )
     subject at x costs      min( 1/2 d_in^2, STRANGE )
     d^2                     min_i |c - c_i|^2 / s^2 + |x - x_i|^2 / r^2
 
-c: colour at x, of 255, a little blurred. b, v: the background beyond the strip continued to x, affine in place, and the
-variance about that. c_i: colours that the photo has near x further outside (d_out), further inside (d_in). s: what
-colours may differ by, the photo's noise included. A colour that neither side knows is the subject's: what a surface
-shows at its edge it need not show elsewhere. Neighbours cost what the other side takes the less they differ, and the
-least cut decides. Where the background varies as much as the subject differs from it, or the photo is loud, the
-contour stays. What it is worth is in docs/captures.md, 'Contours'.
+c: colour at x, of 255, slightly blurred. b, v: the background outside the strip extrapolated to x by an affine
+function, and its variance. c_i: colours near x further outside (d_out) or further inside (d_in). s: tolerance of
+colours, including the photo's noise. A colour that is on neither side is the subject's, because the edge of a surface
+may look different from the rest. Separating two neighbours costs the more the less they differ; the minimum cut
+decides. If the background varies as much as the subject differs from it, or the photo is noisy, the contour is
+unchanged. Accuracy: docs/captures.md, 'Contours'.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ import numpy as np
 from pipeline.least_cut import ENDLESS, I32, I64, least_cut
 from stages.masks.region import F32, U8, Bool
 
-REACH = 14 / 640  # of the longest edge: how much may be missing
-INWARD = 3  # pixels of the contour's inside that are open
-DEPTH = 2.5  # reaches (inwards: of INWARD, and 4 pixels) within which a side is asked for its colours
-CONTINUED = 0.6  # reaches: the width of the window that continues the background
+REACH = 14 / 640  # of the longest edge: width of the undecided strip outside the contour
+INWARD = 3  # pixels: width of the undecided strip inside the contour
+DEPTH = 2.5  # width of the colour samples, in reaches (inwards: of INWARD, plus 4 pixels)
+CONTINUED = 0.6  # reaches: width of the window that extrapolates the background
 LEVELS = 4.0  # s without noise, of 255
-NOISE = 2.0  # what the photo's noise counts for in s
-LOUD = 2.5  # noise from which colours beside the contour tell less than those of all; about 6 before the blur
+NOISE = 2.0  # weight of the photo's noise in s
+LOUD = 2.5  # largest noise at which local colours are better than global ones; about 6 before the blur
 VARIED = 9.0  # k
 NEAR = 25 / 640  # r, of the longest edge
 MAX_COST, STRANGE = 6.0, 2.0
-TOGETHER, CONTRAST, MIN_TOGETHER = 4.0, 6.0, 0.15  # cost of parting neighbours: at equal colours, its scale, its end
-UNIT = 100.0  # costs in whole numbers
+TOGETHER, CONTRAST, MIN_TOGETHER = 4.0, 6.0, 0.15  # cost of separating neighbours: at equal colours, scale, minimum
+UNIT = 100.0  # factor from costs to integers
 BLUR = 0.7  # pixels
-FEWEST = 50  # pixels that a side must have to be asked
-SPECK, HOLE = 20, 200  # pixels: smaller parts outside and holes inside are mistakes
-SLOPE = 0.1  # of the window's own variance: what holds a slope back
+FEWEST = 50  # pixels: fewest colour samples of a side
+SPECK, HOLE = 20, 200  # pixels: smaller components and smaller holes are removed
+SLOPE = 0.1  # of the window's variance: regularisation of the slope
 STEPS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, 0.7), (1, -1, 0.7))  # to half the neighbours, and their weight
 
 
 def refined_contour(image: U8, inside: Bool) -> Bool:
-    """A hard mask (h, w) with a better contour. image: (h, w, 3) 8-bit sRGB, of the mask's own size.
+    """A hard mask (h, w) with a better contour. inside: (h, w). image: (h, w, 3) 8-bit sRGB.
 
-    The mask comes back as it is if the photo shows too little of either side, or is too noisy. Pixels that both share
-    are inside: how much of them is the subject is for soft_edge to say (matting.py).
+    The mask is returned unchanged if the photo shows too little of either side, or is too noisy. Mixed pixels are
+    inside; matting.soft_edge computes their alpha.
     """
     reach = max(4, round(REACH * max(inside.shape)))
     far_out, far_in = _distance(~inside), _distance(inside)
@@ -64,12 +64,12 @@ def refined_contour(image: U8, inside: Bool) -> Bool:
 
 
 def _distance(where: Bool) -> F32:
-    """Pixels to the nearest pixel that is not there, 0 for such."""
+    """(h, w) distance in pixels to the nearest pixel outside `where`; 0 there."""
     return np.asarray(cv2.distanceTransform(where.astype(np.uint8), cv2.DIST_L2, 5), np.float32)
 
 
 def _window(near: Bool, inside: Bool) -> tuple[slice, slice] | None:
-    """Rows and columns of what is near; None where there is no contour."""
+    """Bounding rows and columns of `near`; None if there is no contour."""
     if not inside.any() or inside.all():
         return None
     rows, columns = np.flatnonzero(near.any(1)), np.flatnonzero(near.any(0))
@@ -103,13 +103,14 @@ def _cut(image: U8, far_out: F32, far_in: F32, reach: int, near: float) -> Bool 
 
 
 def _noise(seen: F32, where: Bool) -> float:
-    """Robust deviation of a picture from its own surroundings."""
+    """Robust standard deviation of a picture from its blurred copy."""
     rough = (seen - np.asarray(cv2.GaussianBlur(seen, (0, 0), 2.0)))[where]
     return 1.4826 * float(np.median(np.abs(rough))) if len(rough) else 0.0
 
 
 def _strange(seen: F32, of: Bool, known: Bool, spread: float, near: float, most: float) -> F32:
-    """d^2 of the pixels `of` from every other pixel and row of `known`; inf where half of it exceeds `most`."""
+    """d^2 of the pixels `of` from `known`, of which every second pixel and row is used; inf if half of it exceeds
+    `most`."""
     from scipy.spatial import cKDTree
 
     some = known.copy()
@@ -125,11 +126,11 @@ def _strange(seen: F32, of: Bool, known: Bool, spread: float, near: float, most:
 
 
 def continued(colour: F32, known: Bool, sigma: float) -> tuple[F32, F32, Bool]:
-    """The colours `known` continued to everywhere: at each pixel the value there of the affine function of place that
-    is nearest to them under a Gaussian window; the variance about it; where anything is known.
+    """The colours of the pixels `known` (h, w), extrapolated by local affine regression with a Gaussian window.
 
-    colour: (h, w, 3). sigma: of the window, pixels. Slopes are held back by SLOPE, so that where little is known, or
-    on one side alone, it is nearer to the mean. Worked out at half the size. Source: local regression, textbook.
+    Returns the colours (h, w, 3), the variance (h, w, 1) about the regression, and where any colour is known (h, w).
+    colour: (h, w, 3). sigma: of the window, pixels. Slopes are regularised by SLOPE towards the mean, for places with
+    few samples or samples on one side. Computed at half the size. Source: local regression, textbook.
     """
     h, w = known.shape
     small = (max(w // 2, 1), max(h // 2, 1))
@@ -150,7 +151,7 @@ def continued(colour: F32, known: Bool, sigma: float) -> tuple[F32, F32, Bool]:
 
 
 def _regression(weight: F32, value: F32, square: F32, sigma: float) -> tuple[F32, F32, F32]:
-    """Weighted sums to a local affine function: its value in the middle (h, w, 3), variance about it, sum of weights.
+    """Local affine regression: its value at the centre (h, w, 3), variance about it (h, w), sum of weights (h, w).
 
     weight: (h, w); value, square: weight times colour (h, w, 3) and mean squared colour (h, w).
     """
@@ -173,13 +174,13 @@ def _regression(weight: F32, value: F32, square: F32, sigma: float) -> tuple[F32
     cy = moment(value, 1, 0) / n[..., None] - y[..., None] * mean
     det = (xx * yy - xy * xy)[..., None]
     sx, sy = (yy[..., None] * cx - xy[..., None] * cy) / det, (xx[..., None] * cy - xy[..., None] * cx) / det
-    middle = mean - sx * x[..., None] - sy * y[..., None]
+    centre = mean - sx * x[..., None] - sy * y[..., None]
     variance = moment(square, 0, 0) / n - (mean * mean + sx * cx + sy * cy).mean(-1)
-    return np.asarray(middle, np.float32), np.asarray(np.maximum(variance, 0), np.float32), total
+    return np.asarray(centre, np.float32), np.asarray(np.maximum(variance, 0), np.float32), total
 
 
 def _neighbours(seen: F32, open_: Bool) -> tuple[I64, I64, I32]:
-    """Pairs of open pixels that touch, by their numbers among the open ones, and what parting them costs."""
+    """Pairs of neighbouring undecided pixels, by their indices among these pixels, and the cost of separating them."""
     number = np.full(open_.shape, -1)
     number[open_] = np.arange(int(open_.sum()))
     h, w = open_.shape
@@ -197,7 +198,7 @@ def _neighbours(seen: F32, open_: Bool) -> tuple[I64, I64, I32]:
 
 
 def _tidy(out: Bool, inside: Bool) -> Bool:
-    """Without parts that the old mask hardly knew, small holes closed."""
+    """The new mask (h, w) without components that hardly overlap the old one, and with small holes filled."""
     count, label = cv2.connectedComponents(out.astype(np.uint8), connectivity=4)
     overlap = np.bincount(np.asarray(label)[inside & out], minlength=count)
     overlap[0] = 0

@@ -1,4 +1,4 @@
-"""Where the region of interest lies in a photo, and photos at the size that the masks are worked out at."""
+"""Projection of the region of interest into a photo, the working size of the masks, and morphology."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ LINEAR: F32 = linear_from_srgb(np.arange(256) / 255).astype(np.float32)  # of 8-
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """The region of interest in a photo. x, y, radius: pixels from the corner. roll: radians, of asset +Y against the
-    photo's upward direction, clockwise positive."""
+    """The region of interest in a photo. x, y: centre in pixels from the corner. radius: pixels. roll: radians from the
+    photo's upward direction to asset +Y, clockwise positive."""
 
     x: float
     y: float
@@ -51,7 +51,7 @@ def region(camera: Camera, roi_radius: float) -> Disc | None:
         return None
     up = uv[1] - uv[0]
     length = float(np.hypot(*up))
-    # seen from straight above or below there is no 'up' in the picture worth turning it for
+    # from directly above or below, the picture has no meaningful up direction
     roll = float(np.arctan2(up[0], -up[1])) if length > 0.2 * 0.1 * roi_radius * K[1, 1] / z[0] else 0.0
     return Disc(float(uv[0, 0]), float(uv[0, 1]), float(roi_radius * np.sqrt(K[0, 0] * K[1, 1]) / z[0]), roll)
 
@@ -68,7 +68,7 @@ def eight_bit(image: npt.NDArray[np.generic]) -> U8:
 
 
 def resized(image: npt.NDArray[np.generic], width: int, height: int) -> npt.NDArray[np.generic]:
-    """`image` at another size: means of areas when smaller, cubic when larger (clamped to the kind's range by OpenCV
+    """`image` (H, W, ...) at another size: area average if smaller, cubic interpolation if larger (clamped by OpenCV
     for 8 bit, to [0, 1] for float)."""
     if image.shape[:2] == (height, width):
         return image
@@ -85,16 +85,16 @@ def working_size(width: int, height: int, longest: int) -> tuple[int, int]:
 
 
 def disc_element(radius: int) -> U8:
-    """Round structuring element."""
+    """Disc as structuring element, (2 radius + 1, 2 radius + 1)."""
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1)), np.uint8)
 
 
 def eroded(mask: Bool, radius: int) -> Bool:
-    """Pixels whose whole neighbourhood is in the mask; what lies beyond the frame counts as in it."""
+    """(H, W) erosion by a disc of `radius` pixels; pixels beyond the frame count as inside."""
     out = cv2.erode(mask.astype(np.uint8), disc_element(radius), borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return np.asarray(out) > 0
 
 
 def dilated(mask: Bool, radius: int) -> Bool:
-    """Pixels with the mask in their neighbourhood."""
+    """(H, W) dilation by a disc of `radius` pixels."""
     return ~eroded(~mask, radius)

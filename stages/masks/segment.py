@@ -1,4 +1,5 @@
-"""Masks for all views of a capture: make them, hold them against each other, mend or drop what does not fit."""
+"""Masks for all views of a capture: segmentation, consistency check, second segmentation, and dropping of wrong
+masks."""
 
 from __future__ import annotations
 
@@ -34,17 +35,17 @@ from stages.masks.sources import Plan, View, inverted, mask, plan, to_full_size
 from stages.masks.support_object import SupportedObject, distinct, find_supported_object
 from stages.masks.user_model import UserModel, hair_model, user_model
 
-WORKING_SIZE = 640  # longest edge at which people and objects are cut out
-MIN_AGREEMENT = 0.8  # least IoU of a mask and the hull of all masks, in the region of interest
+WORKING_SIZE = 640  # pixels, longest edge at which people and objects are segmented
+MIN_AGREEMENT = 0.8  # smallest IoU of a mask and the hull of all masks, in the region of interest
 MAX_DEVIATION = 0.05  # IoU below the median from which a mask may be an outlier
-LIMITS = 0.001, 0.999  # mean alpha of a mask that shows something, and not everything
-SMALL = 512  # longest edge of the masks that are held against each other
-CONTRADICTED = 0.007  # share of a mask's area from which it is cut out anew
-HOLE = 0.001  # or of a hole: one such in a single mask is a tunnel through the subject
+LIMITS = 0.001, 0.999  # mean alpha of a mask that is neither empty nor full
+SMALL = 512  # pixels, longest edge of the masks for the consistency check
+CONTRADICTED = 0.007  # share of a mask's area from which the view is segmented again
+HOLE = 0.001  # the same for a hole: one in a single mask makes a tunnel through the subject
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
-LEARNED = ("model", "person")  # cut out along a network's contour
-COMPUTED = ("plate", "model", "person", "object", "grabcut")  # what the hull may find wrong
+LEARNED = ("model", "person")  # methods with a network's contour
+COMPUTED = ("plate", "model", "person", "object", "grabcut")  # methods whose masks the hull may contradict
 Labelled = tuple[Path, tuple[str, ...]]
 T = TypeVar("T")
 R = TypeVar("R")
@@ -52,7 +53,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, slots=True)
 class Masked:
-    """A view's mask: small (h, w) in memory, the full one in a file."""
+    """A view's mask: reduced (h, w) in memory, full size in a file. coverage: mean alpha. iou: with the hull."""
 
     view: View
     camera: Camera
@@ -63,13 +64,13 @@ class Masked:
 
     @property
     def useless(self) -> bool:
-        """Whether it shows nothing, or everything."""
+        """Whether it is empty or full."""
         return not LIMITS[0] <= self.coverage <= LIMITS[1]
 
 
 @dataclass(frozen=True, slots=True)
-class Looked:
-    """What a photo shows of the face: where, and the file of its labels with the names of those in it."""
+class FaceResult:
+    """The face in a photo, and the file of its labels with the names of the labels in it."""
 
     face: Face | None = None
     labels: Labelled | None = None
@@ -78,15 +79,15 @@ class Looked:
 def segment(
     capture: Located[Capture], located: Located[CameraSet], config: Config, context: Context
 ) -> MaskSet:  # fmt: skip
-    """Masks of all registered views; see stages.masks.stage.run."""
+    """Masks of all registered views: the whole stage. See stages.masks.stage.run."""
     poses = located.artifact
     pairs = _views(capture, poses)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
                lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, context, "masking")
-    warnings = [f"view {m.view.index} ({m.view.name}): its mask is inverted, black on the subject; it is used the "
-                "other way round; save it white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
+    warnings = [f"view {m.view.index} ({m.view.name}): its mask is black on the subject and was inverted; save it "
+                "white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
     support = how.solid.support if how.solid is not None else None
@@ -95,54 +96,54 @@ def segment(
     first = _seen(masked, [])
     if config.resegment:
         bad = _outliers(masked)
-        mended = _each(lambda t: _mend(t[0], t[1], t[2], config, context),
-                       list(zip(masked, found, bad, strict=True)), context, "checking")  # fmt: skip
-        if any(a is not b for a, b in zip(mended, masked, strict=True)):
-            voting = [not m.view.holdout and not m.useless for m in mended]
-            found = _opinions(mended, voting, poses, config, support)
-            mended = [replace(m, iou=o.iou) for m, o in zip(mended, found, strict=True)]
-        masked = mended
+        corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
+                          list(zip(masked, found, bad, strict=True)), context, "checking masks")  # fmt: skip
+        if any(a is not b for a, b in zip(corrected, masked, strict=True)):
+            voting = [not m.view.holdout and not m.useless for m in corrected]
+            found = _opinions(corrected, voting, poses, config, support)
+            corrected = [replace(m, iou=o.iou) for m, o in zip(corrected, found, strict=True)]
+        masked = corrected
     dropped = _dropped(masked, warnings)
-    looked = [Looked()] * len(masked)
+    faces = [FaceResult()] * len(masked)
     if config.faces:
         hair = hair_model(config)
-        looked = _each(lambda m: _look(m, hair, context), masked, context, "looking for a face")
-    fitted = [(m.camera, x.face) for m, x in zip(masked, looked, strict=True)
+        faces = _each(lambda m: _find_face(m, hair, context), masked, context, "detecting faces")
+    fitted = [(m.camera, x.face) for m, x in zip(masked, faces, strict=True)
               if x.face is not None and not m.view.holdout and m.view.index not in dropped]  # fmt: skip
     found_face = agreed(fitted)
     landmarks = None if found_face is None else save_landmarks(found_face, context)
-    # what is cut out as an object is one, even with a face
+    # a subject that is segmented as an object is an object, even with a face
     people = found_face is not None and how.method != "object"
     frame = head_frame(found_face.face.xyz) if found_face is not None and people else None
     votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
     extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
     parts = _asked(masked, votes, extent, context)
-    made = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, looked, strict=True))
+    masks = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, faces, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
-                     sum("face" in m.labelled for m in made))  # fmt: skip
+                     sum("face" in m.labelled for m in masks))  # fmt: skip
     if how.method != "object":
         agreeing = 0 if found_face is None else int(found_face.face.kept.sum())
         known = extent_finding(len(fitted), agreeing, extent is not None)
         findings = findings if known is None else (*findings, known)
-    return MaskSet(masks=made, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks, extent=extent,
+    return MaskSet(masks=masks, label_names=LABELS, dropped=tuple(dropped), landmarks=landmarks, extent=extent,
                    warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
 def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
-    """The masks as they are judged."""
+    """The masks as input of the checks."""
     return [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, None if m.useless else m.iou, m.view.holdout,
                  m.view.index in dropped) for m in masked]  # fmt: skip
 
 
 def _is_bust(votes: list[Masked], frame: HeadFrame, roi_radius: float) -> bool:
-    """Whether so little is beyond head and neck that the subject stays whole: a head scan ends in its shoulders."""
+    """Whether the subject is a bust, which is kept whole: a head scan that ends in its shoulders."""
     head = head_extent(frame, HEAD_BELOW, HEAD_RADIUS)
     beyond = share_beyond([m.camera for m in votes], [m.small for m in votes], head, roi_radius)
     return beyond <= BUST
 
 
 def _asked(masked: list[Masked], votes: list[Masked], extent: Extent | None, context: Context) -> dict[int, Path]:
-    """Files of what is asked of each view in which not all is, by the view's index."""
+    """Files of the pixels that count, by view index; only for views in which not all pixels count."""
     if extent is None:
         return {}
     points = outline_points(whole_hull([m.camera for m in votes], [m.small for m in votes], extent), extent)
@@ -154,7 +155,7 @@ def _asked(masked: list[Masked], votes: list[Masked], extent: Extent | None, con
             write_png(path, part)
         return m.view.index, None if part is None else path
 
-    found = _each(one, masked, context, "finding the extent")
+    found = _each(one, masked, context, "computing the extent")
     return {index: path for index, path in found if path is not None}
 
 
@@ -194,16 +195,16 @@ def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F
     def read() -> F32:
         alpha = read_alpha(path)
         if alpha.shape != (view.height, view.width):
-            raise StageError("the mask is not of the photo's size", where=f"view {view.index} ({view.name})",
+            raise StageError("the mask does not have the photo's size", where=f"view {view.index} ({view.name})",
                              value=f"{alpha.shape[1]} x {alpha.shape[0]}", limit=f"{view.width} x {view.height}",
-                             remedy="give a mask of the photo's own size")  # fmt: skip
+                             remedy="give a mask of the photo's size")  # fmt: skip
         return alpha
 
     return read
 
 
 def _each(work: Callable[[T], R], items: list[T], context: Context, message: str) -> list[R]:
-    """`work` on every item, a few at a time, results in order; OpenCV lets other threads run while it works."""
+    """`work` on every item in a thread pool, results in order; OpenCV releases Python's lock."""
     out: list[R] = []
     pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
     try:
@@ -236,7 +237,7 @@ def _path(index: int, context: Context) -> Path:
 
 
 def _solid(poses: Located[CameraSet], seed: int) -> SupportedObject | None:
-    """The object among the sparse points, if the cameras came with any."""
+    """The object among the sparse points; None without points."""
     ref = poses.artifact.points
     if ref is None:
         return None
@@ -253,17 +254,17 @@ def _opinions(
 
 
 def _outliers(masked: list[Masked]) -> list[bool]:
-    """Of the fitted views; held-out ones are measured and left alone."""
+    """Which fitted views are outliers; held-out ones are never."""
     ious = [None if m.view.holdout or m.useless else m.iou for m in masked]
     found = outliers(ious, MIN_AGREEMENT, MAX_DEVIATION)
     return [f or (m.useless and not m.view.holdout) for f, m in zip(found, masked, strict=True)]
 
 
-def _mend(made: Masked, opinion: Opinion, bad: bool, config: Config, context: Context) -> Masked:
-    """The view with a mask cut out anew where the hull contradicts it; unchanged if that is no better."""
+def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, context: Context) -> Masked:
+    """The view with a new mask if the hull contradicts the old one; unchanged if the new one is no better."""
     inside = made.small >= 0.5
     if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
-        return made  # a photo that is all background shows no subject whose edge could be found
+        return made  # a photo of background only has no subject to segment
     doubtful = made.source in COMPUTED and (
         contradiction(inside, opinion) > CONTRADICTED or hole(inside, opinion) > HOLE
     )
@@ -295,42 +296,42 @@ def _at_size(o: Opinion, width: int, height: int) -> Opinion:
 
 def _dropped(masked: list[Masked], warnings: list[str]) -> list[int]:
     known = [m.iou for m in masked if m.iou is not None and not m.view.holdout]
-    middle = float(np.median(known)) if known else 0.0
-    if middle < MIN_AGREEMENT:
-        warnings.append(f"masks and cameras agree poorly: median IoU with the visual hull {middle:.2f}, expected at "
-                        f"least {MIN_AGREEMENT:.2f}; look at the masks and the poses")  # fmt: skip
+    median = float(np.median(known)) if known else 0.0
+    if median < MIN_AGREEMENT:
+        warnings.append(f"masks and cameras agree poorly: median IoU with the visual hull {median:.2f}, expected at "
+                        f"least {MIN_AGREEMENT:.2f}; check the masks and the cameras")  # fmt: skip
     out = []
     for m, bad in zip(masked, _outliers(masked), strict=True):
         name = f"view {m.view.index} ({m.view.name})"
         if bad:
             out.append(m.view.index)
-            why = "shows nothing or everything" if m.useless else f"has IoU {m.iou:.2f} with the other views' hull"
-            warnings.append(f"{name} is not fitted: its mask {why} (median {middle:.2f})")
+            why = "is empty or full" if m.useless else f"has IoU {m.iou:.2f} with the other views' hull"
+            warnings.append(f"{name} is not fitted: its mask {why} (median IoU {median:.2f})")
         elif m.view.holdout and (m.useless or (m.iou is not None and m.iou < MIN_AGREEMENT)):
-            warnings.append(f"{name} is held out and its mask is doubtful: IoU {m.iou or 0:.2f} with the fitted views' "
-                            f"hull (median {middle:.2f})")  # fmt: skip
+            warnings.append(f"{name} is held out and its mask may be wrong: IoU {m.iou or 0:.2f} with the fitted "
+                            f"views' hull (median {median:.2f})")  # fmt: skip
     _enough(sum(not m.view.holdout for m in masked) - len(out), len(masked), warnings)
     return out
 
 
 def _enough(left: int, views: int, warnings: list[str]) -> None:
     if left < FEWEST:
-        raise StageError("too few views have a mask that fits the others", where="masks",
+        raise StageError("too few views have a mask that agrees with the others", where="masks",
                          value=f"{left} of {views}; {'; '.join(warnings) or 'no usable masks'}",
-                         limit=f"at least {FEWEST} views to fit", remedy="look at the photos named; give masks, or "
+                         limit=f"at least {FEWEST} views to fit", remedy="check the listed photos; give masks, or "
                          "choose another masks.method")  # fmt: skip
 
 
-def _look(m: Masked, hair: UserModel | None, context: Context) -> Looked:
-    """The subject's face in a photo, and the file of its labels where it shows face or hair."""
+def _find_face(m: Masked, hair: UserModel | None, context: Context) -> FaceResult:
+    """The subject's face in a photo, and the file of its labels if it shows face or hair."""
     image, alpha = m.view.read(), read_alpha(_path(m.view.index, context))
     face = subjects_face(image, alpha, m.view.disc)
     labels = labels_with(face, image, alpha, m.view.disc, hair)
     if labels is None:
-        return Looked(face)
+        return FaceResult(face)
     path = context.workdir / "labels" / f"{m.view.index}.png"
     write_png(path, labels / 255)
-    return Looked(face, (path, tuple(LABELS[i] for i in np.unique(labels) if i)))
+    return FaceResult(face, (path, tuple(LABELS[i] for i in np.unique(labels) if i)))
 
 
 def _manifest(m: Masked, labels: Labelled | None, part: Path | None, context: Context) -> ViewMask:

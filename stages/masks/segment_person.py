@@ -1,7 +1,7 @@
-"""People against any background: a small network says where, grabCut and the edge's colours say exactly where.
+"""Person segmentation: a small network gives a rough mask; GrabCut and the contour refinement make it accurate.
 
-The network (models/NOTICE) takes 256 x 256 RGB in [0, 1], channels first, and gives the probability of 'person' after
-its own sigmoid. It was trained on upright people, so the crop around the subject is turned by the camera's roll.
+The network (models/NOTICE) has an input of 256 x 256 RGB in [0, 1], channels first, and returns the probability of
+'person' (its last layer is a sigmoid). It was trained on upright people, so the crop is rotated by the camera's roll.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized, w
 MODEL = Path(__file__).parent / "models" / "selfie_segmentation.tflite"
 SIDE = 256  # the network's input
 CROP = 1.6  # half-edge of the crop in radii of the region of interest
-UNSURE = 2.5  # network pixels on both sides of its contour that grabCut decides
-MIN_PART = 0.3  # of the largest piece: smaller ones are mistakes of the network
+UNSURE = 2.5  # network pixels on both sides of its contour that GrabCut decides
+MIN_PART = 0.3  # of the largest component: smaller ones are errors of the network
 
 
 def probability(square: U8) -> F32:
@@ -33,10 +33,10 @@ def probability(square: U8) -> F32:
 
 
 def person_probability(image: U8, disc: Disc) -> tuple[F32, float]:
-    """Probability (H, W) of 'person', and the size in pixels of what the network took for one pixel.
+    """Probability (H, W) of 'person', and the size in photo pixels of one network pixel. image: (H, W, 3) 8-bit sRGB.
 
-    The whole photo is looked at, and a crop around the subject where that shows it larger; the crop's word counts
-    where it reaches.
+    The network runs on the whole photo, and on a crop around the subject if it shows the subject larger; inside the
+    crop, the crop's result is used.
     """
     h, w = image.shape[:2]
     half = min(CROP * disc.radius, max(h, w) / 2)
@@ -48,12 +48,12 @@ def person_probability(image: U8, disc: Disc) -> tuple[F32, float]:
 
 
 def _through(image: U8, centre: Disc, half: float) -> tuple[F32, float]:
-    """Run a square of half-edge `half` around a point, turned by its roll. Where the square does not reach: NaN if the
-    square is a crop."""
+    """Run the network on a square of half-edge `half` pixels around a point, rotated by its roll. Pixels outside of a
+    crop are NaN."""
     h, w = image.shape[:2]
     scale = 2 * half / SIDE
     c, s = np.cos(centre.roll) * scale, np.sin(centre.roll) * scale
-    # photo position = centre + turn @ (net position - middle); both in OpenCV's pixel-centre coordinates
+    # photo position = centre + turn @ (net position - net centre); both in OpenCV's pixel-centre coordinates
     turn = np.array([[c, -s], [s, c]])
     shift = np.array([centre.x - 0.5, centre.y - 0.5]) - turn @ np.array([SIDE / 2 - 0.5] * 2)
     photo_from_net = np.concatenate([turn, shift[:, None]], 1)
@@ -78,10 +78,10 @@ def person_mask(image: U8, disc: Disc, threshold: float, longest: int, seed: int
 
 
 def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, seed: int) -> Bool:
-    """Hard mask (h, w) from a network's probability: the photo's colours and contrast decide near its contour, first
-    all of them (grabcut.py), then those beside it (refine_contour.py).
+    """Hard mask (h, w) from a network's probability (h, w): near its contour the colours decide, first by global colour
+    models (grabcut.py), then by local ones (refine_contour.py). small: (h, w, 3) 8-bit sRGB.
 
-    scale: size in pixels of what the network took for one pixel.
+    scale: size in pixels of one network pixel.
     """
     inside = of_subject(found >= threshold, disc)
     if not inside.any():
@@ -94,7 +94,7 @@ def refined(small: U8, found: F32, scale: float, disc: Disc, threshold: float, s
 
 
 def of_subject(inside: Bool, disc: Disc) -> Bool:
-    """The pieces of a mask that matter: large ones that reach into the region of interest, holes filled where small."""
+    """The mask (h, w) reduced to large components that reach into the region of interest, with small holes filled."""
     label = np.asarray(cv2.connectedComponents(inside.astype(np.uint8), connectivity=4)[1])
     core = np.unique(label[disc.covers(inside.shape[0], inside.shape[1], 0.7)])
     kept = largest_parts(np.isin(label, core[core > 0]), MIN_PART)
@@ -103,7 +103,7 @@ def of_subject(inside: Bool, disc: Disc) -> Bool:
 
 
 def largest_parts_over(inside: Bool, area: float) -> Bool:
-    """Pieces of a mask of at least `area` pixels."""
+    """The mask (h, w) without connected components of less than `area` pixels."""
     _, label, stats, _ = cv2.connectedComponentsWithStats(inside.astype(np.uint8), connectivity=4)
     big = stats[:, cv2.CC_STAT_AREA] >= area
     big[0] = False

@@ -1,4 +1,4 @@
-"""The ways to a mask, and which of them a capture takes."""
+"""The segmentation methods, and the choice between them."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from stages.masks.segment_person import person_mask
 from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
-LOOKED_AT = 12  # views from which the kind of background and subject is judged
-PERSON_SHARE = 0.5  # of the middle of the region of interest that the network must call a person
-PERSON_VIEWS = 0.9  # share of the views in which it must: it takes a statue for a person from some sides, but not all
-TELLING, WRONG_SIDE = 0.02, 0.3  # share of the photo around the region; mean alpha that is all but empty
-SOFT = 2  # pixels of the working size to which a cut-out contour is right
+LOOKED_AT = 12  # views that are used for the choice
+PERSON_SHARE = 0.5  # of the centre of the region of interest that the network must classify as person
+PERSON_VIEWS = 0.9  # smallest share of such views: the network takes a statue for a person from some sides, but not all
+MIN_AROUND, WRONG_SIDE = 0.02, 0.3  # smallest share of the photo around the region; mean alpha of a nearly empty area
+SOFT = 2  # pixels of the working size: accuracy of a segmented contour
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A photo to mask. read: its 8-bit sRGB (H, W, 3). given: reads its mask, alpha (H, W). plate: reads the
-    same view without the subject."""
+    """A photo to segment. read: its 8-bit sRGB (H, W, 3). given: reads its given mask, alpha (H, W). plate: reads its
+    clean plate (H, W, 3)."""
 
     index: int
     name: str
@@ -41,7 +41,7 @@ class View:
     plate: Callable[[], U8] | None = None
 
     def known(self, method: Method) -> bool:
-        """Whether the user's own mask or clean plate says what is subject."""
+        """Whether it has a given mask or a clean plate that `method` uses."""
         return (self.given is not None and method in ("auto", "given")) or (
             self.plate is not None and method in ("auto", "plate")
         )
@@ -49,7 +49,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How views without a mask of their own are masked."""
+    """The segmentation method for views without a given mask, with its data."""
 
     method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
@@ -61,11 +61,12 @@ def plan(
     views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
     solid: Callable[[], SupportedObject | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
-    """Choose the way from a few of the views that are fitted. solid: looks for the object among the sparse points.
-    model: the user's network, which goes before all guesses.
+    """Choose the method from a few of the fitted views. solid: finds the object among the sparse points. model: the
+    user's network; `auto` prefers it to the methods from key on.
 
     Raises:
-        StageError: masks, a uniform background or an object were asked for and are not there.
+        UsageError: `method` needs masks or clean plates that are missing. StageError: `method` is key or object, and
+            there is no uniform background or no object.
     """
     bare = [v for v in views if not v.known(method)]
     if method in ("given", "plate") and bare:
@@ -105,7 +106,7 @@ def plan(
 def _by_points(solid: SupportedObject | None) -> Plan:
     if solid is None:
         raise StageError("no object is found among the sparse points", where="masks.method=object",
-                         value="no points, or too few that hang together", limit="cameras solved from the photos "
+                         value="no points, or too few connected ones", limit="cameras solved from the photos "
                          "(poses.method=colmap) of an object with texture",
                          remedy="use masks.method=auto, or give masks")  # fmt: skip
     return Plan("object", solid=solid)
@@ -113,12 +114,12 @@ def _by_points(solid: SupportedObject | None) -> Plan:
 
 def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> float:
     inside = person_mask(image, disc, threshold, longest, seed)
-    middle = disc.scaled(inside.shape[1] / image.shape[1]).covers(inside.shape[0], inside.shape[1], 0.5)
-    return float(inside[middle].mean()) if middle.any() else 0.0
+    centre = disc.scaled(inside.shape[1] / image.shape[1]).covers(inside.shape[0], inside.shape[1], 0.5)
+    return float(inside[centre].mean()) if centre.any() else 0.0
 
 
 def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:
-    """Alpha (H, W) at the photo's size and where it is from. A given mask is handed on as it is.
+    """Alpha (H, W) at the photo's size, and the method. A given mask is returned unchanged.
 
     Raises:
         StageError: a given mask of the wrong size.
@@ -141,19 +142,19 @@ def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) 
 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
-    """Whether a given mask shows the background: all but empty in the middle of the region of interest and all but
-    full around it: beyond the region, and along the frame's upper edge and sides where a head has no neck. A subject
-    that fills the frame is not empty in the middle."""
+    """Whether a given mask (H, W) is white on the background: nearly empty in the centre of the region of interest and
+    nearly full around it, that is, beyond the region and along the frame's upper edge and sides, where there is no
+    neck. The mask of a subject that fills the frame is not empty in the centre."""
     h, w = alpha.shape
     core, around = disc.covers(h, w, INNER), ~disc.covers(h, w, OUTER)
     around[0], around[:, 0], around[:, -1] = True, True, True
-    if not core.any() or around.mean() < TELLING:
+    if not core.any() or around.mean() < MIN_AROUND:
         return False
     return bool(alpha[core].mean() < WRONG_SIDE and alpha[around].mean() > 1 - WRONG_SIDE)
 
 
 def to_full_size(image: U8, inside: Bool) -> F32:
-    """Alpha (H, W) of a photo from a hard mask of a smaller size: smooth contour, then the colours of its edge."""
+    """Alpha (H, W) of a photo (H, W, 3) from a smaller hard mask (h, w): enlarged, then matted at the edge."""
     h, w = image.shape[:2]
     factor = w / inside.shape[1]
     hard = inside if factor == 1 else np.asarray(resized(inside.astype(np.float32), w, h), np.float32) >= 0.5

@@ -1,4 +1,4 @@
-"""masks: photos and cameras in, one soft mask per registered view out, checked against each other in space."""
+"""masks: one soft alpha mask for each registered view; the masks are checked against each other by the visual hull."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> MaskSet:
     """Masks of all registered views.
 
     Raises:
-        StageError: a mask that is missing or of the wrong size; no uniform background where one was asked for; too few
-            views left that agree.
+        StageError: a mask is missing or of the wrong size; no uniform background for masks.method=key; too few views
+            with consistent masks.
     """
     from stages.masks.segment import segment
 

@@ -1,8 +1,8 @@
-"""An object that no network knows, from the sparse points of structure from motion: what stands on the support.
+"""Segmentation of an object on a support, for objects that no network recognises, from the sparse points of SfM.
 
 Symbols: points (N, 3) asset coordinates; R radius of the region of interest; plane n . x = o, n towards the cameras.
-What rises from the support (pipeline.support) within reach of the region of interest and hangs together is the object;
-its points, seen from anywhere, fill its silhouette.
+The object is the largest connected group of points above the support plane (pipeline.support) within REACH of the
+region of interest. Its projected points give the silhouette.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from pipeline.transforms import F64, inverse_rigid, matrix, project
 from stages.masks.grabcut import cut
 from stages.masks.region import U8, Bool, dilated, eroded, resized, working_size
 
-AROUND, REACH = 2.5, 1.6  # R: where a support is looked for; how far the object may reach
-LINK, COMPANY = 0.1, 4  # R: points nearer than this hang together; of so many others at least
+AROUND, REACH = 2.5, 1.6  # R: where the support is searched; how far the object may extend
+LINK, COMPANY = 0.1, 4  # R: distance of connected points; fewest neighbours within it
 MIN_POINTS = 200
 SPACING = 0.07  # R: gaps between projected points that are closed
-GREY = 6  # levels: a photo whose channels differ less has no colours
+GREY = 6  # levels: a photo whose channels differ less is grey
 TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class SupportedObject:
-    """Points on an object, and what it stands on if that was found."""
+    """An object. points: (N, 3) on it. support: its support plane, None if not found."""
 
     points: F64
     support: Support | None
@@ -40,7 +40,7 @@ class SupportedObject:
 def find_supported_object(
     points: F64, cameras: Sequence[Camera], roi_radius: float, seed: int
 ) -> SupportedObject | None:
-    """The object, or None if too few points say where it is."""
+    """The object among points (N, 3), or None if it has too few points."""
     centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras])
     distance = np.linalg.norm(points, axis=1)
     support = find_support(points[distance < AROUND * roi_radius], centres, roi_radius, seed)
@@ -52,7 +52,7 @@ def find_supported_object(
 
 
 def _largest_cluster(points: F64, link: float) -> F64:
-    """The points of the largest group in which each is within about `link` of others; wrong ones stand alone."""
+    """The points of the largest group in which each is within about `link` of others; outliers are isolated."""
     if len(points) <= COMPANY:
         return points
     farthest = spatial.cKDTree(points).query(points, COMPANY + 1)[0][:, -1]
@@ -68,7 +68,8 @@ def _largest_cluster(points: F64, link: float) -> F64:
 
 
 def cut_by_points(image: U8, camera: Camera, solid: SupportedObject, longest: int, seed: int) -> Bool:
-    """Hard mask at the working size: the silhouette of the object's points decides where, the photo the edge."""
+    """Hard mask at the working size: silhouette of the object's points, then GrabCut at its edge. image: (H, W, 3)
+    8-bit sRGB."""
     w, h = working_size(image.shape[1], image.shape[0], longest)
     small = np.asarray(resized(image, w, h), np.uint8)
     inside, gap = silhouette_of_points(camera, solid, h, w)
@@ -79,7 +80,8 @@ def cut_by_points(image: U8, camera: Camera, solid: SupportedObject, longest: in
 
 
 def silhouette_of_points(camera: Camera, solid: SupportedObject, height: int, width: int) -> tuple[Bool, int]:
-    """(height, width) where the object's points project, gaps closed and holes filled; the gap in pixels."""
+    """(height, width) silhouette of the object's projected points, gaps closed and holes filled; and the gap in
+    pixels."""
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
     uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, solid.points)
     scale = width / camera.width
@@ -88,7 +90,7 @@ def silhouette_of_points(camera: Camera, solid: SupportedObject, height: int, wi
         return np.zeros((height, width), bool), 1
     gap = max(1, int(np.ceil(SPACING * solid.roi_radius * K[0, 0] * scale / float(np.median(z[front])))))
     gap = min(gap, max(height, width) // 4)
-    pad = 2 * gap + 2  # so that what is closed or filled beyond the frame counts in it
+    pad = 2 * gap + 2  # so that areas are also closed and filled across the frame's border
     canvas = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)
     at = np.floor(uv[front] * scale).astype(np.int64) + pad
     at = at[(at >= 0).all(1) & (at[:, 0] < canvas.shape[1]) & (at[:, 1] < canvas.shape[0])]
@@ -99,8 +101,8 @@ def silhouette_of_points(camera: Camera, solid: SupportedObject, height: int, wi
 
 
 def distinct(image: U8) -> U8:
-    """(H, W, 3) in which subject and background differ most: the colours; of a grey photo brightness, its local mean
-    and how strongly it varies there, because a grey level alone says little."""
+    """(H, W, 3) features that separate subject and background: the colours; for a grey photo brightness, its local mean
+    and its local standard deviation, because a grey level alone is not distinctive."""
     spread = image.max(2).astype(np.int16) - image.min(2)
     if float(np.quantile(spread, 0.9)) > GREY:
         return image

@@ -1,8 +1,8 @@
-"""Networks of the user's, ONNX files that OpenCV can run: one for the subject, one that knows hair.
+"""The user's networks, ONNX files that OpenCV can run: one for the subject, one for hair.
 
-Input (1, 3, N, N) float32, RGB in [0, 1] (or normalised as ImageNet's networks expect); first output with N x N values,
-the probability of what is looked for, or its logit if any value lies outside [0, 1]; of two channels the second counts.
-One that tells several classes apart has (1, C, N, N): probabilities, or values whose softmax they are.
+Input (1, 3, N, N) float32, RGB in [0, 1] (or normalised by ImageNet's mean and standard deviation). The first output
+has N x N values: probabilities of the subject or hair, or logits if any value is outside [0, 1]; of two channels the
+second is used. A network with several classes has (1, C, N, N): probabilities, or logits for a softmax.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ IMAGENET_MEAN, IMAGENET_DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True, slots=True)
 class UserModel:
-    """path: the ONNX file. side: N. imagenet: whether the input is normalised with ImageNet's mean and deviation.
-    of_class: which of C classes is looked for, None of a network that knows one. setting: what the user calls it."""
+    """path: the ONNX file. side: N. imagenet: whether the input is normalised by ImageNet's mean and standard
+    deviation. of_class: index of the class, None for a network with one class. setting: name of the setting, for
+    errors."""
 
     path: Path
     side: int
@@ -34,9 +35,9 @@ class UserModel:
     setting: str = "masks.model"
 
     def probability(self, square: U8) -> F32:
-        """(N, N) probability of what is looked for in a (N, N, 3) 8-bit RGB picture.
+        """(N, N) probability of the subject or hair in a (N, N, 3) 8-bit RGB picture.
 
-        Raises UsageError if the file is no network, or one of another kind.
+        Raises UsageError if the file is no network, or its input or output has another shape.
         """
         values = square.astype(np.float32) / 255
         if self.imagenet:
@@ -68,14 +69,14 @@ class UserModel:
 
 
 def user_model(config: Config) -> UserModel | None:
-    """The network that the settings name for the subject, if any."""
+    """The network of masks.model for the subject, if any."""
     if not config.model:
         return None
     return UserModel(Path(config.model), config.model_side, config.model_imagenet)
 
 
 def hair_model(config: Config) -> UserModel | None:
-    """The network that the settings name for hair, if any."""
+    """The network of masks.hair_model for hair, if any."""
     if not config.hair_model:
         return None
     only = config.hair_model_class if config.hair_model_class >= 0 else None
@@ -84,7 +85,7 @@ def hair_model(config: Config) -> UserModel | None:
 
 
 def mask_by_model(image: U8, disc: Disc, model: UserModel, threshold: float, longest: int, seed: int) -> Bool:
-    """Hard mask of the subject at the working size. The whole photo is looked at, squeezed into a square."""
+    """Hard mask of the subject at the working size. The whole photo (H, W, 3), resized to a square, is the input."""
     w, h = working_size(image.shape[1], image.shape[0], longest)
     small = np.asarray(resized(image, w, h), np.uint8)
     found = model.probability(np.asarray(resized(image, model.side, model.side), np.uint8))

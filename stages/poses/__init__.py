@@ -1,1 +1,1 @@
-"""Cameras around the subject: given ones as they are, or solved from the photos."""
+"""Cameras around the subject: given, or solved from the photos by structure from motion."""

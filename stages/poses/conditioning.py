@@ -1,10 +1,10 @@
-"""How well do the photos tell where a lens has its principal point? Its standard deviation by linear error theory.
+"""Standard deviation of a lens's principal point by linear error propagation: do the photos determine it?
 
 Symbols: r = u - project(lens, pose, point) of L observations, pixels; J its derivatives by lens (f, cx, cy, k1), by
-pose (6 a photo: turn and shift) and by point (3 each). With H = J^T J and the points eliminated,
+pose (6 per photo: rotation and translation) and by point (3 each). With H = J^T J and the points eliminated,
     S = H_xx - H_xp H_pp^-1 H_px,      covariance of lens and poses = s^2 S^-1,      s^2 = sum r^2 / (2 L - unknowns)
-(Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section 9). The world's own 7 freedoms leave lenses alone;
-a weak prior keeps S regular in spite of them.
+(Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000, section 9). The 7 gauge freedoms of the world do not affect
+the lenses; a weak prior keeps S regular.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from scipy import sparse
 from pipeline.transforms import F64
 
 STEP = 1e-6
-PRIOR = 1e-10  # of each unknown's own information
+PRIOR = 1e-10  # of each unknown's diagonal element of S
 LENS, POSE = 4, 6
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """L sightings of points in photos. photo, point: (L,) numbers; uv: (L, 2) pixels; lens_of: photo -> lens."""
+    """L observations of points in photos. photo, point: (L,) indices; uv: (L, 2) pixels; lens_of: (N,) lens of each
+    photo."""
 
     photo: npt.NDArray[np.int64]
     point: npt.NDArray[np.int64]
@@ -44,7 +45,7 @@ def project_all(lens: F64, aspect: F64, cam_from_world: F64, points: F64) -> F64
 def principal_point_deviation(
     K: F64, k1: F64, cam_from_world: F64, points: F64, seen: Observations
 ) -> F64:  # fmt: skip
-    """(lenses, 2) standard deviations of cx and cy in pixels if they were set free; infinite where nothing tells.
+    """(lenses, 2) standard deviations of cx and cy in pixels if they were refined; infinite if undetermined.
 
     K (N, 3, 3), k1 (N,), cam_from_world (N, 3, 4) by photo; points (M, 3).
     """
@@ -74,7 +75,7 @@ def principal_point_deviation(
     S = _schur(by_camera, by_point, len(points))
     freedom = max(2 * len(i) - by_camera.shape[1] - by_point.shape[1] + 7, 1)
     variance = float((residual**2).sum()) / freedom
-    size = np.sqrt(np.maximum(np.diag(S), 1e-300))  # turns and pixels have sizes of their own
+    size = np.sqrt(np.maximum(np.diag(S), 1e-300))  # rotations and pixels differ in size
     covariance = np.linalg.inv(S / np.outer(size, size) + PRIOR * np.eye(len(S))) * variance / np.outer(size, size)
     first = photos * POSE + np.arange(lenses) * LENS
     diagonal = np.diag(covariance)
@@ -82,7 +83,7 @@ def principal_point_deviation(
 
 
 def _moved(pose: F64, k: int, h: float) -> F64:
-    """Poses (L, 3, 4) turned about (k < 3) or shifted along (k >= 3) a camera axis by h."""
+    """Poses (L, 3, 4) rotated about (k < 3, radians) or shifted along (k >= 3) a camera axis by h."""
     out = pose.copy()
     if k >= 3:
         out[:, k - 3, 3] += h
@@ -94,7 +95,7 @@ def _moved(pose: F64, k: int, h: float) -> F64:
 
 
 def _sparse(blocks: Sequence[tuple[list[F64], npt.NDArray[np.int64]]], width: int) -> sparse.csr_matrix:
-    """(2 L, width): columns (L, 2) of derivatives at each observation's own place."""
+    """(2 L, width) Jacobian from blocks: derivatives (L, 2), and each observation's first column (L,)."""
     rows, columns, values = [], [], []
     for derivatives, first in blocks:
         for k, d in enumerate(derivatives):
@@ -108,7 +109,7 @@ def _sparse(blocks: Sequence[tuple[list[F64], npt.NDArray[np.int64]]], width: in
 
 
 def _schur(by_camera: sparse.csr_matrix, by_point: sparse.csr_matrix, points: int) -> F64:
-    """H_xx - H_xp H_pp^-1 H_px, dense; H_pp is 3 x 3 by 3 x 3."""
+    """H_xx - H_xp H_pp^-1 H_px, dense; H_pp is block diagonal with blocks of 3 x 3."""
     H_pp = (by_point.T @ by_point).tocoo()
     blocks = np.zeros((points, 3, 3))
     blocks[H_pp.row // 3, H_pp.row % 3, H_pp.col % 3] = H_pp.data

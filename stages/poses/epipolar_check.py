@@ -1,7 +1,7 @@
-"""Do the given cameras belong to the photos? Features of neighbouring photos must lie on each other's epipolar lines.
+"""Check of given cameras against the photos: matches of neighbouring photos must satisfy the epipolar constraint.
 
 Symbols: x_i (N, 2) undistorted positions on camera i's plane z = 1; E the essential matrix of two cameras,
-(x_j, 1)^T E (x_i, 1) = 0 for the same point. A pair counts where the photos themselves agree on some geometry.
+(x_j, 1)^T E (x_i, 1) = 0 for the same point. Only pairs are used whose matches fit some fundamental matrix.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from pipeline.transforms import F64, inverse_rigid, matrix, undistort
 from stages.poses.features import PLAIN, Features, detect, grey8
 from stages.poses.matching import match, verify
 
-EDGE, FEATURES = 400, 600  # pixels, number: quick, and noise is averaged away
-PARTNERS = 4  # photos that each is held against
-FAR = 0.01  # of the longest edge: farther from its epipolar line a match speaks against the cameras
-IMPERFECT = 0.03  # the same for cameras that are known not to be exact, and mended afterwards
-AGREE = 0.3  # share of a view's matches that must agree with its camera
-MIN_MATCHES = 20  # of a view over all its pairs, to judge it
+EDGE, FEATURES = 400, 600  # pixels, number: fast, and the reduction averages noise
+PARTNERS = 4  # photos that each is compared with
+FAR = 0.01  # of the longest edge: largest distance of a consistent match from its epipolar line
+IMPERFECT = 0.03  # the same for inexact cameras that are refined afterwards
+AGREE = 0.3  # smallest share of consistent matches of a correct view
+MIN_MATCHES = 20  # fewest matches of a view over all its pairs for a decision
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """share: of each view's matches that agree with the cameras, NaN where there are too few to tell."""
+    """share: (N,) consistent matches of each view, NaN if it has too few matches."""
 
     share: F64
 
     @property
     def wrong(self) -> list[int]:
-        """Views whose photos and cameras don't belong together."""
+        """Indices of views whose photo contradicts its camera."""
         return [int(i) for i in np.flatnonzero(self.share < AGREE)]
 
     @property
     def known(self) -> int:
-        """Number of views that can be judged."""
+        """Number of views with enough matches."""
         return int(np.isfinite(self.share).sum())
 
 
@@ -48,8 +48,8 @@ def check_cameras(
     cameras: Sequence[Camera], features: Sequence[Features], seed: int, tick: Callable[[int, int], None],
     far: float = FAR,
 ) -> Verdict:  # fmt: skip
-    """Hold each view against its nearest ones. A wrong view spoils its pairs: it is found first, and its pairs no
-    longer count against its neighbours. tick: done, total. far: of the longest edge, see FAR."""
+    """Compare each view with its nearest ones. The worst view is excluded first, with its pairs, so that it does not
+    make its neighbours look wrong. tick: done, total. far: as a share of the longest edge, see FAR."""
     pairs = near_pairs(cameras)
     counts: dict[tuple[int, int], tuple[int, int]] = {}
     for n, (i, j) in enumerate(pairs):
@@ -67,7 +67,7 @@ def check_cameras(
 
 
 class Picture(Protocol):
-    """What features are looked for in: see stages.poses.photos.StoredPhoto."""
+    """A photo for feature detection: see stages.poses.photos.StoredPhoto."""
 
     @property
     def width(self) -> int: ...
@@ -81,7 +81,7 @@ class Picture(Protocol):
 
 
 def features_of(photos: Sequence[Picture], tick: Callable[[int, int], None]) -> list[Features]:
-    """Features of every photo, on the subject only where it has a mask. tick: done, total."""
+    """Features of every photo; with a mask, on the subject only. tick: done, total."""
     found = []
     for n, photo in enumerate(photos):
         tick(n, len(photos))
@@ -95,7 +95,7 @@ def features_of(photos: Sequence[Picture], tick: Callable[[int, int], None]) -> 
 
 
 def near_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Each view with the PARTNERS that look from the most similar direction, first < second."""
+    """Pairs of each view with the PARTNERS views of the most similar direction, first < second."""
     axes = np.stack([matrix(c.world_from_cam)[:3, 2] for c in cameras])
     likeness = axes @ axes.T
     np.fill_diagonal(likeness, -np.inf)
@@ -116,7 +116,7 @@ def epipolar_pixels(a: Camera, b: Camera, uv_a: F64, uv_b: F64) -> F64:
 
 
 def _on_plane(camera: Camera, uv: F64) -> F64:
-    """(N, 3) positions on the plane z = 1, the lens undone."""
+    """(N, 3) undistorted positions on the plane z = 1 of pixels uv (N, 2)."""
     K = matrix(camera.K)
     flat = np.asarray(np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T, np.float64)
     xy = undistort(flat, np.array(camera.distortion, np.float64))
@@ -124,7 +124,8 @@ def _on_plane(camera: Camera, uv: F64) -> F64:
 
 
 def _shares(counts: dict[tuple[int, int], tuple[int, int]], views: int) -> F64:
-    """Share of agreeing matches of each view; the worst view is taken out before its neighbours are judged again."""
+    """(views,) share of consistent matches; the worst view is excluded before its neighbours are judged again. counts:
+    consistent matches and all matches of each pair."""
     out, left = np.full(views, np.nan), dict(counts)
     while True:
         good, every = np.zeros(views), np.zeros(views)

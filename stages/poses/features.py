@@ -1,8 +1,8 @@
 """SIFT features of one photo, spread over the frame.
 
-Skin has little contrast: the detector's threshold is set far below its usual value and the strongest features of each
-cell of a grid are kept, so that a sharp background or the eyebrows alone don't take all the places.
-Image positions are in pixels of the full photo, first pixel's centre at (0.5, 0.5).
+Skin has little contrast, so the detector's threshold is far below its usual value. The strongest features of each cell
+of a grid are kept, so that a sharp background or the eyebrows do not use up the number of features.
+Positions are in pixels of the full photo, first pixel's centre at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ U8 = npt.NDArray[np.uint8]
 
 LAYERS, SIGMA = 3, 1.6  # Lowe's values
 GRID = 8
-OVERSAMPLING = 2  # describe this many times more features than are kept, so that the cells have a choice
+OVERSAMPLING = 2  # detected features per kept one, so that each cell can be filled
 NLM_STRENGTH, NLM_PATCH, NLM_WINDOW = 8.0, 5, 15  # levels of 255, pixels, pixels
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How hard to look. contrast: cv2's threshold (its default 0.04 finds next to nothing on skin). edge_ratio: how
-    elongated a spot may be. ratio: Lowe's test on distances, when matching. denoise: non-local means beforehand.
-    tilts: look at the photo as if seen askew too, so many steps of the square root of 2 (Morel, Yu, ASIFT, 2009).
+    """Parameters of detection and matching. contrast: cv2's threshold (the default 0.04 detects almost nothing on
+    skin). edge_ratio: largest elongation of a feature. ratio: Lowe's ratio test on distances. denoise: non-local means
+    first. tilts: number of simulated oblique views, in steps of the square root of 2 (Morel, Yu, ASIFT, 2009).
     """
 
     contrast: float
@@ -40,11 +40,11 @@ class Effort:
 
 
 PLAIN = Effort(contrast=0.004, edge_ratio=10.0, ratio=0.85, denoise=False)
-# a second chance for noisy or small photos: wrinkles and hair count too, geometry weeds out what slides along them
-PATIENT = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True)
-# the last chance, ten times slower: photos too far apart for SIFT, such as the next ring of cameras seen from above
-ASKEW = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True, tilts=2)
-MORE_ASKEW = 3  # times the features: the same spot is found under several tilts
+# second attempt, for noisy or small photos: edges of wrinkles and hair too; verification removes wrong matches
+DENOISED = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True)
+# last attempt, ten times slower: photos too far apart for SIFT, such as the next ring of cameras seen from above
+ASIFT = Effort(contrast=0.001, edge_ratio=20.0, ratio=0.9, denoise=True, tilts=2)
+MORE_ASIFT = 3  # times the features: a spot is detected under several tilts
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Features:
 def grey8(image: npt.NDArray[np.generic], max_edge: int) -> U8:
     """(H, W, C) as stored -> (h, w) 8-bit, encoded as sRGB, longest edge at most `max_edge`.
 
-    Float pictures are linear and without a fixed white: their brightest percent is mapped to white.
+    Float pictures are linear, without a fixed white: their 99th percentile is mapped to white.
     """
     plane: F32 = np.asarray(image[..., :3], np.float32)
     if np.issubdtype(image.dtype, np.floating):
@@ -78,9 +78,9 @@ def grey8(image: npt.NDArray[np.generic], max_edge: int) -> U8:
 def detect(
     grey: U8, size: tuple[int, int], max_features: int, effort: Effort = PLAIN, inside: U8 | None = None
 ) -> Features:
-    """Features of a (possibly reduced) grey picture, in pixels of the photo of `size` (width, height).
+    """Features of a (possibly reduced) grey picture (h, w), in pixels of the photo of `size` (width, height).
 
-    inside: (h, w) mask at the grey picture's size; features where it is 0 are left out.
+    inside: (h, w) mask; features where it is 0 are left out.
     """
     if effort.denoise:
         grey = np.asarray(cv2.fastNlMeansDenoising(grey, None, NLM_STRENGTH, NLM_PATCH, NLM_WINDOW), np.uint8)
@@ -101,14 +101,15 @@ def detect(
 
 
 def _spread(keypoints: Sequence[cv2.KeyPoint], shape: tuple[int, ...], count: int) -> npt.NDArray[np.int64]:
-    """Indices of at most `count` keypoints: rank by rank over the cells of a grid, in each the strongest first."""
+    """Indices of at most `count` keypoints: the strongest of each grid cell, then the second of each cell, and so
+    on."""
     if not keypoints:
         return np.zeros(0, np.int64)
     xy = np.array([k.pt for k in keypoints])
     response = np.array([k.response for k in keypoints])
     cell = (xy[:, 1] * GRID / shape[0]).astype(int).clip(0, GRID - 1) * GRID
     cell += (xy[:, 0] * GRID / shape[1]).astype(int).clip(0, GRID - 1)
-    # ties are broken by position, so that the order never depends on how the detector ran
+    # ties are sorted by position, so that the order does not depend on the detector's threads
     order = np.lexsort((xy[:, 0], xy[:, 1], -response))
     rank = np.empty(len(order), int)
     for c in np.unique(cell):

@@ -1,4 +1,4 @@
-"""Cameras that came with the capture: held against the photos, mended if asked for, moved to asset coordinates."""
+"""Given cameras: checked against the photos, refined if configured, transformed to asset coordinates."""
 
 from __future__ import annotations
 
@@ -27,58 +27,58 @@ if TYPE_CHECKING:
 
 
 def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
-    """The capture's own cameras, moved to asset coordinates; without views that their photos contradict. Where most
-    do, nobody knows which are right: all stay, and the finding says it.
+    """The capture's cameras in asset coordinates, without views whose photos contradict them. If most views are
+    contradicted, it is unknown which are right: all are kept, and the finding is unusable.
 
     Raises:
-        StageError: the photos share no point under them.
+        StageError: the photos share no point under these cameras.
     """
     cameras = [
         camera_of(v, matrix(c.K), inverse_rigid(matrix(c.cam_from_world)), c.distortion)
         for v, c in ((v, v.camera) for v in capture.artifact.views)
         if c is not None
     ]
-    # only FaceScape says what its numbers are: metres or millimetres; the others' worlds have any size
+    # only FaceScape defines its unit: metres or millimetres; the other formats have arbitrary units
     auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
     unit: Unit = auto if config.unit == "auto" else config.unit
     wrong, findings = _contradicted(capture, cameras, config, context) if config.check else ([], ())
     names = tuple(cameras[i].name for i in wrong)
     right = [i for i in range(len(cameras)) if i not in wrong]
     cameras = [cameras[i] for i in right]
-    warnings_ = [f"{n} is left out: its photo and its camera do not belong together; check its file name and its pose"
-            for n in names]  # fmt: skip
+    warnings = [f"{n} is left out: its photo contradicts its camera; check its file name and its pose"
+                for n in names]  # fmt: skip
     model = None
     if config.given != "keep":
-        model, cameras, doubtful = _held_against_photos(capture, right, cameras, config, context)
+        model, cameras, doubtful = _triangulated(capture, right, cameras, config, context)
         if doubtful:
-            warnings_.append(
-                "the photos say too little to mend the cameras of " + ", ".join(doubtful) + "; they stay as given"
+            warnings.append(
+                "too few points to refine the cameras of " + ", ".join(doubtful) + "; they are used as given"
             )
     faces = find_faces(capture, some_of(capture, cameras), context.check)
     eyes = eyes_of([(c, face.pupils) for c, face in faces]) if config.pupils_mm else None
-    known = known_scale(capture, cameras, config, eyes, warnings_)
+    known = known_scale(capture, cameras, config, eyes, warnings)
     world, axes = capture.artifact.metres_from_world, None
     if world is not None and config.unit == "auto":
         published, axes = by_world(matrix(world))
         known = published if known is None and config.scale == "auto" else known
     found = normalise(cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces))
-    warnings = (*warnings_, *found.warnings)
-    made = camera_set("given", cameras, found, model, [c.name for c in cameras], names, warnings, context)
-    return made.model_copy(update={"findings": findings})
+    all_warnings = (*warnings, *found.warnings)
+    result = camera_set("given", cameras, found, model, [c.name for c in cameras], names, all_warnings, context)
+    return result.model_copy(update={"findings": findings})
 
 
-def _held_against_photos(
+def _triangulated(
     capture: Located[Capture], right: list[int], cameras: list[Camera], config: Config, context: Context
 ) -> tuple[Model, list[Camera], list[str]]:
-    """Points triangulated from the given cameras `right` of the capture; the cameras, moved if asked for; names of
-    those that should have been and were not.
+    """Points triangulated from the given cameras `right` of the capture; these cameras, refined if configured; names of
+    cameras that could not be refined.
 
     Raises:
         StageError: the photos share no point under these cameras.
     """
     from stages.poses.sfm import (
         triangulate_given,
-    )  # takes COLMAP, which cameras that stay as they are do not
+    )  # imports COLMAP, which is not needed for poses.given=keep
 
     photos = photos_of(capture)
     centres, axes = viewing_rays(cameras)
@@ -89,7 +89,7 @@ def _held_against_photos(
         refine=config.given == "refine", deviation=config.given_deviation * distance,
     )  # fmt: skip
     if found is None:
-        raise StageError("no point is seen by two photos", where="poses", value="0 points",
+        raise StageError("no point is visible in two photos", where="poses", value="0 points",
                          limit="features that neighbouring photos share",
                          remedy="set poses.given=keep to use the cameras as they are")  # fmt: skip
     model, doubtful = found
@@ -104,14 +104,14 @@ def _held_against_photos(
 def _contradicted(
     capture: Located[Capture], cameras: list[Camera], config: Config, context: Context
 ) -> tuple[list[int], tuple[Finding, ...]]:  # fmt: skip
-    """Places of the views whose photos contradict their cameras, none if most do; and what follows from it."""
+    """Indices of the views whose photos contradict their cameras (empty if most do), and the findings."""
     progress = progress_of(context)
     photos = photos_of(capture)
-    features = features_of(photos, lambda n, m: progress(n, m, "looking for features"))
+    features = features_of(photos, lambda n, m: progress(n, m, "detecting features"))
     far = IMPERFECT if config.given == "refine" else FAR
     verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
     right = [i for i in range(len(cameras)) if verdict.share[i] >= AGREE]
-    silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image matches nothing
+    silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image has no matches
     flipped = find_mirrored(photos, [*verdict.wrong, *silent], right, config.seed)
     findings = (contradicted([cameras[i].name for i in verdict.wrong], verdict.known, len(cameras)),
                 mirrored([cameras[i].name for i in flipped], len(cameras)))  # fmt: skip

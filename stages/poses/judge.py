@@ -1,7 +1,7 @@
-"""How good the cameras are: how many photos have one, whether they fit the photos, and what of the subject they see.
+"""The checks of the cameras: how many photos have one, their errors, and which directions of the subject they see.
 
-Limits are from the captures that they were measured on: rigs (54 and 36 views), 44 photos by hand all around, and an
-arc of a film before a face (27 degrees), which is usable.
+The limits come from measured captures: rigs (54 and 36 views), 44 hand-held photos all around, and a video of an arc in
+front of a face (27 degrees), which is usable.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from pipeline.verdict import Finding, Limits, judged
 from stages.poses.normalise import PLAUSIBLE_ROI
 
 AROUND = "photograph all around the subject, a step of 15 degrees at a time, also from above and below"
-HIDDEN = 0.5  # a part of the head of which less is seen is named
-PER = 1000.0  # pixels of the longer edge to which errors in pixels are brought
+HIDDEN = 0.5  # parts of the head of which a smaller share is seen are listed
+PER = 1000.0  # errors are in pixels per 1000 pixels of the longer edge
 
-PLACED = Limits(0.9, 0.6)  # 43 of 44 by hand; 30 of 66 of a skull under a flash, which is of no use
+PLACED = Limits(0.9, 0.6)  # 43 of 44 by hand; 30 of 66 of a skull under a flash, which is unusable
 GROUPS = Limits(
     0.1, 0.5, lower=False
-)  # largest other group against the photos placed: half as many is a second subject
-CONTRADICTED = Limits(0.05, 0.5, lower=False)  # one bumped camera of 20 is left out; from half on nobody knows which
-REPROJECTION = Limits(1.5, 3.0, lower=False)  # px per 1000: .5 and 1.0 in captures by hand that are right
-FOCAL = Limits(0.15, 0.4, lower=False)  # from EXIF: right solutions within 2 %, a wrong one was 41 % off
-POINTS = Limits(500, 100)  # 651 on a person by hand, all around; below 100 a principal point or a front is not told
-FLAT = Limits(0.05, 0.05)  # thickness of the points against their length: a wall has .01, a face from the front .3
-SEEN = Limits(0.85, 0.3)  # of the directions around: rigs .96 and 1, by hand .92, an arc before a face .40
+)  # largest other group relative to the registered photos: half as many is a second subject
+CONTRADICTED = Limits(0.05, 0.5, lower=False)  # one bumped camera of 20 is left out; from half on it is unknown which
+REPROJECTION = Limits(1.5, 3.0, lower=False)  # px per 1000: .5 and 1.0 in correct hand-held captures
+FOCAL = Limits(0.15, 0.4, lower=False)  # from EXIF: correct solutions within 2 %, a wrong one was 41 % off
+POINTS = Limits(500, 100)  # 651 on a person by hand, all around; fewer than 100 give no principal point and no front
+FLAT = Limits(0.05, 0.05)  # thickness of the points relative to their length: a wall .01, a face from the front .3
+SEEN = Limits(0.85, 0.3)  # of the directions around: rigs .96 and 1, by hand .92, an arc in front of a face .40
 FRONT_SEEN = Limits(0.9, 0.5)
-SPREAD = Limits(60.0, 10.0)  # degrees: 174 and more all around, 27 an arc; below 10 depth is not told
+SPREAD = Limits(60.0, 10.0)  # degrees: at least 174 all around, 27 an arc; below 10 depth can't be triangulated
 MIRRORED = Limits(0.0, 0.5, lower=False)
 
 
 def judge(found: CameraSet, capture: Capture, points: F64 | None) -> tuple[Counts, tuple[Finding, ...]]:
-    """Which directions the fitted views see, and all findings that cameras alone allow. points: (M, 3) sparse points in
-    asset coordinates, None where cameras were given."""
+    """Directions seen by the fitted views, and the findings. points: (M, 3) sparse points in asset coordinates, or
+    None."""
     views, stated = capture.views, found.source == "given" and capture.kind == "facescape"
     fitted = fitted_cameras(found.cameras, views)
     directions = view_directions(fitted)
@@ -54,34 +54,36 @@ def fitted_cameras(cameras: Sequence[Camera], views: Sequence[CaptureView]) -> l
 
 
 def contradicted(wrong: Sequence[str], known: int, total: int) -> Finding:
-    """Given cameras held against their photos. wrong: names of views that contradict; known: views that tell."""
+    """The check of given cameras against the photos. wrong: names of contradicted views; known: number of views with
+    enough matches; total: of all views."""
     share = len(wrong) / max(1, known)
     return judged("cameras_against_photos", share, CONTRADICTED,
-                  f"the photos contradict the cameras of {len(wrong)} of {known} views that tell (of {total})",
+                  f"the photos contradict {len(wrong)} of {known} cameras (of {total} views, {known} have enough "
+                  "matches for the check)",
                   "check that photos and cameras are in the same order and of the same size, or set "
-                  "poses.method=colmap to have the cameras solved", views=wrong)  # fmt: skip
+                  "poses.method=colmap to solve the cameras from the photos", views=wrong)  # fmt: skip
 
 
 def groups(placed: int, others: Sequence[Sequence[str]]) -> Finding:
-    """The largest group of photos that fit together, but not with the placed ones. others: names in each."""
+    """The check of the largest group of photos that fit together, but not with the registered ones. placed: number of
+    the latter; others: names in each group."""
     largest = max(others, key=len, default=())
     message = (
         f"{len(largest)} photos fit together, but not with the {placed} others"
         if largest
-        else "all placed photos \
-fit together"
+        else "all registered photos fit together"
     )
     return judged("largest_other_group", len(largest) / max(1, placed), GROUPS, message,
-                  "photograph the way between the groups; if they show another subject, make a capture of their own",
+                  "take photos between the groups; if they show another subject, put them into a separate capture",
                   views=largest)  # fmt: skip
 
 
 def mirrored(names: Sequence[str], total: int) -> Finding:
-    """Photos that fit the others only when they are turned over from left to right."""
+    """The check for photos that fit the others only when flipped horizontally. total: number of all photos."""
     return judged("mirrored_photos", len(names) / max(1, total), MIRRORED,
-                  f"{len(names)} of {total} photos are the mirror image of what the others show" if names else
+                  f"{len(names)} of {total} photos are mirror images" if names else
                   "no photo is a mirror image",
-                  "use the originals: a phone's front camera mirrors what it saves unless that is switched off",
+                  "use the original photos; a phone's front camera saves mirror images unless that is switched off",
                   views=names)  # fmt: skip
 
 
@@ -89,9 +91,9 @@ def _placed(found: CameraSet) -> Finding:
     total = len(found.cameras) + len(found.unregistered)
     return judged("photos_placed", len(found.cameras) / max(1, total),
                   PLACED,
-                  f"{len(found.cameras)} of {total} photos have a camera that fits",
-                  "take the photos around one still subject, sharp, each overlapping the next by two thirds; remove "
-                  "those named if they show something else", views=found.unregistered)  # fmt: skip
+                  f"{len(found.cameras)} of {total} photos have a camera",
+                  "take sharp photos around one still subject, each overlapping the next by two thirds; remove the "
+                  "listed photos if they show something else", views=found.unregistered)  # fmt: skip
 
 
 def _errors(found: CameraSet) -> list[Finding]:
@@ -101,9 +103,9 @@ def _errors(found: CameraSet) -> list[Finding]:
     value = found.reprojection_error_px * PER / edge
     worst = sorted(found.view_errors_px.items(), key=lambda x: -x[1])
     far = [n for n, e in worst if e * PER / edge > REPROJECTION.good]
-    message = f"points on the subject are {found.reprojection_error_px:.2f} px from where the photos show them"
+    message = f"the mean reprojection error is {found.reprojection_error_px:.2f} px"
     return [judged("reprojection_error", value, REPROJECTION, message,
-                   "keep subject and lens still; take photos that overlap more", unit="px per 1000 px",
+                   "keep the subject still and the zoom fixed; take photos that overlap more", unit="px per 1000 px",
                    views=far)]  # fmt: skip
 
 
@@ -113,23 +115,23 @@ def _focal(found: CameraSet, views: Sequence[CaptureView]) -> list[Finding]:
     if found.source != "colmap" or not ratios:
         return []
     off = abs(float(np.median(list(ratios.values()))) - 1)
-    return [judged("focal_length", off, FOCAL, f"the solved focal length is {off:.0%} off what EXIF says",
-                   "take more photos with more overlap, all at one zoom; the solution is doubtful",
+    return [judged("focal_length", off, FOCAL, f"the solved focal length differs by {off:.0%} from EXIF",
+                   "the cameras may be wrong; take more photos with more overlap, all at one zoom",
                    views=sorted(ratios, key=lambda n: -abs(ratios[n] - 1)))]  # fmt: skip
 
 
 def _scale(found: CameraSet, stated: bool) -> Finding:
-    """A size in metres must be a head's. One that is not known is no fault of the photos; stated: but of cameras in a
-    format that says its unit, of which none makes a head."""
+    """The check of the subject's size, which must be a head's if the scale is known. An unknown scale is no fault,
+    unless the cameras' format defines its unit (stated) and no unit gives a head's size."""
     low, high = PLAUSIBLE_ROI
     capture_unit = float(np.cbrt(np.linalg.det(matrix(found.capture_from_asset)[:3, :3])))
     radius = found.roi_radius * (1.0 if found.metric else capture_unit)
     known = found.metric or stated
     off = max(low / radius, radius / high, 1.0) if known else 1.0
-    message = f"the views see {radius:.3g} {'m' if found.metric else 'units'} around the subject"
+    message = f"the region of interest has a radius of {radius:.3g} {'m' if found.metric else 'units'}"
     return judged("scale", off, Limits(1.0, float("inf"), lower=False),
-                  (message if known else "the size of the subject is not known, and made a head's")
-                  + (f", where a head is {low} to {high} m" if off > 1 else ""),
+                  (message if known else "the subject's size is unknown; it is scaled to the size of a head")
+                  + (f"; a head has {low} to {high} m" if off > 1 else ""),
                   "check poses.unit, poses.distance, poses.marker_mm or poses.pupils_mm", unit="times")  # fmt: skip
 
 
@@ -137,7 +139,7 @@ def _points(found: CameraSet, points: F64 | None) -> list[Finding]:
     if points is None:
         return []
     own = points[np.linalg.norm(points, axis=1) <= found.roi_radius]
-    out = [judged("points_on_subject", len(own), POINTS, f"{len(own)} points on the subject are shared by photos",
+    out = [judged("points_on_subject", len(own), POINTS, f"{len(own)} sparse points lie on the subject",
                   "use sharper photos with more overlap; skin without pores needs a closer camera or more light",
                   unit="points")]  # fmt: skip
     if len(own) >= 3:
@@ -146,7 +148,7 @@ def _points(found: CameraSet, points: F64 | None) -> list[Finding]:
         flat = FLAT.level(thick) != "good"
         out.append(judged("depth_of_subject", thick, FLAT,
                           "the points lie in one plane: the photos show a wall or a picture" if flat else
-                          "the points fill a body", "photograph a person or an object, from all around"))  # fmt: skip
+                          "the points are not flat", "photograph a person or an object, from all around"))  # fmt: skip
     return out
 
 
@@ -154,17 +156,17 @@ def _seen(counts: Counts) -> list[Finding]:
     shares = {name: share_seen(counts, where) for name, where in parts().items()}
     hidden = [f"the {n} ({s:.0%} seen)" for n, s in shares.items() if s < HIDDEN and n != "underside"]
     all_round = share_seen(counts, around())
-    unseen = f"; hardly seen by any photo: {', '.join(hidden)}" if hidden else ""
+    unseen = f"; hardly visible in any photo: {', '.join(hidden)}" if hidden else ""
     return [
         judged("directions_seen", all_round, SEEN,
-               f"{all_round:.0%} of the directions around the subject are seen by a photo{unseen}", AROUND),
-        judged("front_seen", shares["front"], FRONT_SEEN, f"{shares['front']:.0%} of the front is seen by a photo",
-               "photograph the face from both sides, in steps of 15 degrees; if this is its front already, its "
-               "direction is wrong: take photos in which the face is seen"),
+               f"photos cover {all_round:.0%} of the directions around the subject{unseen}", AROUND),
+        judged("front_seen", shares["front"], FRONT_SEEN, f"photos cover {shares['front']:.0%} of the front",
+               "photograph the face from both sides, in steps of 15 degrees; if the photos show the face already, the "
+               "front was detected wrongly: take photos in which the face is clearly visible"),
     ]  # fmt: skip
 
 
 def _spread(directions: F64) -> Finding:
     degrees = spread(directions)
     return judged("view_spread", degrees, SPREAD, f"the views are at most {degrees:.0f} degrees apart",
-                  f"{AROUND}; photos from one side tell no depth", unit="degrees")  # fmt: skip
+                  f"{AROUND}; photos from one side do not determine depth", unit="degrees")  # fmt: skip

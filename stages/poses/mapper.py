@@ -1,8 +1,8 @@
-"""Structure from motion: features and matches in, cameras and sparse points out, by COLMAP's mappers.
+"""Structure from motion: cameras and sparse points from features and matches, by COLMAP's mappers.
 
-The incremental mapper places photo after photo; the global one turns and places all at once, which many photos need.
+The incremental mapper registers photo after photo; the global one solves all at once, for many photos.
 The same input gives the same cameras: every sampler is seeded and the mappers run on one thread, because the order of
-a parallel sum is not fixed. COLMAP has the first pixel's centre at (0.5, 0.5), as everything here has.
+a parallel sum is not fixed. COLMAP has the first pixel's centre at (0.5, 0.5), like this project.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, project, rigid
-from stages.poses.bundle_adjustment import Refine, settle
+from stages.poses.bundle_adjustment import Refine, adjust
 from stages.poses.features import Features
 from stages.poses.matching import Pair, Verified
 from stages.poses.well_supported import well_supported
@@ -27,17 +27,17 @@ MAX_MODELS = 8
 MIN_MODEL = 3
 GLOG_ERROR = 2
 MIN_POINTS = 100
-LOOSE_MODELS = 3  # a beginning anew costs more where more photos can be tried
-LOOSE_INLIERS, LOOSE_SHARE = 15, 0.15  # matches with the points so far, to place a photo; COLMAP's own: 30 and 0.25
+LOOSE_MODELS = 3  # each further model costs more here, because more photos are tried
+LOOSE_INLIERS, LOOSE_SHARE = 15, 0.15  # fewest inliers to register a photo; COLMAP's defaults: 30 and 0.25
 Mapper = Literal["incremental", "global"]
 PRINCIPAL_POINT_LIMIT = (
-    1.5e-3  # of the longest edge, standard deviation: it turns a view by less than a tenth of a degree
+    1.5e-3  # of the longest edge, standard deviation: this rotates a view by less than a tenth of a degree
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """A start for the intrinsics of the photos that share them. focal: pixels, None if nothing is known."""
+    """Initial intrinsics of the photos that share a lens. width, height, focal: pixels; focal is None if unknown."""
 
     width: int
     height: int
@@ -46,7 +46,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A registered photo. K (3, 3); world_from_cam (4, 4) rigid; distortion k1 k2 p1 p2 k3."""
+    """Camera of a registered photo. K (3, 3) pixels; world_from_cam (4, 4) rigid; distortion k1 k2 p1 p2 k3."""
 
     K: F64
     world_from_cam: F64
@@ -55,8 +55,8 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """The largest reconstruction. poses, view_error_px: by photo number. points (M, 3); error_px (M,); track (M,)
-    photos per point. others: photos of each other reconstruction, of another subject or not linked to this one.
+    """The largest reconstruction. poses, view_error_px: by photo index. points (M, 3); error_px (M,); track (M,) photos
+    per point. others: photos of each other reconstruction: of another subject, or not linked to this one.
     """
 
     poses: dict[int, Pose]
@@ -82,11 +82,11 @@ def reconstruct(
     next_image: Callable[[], bool],
     loose: bool = False,
 ) -> Model | None:
-    """The largest model that COLMAP finds, or None. lens_of: for each photo, its place in `lenses`.
+    """The largest model of COLMAP's mapper, or None. lens_of: index of each photo's lens in `lenses`.
 
-    loose: photos are placed by half as many matches as COLMAP asks for by itself, and those that in the end do not hang
-    on the rest by as many as it asks for are let go. next_image: called before each photo is placed (by the global
-    mapper, before all); True stops the mapper. scratch: an empty folder.
+    loose: a photo is registered with half of COLMAP's default number of inliers; photos that in the end do not share
+    the default number of points with the rest are removed. next_image: called before each photo is registered (by the
+    global mapper: once before all); True stops the mapper. scratch: an empty folder.
     """
     pycolmap.logging.minloglevel = GLOG_ERROR
     database = scratch / "matches.db"
@@ -100,14 +100,14 @@ def reconstruct(
         return None
     if loose:
         for reconstruction in found.values():
-            _let_go(reconstruction)
-    # the most photos; of equally large ones the one with more points
+            _remove_poorly_supported(reconstruction)
+    # the most photos; if equal, the most points
     ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
     largest, of_lens = ranked[0], np.array(lens_of, np.int64)
     determined = _determines_principal_points(largest, numbers, of_lens)
-    # lenses that the photos hardly tell drift under a loss that gives up a part of what the photos say
+    # a lens that the photos hardly determine drifts under a robust loss, which ignores a part of the observations
     own = refine if determined else Refine(focal=False, distortion=False)
-    settle(largest, own, principal_point={"auto": determined, "yes": True, "no": False}[refine.principal_point])
+    adjust(largest, own, principal_point={"auto": determined, "yes": True, "no": False}[refine.principal_point])
     return model_of(largest, numbers, ranked[1:])
 
 
@@ -124,7 +124,7 @@ def _one_by_one(database: Path, scratch: Path, options: Any, next_image: Callabl
                 database, scratch, scratch / "models", options, next_image_callback=tick, cancellation_token=token,
             )
         )  # fmt: skip
-    except InterruptedError:  # what a cancelled token raises; whoever cancelled knows why
+    except InterruptedError:  # raised by a cancelled token; the caller handles the reason
         return {}
 
 
@@ -143,7 +143,7 @@ def _all_at_once(
 
 
 def _start(lens: Lens, camera_model: str) -> Any:
-    """COLMAP's camera to begin with."""
+    """The initial COLMAP camera of a lens."""
     focal = lens.focal or DEFAULT_FOCAL * max(lens.width, lens.height)
     camera = pycolmap.Camera.create_from_model_name(0, camera_model, focal, lens.width, lens.height)
     camera.has_prior_focal_length = lens.focal is not None
@@ -151,7 +151,7 @@ def _start(lens: Lens, camera_model: str) -> Any:
 
 
 def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float, float, float, float]:
-    """(k1, k2, p1, p2, k3) of a COLMAP camera, exactly. Only models that OpenCV's five terms can say are accepted."""
+    """(k1, k2, p1, p2, k3) of a COLMAP camera, exactly. Only models that these five terms represent are accepted."""
     if model == "SIMPLE_RADIAL":  # f, cx, cy, k
         return (float(params[3]), 0.0, 0.0, 0.0, 0.0)
     if model == "OPENCV":  # fx, fy, cx, cy, k1, k2, p1, p2
@@ -166,7 +166,7 @@ def opencv_distortion(model: str, params: Sequence[float]) -> tuple[float, float
 def _determines_principal_points(
     reconstruction: Any, numbers: Mapping[str, int], lens_of: npt.NDArray[np.int64]
 ) -> bool:
-    """Whether the photos of every lens tell its principal point well enough to move it from the frame's centre."""
+    """Whether the photos determine the principal point of every lens well enough to refine it."""
     from stages.poses.conditioning import Observations, principal_point_deviation
 
     if reconstruction.num_points3D() < MIN_POINTS:
@@ -193,13 +193,13 @@ def _determines_principal_points(
 
 
 def _observations(image: Any) -> tuple[list[int], F64]:
-    """Points (ids) that an image sees, and where (L, 2)."""
+    """Ids of the points that an image observes, and their pixels (L, 2)."""
     found = [(p.point3D_id, p.xy) for p in image.points2D if p.has_point3D()]
     return [k for k, _ in found], np.array([uv for _, uv in found], np.float64).reshape(-1, 2)
 
 
-def _let_go(reconstruction: Any) -> None:
-    """Photos that the rest does not hold lose their places. In place."""
+def _remove_poorly_supported(reconstruction: Any) -> None:
+    """Deregister photos that share too few points with the rest. In place."""
     seen = {number: {p.point3D_id for p in image.points2D if p.has_point3D()}
             for number, image in reconstruction.images.items() if image.has_pose}  # fmt: skip
     for number in sorted(set(seen) - set(well_supported(seen))):
@@ -230,8 +230,8 @@ def write_database(
     features: Sequence[Features],
     verified: Mapping[Pair, Verified],
 ) -> dict[str, int]:
-    """COLMAP's database of cameras, keypoints and verified pairs. lens_of: each photo's place in `cameras`. Returns
-    photo numbers by image name."""
+    """Write COLMAP's database of cameras, keypoints and verified pairs. lens_of: index of each photo's camera in
+    `cameras`. Returns photo indices by image name."""
     database = pycolmap.Database.open(path)
     written = [database.write_camera(camera) for camera in cameras]
     images = []
@@ -249,7 +249,7 @@ def write_database(
 
 
 def model_of(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[Any] = ()) -> Model:
-    """What a reconstruction of COLMAP says. others: the smaller ones."""
+    """The model of a COLMAP reconstruction. numbers: photo indices by image name. others: smaller reconstructions."""
     poses, errors = {}, {}
     for image in reconstruction.images.values():
         if not image.has_pose:

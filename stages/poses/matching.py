@@ -1,4 +1,4 @@
-"""Which features of two photos show the same spot: nearest neighbours, checked both ways, then by geometry."""
+"""Feature matching: mutual nearest neighbours, then geometric verification."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ F64 = npt.NDArray[np.float64]
 U32 = npt.NDArray[np.uint32]
 Pair = tuple[int, int]
 
-FARTHEST = 0.8  # unit descriptors farther apart than this are never the same spot
-SCOUTS = 300  # strongest features of each photo, matched first to find the pairs worth a full match
+FARTHEST = 0.8  # largest distance of the unit descriptors of a match
+SCOUTS = 300  # strongest features of each photo, matched first to select the pairs for a full match
 NEIGHBOURS = 14  # most promising partners per photo
 EXHAUSTIVE_UP_TO = 20  # photos; up to here every pair gets a full match
 MIN_INLIERS = 15
@@ -27,7 +27,8 @@ RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 3000
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """Matches of one pair that a fundamental matrix explains. F: (3, 3), second^T F first = 0. matches: (M, 2)."""
+    """Matches of one pair that fit a fundamental matrix. F: (3, 3), second^T F first = 0. matches: (M, 2) feature
+    indices."""
 
     F: F64
     matches: U32
@@ -36,7 +37,7 @@ class Verified:
 def match(a: F32, b: F32, ratio: float) -> U32:
     """(M, 2) indices into descriptors a (N, 128) and b (K, 128), unit length: mutual nearest and unambiguous.
 
-    ratio: Lowe's test; geometry weeds out what it lets through.
+    ratio: Lowe's ratio test; `verify` removes the remaining wrong matches.
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.uint32)
@@ -54,11 +55,11 @@ def promising_pairs(
     features: Sequence[Features], ratio: float, neighbours: int = NEIGHBOURS, tick: Callable[[], None] = lambda: None,
     in_order: bool = False,
 ) -> list[Pair]:  # fmt: skip
-    """Pairs (i < j) worth a full match: each photo's partners with the most matches among the strongest features.
+    """Pairs (i < j) for a full match: each photo and its partners with the most matches of the strongest features.
 
-    Few photos are all paired. in_order: the photos are frames of a film, so that the next ones are partners whatever
-    the features say; they take half the places, and the film's return to where it was finds its place in the other
-    half. Cost: SCOUTS^2 x 128 products per pair, about a second for 50 photos.
+    Up to EXHAUSTIVE_UP_TO photos, all pairs. in_order: the photos are frames of a video, so the next frames are always
+    partners; they are half of the partners, and the other half allows loop closure. Cost: SCOUTS^2 x 128 products per
+    pair, about a second for 50 photos.
     """
     n = len(features)
     if n <= EXHAUSTIVE_UP_TO:
@@ -79,7 +80,7 @@ def promising_pairs(
 
 
 def _votes(one: F32, others: F32, ratio: float) -> npt.NDArray[np.int64]:
-    """Number of mutual, unambiguous matches of (S, 128) with each of (m, S, 128)."""
+    """(m,) number of mutual, unambiguous matches of (S, 128) with each of (m, S, 128)."""
     m, s = others.shape[:2]
     similarity = (one @ others.reshape(m * s, -1).T).reshape(s, m, s)
     best = similarity.argmax(2)[..., None]
@@ -96,9 +97,9 @@ def _distinct(top: F32, second: F32, ratio: float) -> npt.NDArray[np.bool_]:
 
 
 def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Verified | None:
-    """The matches that one fundamental matrix explains (MAGSAC), or None if there are too few to trust.
+    """The matches that fit one fundamental matrix (MAGSAC), or None if there are fewer than MIN_INLIERS.
 
-    edge: longest edge of the photos in pixels. Pure in its arguments: the sampler is seeded.
+    matches: (M, 2). edge: longest edge of the photos in pixels. Deterministic: the sampler is seeded.
     """
     if len(matches) < MIN_INLIERS:
         return None
@@ -113,7 +114,7 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
     uv_a, uv_b = a.uv[matches[:, 0]], b.uv[matches[:, 1]]
     try:
         F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
-    except cv2.error:  # USAC's polisher asserts on some degenerate samples: such a pair says nothing
+    except cv2.error:  # USAC's polisher asserts on some degenerate samples: such a pair is not used
         return None
     if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
         return None
@@ -121,14 +122,15 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
 
 
 def without_repeats(pair: Verified, a: Features, b: Features, cell: float) -> Verified:
-    """One match for each pair of places: the same spot is found under several tilts. cell: pixels."""
+    """One match for each pair of positions: a spot is detected under several tilts. cell: pixels."""
     at = np.concatenate([a.uv[pair.matches[:, 0]], b.uv[pair.matches[:, 1]]], 1)
     _, first = np.unique(np.floor(at / cell), axis=0, return_index=True)
     return Verified(pair.F, pair.matches[np.sort(first)])
 
 
 def joined(one: Mapping[Pair, Verified], other: Mapping[Pair, Verified], counts: Sequence[int]) -> dict[Pair, Verified]:
-    """Matches of two kinds of features; those of `other` come behind the counts[i] features of each photo."""
+    """The union of two sets of matches; feature indices of `other` are shifted by counts[i], the number of features of
+    photo i in `one`."""
     out = dict(one)
     for (i, j), pair in other.items():
         moved = pair.matches + np.array([counts[i], counts[j]], np.uint32)
@@ -139,7 +141,8 @@ def joined(one: Mapping[Pair, Verified], other: Mapping[Pair, Verified], counts:
 
 
 def homography_share(a: Features, b: Features, pair: Verified, edge: int, seed: int) -> float:
-    """Share of a pair's matches that one homography explains: all, if the camera only turned or the scene is flat."""
+    """Share of a pair's matches that fit one homography: all, if the camera only rotated or the scene is flat. edge:
+    longest edge of the photos in pixels."""
     cv2.setRNGSeed(seed)
     uv_a, uv_b = a.uv[pair.matches[:, 0]], b.uv[pair.matches[:, 1]]
     _, inliers = cv2.findHomography(uv_a, uv_b, cv2.RANSAC, 1.5 * EPIPOLAR_LIMIT * edge, None, RANSAC_TRIALS)

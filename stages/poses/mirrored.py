@@ -1,7 +1,7 @@
-"""Photos that are mirror images: their features match nothing, and those of the picture turned over match well.
+"""Detection of mirror images: photos whose features match only after a horizontal flip.
 
-Phones save what the front camera sees as a mirror shows it. Only photos that found no place, or contradict their
-camera, are looked at, and each is held against a few others: it takes a fraction of a second a photo.
+Phones save photos of the front camera as mirror images. Only photos without a camera, or that contradict their given
+camera, are checked, each against a few others: a fraction of a second per photo.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from stages.poses.features import PLAIN, Features
 from stages.poses.matching import match, verify
 from stages.poses.photos import StoredPhoto
 
-MAX_SUSPECTS, PARTNERS = 12, 12  # photos looked at, and photos that each is held against
-CLEAR, MANY = 2.0, 25  # matches of the flipped picture against the photo's own: so many times, and so many at least
+MAX_SUSPECTS, PARTNERS = 12, 12  # photos checked, and photos that each is compared with
+CLEAR, MANY = 2.0, 25  # fewest matches of the flipped picture: relative to those of the photo itself; absolute
 
 
 @dataclass(frozen=True, slots=True)
 class Flipped:
-    """A photo turned over from left to right."""
+    """A photo flipped horizontally."""
 
     photo: StoredPhoto
 
@@ -48,16 +48,16 @@ class Flipped:
 
 
 def find_mirrored(photos: Sequence[StoredPhoto], suspects: Sequence[int], fine: Sequence[int], seed: int) -> list[int]:
-    """Which of the `suspects` fit the photos `fine` only when they are turned over. Both are places in `photos`."""
-    asked = list(suspects)[:MAX_SUSPECTS]
+    """Which of the `suspects` match the photos `fine` only when flipped. Both are indices into `photos`."""
+    checked = list(suspects)[:MAX_SUSPECTS]
     partners = list(fine)[:: max(1, -(-len(fine) // PARTNERS))]
-    if not asked or not partners:
+    if not checked or not partners:
         return []
     near = features_of([photos[i] for i in partners], _silent)
-    own = features_of([photos[i] for i in asked], _silent)
-    turned = features_of([Flipped(photos[i]) for i in asked], _silent)
+    own = features_of([photos[i] for i in checked], _silent)
+    turned = features_of([Flipped(photos[i]) for i in checked], _silent)
     out = []
-    for i, plain, flipped in zip(asked, own, turned, strict=True):
+    for i, plain, flipped in zip(checked, own, turned, strict=True):
         edge = max(photos[i].width, photos[i].height)
         best, other = (max(_agreeing(f, n, edge, seed) for n in near) for f in (flipped, plain))
         if best >= max(MANY, CLEAR * other):
@@ -66,7 +66,7 @@ def find_mirrored(photos: Sequence[StoredPhoto], suspects: Sequence[int], fine: 
 
 
 def _agreeing(a: Features, b: Features, edge: int, seed: int) -> int:
-    """Matches that one geometry explains."""
+    """Number of geometrically verified matches."""
     pair = verify(a, b, match(a.descriptors, b.descriptors, PLAIN.ratio), edge, seed)
     return 0 if pair is None else len(pair.matches)
 

@@ -1,4 +1,4 @@
-"""The photos as structure from motion sees them: pixels, subject, and what is known of the lens."""
+"""The photos as input of structure from motion: pixels, mask, focal length and lens group."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pipeline.images import read_alpha, read_encoded
 
 @dataclass(frozen=True, slots=True)
 class StoredPhoto:
-    """A view of the capture. focal: pixels, from EXIF or a given camera. group: photos of one lens have the same."""
+    """A view of the capture. width, height: pixels. focal: pixels, from EXIF or a given camera. group: equal for photos
+    of one lens."""
 
     width: int
     height: int
@@ -43,10 +44,10 @@ def photos_of(capture: Located[Capture]) -> list[StoredPhoto]:
 
 
 def _lens(view: CaptureView) -> tuple[float | None, str]:
-    """What is known of the focal length, and the photos to share it with.
+    """Focal length in pixels, if known, and the lens group.
 
-    Given cameras that are to be solved anew share a lens where their matrices agree: FaceScape names the body in every
-    view, and a rig has as many bodies as views even if all have the same lens.
+    If given cameras are solved again, photos with equal intrinsics share a lens. The camera body is not used: in a rig
+    each view has its own body, even if all have the same lens.
     """
     if view.camera is None:
         return view.focal_px, view.camera_group

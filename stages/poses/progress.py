@@ -1,4 +1,4 @@
-"""How the work tells its progress, and learns that it is to stop."""
+"""Progress and cancellation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipeline.contract import Context
 
 
 def progress_of(context: Context) -> Callable[[int, int, str], None]:
-    """A function of done, total and message that stops the stage where its context says so."""
+    """A function (done, total, message) that reports progress, and raises if the run was cancelled."""
 
     def progress(done: int, total: int, message: str) -> None:
         context.check()

@@ -1,8 +1,8 @@
-"""How far a solution of structure from motion can be trusted, from what it says alone.
+"""Score of a solution of structure from motion, from the solution alone.
 
-The mapper draws its first pair and its samples at random. Once in about twenty runs a draw leads astray: on one
-capture it placed 34 of 44 photos with half of the true focal length, where other seeds place 43. The solution itself
-shows that, and another seed costs seconds.
+The mapper chooses its first pair and its samples at random. About one run in twenty fails: on one capture it registered
+34 of 44 photos with half of the true focal length, where other seeds register 43. The score detects this, and another
+seed costs seconds.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from stages.poses.normalise import nearest_point
 if TYPE_CHECKING:
     from stages.poses.mapper import Model
 
-GOOD_SCORE = 0.9  # below this a solution is doubted, and more effort is worth its time
+GOOD_SCORE = 0.9  # below this score further attempts follow
 FOCAL_OFF = (
-    1.25  # times; EXIF rounds, crops and ignores the focus: right solutions were up to 1.06 off, a stray one 1.7
+    1.25  # ratio to EXIF, which is rounded and ignores crop and focus: 1.06 in correct solutions, 1.7 in a wrong one
 )
-FOCAL_RANGE = (0.4, 10.0)  # of the longest edge, where EXIF is silent: 14 mm to 360 mm lenses on full frame
-POINTS_PER_PHOTO = 10  # on the subject; right solutions have 25 to 120
-ERROR_LIMIT = 2.0  # pixels; the mapper throws points of more than 4 away, right solutions have 0.3 to 1
-SUBJECT = 0.5  # of the cameras' mean distance from where they look: points nearer to that place are on the subject
+FOCAL_RANGE = (0.4, 10.0)  # of the longest edge, without EXIF: 14 mm to 360 mm lenses on full frame
+POINTS_PER_PHOTO = 10  # on the subject; correct solutions have 25 to 120
+ERROR_LIMIT = 2.0  # pixels; the mapper removes points of more than 4, correct solutions have 0.3 to 1
+SUBJECT = 0.5  # radius around the point that the cameras look at, as a share of their mean distance from it
 
 
 class Known(Protocol):
-    """What is known of a photo before it is placed."""
+    """What is known of a photo before it is registered: size and focal length in pixels."""
 
     @property
     def width(self) -> int: ...
@@ -43,8 +43,8 @@ class Known(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """placed: share of the photos. focal_off: how many times the lenses are longer or shorter than EXIF says, or than
-    lenses are, median over the photos. points: on the subject, per placed photo. error_px: mean reprojection error."""
+    """placed: share of photos registered. focal_off: ratio of the focal length to EXIF, or to FOCAL_RANGE, at least 1,
+    median over the photos. points: on the subject, per registered photo. error_px: mean reprojection error."""
 
     placed: float
     focal_off: float
@@ -53,18 +53,18 @@ class Quality:
 
     @property
     def trust(self) -> float:
-        """1 where nothing but missing photos speaks against it, towards 0 the more does."""
+        """0 to 1 from focal length, points and error: 1 if all of them are within their limits."""
         off = min(1.0, FOCAL_OFF / self.focal_off) * min(1.0, self.points / POINTS_PER_PHOTO)
         return off * min(1.0, ERROR_LIMIT / max(self.error_px, 1e-9))
 
     @property
     def score(self) -> float:
-        """Share of the photos placed, times the trust in it: what solutions are compared by."""
+        """Share of photos registered, times `trust`. Solutions are compared by it."""
         return self.placed * self.trust
 
 
 def quality(model: Model, photos: Sequence[Known]) -> Quality:
-    """The figures of a solution of `photos`."""
+    """The quality figures of a solution of `photos`."""
     return Quality(
         placed=len(model.poses) / len(photos),
         focal_off=float(np.median([_focal_off(p.K, photos[i]) for i, p in model.poses.items()])),
@@ -74,12 +74,12 @@ def quality(model: Model, photos: Sequence[Known]) -> Quality:
 
 
 def score(model: Model | None, photos: Sequence[Known]) -> float:
-    """Of a solution, or of none."""
+    """Score of a solution; 0 without one."""
     return 0.0 if model is None else quality(model, photos).score
 
 
 def better(a: Model | None, b: Model | None, photos: Sequence[Known]) -> Model | None:
-    """The one with the higher score, of equal ones the one with more points, else the first."""
+    """The one with the higher score; if equal, the one with more points; else the first."""
     if a is None or b is None:
         return b if a is None else a
     ranks = [(round(score(m, photos), 6), len(m.points)) for m in (a, b)]
@@ -95,7 +95,7 @@ def _focal_off(K: F64, photo: Known) -> float:
 
 
 def _on_subject(model: Model) -> int:
-    """Points near where the cameras look."""
+    """Number of points near the point that the cameras look at."""
     poses = np.stack([p.world_from_cam for p in model.poses.values()])
     centres = poses[:, :3, 3]
     try:

@@ -1,9 +1,9 @@
-"""How many metres a unit of the capture's world is, from what is known of the scene.
+"""Metres per unit of the capture's world, from known lengths in the scene.
 
-Symbols: cameras in the capture's world; s metres per unit. Each way gives s and says how; none is ever assumed.
+Symbols: cameras in the capture's world; s metres per unit. Each source gives s with a description; none is assumed.
     distance   s = d / |a - b|, a and b camera centres or points seen in photos
     markers    s = edge / median of the measured edges of all markers
-    pupils     s = interpupillary distance / |a - b|, a and b the eyes' middles seen in photos
+    pupils     s = interpupillary distance / |a - b|, a and b the centres of the eyes seen in photos
     positions  least squares s of  s R c_i + t = p_i  (Umeyama, 1991), p_i from EXIF
 """
 
@@ -30,11 +30,11 @@ DICTIONARIES = {
     "apriltag_25h9": cv2.aruco.DICT_APRILTAG_25h9,
     "apriltag_36h11": cv2.aruco.DICT_APRILTAG_36h11,
 }
-MET = 0.004  # of the photo's longest edge: rays to one spot may miss it by so much
+MET = 0.004  # of the photo's longest edge: largest reprojection error of a point
 SQUARE = 0.05  # of the longer edge: a marker whose edges differ more is two markers, or bent
-TOLD_APART = 5.0  # positions must be spread so many times wider than they are wrong
+MIN_SPREAD = 5.0  # smallest ratio of the positions' spread to their error
 MIN_POSITIONS = 5
-MIN_FACES, EYE_MET = 3, 0.1  # photos; of the pupils' distance in the photo: rays to an eye miss it by so much at most
+MIN_FACES, EYE_MET = 3, 0.1  # photos; largest reprojection error of an eye, as a share of the pupils' distance
 _SPEC = re.compile(r"(?P<a>[^=]+?)\s+to\s+(?P<b>[^=]+?)\s*=\s*(?P<d>[0-9.eE+-]+)")
 _GRAMMAR = "A to B = METRES, where A and B are photos, or points as PHOTO@X,Y+PHOTO@X,Y"
 U8 = npt.NDArray[np.uint8]
@@ -42,29 +42,29 @@ U8 = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """metres_per_unit, and where it is from in words."""
+    """metres_per_unit, and its source as text."""
 
     metres_per_unit: float
     source: str
 
 
 def check_distance(spec: str) -> str:
-    """The setting itself if its grammar holds. Raises UsageError."""
+    """The setting itself if its grammar is right. Raises UsageError otherwise."""
     if spec:
         _parsed(spec)
     return spec
 
 
 def by_distance(spec: str, cameras: Sequence[Camera]) -> Scale:
-    """From a known distance between two cameras, two points, or one of each.
+    """The scale from a known distance between two cameras, two points, or one of each.
 
     Raises UsageError: a photo that has no camera; StageError: rays that do not meet.
     """
     a, b, metres = _parsed(spec)
     apart = float(np.linalg.norm(_place(a, cameras) - _place(b, cameras)))
     if apart < 1e-9:
-        raise UsageError("the known distance is between one and the same place", where="poses.distance", value=spec,
-                         limit="two places", remedy="name another camera or point")  # fmt: skip
+        raise UsageError("both ends of the known distance are the same point", where="poses.distance", value=spec,
+                         limit="two different points", remedy="give another camera or point")  # fmt: skip
     return Scale(metres / apart, f"from the known distance of {metres:g} m: {a} to {b}")
 
 
@@ -78,7 +78,7 @@ def _parsed(spec: str) -> tuple[str, str, float]:
 
 
 def _place(text: str, cameras: Sequence[Camera]) -> F64:
-    """(3,) centre of the camera so named, or the point where the rays of PHOTO@X,Y+... meet."""
+    """(3,) centre of the camera with this name, or the point where the rays of PHOTO@X,Y+... meet."""
     if "@" not in text:
         return np.asarray(matrix(_camera(text, cameras).world_from_cam)[:3, 3], np.float64)
     observed = []
@@ -92,9 +92,9 @@ def _place(text: str, cameras: Sequence[Camera]) -> F64:
         observed.append((_camera(name, cameras), np.array([x, y])))
     point = meeting_point(observed)
     if point is None:
-        raise StageError("the photos don't see the point of the known distance in one place", where="poses.distance",
-                         value=text, limit=f"rays that meet within {MET:.1%} of the photo's longest edge, from two "
-                         "sides", remedy="name the pixel of the same spot in two photos or more")  # fmt: skip
+        raise StageError("the rays to a point of the known distance do not meet", where="poses.distance",
+                         value=text, limit=f"rays that meet within {MET:.1%} of the photo's longest edge, from "
+                         "different directions", remedy="give the spot's pixel in at least two photos")  # fmt: skip
     return point
 
 
@@ -104,11 +104,11 @@ def _camera(name: str, cameras: Sequence[Camera]) -> Camera:
             return c
     raise UsageError("a photo of the known distance has no camera", where="poses.distance", value=name,
                      limit=f"one of {cameras[0].name} ... {cameras[-1].name}",
-                     remedy="name a photo that found its place")  # fmt: skip
+                     remedy="give a photo that has a camera")  # fmt: skip
 
 
 def meeting_point(observed: Sequence[tuple[Camera, F64]]) -> F64 | None:
-    """(3,) the point nearest to the rays through pixels uv (2,), or None if there is none that all of them see.
+    """(3,) the point nearest to the rays through pixels uv (2,), or None if the rays do not meet.
 
     sum_i (1 - d_i d_i^T) (x - o_i) = 0
     """
@@ -120,7 +120,7 @@ def meeting_point(observed: Sequence[tuple[Camera, F64]]) -> F64 | None:
 
 
 def _nearest(observed: Sequence[tuple[Camera, F64]]) -> F64:
-    """(3,) the point nearest to the rays; NaN where they are as good as parallel."""
+    """(3,) the point nearest to the rays; NaN if they are nearly parallel."""
     A, b = np.zeros((3, 3)), np.zeros(3)
     for camera, uv in observed:
         o, d = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv[None])
@@ -132,17 +132,18 @@ def _nearest(observed: Sequence[tuple[Camera, F64]]) -> F64:
 
 
 def _miss(camera: Camera, x: F64, uv: F64) -> float:
-    """Pixels between where a camera sees x (3,) and uv (2,); infinite if x is behind it, or none."""
+    """Distance in pixels between the projection of x (3,) and uv (2,); infinite if x is behind the camera, or NaN."""
     cam_from_world = inverse_rigid(matrix(camera.world_from_cam))
     seen, z = project(matrix(camera.K), cam_from_world, np.array(camera.distortion), x[None])
     return float(np.linalg.norm(seen[0] - uv)) if z[0] > 0 and np.isfinite(seen).all() else float("inf")
 
 
 def find_markers(grey: U8, dictionary: str) -> dict[int, F64]:
-    """Corners (4, 2) in pixels, first pixel's centre at (0.5, 0.5), of each marker in a photo, by its number."""
+    """Corners (4, 2) in pixels, first pixel's centre at (0.5, 0.5), of each marker in a grey photo (H, W), by its
+    id."""
     detector: Any = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]))
     parameters = detector.getDetectorParameters()
-    # lines along the edges: a corner's own shape is rounded by blur, which makes markers of 60 pixels 0.8 % too small
+    # corners from lines along the edges: blur rounds the corners, which makes markers of 60 pixels 0.8 % too small
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector.setDetectorParameters(parameters)
     corners, numbers, _ = detector.detectMarkers(grey)
@@ -156,7 +157,8 @@ def find_markers(grey: U8, dictionary: str) -> dict[int, F64]:
 
 
 def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) -> Scale | None:
-    """From square markers whose black edge is `edge` metres; None if no marker is seen well by two photos."""
+    """The scale from square markers whose black edge is `edge` metres; None if no marker is well visible in two
+    photos."""
     lengths, used = [], []
     for number in sorted({n for _, found in seen for n in found}):
         corners = [meeting_point([(c, found[number][k]) for c, found in seen if number in found]) for k in range(4)]
@@ -175,15 +177,15 @@ def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) ->
 
 
 def by_world(metres_from_world: F64) -> tuple[Scale, F64]:
-    """From a published similarity (4, 4): the scale, and the rotation (3, 3) to upright axes."""
+    """The scale and the rotation (3, 3) to upright axes of a published similarity (4, 4)."""
     s = float(np.cbrt(np.linalg.det(metres_from_world[:3, :3])))
     return Scale(s, "from FaceScape's scale dictionary"), np.asarray(metres_from_world[:3, :3] / s, np.float64)
 
 
 @dataclass(frozen=True, slots=True)
 class Eyes:
-    """right, left: (3,) middles of the person's own eyes. photos: in how many they were seen; off: by what share of
-    their distance there the photos disagree."""
+    """right, left: (3,) centres of the person's own eyes. photos: number of photos used; off: median reprojection error
+    as a share of the eyes' distance in the photo."""
 
     right: F64
     left: F64
@@ -192,9 +194,10 @@ class Eyes:
 
 
 def eyes_of(seen: Sequence[tuple[Camera, tuple[F64, F64]]]) -> Eyes | None:
-    """From the right and left pupil (2,) pixels of each photo with a face; None if fewer than MIN_FACES agree.
+    """The eyes from the right and left pupil (2,) in pixels in each photo with a face; None if fewer than MIN_FACES
+    photos agree.
 
-    Photos in which a face was seen wrongly, or from the side, are left out one by one, the worst first.
+    Photos with a wrong detection, or a face from the side, are left out one by one, the worst first.
     """
     left = list(seen)
     while len(left) >= MIN_FACES:
@@ -204,15 +207,16 @@ def eyes_of(seen: Sequence[tuple[Camera, tuple[F64, F64]]]) -> Eyes | None:
         off = np.array(missed) / wide
         if off.max() <= EYE_MET:
             return Eyes(eyes[0], eyes[1], len(left), float(np.median(off)))
-        # by its share of the frame: a face seen wrongly may be seen as wide as it likes
+        # relative to the frame, because a wrong detection may have any width
         left.pop(int(np.argmax([m / max(c.width, c.height) for m, (c, _) in zip(missed, left, strict=True)])))
     return None
 
 
 def by_pupils(eyes: Eyes, metres: float) -> Scale:
-    """From the distance of the pupils."""
+    """The scale from the distance of the pupils in metres."""
     source = (
-        f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {eyes.photos} photos to {eyes.off:.1%}"
+        f"from a distance of {1e3 * metres:g} mm between the pupils, seen in {eyes.photos} photos with an error of "
+        f"{eyes.off:.1%}"
     )
     return Scale(metres / float(np.linalg.norm(eyes.left - eyes.right)), source)
 
@@ -220,19 +224,20 @@ def by_pupils(eyes: Eyes, metres: float) -> Scale:
 def by_positions(
     cameras: Sequence[Camera], places: Mapping[int, tuple[float, float, float]]
 ) -> tuple[Scale | None, str]:
-    """From positions in metres by the cameras' index; or None and why they don't tell. Wrong by a few metres each, they
-    say nothing of a rig around a head, and much of a walk around a statue."""
+    """The scale from GPS positions in metres by the cameras' index; or None and the reason. With errors of a few metres
+    they are useless for a rig around a head, but good for a walk around a statue."""
     known = [c for c in cameras if c.index in places]
     if len(known) < MIN_POSITIONS:
-        return None, f"only {len(known)} photos with a place have a GPS position"
+        return None, f"only {len(known)} photos with a camera have a GPS position"
     a = np.stack([matrix(c.world_from_cam)[:3, 3] for c in known])
     b = np.array([places[c.index] for c in known])
     found = umeyama(a, b)
     scale, residual = float(np.cbrt(np.linalg.det(found[:3, :3]))), apply(found, a) - b
     spread = float(np.sqrt(((b - b.mean(0)) ** 2).sum(1).mean()))
     wrong = float(np.sqrt((residual**2).sum(1).mean() * len(b) / (len(b) - 7 / 3)))
-    if scale <= 0 or spread < TOLD_APART * wrong:
-        return None, f"the GPS positions are {wrong:.2g} m wrong and {spread:.2g} m apart"
+    if scale <= 0 or spread < MIN_SPREAD * wrong:
+        return None, f"the GPS positions have an error of {wrong:.2g} m and a spread of only {spread:.2g} m"
     return Scale(
-        scale, f"from the GPS positions of {len(known)} photos, wrong by {wrong:.2g} m over {spread:.2g} m"
+        scale,
+        f"from the GPS positions of {len(known)} photos, with an error of {wrong:.2g} m and a spread of {spread:.2g} m",
     ), ""

@@ -1,4 +1,4 @@
-"""Which of the ways to a scale a capture takes: a distance that is known, markers in view, a face, GPS positions."""
+"""Choice of the source of scale: a known distance, markers, pupils or GPS positions. Also the detection of faces."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from stages.poses.config import Config
 from stages.poses.features import U8, grey8
 from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, eyes_of, find_markers
 
-LOOKED_AT = 48  # photos in which the face of a given world is looked for
+LOOKED_AT = 48  # photos in which a face is detected if cameras are given
 NEEDS = {
-    "markers": "markers of poses.marker_kind and poses.marker_mm in view",
-    "pupils": "poses.pupils_mm, and a face in three photos or more",
-    "gps": "GPS positions in EXIF, spread wider than they are wrong",
+    "markers": "visible markers of poses.marker_kind and poses.marker_mm",
+    "pupils": "poses.pupils_mm, and a face in at least three photos",
+    "gps": "GPS positions in EXIF with a spread much larger than their error",
 }
 
 
 def known_scale(
     capture: Located[Capture], cameras: list[Camera], config: Config, eyes: Eyes | None, warnings: list[str]
 ) -> Scale | None:  # fmt: skip
-    """Metres per unit of the cameras' world from what the user or the photos say of it, or None.
+    """Metres per unit of the cameras' world from settings or photos, or None.
 
     Raises:
-        UsageError: a way was asked for whose setting is missing. StageError: one that was asked for does not tell.
+        UsageError: a setting of poses.distance is wrong. StageError: the source of poses.scale gives no scale.
     """
     wanted = config.scale
     if wanted == "distance" or (wanted == "auto" and config.distance):
@@ -42,29 +42,29 @@ def known_scale(
         if found is not None:
             return found
         count = len({n for _, corners in seen for n in corners})
-        why = f"{count} markers of the kind {config.marker_kind} are seen, none of them whole and square by two photos"
+        why = f"{count} markers of {config.marker_kind} are detected, none of them complete and square in two photos"
     if wanted == "pupils" or (wanted == "auto" and not why and config.pupils_mm):
         if config.pupils_mm and eyes is not None:
             return by_pupils(eyes, config.pupils_mm / 1e3)
-        why = "no face is seen alike in three photos" if config.pupils_mm else "poses.pupils_mm is not set"
+        why = "no three photos agree on a face" if config.pupils_mm else "poses.pupils_mm is not set"
     places = {v.index: v.place_m for v in capture.artifact.views if v.place_m is not None}
     if wanted == "gps" or (wanted == "auto" and not why and places):
         found, why = by_positions(cameras, places)
         if found is not None:
             return found
     if wanted in NEEDS:
-        raise StageError("the scale can't be told", where=f"poses.scale={wanted}", value=why,
+        raise StageError("the scale can't be determined", where=f"poses.scale={wanted}", value=why,
                          limit=NEEDS[wanted],
                          remedy="check these settings, or give poses.distance")  # fmt: skip
     if why:
-        warnings.append(f"the scale is not taken from the photos: {why}")
+        warnings.append(f"the photos do not determine the scale: {why}")
     return None
 
 
 def find_faces(
     capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]
 ) -> list[tuple[Camera, Face]]:  # fmt: skip
-    """The photos in which a face is found, and where. check: raises to stop."""
+    """The cameras whose photos show a face, and the face. check: raises if the run was cancelled."""
     photos = {v.index: v for v in capture.artifact.views}
     out = []
     for c in cameras:
@@ -78,19 +78,19 @@ def find_faces(
 
 
 def find_eyes(capture: Located[Capture], cameras: list[Camera], check: Callable[[], None]) -> Eyes | None:
-    """The subject's eyes in the cameras' world, or None if no face is seen alike in three photos. check: raises to
-    stop."""
+    """The subject's eyes in the cameras' world, or None if no three photos agree on a face. check: raises if the run
+    was cancelled."""
     return eyes_of([(c, face.pupils) for c, face in find_faces(capture, cameras, check)])
 
 
 def head_of(faces: list[tuple[Camera, Face]]) -> HeadFrame | None:
-    """The head's axes in the cameras' world, or None if no face is seen alike in three photos."""
+    """The head's axes in the cameras' world, or None if no three photos agree on a face."""
     found = triangulate([c for c, _ in faces], np.stack([f.points for _, f in faces])) if faces else None
     return None if found is None else head_frame(found.xyz)
 
 
 def some_of(capture: Located[Capture], cameras: list[Camera]) -> list[Camera]:
-    """At most LOOKED_AT of the cameras whose photos are fitted, evenly chosen."""
+    """At most LOOKED_AT of the cameras of fitted photos, evenly spaced."""
     held = {v.index for v in capture.artifact.views if v.holdout}
     fitted = [c for c in cameras if c.index not in held] or cameras
     return fitted[:: -(-len(fitted) // LOOKED_AT)]

@@ -1,6 +1,6 @@
-"""Cameras from photos alone: features, matches, structure from motion, and more effort if that is not enough.
+"""Cameras from photos alone by structure from motion: features, matches, mappers, and further attempts.
 
-Held-out views take part here: their cameras have to come from somewhere, and no pixel of theirs reaches the fit.
+Held-out views are solved too, because scoring needs their cameras; no pixel of theirs reaches the fit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pipeline.errors import StageError
 from pipeline.sharpness import detail
 from stages.poses.bundle_adjustment import Refine
 from stages.poses.config import Config
-from stages.poses.features import ASKEW, MORE_ASKEW, PATIENT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.features import ASIFT, DENOISED, MORE_ASIFT, PLAIN, Effort, Features, detect, grey8
 from stages.poses.mapper import MIN_POINTS, Lens, Mapper, Model, reconstruct
 from stages.poses.matching import (
     MIN_INLIERS,
@@ -39,19 +39,19 @@ from stages.poses.quality import GOOD_SCORE, better, quality, score
 from stages.poses.triangulate import triangulate
 from stages.poses.unregistered import disjoint, linked, reasons
 
-WORKERS = 2  # the result does not depend on it: each photo, and each pair, is a task of its own
-SEEDS = 2  # more tries of the mapper where the first solution is doubted for more than the photos that it lacks
-POOR_SCORE = 0.75  # below it is worth doubting that the photos share a lens
-REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends are one
+WORKERS = 2  # the result does not depend on it: each photo, and each pair, is a separate task
+SEEDS = 2  # further seeds for the mapper if the first solution has a trust below 1
+POOR_SCORE = 0.75  # below this score, a separate lens for each photo is tried
+REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends count as one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
-CHUNK = 64  # pairs between two looks at whether to stop
-DETAIL_EDGE = 1000  # pixels, at which the photos' sharpness is compared
-GLOBAL_FROM = 200  # photos: from here on all are placed at once, which takes minutes where one by one takes hours
-BETTER_BY = 1.05  # a try with a lens for each photo must have so many times the score: it is the looser model
+CHUNK = 64  # pairs between two checks for cancellation
+DETAIL_EDGE = 1000  # pixels, longest edge at which the photos' sharpness is compared
+GLOBAL_FROM = 200  # photos: from here on the global mapper, which takes minutes instead of hours
+BETTER_BY = 1.05  # a solution with a lens for each photo has more freedom, so its score must be better by this factor
 
 
 class Photo(Protocol):
-    """One photo: how to read it, and what is known of its lens."""
+    """One photo with its focal length, if known, and its lens group. width, height: pixels."""
 
     @property
     def width(self) -> int: ...
@@ -66,7 +66,7 @@ class Photo(Protocol):
 
     @property
     def group(self) -> str:
-        """Photos of one lens have the same."""
+        """Equal for photos of one lens."""
         ...
 
     def pixels(self) -> npt.NDArray[np.generic]:
@@ -83,8 +83,8 @@ Progress = Callable[[int, int, str], None]  # done, total, message; raises to st
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The best model, if any two photos fit together. left_out: why, by number of each photo without a place. groups:
-    of photos that fit among themselves; the first is that of the model, the others follow by size.
+    """The best model, None if no two photos fit together. left_out: reasons by index of each photo without a camera.
+    groups: of photos that fit together; the first is the model's, the others follow by size.
     """
 
     model: Model | None
@@ -95,15 +95,15 @@ class Solution:
 def solve(
     photos: Sequence[Photo], config: Config, in_order: bool, scratch: Path, progress: Progress
 ) -> Solution:  # fmt: skip
-    """The solution with the highest score (`quality`) of all tries. Photos of equal size and EXIF share a lens, unless
-    the score doubts it and far more photos fit without. in_order: the photos follow each other, as a film's frames do.
+    """The solution with the highest score (`quality`) of all attempts. Photos of equal size and EXIF share a lens,
+    unless the score is poor and separate lenses are better. in_order: the photos are in order, as frames of a video.
 
     Raises:
         StageError: the photos were taken from one spot.
     """
     best: Model | None = None
     counts = [0] * len(photos)
-    for effort in (PLAIN, PATIENT)[: config.attempts]:
+    for effort in (PLAIN, DENOISED)[: config.attempts]:
         features = detect_all(photos, config, effort, progress)
         counts = counts if any(counts) else [len(f.uv) for f in features]
         verified = match_all(photos, features, config, effort, progress, in_order)
@@ -126,7 +126,7 @@ def solve(
 def _explained(
     model: Model | None, photos: Sequence[Photo], counts: Sequence[int], verified: dict[Pair, Verified]
 ) -> Solution:
-    """The model, and a reason for each photo that it lacks."""
+    """The model, and a reason for each photo without a camera."""
     placed = sorted(model.poses) if model is not None else []
     missing = [i for i in range(len(photos)) if i not in placed]
     groups = disjoint([placed, *(model.others if model is not None else ())])
@@ -141,13 +141,13 @@ def triangulate_given(
     photos: Sequence[Photo], cameras: Sequence[Camera], config: Config, in_order: bool, scratch: Path,
     progress: Progress, *, refine: bool, deviation: float,
 ) -> tuple[Model, list[int]] | None:  # fmt: skip
-    """Sparse points from given cameras, and with `refine` better poses; None if no point is seen twice. Second: the
-    views that were not mended. deviation: of the given centres, in the world's unit."""
+    """Sparse points from given cameras, and with `refine` refined poses; None if no point is visible in two photos.
+    Second: the views that could not be refined. deviation: of the given centres, in the world's unit."""
     features = detect_all(photos, config, PLAIN, progress)
     verified = match_all(photos, features, config, PLAIN, progress, in_order)
     if not verified:
         return None
-    progress(0, 1, "finding points")
+    progress(0, 1, "triangulating points")
     folder = scratch / "mapper"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -161,17 +161,17 @@ def _oblique(
     photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], config: Config,
     progress: Progress, lost: Sequence[int],
 ) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
-    """The features and matches so far, and those of the `lost` photos and their likeliest neighbours seen as if from
-    farther round; the others have found their place without."""
-    more = config.changed(max_features=MORE_ASKEW * config.max_features)
-    near = promising_pairs(features, ASKEW.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
+    """The features and matches so far, plus ASIFT features and matches of the `lost` photos and their most similar
+    neighbours; the other photos have a camera already."""
+    more = config.changed(max_features=MORE_ASIFT * config.max_features)
+    near = promising_pairs(features, ASIFT.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
     pairs = [p for p in near if set(p) & set(lost)]
     wanted = sorted({i for p in pairs for i in p})
     nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
     oblique = [nothing] * len(photos)
-    for i, f in zip(wanted, detect_all([photos[i] for i in wanted], more, ASKEW, progress), strict=True):
+    for i, f in zip(wanted, detect_all([photos[i] for i in wanted], more, ASIFT, progress), strict=True):
         oblique[i] = f
-    found = match_pairs(photos, oblique, pairs, more, ASKEW, progress)
+    found = match_pairs(photos, oblique, pairs, more, ASIFT, progress)
     single = {}
     for (i, j), pair in found.items():
         cell = REPEAT * max(photos[i].width, photos[i].height)
@@ -184,7 +184,7 @@ def _oblique(
 
 
 def _hardly_moved(model: Model) -> bool:
-    """Whether the cameras' centres lie close together against their distance from the points."""
+    """Whether the cameras' spread is small relative to their distance from the points."""
     if len(model.points) < MIN_POINTS:
         return True
     centres = np.stack([p.world_from_cam[:3, 3] for p in model.poses.values()])
@@ -196,18 +196,19 @@ def _hardly_moved(model: Model) -> bool:
 def _not_from_one_spot(
     photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], seed: int
 ) -> None:  # fmt: skip
-    """Photos from one spot differ by a homography each, whatever they show."""
+    """Raises StageError if nearly all matches fit homographies: photos from one spot differ by homographies only."""
     shares = []
     for (i, j), pair in verified.items():
         edge = max(photos[i].width, photos[i].height)
         shares.append(homography_share(features[i], features[j], pair, edge, seed))
     if len(shares) >= len(photos) / 2 and float(np.median(shares)) > ONE_SPOT_SHARE:
         raise StageError(
-            "the photos look as if taken from one spot",
+            "the photos seem to be taken from one spot",
             where="poses",
-            value=f"{np.median(shares):.0%} of the matches of two photos fit a camera that only turns",
+            value=f"{np.median(shares):.0%} of the matches of two photos fit a camera that only rotates",
             limit=f"at most {ONE_SPOT_SHARE:.0%}",
-            remedy="walk around the subject instead of turning the camera or zooming; each photo from another place",
+            remedy="walk around the subject instead of turning the camera or zooming; take each photo from another "
+            "place",
         )
 
 
@@ -227,7 +228,7 @@ def detect_all(photos: Sequence[Photo], config: Config, effort: Effort, progress
         tasks = [pool.submit(one, p) for p in photos]
         try:
             for i, task in enumerate(tasks):
-                progress(i, len(photos), "looking for features")
+                progress(i, len(photos), "detecting features")
                 found.append(task.result())
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -239,7 +240,7 @@ def match_all(
     photos: Sequence[Photo], features: Sequence[Features], config: Config, effort: Effort, progress: Progress,
     in_order: bool = False,
 ) -> dict[Pair, Verified]:  # fmt: skip
-    """Verified matches by pair of photos. in_order: they follow each other, as a film's frames do."""
+    """Verified matches by pair of photos. in_order: the photos are in order, as frames of a video."""
     pairs = promising_pairs(features, effort.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"),
                             in_order)  # fmt: skip
     return match_pairs(photos, features, pairs, config, effort, progress)
@@ -285,10 +286,10 @@ def _place(
     together = set(next(iter(linked(verified, len(photos))), []))
 
     def next_image() -> bool:
-        """Progress must not raise through COLMAP's own frames: the exception is kept and raised behind it."""
+        """An exception must not pass through COLMAP's C++ frames: it is stored and raised after COLMAP returns."""
         nonlocal placed
         try:
-            progress(min(placed, len(photos) - 1), len(photos), "placing photos")
+            progress(min(placed, len(photos) - 1), len(photos), "registering photos")
         except BaseException as e:
             stopped.append(e)
         placed += 1
@@ -313,11 +314,11 @@ def best_of(
     attempt: Callable[[Mapper, int, bool], Model | None], photos: Sequence[Photo], together: Set[int],
     ways: Sequence[Mapper],
 ) -> Model | None:  # fmt: skip
-    """The best solution of the same matches; more are tried only while there is a doubt that they could dispel.
+    """The best solution of the same matches; further attempts only if they can help.
 
-    attempt(mapper, what is added to the seed, loose). together: photos that hang together by their matches. A mapper
-    that accepts fewer matches is worth a try where some of these lack a place; another seed where lenses, points or
-    errors are not as they should be. Both are for fewer than GLOBAL_FROM photos: of more, each try takes long.
+    attempt(mapper, number added to the seed, loose). together: photos linked by matches. If some of these have no
+    camera, a mapper that accepts fewer matches is tried; if lenses, points or errors are out of range, other seeds.
+    Both only for fewer than GLOBAL_FROM photos: with more, each attempt takes long.
     """
     best: Model | None = None
     for mapper in ways:
@@ -334,7 +335,7 @@ def best_of(
 
 
 def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tuple[Mapper, ...]:
-    """The ways to place so many photos, the likeliest first; the next is taken where one leaves too many out."""
+    """The mappers for so many photos, in the order of use; the next one is used if the score is low."""
     if wanted != "auto":
         return (wanted,)
     return ("global", "incremental") if photos >= GLOBAL_FROM else ("incremental",)
@@ -342,7 +343,7 @@ def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tu
 
 @contextmanager
 def _single_threaded_cv2() -> Iterator[None]:
-    """OpenCV's own threads would fight over the cores with ours."""
+    """Switch off OpenCV's threads, which would compete with this module's."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

@@ -1,4 +1,4 @@
-"""Cameras from the photos alone: who has a place, what is told of those that have none, and the asset's coordinates."""
+"""The result of structure from motion: cameras in asset coordinates, and messages about photos without a camera."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     """Cameras from the photos alone.
 
     Raises:
-        StageError: fewer than MIN_FITTED photos that are not held out have a place. With few more the finding
-            `photos_placed` says that the result is unusable.
+        StageError: fewer than MIN_FITTED photos that are not held out have a camera. With few more, the finding
+            `photos_placed` is unusable.
     """
     views = capture.artifact.views
-    in_order = capture.artifact.kind == "video"  # a film's frames follow each other
+    in_order = capture.artifact.kind == "video"  # frames of a video are in order
     solution = solve(photos_of(capture), config, in_order, context.scratch, progress_of(context))
     model = solution.model
     placed = sorted(model.poses) if model is not None else []
@@ -46,23 +46,23 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     warnings += found.warnings
     if missing:
         listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())
-        warnings.append(f"{len(missing)} of {len(views)} photos found no place and are left out: "
-                        f"{listed}. Photograph the way between them and the others, sharp and in steps of 15 degrees; "
-                        "photos of something else and mirrored ones never fit")  # fmt: skip
+        warnings.append(f"{len(missing)} of {len(views)} photos have no camera and are left out: "
+                        f"{listed}. Take sharp photos between them and the others, in steps of 15 degrees; photos of "
+                        "something else and mirror images never fit")  # fmt: skip
     for group in others:
         warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
-                        + "; if they show another subject, make a capture of their own")  # fmt: skip
-    made = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
+                        + "; if they show another subject, put them into a separate capture")  # fmt: skip
+    result = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
     lost = [i for i in range(len(views)) if i not in placed]
     flipped = find_mirrored(photos_of(capture), lost, placed, config.seed)
     findings = (groups(len(placed), [[views[i].name for i in group] for group in others]),
                 mirrored([views[i].name for i in flipped], len(views)))  # fmt: skip
     sizes = tuple(len(g) for g in solution.groups)
-    return made.model_copy(update={"findings": findings, "left_out": why, "groups": sizes})
+    return result.model_copy(update={"findings": findings, "left_out": why, "groups": sizes})
 
 
 def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
-    """Names of the photos whose reasons begin alike: no match, other group, blurred, few features, weak match."""
+    """Names of photos by kind of reason: no match, other group, blurred, few features, weak match."""
     out: dict[str, list[str]] = {}
     for name, reason in why.items():
         out.setdefault(reason.split(":")[0], []).append(name)
@@ -73,11 +73,11 @@ def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str]) ->
     missing = list(why)
     named = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
     return StageError(
-        "the photos do not fit together" if placed else "the photos show nothing in common",
+        "the photos do not fit together" if placed else "the photos have no matches",
         where="poses",
-        value=f"{placed} of {total} placed, {fitted} of them not held out; without a place: {named}",
+        value=f"{placed} of {total} have a camera, {fitted} of them are not held out; without a camera: {named}",
         limit=f"at least {MIN_FITTED} that are not held out",
-        remedy="take the photos around one still subject, sharp, each overlapping the next by two thirds (15 degrees "
-        "or less apart), with the lens at one zoom; remove those named if they show something else; or give the "
+        remedy="take sharp photos around one still subject, each overlapping the next by two thirds (15 degrees or "
+        "less apart), with the lens at one zoom; remove the listed photos if they show something else; or give the "
         "cameras in params.json",
     )

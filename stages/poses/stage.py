@@ -1,4 +1,4 @@
-"""poses: checked photos in, cameras in asset coordinates out. Given cameras are used as they are, else solved."""
+"""poses: a camera in asset coordinates for each photo. Given cameras are used; otherwise they are solved."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> CameraSet:
     """Cameras around the subject.
 
     Raises:
-        UsageError: given cameras are asked for and there are none.
-        StageError: the given cameras share no view, or the photos can't be placed.
+        UsageError: poses.method=given, but the capture has no cameras.
+        StageError: the given cameras look at no common point, or the photos can't be registered.
     """
     from stages.poses.given_cameras import given_cameras
     from stages.poses.judge import judge

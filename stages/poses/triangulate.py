@@ -1,8 +1,8 @@
-"""Given cameras held against the photos: sparse points triangulated from them, and their own small errors mended.
+"""Triangulation of sparse points from given cameras, and refinement of their poses.
 
-A rig's calibration is good and never perfect: a bumped camera is a few pixels off. Its centre is known far better than
-photos alone tell it, its direction hardly: so bundle adjustment holds the centres near the given ones (a Gaussian prior
-of the width `deviation`), leaves the lenses alone and moves the rest.
+A rig's calibration is not perfect: a bumped camera is a few pixels off. The given centres are far more accurate than
+photos alone allow, the given directions are not. So bundle adjustment has a Gaussian prior on the centres (standard
+deviation `deviation`), keeps the lenses and refines the rest.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 from pipeline.artifacts import Camera
 from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, matrix
-from stages.poses.bundle_adjustment import settle_near
+from stages.poses.bundle_adjustment import adjust_near
 from stages.poses.features import Features
 from stages.poses.mapper import GLOG_ERROR, Model, model_of, write_database
 from stages.poses.matching import Pair, Verified
 
-SIGHTINGS = 20  # a view with fewer says too little of its camera
-TURN = 0.05  # radians: no rig is that wrong; a view that is turned so far followed wrong matches
-ROUNDS = (12.0, 4.0)  # pixels: how far off a sighting may be before and after the cameras were moved once
+MIN_OBSERVATIONS = 20  # fewest observed points of a view for a refinement
+TURN = 0.05  # radians: no rig has such an error; a view that is rotated more has wrong matches
+ROUNDS = (12.0, 4.0)  # pixels: largest reprojection error in the first and in the second round
 
 
 def triangulate(
@@ -33,8 +33,8 @@ def triangulate(
 ) -> tuple[Model, list[int]] | None:  # fmt: skip
     """Points (and with `refine` poses) from cameras in the capture's world, or None if the photos share no point.
 
-    Second: the views that were to be mended and stay as given, because the photos say too little of them. deviation: of
-    the given centres, in the world's unit. scratch: an empty folder.
+    Second: indices of the views that could not be refined, and keep the given pose. deviation: of the given centres, in
+    the world's unit. scratch: an empty folder.
     """
     pycolmap.logging.minloglevel = GLOG_ERROR
     database = scratch / "matches.db"
@@ -49,22 +49,22 @@ def triangulate(
         if not found.num_points3D():
             return None
         if refine:
-            settle_near(found, centres, deviation)
-            _turn_back(found, turns)
+            adjust_near(found, centres, deviation)
+            _restore_orientation(found, turns)
     model, given = model_of(found, numbers), [matrix(c.world_from_cam) for c in cameras]
     seen = {numbers[i.name]: i.num_points3D for i in found.images.values()}
     doubtful = [n for n, p in model.poses.items()
-                if refine and (seen[n] < SIGHTINGS or _turn(given[n], p.world_from_cam) > TURN)]  # fmt: skip
+                if refine and (seen[n] < MIN_OBSERVATIONS or _turn(given[n], p.world_from_cam) > TURN)]  # fmt: skip
     poses = {n: replace(p, K=matrix(cameras[n].K), world_from_cam=given[n] if n in doubtful else p.world_from_cam)
              for n, p in model.poses.items()}  # fmt: skip
     return replace(model, poses=poses), doubtful
 
 
-def _turn_back(found: Any, turns: Mapping[int, F64]) -> None:
-    """The whole world turned about the cameras' middle so that they look where the given ones did. In place.
+def _restore_orientation(found: Any, turns: Mapping[int, F64]) -> None:
+    """Rotate the world about the cameras' mean centre so that the rotations agree with the given ones. In place.
 
-    Centres in a row leave a turn about the row open, and flat rings say little of it; the given rotations don't.
-    turns: cam_from_world (3, 3) by image id. Least sum of distances, by reweighting, so that a lost view has no say.
+    Centres on a line do not determine the rotation about it, and flat rings do so only weakly; the given rotations do.
+    turns: cam_from_world (3, 3) by image id. Least sum of distances, by reweighting, so that outliers have no effect.
     """
     pairs = [(turns[n], np.asarray(i.cam_from_world().matrix()[:, :3])) for n, i in found.images.items()]
     true_from_found = np.stack([given.T @ now for given, now in pairs])
@@ -73,8 +73,8 @@ def _turn_back(found: Any, turns: Mapping[int, F64]) -> None:
         u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weights, true_from_found))
         Q = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
         weights = 1 / np.maximum(np.linalg.norm(true_from_found - Q, axis=(1, 2)), 1e-6)
-    middle = np.mean([i.projection_center() for i in found.images.values()], axis=0)
-    found.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(Q), middle - Q @ middle))
+    centre = np.mean([i.projection_center() for i in found.images.values()], axis=0)
+    found.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(Q), centre - Q @ centre))
 
 
 def _turn(a: F64, b: F64) -> float:
@@ -83,7 +83,7 @@ def _turn(a: F64, b: F64) -> float:
 
 
 def _with_poses(database: Path, poses: Sequence[F64]) -> Any:
-    """COLMAP's reconstruction of photos at cam_from_world (4, 4), without points."""
+    """A COLMAP reconstruction with the poses cam_from_world (4, 4) and without points."""
     found, opened = pycolmap.Reconstruction(), pycolmap.Database.open(database)
     for camera in opened.read_all_cameras():
         found.add_camera_with_trivial_rig(camera)
@@ -106,14 +106,14 @@ def _options(limit: float, seed: int) -> Any:
 
 
 def _lens(c: Camera) -> Any:
-    """fx fy cx cy k1 k2 p1 p2 k3 exactly; the skew is taken out of the positions."""
+    """COLMAP's camera with fx fy cx cy k1 k2 p1 p2 k3; `_without_skew` removes the skew from the positions."""
     K = c.K
     params = [K[0][0], K[1][1], K[0][2], K[1][2], *c.distortion[:4], c.distortion[4], 0.0, 0.0, 0.0]
     return pycolmap.Camera(model="FULL_OPENCV", width=c.width, height=c.height, params=params)
 
 
 def _without_skew(uv: Any, c: Camera) -> Any:
-    """(N, 2) positions as a lens without skew would have them: u - s y, y = (v - cy) / fy."""
+    """(N, 2) positions in pixels without the skew: u - s y, y = (v - cy) / fy."""
     skew = c.K[0][1]
     if skew == 0:
         return uv

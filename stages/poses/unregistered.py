@@ -1,4 +1,4 @@
-"""Why a photo found no place, in plain words, and which photos fit among themselves."""
+"""Reasons why a photo has no camera, and groups of photos that fit together."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 
 from stages.poses.matching import MIN_INLIERS, Pair, Verified
 
-FEW_FEATURES = 0.25  # of the capture's median: a photo with fewer shows little that can be found again
-SOFT = 0.5  # of the median detail: the capture stage drops what has less than 0.2, motion blur begins here
+FEW_FEATURES = 0.25  # of the capture's median: a photo with fewer has too few to match
+SOFT = 0.5  # of the median detail: a photo with less is blurred; the capture stage drops photos with less than 0.2
 
 
 def linked(verified: Iterable[Pair], photos: int) -> list[list[int]]:
-    """Photos that hang together by pairs that match, the largest group first; photos without a pair are not named."""
+    """Connected components of the photos that match, the largest first; photos without a match are not included."""
     group = list(range(photos))
 
     def of(i: int) -> int:
@@ -31,9 +31,10 @@ def linked(verified: Iterable[Pair], photos: int) -> list[list[int]]:
 
 
 def disjoint(groups: Iterable[Iterable[int]]) -> list[list[int]]:
-    """Groups of two photos or more, each photo in the first that has it; the first stays first, the largest follow.
+    """Groups of at least two photos, each photo in the first group that has it; the first stays first, the others
+    follow by size.
 
-    COLMAP's solutions overlap where it began anew from photos that it had placed before.
+    COLMAP's models overlap: it may start a new one from photos that it registered before.
     """
     taken: set[int] = set()
     out = []
@@ -48,10 +49,10 @@ def reasons(
     missing: Sequence[int], placed: Sequence[int], groups: Sequence[Sequence[int]], counts: Sequence[int],
     details: Sequence[float], verified: Mapping[Pair, Verified],
 ) -> dict[int, str]:  # fmt: skip
-    """A short sentence for each of the `missing` photos.
+    """A short reason for each of the `missing` photos.
 
-    groups: of photos that fit among themselves, but not with the placed ones. counts: features of every photo. details:
-    its `pipeline.sharpness.detail`.
+    groups: of photos that fit together, but not with the `placed` ones. counts: features of every photo. details:
+    `pipeline.sharpness.detail` of every photo.
     """
     inside = {i: g for g in groups for i in g}
     best: dict[int, tuple[int, int]] = {}  # by photo: the photos that it matches, the most matches of one pair
@@ -66,17 +67,17 @@ def reasons(
         few, soft = counts[i] < FEW_FEATURES * usual, details[i] < SOFT * sharp
         if i in inside:
             more = len(inside[i]) - 1
-            out[i] = (f"other group: it fits {_photos(more, 'more ')} without a place, but not the {len(placed)} that "
+            out[i] = (f"other group: it fits {_photos(more, 'more ')} without a camera, but not the {len(placed)} that "
                       "have one")  # fmt: skip
         elif few:
-            out[i] = f"few features: {counts[i]} spots to match by, the photos have {usual:.0f} in the median"
+            out[i] = f"few features: it has {counts[i]}, the median of the photos is {usual:.0f}"
         elif soft:
-            out[i] = f"blurred: it has {details[i] / sharp:.0%} of the fine detail that the photos have in the median"
+            out[i] = f"blurred: it has {details[i] / sharp:.0%} of the median fine detail of the photos"
         elif partners:
-            out[i] = (f"weak match: it matches {_photos(partners)}, {most} spots at best; too few of these tie it "
-                      "to the photos that have a place")  # fmt: skip
+            out[i] = (f"weak match: it matches {_photos(partners)}, with at most {most} features; too few of them link "
+                      "it to the photos that have a camera")  # fmt: skip
         else:
-            out[i] = f"no match: no other photo shares {MIN_INLIERS} spots with it that fit one geometry"
+            out[i] = f"no match: no other photo has {MIN_INLIERS} consistent matches with it"
     return out
 
 

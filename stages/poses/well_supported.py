@@ -1,17 +1,17 @@
-"""Which photos of a solution hold together: a mapper that accepts few matches is not to be believed on them alone."""
+"""Which photos of a solution share enough points: a mapper that accepts few matches may register photos wrongly."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
 
-HELD = 30  # points that a photo, or a group, must share with the rest: what COLMAP by itself asks before it places one
+MIN_SHARED = 30  # points that a photo, or a group, must share with the rest: COLMAP's default to register a photo
 
 
-def well_supported(seen: Mapping[int, Set[int]], least: int = HELD) -> list[int]:
-    """Photos that hang together by `least` points or more, ascending: the largest such group.
+def well_supported(seen: Mapping[int, Set[int]], least: int = MIN_SHARED) -> list[int]:
+    """The largest group of photos that share at least `least` points, ascending.
 
-    seen: points by photo. Two groups are one as soon as they share so many points, over all their photos; so a ring of
-    photos may hang on another by a few matches of many photos, but neither a photo nor a ring by a few of one.
+    seen: points by photo. Two groups are merged if they share `least` points over all their photos. So two rings of
+    cameras may be linked by a few matches of many photos, but not by a few matches of one photo.
     """
     groups = [({photo}, set(points)) for photo, points in sorted(seen.items())]
     merged = True

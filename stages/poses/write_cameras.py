@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def camera_of(view: CaptureView, K: F64, world_from_cam: F64, distortion: Sequence[float]) -> Camera:
-    """A view's camera, still in the capture's world."""
+    """A view's camera in the capture's world. K (3, 3) pixels; world_from_cam (4, 4); distortion k1 k2 p1 p2 k3."""
     k1, k2, p1, p2, k3 = distortion
     return Camera(
         index=view.index,
@@ -32,7 +32,7 @@ def camera_of(view: CaptureView, K: F64, world_from_cam: F64, distortion: Sequen
 
 
 def in_asset(cameras: Sequence[Camera], capture_from_asset: F64) -> tuple[Camera, ...]:
-    """The same cameras with `world_from_cam` in asset coordinates. capture_from_asset: 4x4 similarity."""
+    """The same cameras with `world_from_cam` in asset coordinates. capture_from_asset: (4, 4) similarity."""
     asset_from_capture: F64 = np.asarray(np.linalg.inv(capture_from_asset), np.float64)
     return tuple(
         c.model_copy(update={"world_from_cam": rows(rescale_camera(asset_from_capture, matrix(c.world_from_cam)))})
@@ -41,7 +41,8 @@ def in_asset(cameras: Sequence[Camera], capture_from_asset: F64) -> tuple[Camera
 
 
 def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
-    """Sparse points. npz: points (M, 3) float32 in asset coordinates, error_px (M,), track (M,) photos per point."""
+    """Write the sparse points. npz: points (M, 3) float32 in asset coordinates, error_px (M,), track (M,) photos per
+    point."""
     asset_from_capture: F64 = np.asarray(np.linalg.inv(capture_from_asset), np.float64)
     np.savez(
         path,
@@ -52,7 +53,7 @@ def save_points(path: Path, model: Model, capture_from_asset: F64) -> None:
 
 
 def sparse_points(found: CameraSet, folder: Path) -> F64 | None:
-    """(M, 3) what `save_points` wrote into the artifact's folder; None if there are no points."""
+    """(M, 3) the points that `save_points` wrote into the artifact's folder; None if there are none."""
     if found.points is None:
         return None
     with np.load(folder / found.points.path, allow_pickle=False) as data:
@@ -60,7 +61,7 @@ def sparse_points(found: CameraSet, folder: Path) -> F64 | None:
 
 
 def view_errors(model: Model, names: Sequence[str]) -> dict[str, float]:
-    """Mean reprojection error of each view that has one, by its name. names: of the model's photos."""
+    """Mean reprojection error in pixels of each view that has one, by name. names: of the model's photos."""
     return {names[i]: round(e, 4) for i, e in sorted(model.view_error_px.items()) if e == e}
 
 
@@ -74,9 +75,10 @@ def camera_set(
     warnings: Sequence[str],
     context: Context,
 ) -> CameraSet:
-    """Cameras of the capture's world in asset coordinates, with the sparse points if there are any, which are written.
+    """The manifest: `cameras` (capture's world) in asset coordinates, and the sparse points if there are any, which are
+    written to a file.
 
-    names: of the model's photos. left_out: photos without a place.
+    names: of the model's photos. left_out: photos without a camera.
     """
     if model is not None:
         save_points(context.workdir / "points.npz", model, found.capture_from_asset)

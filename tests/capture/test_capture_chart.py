@@ -146,7 +146,7 @@ def test_what_is_no_chart_is_refused() -> None:
     rng = np.random.default_rng(0)
     for _ in range(8):  # other colours, and the chart's own in another order
         for colours in (rng.random((PATCHES, 3)), REFLECTANCES[rng.permutation(PATCHES)]):
-            assert "does not show" in str(colour_matrix_of(Patches(QUAD, colours, np.ones(PATCHES, bool))))
+            assert "does not have" in str(colour_matrix_of(Patches(QUAD, colours, np.ones(PATCHES, bool))))
     steep = Patches(QUAD, exact(CAMERA).colours * (1 + places() @ [0.7, 0.25])[:, None], np.ones(PATCHES, bool))
     assert "unevenly" in str(colour_matrix_of(steep))
 
@@ -187,7 +187,7 @@ def test_off_on_and_without_one_nothing_changes(tmp_path: Path, gather) -> None:
     auto = gather(tmp_path)
     assert auto.artifact.chart is None and not auto.artifact.warnings
     assert auto.path(auto.artifact.views[0].image).read_bytes() == (tmp_path / "0.png").read_bytes()
-    with pytest.raises(StageError, match="no colour chart is found") as caught:
+    with pytest.raises(StageError, match="no colour checker is found") as caught:
         gather(tmp_path, colour_checker="on")
     assert "capture.colour_checker=auto" in str(caught.value)
 
@@ -199,7 +199,7 @@ def test_a_chart_that_is_none_is_named(tmp_path: Path, gather, monkeypatch) -> N
     monkeypatch.setattr("stages.capture.import_photo.find_chart", lambda image: wrong)
     found = gather(tmp_path).artifact
     assert found.chart is None
-    assert "1.png: the colour chart does not show" in "; ".join(found.warnings)
+    assert "1.png: the colour checker does not have" in "; ".join(found.warnings)
     with pytest.raises(StageError, match=r"0\.png"):
         gather(tmp_path, colour_checker="on")
 

@@ -43,7 +43,7 @@ def test_facescape_with_masks_and_an_invalid_view(facescape, gather) -> None:
     assert [v.index for v in capture.views] == [0, 1, 2, 3, 5]
     assert [v.index for v in capture.views if v.holdout] == [2]
     assert capture.left_out == ("4.jpg: params.json marks it invalid",)
-    assert "only 1 of 5 views have a mask" in capture.warnings
+    assert "only 1 of 5 views have a given mask" in capture.warnings
     view = capture.views[1]
     assert (view.width, view.height) == SIZE and view.camera_group == "96x80 | B1"
     assert view.image.path == "photos/1_1.jpg"
@@ -190,7 +190,7 @@ def test_a_blurred_third_is_left_out_and_named(tmp_path: Path, gather) -> None:
 
 # ------------------------------------------------------------------ bad files
 @pytest.mark.parametrize(("content", "says"), [
-    (b"", "0 bytes"), (b"\xff\xd8\xff\xe0 no picture at all", "cut off"), (b"plain text", "10 bytes"),
+    (b"", "0 bytes"), (b"\xff\xd8\xff\xe0 no picture at all", "truncated"), (b"plain text", "10 bytes"),
 ])  # fmt: skip
 def test_files_that_are_no_pictures(tmp_path: Path, gather, content: bytes, says: str) -> None:
     folder = plain(tmp_path / "c")
@@ -205,7 +205,7 @@ def test_truncated_photos(tmp_path: Path, gather) -> None:
         data = (folder / name).read_bytes()
         (folder / name).write_bytes(data[: len(data) * 2 // 3])
         error = refused(gather, folder)
-        assert error.where == name and "cut off" in error.value
+        assert error.where == name and "truncated" in error.value
         (folder / name).write_bytes(data)
 
 
@@ -267,7 +267,7 @@ def test_a_mask_of_another_size_is_named_and_done_without(tmp_path: Path, gather
     cv2.imwrite(str(folder / "mask" / "b.png"), np.eye(50, dtype=np.uint8) * 255)
     capture = gather(folder).artifact
     assert capture.views[1].mask is None
-    assert "b.png is 50 x 50 and its photo 96 x 80; export it at the photo's size" in capture.warnings[0]
+    assert "b.png has 50 x 50 pixels, its photo 96 x 80; export it at the photo's size" in capture.warnings[0]
 
 
 def test_clean_plates_belong_to_their_photos(tmp_path: Path, gather) -> None:
@@ -277,7 +277,7 @@ def test_clean_plates_belong_to_their_photos(tmp_path: Path, gather) -> None:
     cv2.imwrite(str(folder / "clean_plate" / "b.jpg"), flat((90, 90), 30))
     capture = gather(folder).artifact
     assert capture.views[0].plate is not None and capture.views[0].plate.path == "plates/0_a.png"
-    assert capture.views[1].plate is None and "clean plate of b.jpg is 90 x 90" in capture.warnings[0]
+    assert capture.views[1].plate is None and "clean plate of b.jpg has 90 x 90" in capture.warnings[0]
 
 
 # ------------------------------------------------------------------ bad cameras
@@ -305,7 +305,7 @@ def mirrored(params: dict) -> dict:
     (lambda p: {"2_K": "abc"}, "2_K", "numbers"),
     (lambda p: {"2_K": None}, "2_K", "numbers"),
     (mirrored, "2_Rt", "left-handed"),
-    (lambda p: {"2_Rt": (np.array(p["2_Rt"]) * 1.01).tolist()}, "2_Rt", "no rotation"),
+    (lambda p: {"2_Rt": (np.array(p["2_Rt"]) * 1.01).tolist()}, "2_Rt", "not orthonormal"),
     (lambda p: {"2_Rt": np.array(p["2_Rt"])[:, :3].tolist()}, "2_Rt", "shape"),
     (lambda p: {"2_distortion": [0.1, 0.2]}, "2_distortion", "coefficients"),
     (lambda p: {"2_width": 96.5}, "2_width", "whole number"),

@@ -71,7 +71,7 @@ def refused(folder: Path) -> StageError:
 
 
 def test_no_folder_and_a_file_for_a_folder(tmp_path: Path) -> None:
-    assert "not there" in str(refused(tmp_path / "nowhere"))
+    assert "does not exist" in str(refused(tmp_path / "nowhere"))
     assert "a file" in str(refused(photos(tmp_path, "a.jpg") / "a.jpg"))
 
 
@@ -98,7 +98,7 @@ def test_params_that_name_none_of_the_photos(facescape) -> None:
     folder, _ = facescape
     for i in range(6):
         (folder / f"{i}.jpg").rename(folder / f"view{i}.jpg")
-    assert "params.json names" in refused(folder).value
+    assert "params.json lists" in refused(folder).value
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"cameras": []}', '"0_K"', "[" * 100000])

@@ -64,7 +64,7 @@ def glossy() -> Choices:
 def test_a_lambertian_ball_needs_no_lobe(dull: Choices) -> None:
     assert not dull.specular and dull.light_order == 3
     fact = dull.facts["specular"]
-    assert fact["why"] == "evidence" and float(fact["error_without"]) - float(fact["error_with"]) < 1e-3
+    assert fact["why"] == "cross-validation" and float(fact["error_without"]) - float(fact["error_with"]) < 1e-3
 
 
 def test_a_glossy_ball_needs_one(glossy: Choices) -> None:
@@ -184,7 +184,7 @@ def test_waiting_views_are_few_and_spread() -> None:
     t = trainer(Ball())
     assert t.table is not None
     assert not np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.validation).any()
-    t.table.wait(())
+    t.table.exclude(())
     assert np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.validation).any()
 
 

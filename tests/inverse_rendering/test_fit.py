@@ -104,7 +104,9 @@ def test_the_fit_finds_out_what_the_ball_requires(fitted: Trainer) -> None:
     """It is Lambertian, its photos are of one camera, and it began 8 mm too large (test_evidence.py has more)."""
     c = fitted.choices
     assert c is not None and not c.specular and not c.calibrated and c.refine_geometry and c.light_order == 3
-    assert len(fitted.model.light()) == 16 and all(f["why"] == "evidence" for k, f in c.facts.items() if k != "rank")
+    assert len(fitted.model.light()) == 16 and all(
+        f["why"] == "cross-validation" for k, f in c.facts.items() if k != "rank"
+    )
 
 
 def test_shading_goes_to_the_light(fitted: Trainer) -> None:

@@ -23,9 +23,14 @@ from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
 
 REF = FileRef(path="a.png", sha256="0" * 64, size=1)
 FACTS = {
-    "specular": {"modelled": True, "why": "evidence", "error_without": 0.072, "error_with": 0.054},
-    "calibration": {"modelled": False, "why": "evidence", "error_without": 0.054, "error_with": 0.0529},
-    "relief": {"modelled": True, "why": "evidence", "silhouette_error_of_prior": 0.002, "silhouette_error": 0.004},
+    "specular": {"modelled": True, "why": "cross-validation", "error_without": 0.072, "error_with": 0.054},
+    "calibration": {"modelled": False, "why": "cross-validation", "error_without": 0.054, "error_with": 0.0529},
+    "relief": {
+        "modelled": True,
+        "why": "cross-validation",
+        "silhouette_error_of_prior": 0.002,
+        "silhouette_error": 0.004,
+    },
 }
 RISING = (19.3, 25.2, 32.0, 34.3, 33.6, 34.5, 35.2, 36.4, 37.2, 37.5)
 
@@ -142,12 +147,12 @@ def test_a_start_that_the_masks_contradict(wrong: float, level: str) -> None:
 
 @pytest.mark.parametrize(("left", "level"), [(0.054, "good"), (0.285, "usable"), (0.51, "unusable")])
 def test_photos_that_disagree(left: float, level: str) -> None:
-    facts = {"specular": {"modelled": True, "why": "evidence", "error_without": 1.4 * left, "error_with": left}}
+    facts = {"specular": {"modelled": True, "why": "cross-validation", "error_without": 1.4 * left, "error_with": left}}
     assert only(sound(facts=facts), "photos_agree").level == level
 
 
 def test_matt_people_are_told_and_matt_stones_are_not() -> None:
-    dull = {"specular": {"modelled": False, "why": "evidence", "error_without": 0.0545, "error_with": 0.054}}
+    dull = {"specular": {"modelled": False, "why": "cross-validation", "error_without": 0.0545, "error_with": 0.054}}
     found = only(sound(facts=dull), "specular")
     assert found.level == "usable" and "F0" in found.said and "specular=on" in found.remedy
     assert only(sound(facts=dull, faces=2), "specular").level == "good"

@@ -164,7 +164,7 @@ def test_a_fit_takes_the_light_over() -> None:
     before = t.model.light().detach().clone()
     t.select_model()
     c = t.choices
-    assert c is not None and c.light_known and c.facts["light"]["from"] == "what changes with the view"
+    assert c is not None and c.light_known and c.facts["light"]["from"] == "view-dependent residuals"
     light = t.model.light().detach()
     assert not torch.equal(before[: len(light)], light) and torch.equal(light[:, 0], light[:, 2])
     strongest = int(light[1:, 0].abs().argmax()) + 1

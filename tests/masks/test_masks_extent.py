@@ -20,7 +20,7 @@ from pipeline.transforms import inverse_rigid, matrix, project
 from stages.masks import segment
 from stages.masks.extent import BUST, asked, share_beyond
 from stages.masks.judge import extent_finding
-from stages.masks.segment import Looked, Masked
+from stages.masks.segment import FaceResult, Masked
 from stages.masks.stage import STAGE, Config
 from tests.masks.test_masks_stage import Scene, ball_alpha, scene  # noqa: F401
 from tests.support.faces import camera, face
@@ -94,12 +94,12 @@ def test_the_stage_hands_on_face_and_extent(
     """A small face on a ball: what lies beyond its neck is not asked; an object with a face is one."""
     points = 0.35 * face() + (0, 0.05, 0.05)
 
-    def look(m: Masked, *_: object) -> Looked:
+    def look(m: Masked, *_: object) -> FaceResult:
         uv, _z = project(matrix(m.camera.K), inverse_rigid(matrix(m.camera.world_from_cam)), np.zeros(5), points)
-        return Looked(Face(uv, 1.0) if m.view.index % 3 else None)
+        return FaceResult(Face(uv, 1.0) if m.view.index % 3 else None)
 
     real = segment.plan
-    monkeypatch.setattr(segment, "_look", look)
+    monkeypatch.setattr(segment, "_find_face", look)
     if method == "object":
         monkeypatch.setattr(segment, "plan", lambda *a: replace(real(*a), method="object"))
         monkeypatch.setattr(segment, "mask", lambda view, *_: (ball_alpha(view.camera), "object"))
@@ -112,7 +112,7 @@ def test_the_stage_hands_on_face_and_extent(
         return
     assert found.artifact.extent is not None
     (told,) = [f for f in found.artifact.findings if f.check == "extent"]
-    assert told.level == "good" and "the beginning of the shoulders" in told.said
+    assert told.level == "good" and "the upper shoulders" in told.said
     cut = [m for m in found.artifact.masks if m.asked is not None]
     assert len(cut) > 0.8 * len(found.artifact.masks)
     for m in cut:
@@ -126,7 +126,7 @@ def test_photos_that_do_not_agree_on_a_head_are_told() -> None:
     lost = extent_finding(5, 0, False)
     assert lost is not None and lost.level == "usable" and "5 photos" in lost.said and lost.remedy
     whole = extent_finding(9, 8, False)
-    assert whole is not None and whole.level == "good" and "8 photos" in whole.said and "the whole" in whole.said
+    assert whole is not None and whole.level == "good" and "8 photos" in whole.said and "everything" in whole.said
 
 
 def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:

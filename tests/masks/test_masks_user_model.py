@@ -75,7 +75,7 @@ def test_networks_that_cant_be_used(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="can't be used") as caught:
         UserModel(tmp_path / "text.onnx", 64, True).probability(square)
     assert "masks.model_side" in caught.value.remedy
-    with pytest.raises(UsageError, match="not there"):
+    with pytest.raises(UsageError, match="does not exist"):
         Config(model=str(tmp_path / "nowhere.onnx"))
 
 
@@ -87,7 +87,7 @@ def test_other_content_is_another_setting(tmp_path: Path) -> None:
     assert Config().model_sha256 == "" == first.hair_model_sha256
     hair = Config(hair_model=str(path))
     assert len(hair.hair_model_sha256) == 64 and hair.model_sha256 == ""
-    with pytest.raises(UsageError, match="not there") as caught:
+    with pytest.raises(UsageError, match="does not exist") as caught:
         Config(hair_model=str(tmp_path / "nowhere.onnx"))
     assert caught.value.where == "masks.hair_model"
 

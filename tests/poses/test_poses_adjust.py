@@ -13,7 +13,7 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, inverse_rigid, matrix, project, rigid, rows
-from stages.poses.bundle_adjustment import Refine, settle, settle_near
+from stages.poses.bundle_adjustment import Refine, adjust, adjust_near
 from stages.poses.features import Features
 from stages.poses.mapper import Lens, reconstruct
 from stages.poses.matching import Verified, promising_pairs
@@ -66,7 +66,7 @@ def shape_error(found: pycolmap.Reconstruction) -> float:
 def test_wrong_matches_have_no_say() -> None:
     clean, spoilt = reconstruction(0.0, 0.3), reconstruction(0.08, 0.3)
     for found in (clean, spoilt):
-        settle(found, Refine(), principal_point=False)
+        adjust(found, Refine(), principal_point=False)
     squares = reconstruction(0.08, 0.3)
     pycolmap.bundle_adjustment(squares, pycolmap.BundleAdjustmentOptions(print_summary=False))
     assert shape_error(clean) < 0.004
@@ -75,7 +75,7 @@ def test_wrong_matches_have_no_say() -> None:
 
 def test_exact_matches_stay_exact() -> None:
     found = reconstruction(0.0, 0.0)
-    settle(found, Refine(), principal_point=True)
+    adjust(found, Refine(), principal_point=True)
     assert shape_error(found) < 1e-6
     assert found.cameras[1].params == pytest.approx([700, 160, 140, 0], abs=1e-3)
 
@@ -83,11 +83,11 @@ def test_exact_matches_stay_exact() -> None:
 def test_centres_are_held_near_the_given_ones() -> None:
     truth = {i: p[:3, 3] for i, p in enumerate(ORBIT, 1)}
     free, held = (reconstruction(0.0, 0.3, shift=0.005) for _ in range(2))
-    settle_near(held, truth, 1e-5)
+    adjust_near(held, truth, 1e-5)
     assert np.abs(centres(held) - np.stack(list(truth.values()))).max() < 1e-4
     given = {i: np.array(c) for i, c in enumerate(centres(free), 1)}
     for _ in range(2):  # what the sightings' deviation is shows when the cameras were moved once
-        settle_near(free, given, 0.005)
+        adjust_near(free, given, 0.005)
     before = np.linalg.norm(np.stack(list(given.values())) - np.stack(list(truth.values())), axis=1).mean()
     assert shape_error(free) * 0.6 < 0.5 * before  # the photos say where they are to each other ...
     assert (
@@ -158,7 +158,7 @@ def test_triangulation_knows_skew_and_all_five_terms(tmp_path: Path) -> None:
 
 def test_photos_that_share_no_point(tmp_path: Path, capture_of, place) -> None:
     write_facescape(tmp_path / "c", ORBIT[:3], K, SIZE, pictures=False)
-    with pytest.raises(StageError, match="no point is seen"):
+    with pytest.raises(StageError, match="no point is visible"):
         place(capture_of(tmp_path / "c", drop_blurred=False), given="triangulate", check=False, unit="metres")
 
 

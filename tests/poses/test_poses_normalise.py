@@ -69,7 +69,7 @@ def test_other_units_are_recognised_and_told(unit: str, factor: float) -> None:
 @pytest.mark.parametrize("factor", [1e-3, 12.0, 1e5])
 def test_implausible_units_are_scaled_to_a_nominal_head(factor: float) -> None:
     found = normalise(cameras(orbit(), similarity(factor, np.eye(3), np.zeros(3))), given=True)
-    assert not found.metric and "not known" in found.warnings[0]
+    assert not found.metric and "unknown" in found.warnings[0]
     assert found.roi_radius == pytest.approx(NOMINAL_ROI)
     np.testing.assert_allclose(apply(found.capture_from_asset, np.zeros((1, 3)))[0], TARGET * factor, rtol=1e-6)
     check_rigid(found)
@@ -80,7 +80,7 @@ def test_a_world_with_z_up_is_turned() -> None:
     found = normalise(cameras(orbit((0,)), similarity(1, turn, np.zeros(3))), given=True)
     up = found.capture_from_asset[:3, :3] @ [0, 1, 0]
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
-    assert "turned" in found.warnings[0]
+    assert "rotated" in found.warnings[0]
     check_rigid(found)
 
 
@@ -261,7 +261,7 @@ def test_a_given_world_is_turned_to_the_face(yaw: float, turned: bool) -> None:
     found = normalise(cameras(orbit()), given=True, head=head_turned(turn))
     linear = found.capture_from_asset[:3, :3] / np.cbrt(np.linalg.det(found.capture_from_asset[:3, :3]))
     np.testing.assert_allclose(linear, turn.T if turned else np.eye(3), atol=1e-12)
-    assert any("turned by its landmarks" in w for w in found.warnings) == turned
+    assert any("rotated by its landmarks" in w for w in found.warnings) == turned
 
 
 def test_a_given_world_whose_up_is_another_axis_stands_by_the_face() -> None:

@@ -19,7 +19,7 @@ from stages.poses.matching import Verified, verify
 from stages.poses.quality import GOOD_SCORE, better, quality, score
 from stages.poses.sfm import GLOBAL_FROM, SEEDS, best_of, match_pairs
 from stages.poses.unregistered import disjoint, linked, reasons
-from stages.poses.well_supported import HELD, well_supported
+from stages.poses.well_supported import MIN_SHARED, well_supported
 from tests.support.textured_ball import camera_on_orbit
 
 
@@ -156,8 +156,8 @@ def test_groups_hang_together_by_all_their_photos() -> None:
     assert well_supported(a | b) == list(range(9))  # 12 points each, 42 in all
     thin = {i: set(range(1000, 1100)) | set(range(12)) for i in range(5, 9)}
     assert well_supported(a | thin) == [0, 1, 2, 3, 4]  # 12 points each, the same 12
-    assert well_supported({**a, 9: set(range(HELD - 1))}) == [0, 1, 2, 3, 4]
-    assert well_supported({**a, 9: set(range(HELD))}) == [0, 1, 2, 3, 4, 9] and well_supported({}) == []
+    assert well_supported({**a, 9: set(range(MIN_SHARED - 1))}) == [0, 1, 2, 3, 4]
+    assert well_supported({**a, 9: set(range(MIN_SHARED))}) == [0, 1, 2, 3, 4, 9] and well_supported({}) == []
 
 
 def two_rings() -> tuple[list[np.ndarray], list[Features], dict[tuple[int, int], Verified]]:
@@ -240,8 +240,8 @@ def test_each_photo_without_a_place_has_its_reason() -> None:
     assert [source[i].split(":")[0] for i in range(4, 10)] == [
         "other group", "other group", "weak match", "few features", "blurred", "no match",
     ]  # fmt: skip
-    assert "1 more photo " in source[4] and "2 photos, 22 spots" in source[6]
-    assert "20 spots" in source[7] and "30%" in source[8]
+    assert "1 more photo " in source[4] and "2 photos, with at most 22 features" in source[6]
+    assert "it has 20" in source[7] and "30%" in source[8]
 
 
 def test_groups_of_photos() -> None:

@@ -1,4 +1,4 @@
-"""Ways in which a capture says where its cameras were: one module each, found by looking at the folder."""
+"""Readers of given cameras: one module for each format. The format is detected from the folder's files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ READERS: dict[CaptureKind, Reader] = {
 
 
 def find_reader(folder: Path) -> tuple[CaptureKind, list[Path]] | None:
-    """The kind of description in `folder` and its files, or None: photos alone."""
+    """The format of the cameras' files in `folder`, and these files; None for photos alone."""
     for kind, reader in READERS.items():
         files = reader.find(folder)
         if files:
@@ -30,7 +30,7 @@ def find_reader(folder: Path) -> tuple[CaptureKind, list[Path]] | None:
 
 
 def describe(kind: CaptureKind, folder: Path, files: Sequence[Path]) -> Described:
-    """What the files of that kind say of the views."""
+    """The views of the cameras' files of that format."""
     return READERS[kind].read(folder, files)
 
 

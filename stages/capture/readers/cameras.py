@@ -1,4 +1,4 @@
-"""One camera, checked: what K, a pose and a lens must be, whatever format they come from."""
+"""Checks of one given camera, for all formats: K, pose and distortion."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pipeline.artifacts import GivenCamera
 from pipeline.transforms import F64, rigid, rows
 from stages.capture.readers.values import fault, finite
 
-ORTHONORMAL_LIMIT = 1e-3  # float32 and a few printed digits stay below it, a scaled or sheared matrix does not
+ORTHONORMAL_LIMIT = 1e-3  # float32 and few printed digits give less, a scaled or sheared matrix more
 FOCAL = (0.05, 100.0)  # of the photo's longest edge: a fisheye of 180 degrees has 0.3, a lens of 1200 mm has 33
-PRINCIPAL = 100.0  # longest edges from the frame's middle: a small crop's principal point lies far outside
+PRINCIPAL = 100.0  # longest edges from the frame's centre: a small crop's principal point lies far outside
 FARTHEST = 1e9  # units from the world's origin: millimetres on a map of a country
-BENT = 10.0  # times a corner's distance from the axis, by which one term of the lens may move it
+BENT = 10.0  # largest shift of a corner by one distortion term, relative to its distance from the axis
 
 
 def given_camera(
     K: F64, cam_from_world: F64, distortion: F64, where: str, size: tuple[int, int] | None = None
 ) -> GivenCamera:
-    """A camera, checked. K (3, 3): the first pixel's centre at (0.5, 0.5). Pose (3, 4) or (4, 4). k1 k2 p1 p2 k3.
-    size: the photo's (width, height), None where it is not known."""
+    """A checked camera. K: (3, 3) pixels, the first pixel's centre at (0.5, 0.5). cam_from_world: (3, 4) or (4, 4).
+    distortion: (5,) k1 k2 p1 p2 k3. size: the photo's (width, height) in pixels, None if unknown. where: for errors."""
     K, pose = checked_K(K, where), checked_pose(cam_from_world, where)
     if size is not None:
         checked_lens(checked_frame(K, size, where), distortion, size, where)
@@ -27,28 +27,29 @@ def given_camera(
 
 
 def checked_frame(K: F64, size: tuple[int, int], where: str) -> F64:
-    """K itself. Raises StageError if its focal lengths, skew or principal point can't be those of a photo this size."""
+    """K (3, 3) itself. Raises StageError if its focal lengths, skew or principal point do not fit a photo of this
+    (width, height) in pixels."""
     edge = max(size)
     low, high = FOCAL[0] * edge, FOCAL[1] * edge
     if not (low <= K[0, 0] <= high and low <= K[1, 1] <= high):
-        raise fault("a focal length is not that of a camera", where, f"fx = {K[0, 0]:g}, fy = {K[1, 1]:g}",
+        raise fault("a focal length is out of range", where, f"fx = {K[0, 0]:g}, fy = {K[1, 1]:g}",
                     f"{low:g} to {high:g} for a photo of {size[0]} x {size[1]}",
                     "write the focal lengths in pixels")  # fmt: skip
     off = float(np.abs(K[:2, 2] - np.array(size) / 2).max())
     if not max(off, abs(K[0, 1])) <= PRINCIPAL * edge:
-        raise fault("the principal point or the skew is not that of a camera", where,
+        raise fault("the principal point or the skew is out of range", where,
                     f"cx = {K[0, 2]:g}, cy = {K[1, 2]:g}, skew = {K[0, 1]:g}",
-                    f"at most {PRINCIPAL * edge:g} from the frame's middle",
+                    f"at most {PRINCIPAL * edge:g} from the frame's centre",
                     "write the principal point in pixels")  # fmt: skip
     return K
 
 
 def checked_lens(K: F64, d: F64, size: tuple[int, int], where: str) -> F64:
-    """k1 k2 p1 p2 k3 themselves. Raises StageError if one of them moves a corner of the frame beyond all lenses."""
+    """d (5,), k1 k2 p1 p2 k3, itself. Raises StageError if one term moves a corner of the frame too far."""
     r = float(np.hypot(size[0] / 2 / K[0, 0], size[1] / 2 / K[1, 1]))
     moved = float(np.abs(finite(d, where) * np.array([r**2, r**4, r, r, r**6])).max())
     if moved > BENT:
-        raise fault("the lens bends more than any lens", where,
+        raise fault("the lens distortion is too large", where,
                     f"{', '.join(f'{x:g}' for x in d)}: a corner moves by {moved:.3g} times its distance",
                     f"at most {BENT:g} times for each of k1 k2 p1 p2 k3",
                     "check the order k1 k2 p1 p2 k3 and their unit; zeros for a lens without distortion")  # fmt: skip
@@ -56,7 +57,7 @@ def checked_lens(K: F64, d: F64, size: tuple[int, int], where: str) -> F64:
 
 
 def checked_K(K: F64, where: str) -> F64:
-    """K itself. Raises StageError if it is not finite, not 3 x 3, singular or not upper triangular."""
+    """K (3, 3) itself. Raises StageError if it is not finite, not 3 x 3, singular or not upper triangular."""
     if K.shape != (3, 3):
         raise fault("camera matrix has the wrong shape", where, f"shape {K.shape}", "3 x 3", "write K as three rows")
     finite(K, where)
@@ -81,7 +82,8 @@ def checked_K(K: F64, where: str) -> F64:
 
 
 def checked_pose(m: F64, where: str) -> F64:
-    """4x4 cam_from_world, its rotation made exact. Raises StageError if it is none, left-handed or too far away."""
+    """cam_from_world (4, 4) with an exact rotation, from m (3, 4) or (4, 4). Raises StageError if m is no pose,
+    left-handed or too far away."""
     if m.shape not in ((3, 4), (4, 4)) or (m.shape == (4, 4) and np.abs(m[3] - [0, 0, 0, 1]).max() > 1e-6):
         raise fault(
             "camera pose has the wrong shape",
@@ -99,11 +101,11 @@ def checked_pose(m: F64, where: str) -> F64:
 
 
 def checked_rotation(R: F64, where: str) -> F64:
-    """The rotation (3, 3) nearest to R. Raises StageError if R is none, or left-handed."""
+    """The rotation (3, 3) nearest to R. Raises StageError if R is not orthonormal, or left-handed."""
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if not error <= ORTHONORMAL_LIMIT:
         raise fault(
-            "camera pose has no rotation matrix",
+            "the rotation of a camera pose is not orthonormal",
             where,
             f"|R R^T - 1| = {error:.3g}",
             f"at most {ORTHONORMAL_LIMIT:g}",
@@ -115,7 +117,7 @@ def checked_rotation(R: F64, where: str) -> F64:
             where,
             "det R = -1 (mirrored)",
             "det R = +1",
-            "use right-handed axes; flip one axis where the pose is written",
+            "use right-handed axes; flip one axis in the program that writes the pose",
         )
     u, _, vt = np.linalg.svd(R)
     return np.asarray(u @ vt, np.float64)

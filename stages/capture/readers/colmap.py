@@ -1,7 +1,7 @@
 """Reads a COLMAP model, binary or text: `cameras`, `images`, `points3D` in `sparse/0/`, `sparse/` or the folder itself.
 
-Every camera model that pycolmap knows is taken: those that k1 k2 p1 p2 k3 can say exactly as they are, the others by
-the nearest lens of that kind over the frame, if it is near enough.
+All camera models of pycolmap are supported. Models that k1 k2 p1 p2 k3 can represent are exact. The others are
+approximated over the frame by k1 k2 p1 p2 k3, if the error is small enough.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap", "")
 NAMES = ("cameras", "images", "points3D")
 MORE = ("rigs", "frames")  # newer versions write these too
 WHOLE = "a complete model as COLMAP writes it"
-AGAIN = "export the model again, or remove it to have the cameras solved"
-NOTED = 0.02  # pixels: a lens replaced with less error than this needs no note
+AGAIN = "export the model again, or remove it to solve the cameras from the photos"
+NOTED = 0.02  # pixels: an approximation with a larger error causes a warning
 
 
 def find(folder: Path) -> list[Path]:
@@ -45,29 +45,29 @@ def find(folder: Path) -> list[Path]:
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
-    """Registered images with their photos; those whose photo is missing are left out and named."""
+    """Registered images with their photos. Images whose photo is missing are left out with a warning."""
     wrong = miscounted(files)
     if wrong is not None:
         raise fault("the COLMAP model can't be read", files[0].parent.name, wrong, WHOLE, AGAIN)
     cameras, images = _model(files[0].parent, files[0].suffix)
     if not images:
         raise fault("the COLMAP model has no registered images", files[1].name, 0, "at least 3",
-                    "run the mapper again, or remove the model to have the cameras solved")  # fmt: skip
+                    "run the mapper again, or remove the model to solve the cameras from the photos")  # fmt: skip
     lenses = {k: _lens(c, f"{files[0].name}, camera {k}") for k, c in cameras.items()}
     views, left_out, warnings = [], [], []
     for index, image in zip(indices_of([i.name for i in images]), images, strict=True):
         photo = find_photo(folder, image.name)
         if photo is None:
             left_out.append(f"{printable(PurePosixPath(image.name).name)}: its photo is missing")
-            warnings.append(f"the COLMAP model has {printable(image.name)}, which is not in the capture; put the "
+            warnings.append(f"the COLMAP model lists {printable(image.name)}, which is not in the capture; put the "
                             "photo into images/ or into the folder itself")  # fmt: skip
             continue
         (K, d, _), camera = lenses[image.camera_id], cameras[image.camera_id]
         size = (int(camera.width), int(camera.height))
         given = given_camera(K, image.pose, d, f"{files[1].name}, {printable(image.name)}", size)
         views.append(Declared(index, photo.name, photo, given, size, f"{image.camera_id}"))
-    warnings += [f"COLMAP camera {k} ({cameras[k].model_name}) is replaced by the nearest k1 k2 p1 p2 k3, "
-                 f"{error:.2f} pixels off at most" for k, (_, _, error) in lenses.items() if error > NOTED]  # fmt: skip
+    warnings += [f"COLMAP camera {k} ({cameras[k].model_name}) is approximated by k1 k2 p1 p2 k3, "
+                 f"error up to {error:.2f} pixels" for k, (_, _, error) in lenses.items() if error > NOTED]  # fmt: skip
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
 
 
@@ -81,7 +81,7 @@ class _Image:
 
 
 def _model(folder: Path, suffix: str) -> tuple[dict[int, Any], list[_Image]]:
-    """COLMAP's cameras by their numbers, and the registered images in natural order. Raises StageError."""
+    """COLMAP's cameras by number, and the registered images in natural order. Raises StageError."""
     from pipeline.colmap import pycolmap
 
     model = pycolmap.Reconstruction()
@@ -108,7 +108,7 @@ def _lens(camera: Any, where: str) -> tuple[F64, F64, float]:
         return checked_frame(K, size, where), np.array(d, np.float64), 0.0
     if camera.is_spherical():
         raise fault("a panorama has no pinhole camera", where, model, "a perspective or fisheye lens",
-                    "cut perspective photos out of the panoramas")  # fmt: skip
+                    "extract perspective photos from the panoramas")  # fmt: skip
     focal = camera.mean_focal_length()
     K = np.array([[focal, 0, camera.principal_point_x], [0, focal, camera.principal_point_y], [0, 0, 1.0]])
 

@@ -1,4 +1,4 @@
-"""Do a binary COLMAP model's counts fit its bytes? COLMAP itself makes room for what a count says, terabytes too.
+"""Do the counts in a binary COLMAP model fit its bytes? COLMAP itself allocates memory for any count, even terabytes.
 
 Source: COLMAP's documentation, 'Output format', and its own reading of `rigs.bin` and `frames.bin`.
 """
@@ -34,7 +34,7 @@ MAX_NAME = 4096
 
 
 def miscounted(files: Sequence[Path]) -> str | None:
-    """What is wrong with the counts, or None. Text models have none that COLMAP trusts."""
+    """What is wrong with the counts, or None. COLMAP trusts no counts in text models, so they are not checked."""
     for path in files:
         if path.stat().st_size > MAX_BYTES:
             return f"{path.name} has more than {MAX_BYTES // 2**30} GB"
@@ -43,14 +43,14 @@ def miscounted(files: Sequence[Path]) -> str | None:
             continue
         try:
             if _end(path.read_bytes(), skip) is None:
-                return f"{path.name} is cut off, or its counts are damaged"
+                return f"{path.name} is incomplete, or its counts are damaged"
         except (struct.error, ValueError):
-            return f"{path.name} is cut off"
+            return f"{path.name} is incomplete"
     return None
 
 
 def _end(data: bytes, skip: Callable[[bytes, int], int]) -> int | None:
-    """Where the records end; None if they reach beyond the data."""
+    """Offset of the end of the records; None if they reach beyond the data."""
     (count,), at = struct.unpack_from("<Q", data), 8
     for _ in range(min(count, len(data))):  # a record has at least one byte
         at = skip(data, at)

@@ -1,4 +1,4 @@
-"""What a description of cameras says, whatever its format; its files, its photos, and lenses of other models."""
+"""What all formats of given cameras share: the views, matching of photo names, approximation of other lens models."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fa
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
-LENS_LIMIT = 0.25  # pixels: a lens whose five-term stand-in is farther off than this is refused
-MAX_BYTES = 64_000_000  # of a description: cameras of some ten thousand photos; beyond it the file is something else
-MAX_DIGITS = 300  # of a number in a file's name that is compared as one
-MAX_STEPS = 100  # of the search: a lens that can be described takes about ten
-GRID = 17  # half the positions along each edge of the frame at which a lens is compared
+LENS_LIMIT = 0.25  # pixels, largest error of the five-term approximation of a lens
+MAX_BYTES = 64_000_000  # of a cameras' file: cameras of about ten thousand photos; a larger file is something else
+MAX_DIGITS = 300  # of a number in a file name that is compared by its value
+MAX_STEPS = 100  # of the least squares: a lens that five terms can describe needs about ten
+GRID = 17  # half the number of positions along each edge of the frame at which a lens is compared
 
 
 def description(path: Path) -> bytes:
-    """A description's bytes. Raises StageError if it is larger than any is, before anything is read."""
+    """The bytes of a cameras' file. Raises StageError before reading if it is too large."""
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise StageError(
@@ -41,7 +41,7 @@ def description(path: Path) -> bytes:
 
 
 def read_json(path: Path, what: str, remedy: str) -> Any:
-    """What a description in JSON holds. what: the message if it is no JSON. Raises StageError."""
+    """The content of a JSON file. what: the message if it is not JSON. Raises StageError."""
     try:
         return json.loads(description(path))
     except (ValueError, RecursionError) as e:
@@ -50,10 +50,10 @@ def read_json(path: Path, what: str, remedy: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """One view. name: the photo as the description writes it. photo, mask: files in the capture, None if not there.
+    """One view of a cameras' file. name: the photo's name in it. photo, mask: files in the capture, None if missing.
 
-    camera: None if the description has none. size: (width, height) in pixels, None if it does not say. serial: the
-    camera body, "" if not named.
+    camera: None if the file has none. size: (width, height) in pixels, None if unknown. serial: the camera body, "" if
+    unknown.
     """
 
     index: int
@@ -67,8 +67,8 @@ class Declared:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """All views that take part. left_out: notes on views that the description itself rules out, with their photos'
-    names in `absent`."""
+    """views: those that may be used. left_out: a note on each view that the cameras' file excludes, or that has no
+    photo; absent: their photos' names."""
 
     views: tuple[Declared, ...]
     left_out: tuple[str, ...] = ()
@@ -80,11 +80,11 @@ class Reader(Protocol):
     """A format. Modules of this package are readers."""
 
     def find(self, folder: Path) -> list[Path]:
-        """The files in `folder` that describe cameras in this format; none if it is not this format."""
+        """The cameras' files of this format in `folder`; empty if there are none."""
         ...
 
     def read(self, folder: Path, files: Sequence[Path]) -> Described:
-        """The views. Raises StageError where a file or a camera is wrong, naming it."""
+        """The views. Raises StageError that names the wrong file or camera."""
         ...
 
 
@@ -95,7 +95,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def indices_of(names: Sequence[str]) -> list[int]:
-    """View numbers: the files' stems if all are different numbers, else the order."""
+    """View numbers: the file stems if all are different numbers, else 0, 1, 2, ... in order."""
     stems = [PurePosixPath(n).stem for n in names]
     if all(s.isdecimal() and len(s) <= DIGITS for s in stems) and len({int(s) for s in stems}) == len(stems):
         return [int(s) for s in stems]
@@ -103,9 +103,10 @@ def indices_of(names: Sequence[str]) -> list[int]:
 
 
 def find_photo(folder: Path, written: str) -> Path | None:
-    """The file that a description means: as written, without its suffix, or by its name in one of the usual folders.
+    """The photo for a path in a cameras' file, or None: the path itself, the path with another suffix, or the file name
+    in one of PHOTO_FOLDERS.
 
-    Paths that lead out of the capture are not followed. A name that is longer than any file's is no file.
+    Paths that lead out of the capture are not followed. A name longer than file systems allow gives None.
     """
     plain = written.replace("\\", "/").removeprefix("./")
     lengths = [len(part.encode("utf-8", "backslashreplace")) for part in plain.split("/")]
@@ -127,11 +128,11 @@ def find_photo(folder: Path, written: str) -> Path | None:
 def five_terms(
     image_from_plane: Callable[[F64], F64], K: F64, width: int, height: int, where: str
 ) -> tuple[F64, F64, float]:
-    """K (3, 3), k1 k2 p1 p2 k3 and the greatest error in pixels of the lens that comes nearest to another model.
+    """K (3, 3), k1 k2 p1 p2 k3 (5,) and the greatest error in pixels of the best approximation of another lens model.
 
-    image_from_plane: pixels (N, 2) of positions (N, 2) on the plane z = 1, NaN where the model has none. Least squares
-    over the frame, so that a fisheye or a rational lens needs no resampled photos.
-    Raises StageError if the nearest one is off by more than LENS_LIMIT.
+    image_from_plane: pixels (N, 2) of positions (N, 2) on the plane z = 1, NaN where undefined. Least squares over the
+    frame, so that photos of a fisheye or a rational lens need not be resampled.
+    Raises StageError if the error is more than LENS_LIMIT.
     """
     from scipy.optimize import least_squares
 
@@ -143,24 +144,25 @@ def five_terms(
 
     p, worst = start, np.inf
     if len(xy) >= 9:
-        with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):  # it ran off to infinity
+        with suppress(ValueError, np.linalg.LinAlgError), np.errstate(all="ignore"):  # it diverged
             p = least_squares(error, start, x_scale=np.maximum(np.abs(start), 0.1), max_nfev=MAX_STEPS).x
             worst = float(np.linalg.norm(error(p).reshape(-1, 2), axis=1).max())
     if not worst <= LENS_LIMIT:
         raise fault(
             "the lens can't be described by k1 k2 p1 p2 k3",
             where,
-            f"{worst:.2f} pixels off somewhere in the frame",
+            f"an error of up to {worst:.2f} pixels in the frame",
             f"at most {LENS_LIMIT} pixels",
-            "undistort the photos first and give the undistorted cameras, or remove the description to have the "
-            "cameras solved",
+            "undistort the photos first and give the undistorted cameras, or remove the cameras' file to solve the "
+            "cameras from the photos",
         )
     found = np.array([[p[0], K[0, 1], p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
     return found, np.asarray(p[4:], np.float64), worst
 
 
 def _over_the_frame(image_from_plane: Callable[[F64], F64], K: F64, width: int, height: int) -> tuple[F64, F64]:
-    """Positions on the plane z = 1 whose images lie in the frame (a pixel around it included), and those images."""
+    """Positions (N, 2) on the plane z = 1 that are projected into the frame or up to one pixel around it, and their
+    pixels (N, 2)."""
     reach = np.array([max(K[0, 2], width - K[0, 2]) / K[0, 0], max(K[1, 2], height - K[1, 2]) / K[1, 1]])
     side = np.linspace(-1, 1, 2 * GRID)
     xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2) * reach * 1.5

@@ -1,8 +1,8 @@
 """Reads FaceScape's `params.json`.
 
 Per view i: `{i}_K` 3x3, `{i}_Rt` 3x4 world-to-camera with OpenCV axes, `{i}_distortion` k1 k2 p1 p2 k3, `{i}_width`,
-`{i}_height`, `{i}_valid`, `{i}_sn` (the camera body). FaceScape has the first pixel's centre at (0, 0), so half a pixel
-is added to the principal point on the way in.
+`{i}_height`, `{i}_valid`, `{i}_sn` (the camera body). FaceScape has the first pixel's centre at (0, 0), so the reader
+adds half a pixel to the principal point.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def find(folder: Path) -> list[Path]:
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
-    """Valid views with their photos; invalid ones and those whose photo is missing are left out."""
+    """Valid views with their photos. Invalid views, and views whose photo is missing, are left out."""
     params = read_params(files[0])
     indices = view_indices(params)
     photos = _by_index(folder, set(indices))
@@ -52,7 +52,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
         elif photo is None:
             left_out.append(f"{name}: its photo is missing")
             absent.append(name)
-            warnings.append(f"params.json names view {index}, but its photo is missing")
+            warnings.append(f"params.json lists view {index}, but its photo is missing")
         else:
             camera, size = given_view(params, index)
             serial = label(params.get(f"{index}_sn", ""), _where(f"{index}_sn"))
@@ -61,7 +61,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 
 
 def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
-    """The photos that params.json names. One file per view."""
+    """The photos of the views of params.json, by view number. Raises StageError if a view has two."""
     named: dict[int, Path] = {}
     for photo in sorted(folder.iterdir(), key=lambda p: natural_key(p.name)):
         usable = photo.suffix.lower() in PHOTO_SUFFIXES and not photo.name.startswith(".") and photo.is_file()
@@ -74,43 +74,44 @@ def _by_index(folder: Path, indices: set[int]) -> dict[int, Path]:
                 where=f"view {index}",
                 value=f"{named[index].name} and {photo.name}",
                 limit="one file per view",
-                remedy="take one of them out of the folder",
+                remedy="remove one of them from the folder",
             )
         named[index] = photo
     return named
 
 
 def read_params(path: Path) -> dict[str, Any]:
-    """The file as a dictionary. Raises StageError if it is not a JSON object that names views."""
+    """The file as a dictionary. Raises StageError if it is not a JSON object with views."""
     found = read_json(path, "params.json can't be read",
-                        "copy the file again, or remove it to have the cameras solved from the photos")  # fmt: skip
+                        "copy the file again, or remove it to solve the cameras from the photos")  # fmt: skip
     if not isinstance(found, dict) or not view_indices(found):
         value = f"{len(found)} keys, none like 0_K" if isinstance(found, dict) else type(found).__name__
         raise StageError(
-            "params.json names no views",
+            "params.json has no views",
             where=path.name,
             value=value,
             limit="keys 0_K, 0_Rt, 0_distortion, 0_width, 0_height, ...",
-            remedy="use FaceScape's layout, or remove the file to have the cameras solved",
+            remedy="use FaceScape's layout, or remove the file to solve the cameras from the photos",
         )
     return found
 
 
 def view_indices(params: Mapping[str, Any]) -> list[int]:
-    """Indices of all views that params.json speaks of, ascending."""
+    """Indices of all views in params.json, ascending."""
     return sorted({view_number(m[1], PARAMS) for m in map(_KEY.fullmatch, params) if m})
 
 
 def is_valid(params: Mapping[str, Any], index: int) -> bool:
-    """`{i}_valid`; a view without it is taken as valid. Raises StageError if it is neither true nor false."""
+    """`{i}_valid`; a view without it is valid. Raises StageError if it is neither true nor false."""
     return flag(params.get(f"{index}_valid", True), _where(f"{index}_valid"))
 
 
 def given_view(params: Mapping[str, Any], index: int) -> tuple[GivenCamera, tuple[int, int]]:
-    """One view's camera, checked, and its photo's width and height in pixels.
+    """One view's checked camera, and its photo's (width, height) in pixels.
 
     Raises:
-        StageError: naming the key: missing, wrong shape, not finite, K singular, R not a rotation or left-handed.
+        StageError: a key is missing, of wrong shape or not finite; K is singular; R is no rotation, or left-handed. The
+            message names the key.
     """
     K = checked_K(_numbers(params, f"{index}_K"), _where(f"{index}_K"))
     pose = _numbers(params, f"{index}_Rt")
@@ -125,7 +126,7 @@ def given_view(params: Mapping[str, Any], index: int) -> tuple[GivenCamera, tupl
             "list five numbers; zeros for a lens without distortion",
         )
     d = np.concatenate([d, np.zeros(5 - d.size)])
-    width, height = (pixels(_said(params, k), _where(k)) for k in (f"{index}_width", f"{index}_height"))
+    width, height = (pixels(_required(params, k), _where(k)) for k in (f"{index}_width", f"{index}_height"))
     K = checked_frame(corner_K_from_centre_K(K), (width, height), _where(f"{index}_K"))
     camera = given_camera(K, pose, checked_lens(K, d, (width, height), _where(key)), _where(f"{index}_Rt"))
     return camera, (width, height)
@@ -135,7 +136,7 @@ def _where(key: str) -> str:
     return f"params.json, key {key}"
 
 
-def _said(params: Mapping[str, Any], key: str) -> Any:
+def _required(params: Mapping[str, Any], key: str) -> Any:
     if key not in params:
         raise fault(
             "a camera parameter is missing",
@@ -149,4 +150,4 @@ def _said(params: Mapping[str, Any], key: str) -> Any:
 
 def _numbers(params: Mapping[str, Any], key: str) -> F64:
     remedy = f"write it again from the calibration, or set {key.split('_')[0]}_valid to false"
-    return table(_said(params, key), _where(key), remedy)
+    return table(_required(params, key), _where(key), remedy)

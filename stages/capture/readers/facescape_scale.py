@@ -1,9 +1,9 @@
-"""FaceScape's published `Rt_scale_dict.json`: from each capture's own world to the millimetres and axes of its models.
+"""FaceScape's published `Rt_scale_dict.json`: from each capture's world to the millimetres and axes of its models.
 
     x_mm = R (s x_world) + t,    [s, (R | t)] = dictionary[ID][EXP]
 
-R turns the world upright with the face along +Z. The file belongs to a tree ID/EXP/params.json and lies in its root, or
-nearer to the photos. EXP is the number that the folder's name begins with (`1_neutral`).
+R rotates the world upright with the face along +Z. The file belongs to a tree ID/EXP/params.json and is in its root, or
+in a folder nearer to the photos. EXP is the number at the beginning of the folder's name (`1_neutral`).
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from stages.capture.readers.described import read_json
 from stages.capture.readers.values import fault, number, shown, table
 
 NAME = "Rt_scale_dict.json"
-MIN_SCALE = 1e-9  # millimetres in a unit of the capture's world, or the other way round
-REMEDY = "copy the file again, or take it out of the tree to have the unit recognised"
+MIN_SCALE = 1e-9  # smallest s, millimetres per unit of the world; the largest is 1 / MIN_SCALE
+REMEDY = "copy the file again, or remove it from the folders; then the unit is estimated"
 
 
 def metres_from_world(folder: Path) -> F64 | None:
-    """(4, 4) similarity for the capture in `folder`, or None if no dictionary names it.
+    """(4, 4) similarity to metres for the capture in `folder`; None without a dictionary that lists it.
 
-    Raises StageError if what it says of this capture is no similarity.
+    Raises StageError if its entry is no similarity.
     """
     path = next((p / NAME for p in (folder, folder.parent, folder.parent.parent) if (p / NAME).is_file()), None)
     expression = re.match(r"\d+", folder.name)

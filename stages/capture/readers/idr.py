@@ -1,7 +1,7 @@
-"""Reads the `cameras_sphere.npz` (or `cameras.npz`) of IDR, NeuS and the sets in their layout.
+"""Reads the `cameras_sphere.npz` (or `cameras.npz`) of IDR, NeuS and data sets in their layout.
 
-`world_mat_{i}`: (4, 4) or (3, 4), projects the world to pixels whose first centre is (0, 0). View i is the i-th photo
-of `image/` (or `images/`, `rgb/`) by name; its mask is the i-th of `mask/` where there are as many.
+`world_mat_{i}`: (4, 4) or (3, 4), projects the world to pixels, the first pixel's centre at (0, 0). View i is the i-th
+photo of `image/` (or `images/`, `rgb/`) by name. Its mask is the i-th of `mask/` if there are as many masks as photos.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from stages.capture.readers.values import DIGITS, fault, finite
 
 NAMES = ("cameras_sphere.npz", "cameras.npz")
 PHOTOS, MASKS = ("image", "images", "rgb"), ("mask", "masks")
-REMEDY = "copy the set again, or remove the file to have the cameras solved from the photos"
+REMEDY = "copy the data set again, or remove the file to solve the cameras from the photos"
 
 
 def find(folder: Path) -> list[Path]:
-    """The npz; cameras.npz only beside a folder of images, because the name is a common one."""
+    """The npz file, only beside a folder of images: `cameras.npz` is a common name."""
     found = [folder / n for n in NAMES if (folder / n).is_file()]
     return found[:1] if any((folder / p).is_dir() for p in PHOTOS) else []
 
@@ -54,21 +54,22 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
         mask = masks[place] if len(masks) == len(photos) else None
         views.append(Declared(index, photo.name, photo, camera, None, mask=mask))
     for place in sorted(set(matrices) - set(range(len(photos)))):
-        warnings.append(f"{files[0].name} has world_mat_{place}, but there is no such photo")
+        warnings.append(f"{files[0].name} has world_mat_{place}, but its photo is missing")
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
 
 
 def camera_of_projection(P: F64, where: str) -> tuple[F64, F64]:
-    """K (3, 3) with K[2, 2] = 1 and positive focal lengths, cam_from_world (3, 4), of P (3, 4) up to any factor.
+    """K (3, 3) with K[2, 2] = 1 and positive focal lengths, and cam_from_world (3, 4), of P (3, 4), which is defined up
+    to a factor.
 
     P[:, :3] = K R by an RQ decomposition: a QR decomposition of the matrix with rows and columns reversed.
-    Raises StageError if P has no camera.
+    Raises StageError if P is no camera.
     """
     M = P[:, :3]
     with np.errstate(all="ignore"):
         scale = float(np.cbrt(np.linalg.det(M)))
     if not np.isfinite(P).all() or abs(np.linalg.det(M / max(np.abs(M).max(), 1e-300))) < 1e-12:
-        raise fault("a projection matrix has no camera", where, "its left 3 x 3 part is singular",
+        raise fault("a projection matrix is no camera", where, "its left 3 x 3 part is singular",
                     "K [R | t]", REMEDY)  # fmt: skip
     P = P / scale  # a negative factor too: det R must be +1
     q, r = np.linalg.qr(P[::-1, :3].T)
@@ -83,7 +84,7 @@ def _matrices(path: Path) -> dict[int, F64]:
     wanted = re.compile(rf"world_mat_(\d{{1,{DIGITS}}})")
     found = {int(m[1]): array for name, array in arrays_of(path, wanted, REMEDY) if (m := wanted.fullmatch(name))}
     if not found or any(m.shape not in ((3, 4), (4, 4)) for m in found.values()):
-        raise fault("the cameras' file holds no cameras", path.name, f"{len(found)} arrays world_mat_0, ...",
+        raise fault("the cameras' file has no cameras", path.name, f"{len(found)} arrays world_mat_0, ...",
                     "a 4 x 4 world_mat_i for every photo", REMEDY)  # fmt: skip
     return found
 

@@ -4,8 +4,8 @@ Metashape's frame camera: x = X / Z, y = Y / Z with OpenCV's axes, the first pix
     x' = x (1 + K1 r^2 + K2 r^4 + K3 r^6 + K4 r^8) + P1 (r^2 + 2 x^2) + 2 P2 x y
     y' = y (1 + K1 r^2 + ...)                      + P2 (r^2 + 2 y^2) + 2 P1 x y
     u = w / 2 + cx + x' f + x' B1 + y' B2,   v = h / 2 + cy + y' f
-so that its P1 and P2 are OpenCV's p2 and p1. A camera's `transform` is chunk from camera; the chunk's own similarity
-takes it to the world. Source: Metashape user manual, appendix 'Camera models'.
+so that its P1 and P2 are OpenCV's p2 and p1. A camera's `transform` is chunk from camera; the chunk's similarity is
+world from chunk. Source: Metashape user manual, appendix 'Camera models'.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from stages.capture.readers.described import (
 )
 from stages.capture.readers.values import fault, pixels, printable, words
 
-HEAD = 4096  # bytes in which the format shows
-MIN_SCALE = 1e-9  # of the chunk: from its own units to the world's, or the other way round
+HEAD = 4096  # bytes that are read to detect the format
+MIN_SCALE = 1e-9  # smallest scale from the chunk's units to the world's; the largest is 1 / MIN_SCALE
 REMEDY = "export the cameras again (File > Export > Export Cameras, Agisoft XML), or remove the file"
 Lens = tuple[F64, F64, tuple[int, int]]
 
 
 def find(folder: Path) -> list[Path]:
-    """The first XML file (by name) that Metashape wrote."""
+    """The first XML file (by name) that is Metashape's."""
     for path in sorted(folder.glob("*.xml")):
         if not path.is_file():
             continue
@@ -54,7 +54,7 @@ def find(folder: Path) -> list[Path]:
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
-    """Aligned and enabled cameras with their photos; others are left out and named."""
+    """Aligned and enabled cameras with their photos. The others are left out."""
     chunk = _chunk(files[0])
     sensors = {s.get("id", ""): s for s in chunk.iter("sensor")}
     lenses: dict[str, Lens] = {}
@@ -70,7 +70,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
         elif photo is None:
             left_out.append(f"{printable(label)}: its photo is missing")
             warnings.append(
-                f"{files[0].name} names {printable(label)}, which is not in the capture; put the photo beside it"
+                f"{files[0].name} lists {printable(label)}, which is not in the capture; put the photo beside it"
             )
         else:
             sensor = camera.get("sensor_id", "")
@@ -91,12 +91,12 @@ def _chunk(path: Path) -> ElementTree.Element:
         raise fault("the cameras' file can't be read", path.name, printable(str(e)), "Agisoft XML", REMEDY) from e
     chunk = root.find("chunk")
     if chunk is None or next(chunk.iter("camera"), None) is None:
-        raise fault("the cameras' file names no cameras", path.name, "no <camera>", "at least 3 cameras", REMEDY)
+        raise fault("the cameras' file has no cameras", path.name, "no <camera>", "at least 3 cameras", REMEDY)
     return chunk
 
 
 def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
-    """The chunk's similarity (4, 4); without one the chunk's own axes are the world."""
+    """The chunk's similarity (4, 4); the identity if the file has none."""
     found = chunk.find("transform")
     if found is None:
         return np.eye(4)
@@ -112,7 +112,7 @@ def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
 
 
 def _rigid_part(world_from_chunk: F64, chunk_from_cam: F64) -> F64:
-    """world_from_cam: the rotation of the product, and the centre where the similarity takes it."""
+    """world_from_cam (4, 4): the rotation of the product, and the camera centre in the world."""
     scale = float(np.cbrt(np.linalg.det(world_from_chunk[:3, :3])))
     centre = apply(world_from_chunk, chunk_from_cam[None, :3, 3])[0]
     return rigid(world_from_chunk[:3, :3] / scale @ chunk_from_cam[:3, :3], centre)
@@ -125,8 +125,8 @@ def _lens(sensor: ElementTree.Element | None, where: str) -> Lens:
         raise fault("a camera has no calibration", where, "no <calibration> of its sensor", "an adjusted one", REMEDY)
     c = adjusted[0]
     if c.get("type", "frame") != "frame":
-        raise fault("the lens is of a kind that is not understood", where, c.get("type"), "frame",
-                    "undistort the photos in Metashape and export those")  # fmt: skip
+        raise fault("the lens model is not supported", where, c.get("type"), "frame",
+                    "undistort the photos in Metashape and export the undistorted photos")  # fmt: skip
     resolution = c.find("resolution")
     if resolution is None:
         raise fault("a calibration has no size", where, "no <resolution>", "width and height", REMEDY)

@@ -1,7 +1,7 @@
-"""Small arrays out of an npz, without trusting what it says of their size.
+"""Reads small arrays from an npz file without trusting the sizes that it declares.
 
-An npz is a zip of npy files. Each is read up to a limit, and its header is compared with the bytes that are there
-before an array is made: a file of a kilobyte can claim a terabyte. Sources: APPNOTE.TXT (zip), NEP 1 (npy).
+An npz is a zip of npy files. Each is read up to a limit, and its header is compared with the actual bytes before an
+array is allocated: a file of a kilobyte can declare a terabyte. Sources: APPNOTE.TXT (zip), NEP 1 (npy).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BROKEN = (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, KeyErro
 
 
 def arrays_of(path: Path, wanted: re.Pattern[str], remedy: str) -> Iterator[tuple[str, F64]]:
-    """(name, array) of the small number arrays whose names match. Raises StageError if the file is damaged."""
+    """(name, array) of the small numeric arrays whose names match. Raises StageError if the file is damaged."""
     try:
         with zipfile.ZipFile(io.BytesIO(description(path))) as archive:
             for entry in archive.infolist():

@@ -2,7 +2,7 @@
 
 `Rotation`: 9 numbers, row by row, camera from world with OpenCV's axes. `Position`: the camera's centre in the world.
 `FocalLength35mm`: focal length where the longer edge of the frame is 36 mm. `PrincipalPointU`, `V`: offset from the
-frame's centre as a share of the longer edge. `DistortionModel`, `DistortionCoeficients` (as they spell it): k1 k2 k3
+frame's centre as a share of the longer edge. `DistortionModel`, `DistortionCoeficients` (their spelling): k1 k2 k3
 k4 t1 t2 of Brown's model. Each may be an attribute or an element. Source: 'RealityCapture XMP Camera Math'.
 """
 
@@ -31,17 +31,17 @@ from stages.capture.readers.values import fault, label, printable, words
 SPACE = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 MARK = b"capturingreality.com/ns/xcr"
 FULL_FRAME_MM = 36.0
-REMEDY = "export the registration again (Export > Metadata (XMP)), or remove the .xmp files to have the cameras solved"
+REMEDY = "export the registration again (Export > Metadata (XMP)), or remove the .xmp files to solve the cameras"
 
 
 def find(folder: Path) -> list[Path]:
-    """Sidecars with a pose, in natural order. Other tools write .xmp files too; those don't speak of cameras."""
+    """Sidecars with a pose, in natural order. Other tools write .xmp files too, without a pose."""
     found = sorted(folder.glob("*.xmp"), key=lambda p: natural_key(p.name))
     return [p for p in found if MARK in (text := description(p)) and b"Position" in text]
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
-    """Photos that have a sidecar; the others are left out, because their place is not known."""
+    """Photos that have a sidecar. The others are left out, because their pose is unknown."""
     photos = [
         p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".") and p.is_file()
     ]
@@ -51,7 +51,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
         photo = by_stem.pop(sidecar.stem, None)
         if photo is None:
             left_out.append(f"{sidecar.stem}: its photo is missing")
-            warnings.append(f"{sidecar.name} has no photo beside it; put the photo back or take the file out")
+            warnings.append(f"{sidecar.name} has no photo beside it; put the photo back or remove the file")
             continue
         size = picture_size(photo)
         K, pose, d = _camera(_fields(sidecar), size, sidecar.name)
@@ -84,7 +84,7 @@ def _camera(fields: Mapping[str, str], size: tuple[int, int], where: str) -> tup
     pose = np.concatenate([R, (-R @ centre)[:, None]], 1)
     model = label(fields.get("DistortionModel", "perspective"), where, REMEDY).lower()
     if not (model == "perspective" or model.startswith("brown")):
-        raise fault("the lens is of a kind that is not understood", where, printable(model), "perspective or Brown",
+        raise fault("the lens model is not supported", where, printable(model), "perspective or Brown",
                     "choose a Brown model in the alignment settings and export again")  # fmt: skip
     k1, k2, k3, k4, t1, t2 = _numbers(fields, "DistortionCoeficients", 6, where, "0 0 0 0 0 0")
     d = checked_lens(checked_frame(K, size, where), np.array([k1, k2, t1, t2, k3]), size, where)
@@ -105,5 +105,5 @@ def _camera(fields: Mapping[str, str], size: tuple[int, int], where: str) -> tup
 def _numbers(fields: Mapping[str, str], key: str, count: int, where: str, default: str | None = None) -> F64:
     text = fields.get(key, default)
     if text is None:
-        raise fault("a camera parameter is missing", f"{where}, xcr:{key}", "not there", "a registered photo", REMEDY)
+        raise fault("a camera parameter is missing", f"{where}, xcr:{key}", "missing", "a registered photo", REMEDY)
     return words(text, count, f"{where}, xcr:{key}", REMEDY)

@@ -1,4 +1,4 @@
-"""Width and height of a picture whose description does not say them."""
+"""Width and height of a picture if the cameras' file does not contain them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipeline.picture_size import declared_size_of
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) in pixels as stored: from the header, or where that does not tell by reading the picture.
+    """(width, height) in pixels as stored: from the header, or else by decoding the picture.
 
     Raises StageError if the file is no picture.
     """

@@ -1,7 +1,7 @@
 """Reads `transforms.json` of instant-ngp and nerfstudio.
 
-For all frames or for each: `fl_x`, `fl_y`, `cx`, `cy` (pixels; the first pixel's centre at (0.5, 0.5)), `w`, `h`, or
-`camera_angle_x` (radians, over the width); `k1`..`k6`, `p1`, `p2` of OpenCV's models, or `is_fisheye` /
+Once for all frames, or for each frame: `fl_x`, `fl_y`, `cx`, `cy` (pixels; the first pixel's centre at (0.5, 0.5)),
+`w`, `h`, or `camera_angle_x` (radians, over the width); `k1`..`k6`, `p1`, `p2` of OpenCV's models, or `is_fisheye` /
 `camera_model: OPENCV_FISHEYE`. `frames[i]`: `file_path`, `transform_matrix` (world from camera, OpenGL axes: y up,
 z backwards), `mask_path`.
 """
@@ -29,33 +29,33 @@ from stages.capture.readers.sizes import picture_size
 from stages.capture.readers.values import fault, flag, label, number, pixels, printable, table
 
 NAMES = ("transforms.json", "transforms_train.json")
-Lenses = dict[object, tuple[F64, F64]]  # stand-ins of other models by all their figures: most frames share one
-REMEDY = "copy the file again, or remove it to have the cameras solved from the photos"
+Lenses = dict[object, tuple[F64, F64]]  # approximations of lenses by all their parameters: most frames share one lens
+REMEDY = "copy the file again, or remove it to solve the cameras from the photos"
 
 
 def find(folder: Path) -> list[Path]:
-    """transforms.json, or the training part of a split one."""
+    """transforms.json, or transforms_train.json."""
     return [folder / n for n in NAMES if (folder / n).is_file()][:1]
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
-    """Frames with their photos; those whose photo is missing are left out and named."""
+    """Frames with their photos. Frames whose photo is missing are left out with a warning."""
     data = _object(files[0])
     frames = data["frames"]
     names = [label(f.get("file_path", ""), f"{files[0].name}, frame {i}, file_path") for i, f in enumerate(frames)]
     views, left_out, warnings = [], [], []
-    bent: Lenses = {}
+    approximated: Lenses = {}
     for index, name, frame in zip(indices_of(names), names, frames, strict=True):
         photo = find_photo(folder, name) if name else None
         if photo is None:
             left_out.append(f"{printable(PurePosixPath(name).name) or f'frame {index}'}: its photo is missing")
-            warnings.append(f"{files[0].name} lists {printable(name) or '(no file_path)'}, which is not there; put the "
-                            "photo back or take the frame out of the file")  # fmt: skip
+            warnings.append(f"{files[0].name} lists {printable(name) or '(no file_path)'}, which is missing; put the "
+                            "photo back or remove the frame from the file")  # fmt: skip
             continue
         where = f"{files[0].name}, {printable(name)}"
         size = _size(data | frame, photo, where)
         mask = find_photo(folder, label(frame["mask_path"], where)) if frame.get("mask_path") else None
-        camera = _camera(data | frame, size, where, bent)
+        camera = _camera(data | frame, size, where, approximated)
         views.append(Declared(index, photo.name, photo, camera, size, mask=mask))
     absent = tuple(note.split(":")[0] for note in left_out)
     return Described(tuple(views), tuple(left_out), absent, tuple(warnings))
@@ -65,7 +65,7 @@ def _object(path: Path) -> dict[str, Any]:
     found = read_json(path, "the cameras' file can't be read", REMEDY)
     frames = found.get("frames") if isinstance(found, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise fault("the cameras' file names no frames", path.name, "no list 'frames'",
+        raise fault("the cameras' file has no frames", path.name, "no list 'frames'",
                     "frames with file_path and transform_matrix", REMEDY)  # fmt: skip
     return dict(found)
 
@@ -77,11 +77,11 @@ def _size(values: Mapping[str, Any], photo: Path, where: str) -> tuple[int, int]
     return pixels(w, f"{where}, w"), pixels(h, f"{where}, h")
 
 
-def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, bent: Lenses) -> GivenCamera:
+def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, approximated: Lenses) -> GivenCamera:
     width, height = size
     if "transform_matrix" not in values:
-        raise fault("a frame has no pose", where, "no transform_matrix", "a 4 x 4 matrix", "write the pose, or take "
-                    "the frame out of the file")  # fmt: skip
+        raise fault("a frame has no pose", where, "no transform_matrix", "a 4 x 4 matrix", "write the pose, or "
+                    "remove the frame from the file")  # fmt: skip
     world_from_cam = checked_pose(_matrix(values, where), where) @ OPENCV_CAM_FROM_OPENGL_CAM
     K = np.array([[_focal(values, size, "x", where), 0, _number(values, "cx", width / 2, where)],
                   [0, _focal(values, size, "y", where), _number(values, "cy", height / 2, where)],
@@ -93,19 +93,20 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, bent: 
     checked_lens(K, d, size, where)
     checked_lens(K, np.array([*higher[:2], 0, 0, higher[2]]), size, where)
     fisheye = flag(values.get("is_fisheye", False), f"{where}, is_fisheye") or model == "OPENCV_FISHEYE"
-    rational = bool(np.any(higher)) and model != "OPENCV"  # k4 is 0 in OPENCV, and some writers leave a stray value
+    rational = bool(np.any(higher)) and model != "OPENCV"  # k4 is 0 in OPENCV, but some programs write another value
     if fisheye or rational:
         key = (fisheye, size, *K.ravel(), *d, *higher)
-        if key not in bent:
-            bent[key] = _stand_in(fisheye, K, d, higher, size, where)
-        K, d = bent[key]
+        if key not in approximated:
+            approximated[key] = _approximation(fisheye, K, d, higher, size, where)
+        K, d = approximated[key]
     return given_camera(K, inverse_rigid(world_from_cam), d, where, size)
 
 
-def _stand_in(
+def _approximation(
     fisheye: bool, K: F64, d: F64, higher: F64, size: tuple[int, int], where: str
 ) -> tuple[F64, F64]:  # fmt: skip
-    """K and k1 k2 p1 p2 k3 nearest to a fisheye or a rational lens. Raises StageError if none is near enough."""
+    """K and k1 k2 p1 p2 k3 that approximate a fisheye or a rational lens. Raises StageError if the error is too
+    large."""
     radial = np.array([d[0], d[1], d[4], higher[0]])
 
     def image_from_plane(xy: F64) -> F64:
@@ -134,7 +135,7 @@ def _rational(xy: F64, d: F64, higher: F64) -> F64:
 
 
 def _focal(values: Mapping[str, Any], size: tuple[int, int], axis: str, where: str) -> float:
-    """Pixels, from fl_x / fl_y or the angle of view; one for both axes where only one is given."""
+    """Focal length in pixels from fl_x / fl_y or the angle of view. If only one axis is given, it is used for both."""
     for a in (axis, "x", "y"):
         if values.get(f"fl_{a}") is not None:
             return _number(values, f"fl_{a}", 0.0, where)
@@ -142,14 +143,14 @@ def _focal(values: Mapping[str, Any], size: tuple[int, int], axis: str, where: s
         if values.get(f"camera_angle_{a}") is not None:
             return edge / 2 / float(np.tan(_angle(values, f"camera_angle_{a}", where) / 2))
     raise fault("a camera has no focal length", where, "neither fl_x nor camera_angle_x", "fl_x in pixels",
-                "write fl_x and fl_y, or remove the file to have the cameras solved")  # fmt: skip
+                "write fl_x and fl_y, or remove the file to solve the cameras from the photos")  # fmt: skip
 
 
 def _angle(values: Mapping[str, Any], key: str, where: str) -> float:
-    """An angle of view in radians. Raises StageError where no lens has it."""
+    """An angle of view in radians. Raises StageError if it is not between 0 and pi."""
     found = _number(values, key, 0.0, where)
     if not 0 < found < np.pi:
-        raise fault("an angle of view is not that of a camera", f"{where}, {key}", found, "above 0, below pi (radians)",
+        raise fault("an angle of view is out of range", f"{where}, {key}", found, "above 0, below pi (radians)",
                     "write it in radians, or write fl_x and fl_y in pixels")  # fmt: skip
     return found
 

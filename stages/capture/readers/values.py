@@ -1,7 +1,7 @@
-"""Strict reading of single values: the one place where a description's numbers, flags, sizes and names are checked.
+"""Strict reading of single values of a cameras' file: numbers, flags, sizes and names.
 
-Whatever a file holds instead of a value, the answer is a `StageError` that names the place and the remedy. Nothing is
-allocated for a value before it is known to be small.
+Any wrong value raises a `StageError` that names the place and the remedy. The size of a value is checked before memory
+is allocated for it.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from pipeline.errors import StageError
 from pipeline.transforms import F64
 
-MAX_MAGNITUDE = 1e15  # magnitude of any number: far beyond every unit, and its square is still a number
+MAX_MAGNITUDE = 1e15  # of any number: larger than in any unit, and its square is still finite
 LONGEST_EDGE = 1_000_000  # pixels
 MAX_NUMBERS, MAX_LETTERS = 64, 10_000  # of one table, of one text
 DIGITS = 9  # of a view's number
-LONGEST_NAME = 240  # bytes: file systems take 255, and a suffix is tried behind it
+LONGEST_NAME = 240  # bytes: file systems allow 255, and a suffix may be added
 LONGEST_PATH = 1000  # bytes, below the capture's folder
 PLAIN = "write it as a plain JSON number"
 ROWS = "write it as plain JSON numbers in rows of equal length"
@@ -28,23 +28,23 @@ _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlist = 2, 80, 80, 
 
 
 def fault(what: str, where: str, value: object, limit: object, remedy: str) -> StageError:
-    """The user's message."""
+    """The error for the user."""
     return StageError(what, where=where, value=value, limit=limit, remedy=remedy)
 
 
 def shown(value: object) -> str:
-    """A value in a message, however large or deep it is."""
+    """A value as short text for a message, also if it is large or deeply nested."""
     return _SHORT.repr(value)[:120]
 
 
 def printable(name: str) -> str:
-    """A name from a file that can be written everywhere: what is no Unicode is escaped, what is long is cut."""
+    """A name from a file in printable form: what is not Unicode is escaped, long names are shortened."""
     clean = name[:MAX_LETTERS].encode("utf-8", "backslashreplace").decode()
     return clean if len(clean) <= 120 else f"{clean[:80]}...{clean[-20:]}"
 
 
 def number(value: object, where: str, remedy: str = PLAIN) -> float:
-    """A finite number. Raises StageError for text, flags, lists and what is not finite or beyond MAX_MAGNITUDE."""
+    """A finite number. Raises StageError for text, flags, lists, and numbers not finite or beyond MAX_MAGNITUDE."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise fault("a camera parameter is not a number", where, shown(value), "a number", remedy)
     if isinstance(value, int) and abs(value) > MAX_MAGNITUDE:
@@ -53,7 +53,7 @@ def number(value: object, where: str, remedy: str = PLAIN) -> float:
 
 
 def table(value: object, where: str, remedy: str = ROWS) -> F64:
-    """A number, a row of numbers or rows of equal length, of at most MAX_NUMBERS. Raises StageError."""
+    """A number (), a row (N,) or rows of equal length (N, M), with at most MAX_NUMBERS numbers. Raises StageError."""
     rows: list[Any] = value if isinstance(value, list) else [value]
     nested = bool(rows) and all(isinstance(r, list) for r in rows)
     width = len(rows[0]) if nested else 1
@@ -71,7 +71,7 @@ def table(value: object, where: str, remedy: str = ROWS) -> F64:
 
 
 def words(text: str | None, count: int, where: str, remedy: str) -> F64:
-    """(count,) numbers that are written with spaces between them. Raises StageError."""
+    """(count,) numbers from a text with spaces between them. Raises StageError."""
     text = text or ""
     try:
         if len(text) > MAX_LETTERS:
@@ -84,8 +84,8 @@ def words(text: str | None, count: int, where: str, remedy: str) -> F64:
     return finite(found, where, remedy)
 
 
-def finite(values: F64, where: str, remedy: str = "write it again from the calibration, or take the view out") -> F64:
-    """The values themselves. Raises StageError if any is NaN, infinite or beyond MAX_MAGNITUDE."""
+def finite(values: F64, where: str, remedy: str = "write it again from the calibration, or remove the view") -> F64:
+    """The values, of any shape, themselves. Raises StageError if any is NaN, infinite or beyond MAX_MAGNITUDE."""
     if not np.isfinite(values).all():
         raise fault("a camera parameter is not finite", where, shown(values.tolist()),
                     "finite numbers only (no NaN, no Infinity)", remedy)  # fmt: skip
@@ -95,7 +95,7 @@ def finite(values: F64, where: str, remedy: str = "write it again from the calib
 
 
 def pixels(value: object, where: str, remedy: str = "write the photo's size in pixels") -> int:
-    """A width or height. Raises StageError if it is no whole number from 1 to LONGEST_EDGE."""
+    """A width or height in pixels. Raises StageError if it is not a whole number from 1 to LONGEST_EDGE."""
     if isinstance(value, int | float) and not isinstance(value, bool) and 1 <= value <= LONGEST_EDGE:
         whole = math.floor(value)
         if whole == value:
@@ -105,19 +105,19 @@ def pixels(value: object, where: str, remedy: str = "write the photo's size in p
 
 
 def flag(value: object, where: str, remedy: str = "write true or false, without quotation marks") -> bool:
-    """A JSON boolean, or 0 or 1. Raises StageError for all else: the text "false" is not false."""
+    """A JSON boolean, or 0 or 1. Raises StageError for anything else, also for the text "false"."""
     if isinstance(value, int) and value in (0, 1):  # a bool is an int
         return bool(value)
     raise fault("a flag is neither true nor false", where, shown(value), "true, false, 0 or 1", remedy)
 
 
 def label(value: object, where: str, remedy: str = "write it as text between quotation marks") -> str:
-    """A name: text, or a whole number that stands for one. Raises StageError."""
+    """A name: text, or a whole number as text. Raises StageError."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) < MAX_MAGNITUDE:
         return str(value)
     if not isinstance(value, str) or len(value) > MAX_LETTERS or "\0" in value:
         raise fault("a name is not text", where, shown(value), f"text of at most {MAX_LETTERS} letters", remedy)
-    return value.encode("utf-8", "backslashreplace").decode()  # half a pair of surrogates is no letter
+    return value.encode("utf-8", "backslashreplace").decode()  # a lone surrogate is not a character
 
 
 def view_number(digits: str, where: str) -> int:

@@ -1,1 +1,1 @@
-"""The paper's own trainer and renderer, to compare with. stages.inverse_rendering.systems is the one door."""
+"""The paper's own trainer and renderer, for comparison. Only stages.inverse_rendering.systems imports it."""

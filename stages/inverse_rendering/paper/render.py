@@ -1,11 +1,12 @@
-"""Rendering as the paper does it: every sample is shaded, then summed. [NeuFace section 4.4]
+"""The paper's rendering: every sample is shaded, then summed. [NeuFace section 4.4]
 
-Symbols: Omega the prior's sphere; t_0 where aggressive sphere tracing found the surface; hit rays have S samples in
-t_0 +- SHELL, unhit ones S sparse samples across Omega; w_i weights of [NeuFace eq. 18].
+Symbols: Omega the prior's sphere; t_0 the surface by aggressive sphere tracing; hit rays have S samples in t_0 +-
+SHELL, other rays S sparse samples across Omega; w_i weights of [NeuFace eq. 18].
 
-Differs: the last sample of a hit ray stands for the solid behind it, up to where the ray leaves Omega, as in VolSDF:
-with a shell of 1 mm and beta near 1 mm the samples alone would be half transparent. Unhit rays end at Omega: a last
-interval without end, as in the authors' code, paints empty rays. Samples are stratified, not on a fixed lattice.
+Differs: the last sample of a hit ray represents the solid behind it, up to where the ray leaves Omega, as in VolSDF:
+with a shell of 1 mm and beta near 1 mm the samples alone would be half transparent. Other rays end at Omega: an
+infinite last interval, as in the authors' code, gives empty rays a colour. Samples are stratified, not on a fixed
+lattice.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pipeline.maths.tracing import sphere_interval
 from stages.inverse_rendering.ray_sampling import Rays
 
 SHELL = 5e-4  # metres: samples lie in t_0 +- 0.5 mm
-NEGLIGIBLE = 1e-6  # samples of less weight are not shaded: eight bits of colour have steps of 4e-3
+NEGLIGIBLE = 1e-6  # samples with a smaller weight are not shaded: eight-bit colours have steps of 4e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +41,13 @@ class Rendered:
 
 
 def geometry_of(model: FaceModel) -> DisplacedSdf:
-    """The geometry of a model of the paper's kind."""
+    """The geometry of a model of method paper."""
     assert isinstance(model.geometry, DisplacedSdf)
     return model.geometry
 
 
 def render_samples(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | None) -> Rendered:
-    """[NeuFace eq. 18] for N rays; `jitter` (N, samples) in [0, 1), default the middle of each interval."""
+    """[NeuFace eq. 18] for N rays; `jitter` (N, samples) in [0, 1), default the centre of each interval."""
     geometry = geometry_of(model)
     centre, radius = geometry.known.sphere()
     near, far = sphere_interval(rays.o, rays.d, centre, radius)

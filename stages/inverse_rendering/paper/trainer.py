@@ -1,7 +1,7 @@
-"""The fit as the paper does it: its networks, its sampling, all its losses, its schedule. [NeuFace section B]
+"""The paper's fit: its networks, sampling, losses and schedule. [NeuFace section B]
 
-Differs: sums over pixels are means over the batch, so that the weights do not depend on its size. Pixels that show
-the subject in part are left out, and the background is black: the masks stand for the paper's ground-truth model.
+Differs: sums over pixels are means over the batch, so that the weights do not depend on its size. Partly covered pixels
+are left out, and the background is black: the masks replace the paper's ground-truth model.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.ray_sampling import WHOLE, Batch, PhotoView, PixelTable
 
 HALVED_EVERY, HALVED_UNTIL = 0.125, 0.75  # shares of the run: every 375 of 3,000 epochs, until 75 %
-EMPTY = 0.01  # alpha below which a pixel shows nothing of the subject
+EMPTY = 0.01  # alpha of background is below
 
 
 def rate_factor(share: float) -> float:
-    """Learning rate at a share of the run, of its start: 0.5 ^ (halvings due). [NeuFace section B]"""
+    """Learning rate at a share of the run, relative to its start: 0.5 ^ (number of halvings). [NeuFace section B]"""
     return float(0.5 ** int(min(share, HALVED_UNTIL) / HALVED_EVERY + 1e-9))
 
 
@@ -73,10 +73,10 @@ def paper_terms(model: FaceModel, batch: Batch, settings: Config, generator: tor
 
 
 class PaperTrainer(Trainer):
-    """A fit of the paper's kind; the loop, the guard and the draws are the fast one's."""
+    """The paper's fit; the loop, the guard and the ray sampling are those of method fast."""
 
     def make_optimiser(self) -> torch.optim.Optimizer:
-        """Adam with betas of its defaults."""
+        """Adam with its default betas."""
         return paper_optimiser(self.model, self.settings)
 
     def enter_level(self) -> None:
@@ -85,7 +85,7 @@ class PaperTrainer(Trainer):
             self.table = PixelTable(self.views, self.settings.image_side, self.device)
 
     def set_rates(self) -> float:
-        """The schedule; beta is learnt, and copied for those who read it."""
+        """Set the scheduled rates; beta is learnt, and copied to the model for its readers."""
         factor = rate_factor(self.share())
         for group in self.optimiser.param_groups:
             group["lr"] = group["start"] * factor
@@ -97,25 +97,25 @@ class PaperTrainer(Trainer):
         return paper_terms(self.model, batch, self.settings, generator)
 
     def geometry_is_finite(self) -> bool:
-        """All of the geometry is in the optimiser."""
+        """Always true: the optimiser has all geometry parameters."""
         return True
 
     def move(self, rate: float) -> None:
-        """Take the step."""
+        """Update the parameters."""
         self.optimiser.step()
 
     def tend(self) -> None:
-        """Nothing is due."""
+        """Nothing to do."""
 
     def forget(self) -> None:
-        """All gradients are the optimiser's."""
+        """Nothing to do: the optimiser has all gradients."""
 
     def finish(self) -> None:
-        """The width that was learnt last."""
+        """Copy the final beta to the model."""
         self.model.beta.copy_(geometry_of(self.model).beta().detach())
 
     def parts(self) -> dict[str, Any]:
-        """Nothing but the model and the optimiser."""
+        """Model and optimiser, for a checkpoint."""
         return {"model": self.model.state_dict(), "optimiser": self.optimiser.state_dict()}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -125,7 +125,7 @@ class PaperTrainer(Trainer):
 
 
 def paper_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
-    """Adam; a prior's networks at its share of the rate, its codes and everything else at the full one."""
+    """Adam; the prior's networks have a reduced rate, its codes and everything else the full rate."""
     prior = geometry_of(model).known
     codes = {id(p) for n, p in model.named_parameters() if n.startswith("geometry.prior.z_")}
     slow = [p for n, p in model.named_parameters() if n.startswith("geometry.prior.") and id(p) not in codes]
@@ -148,7 +148,7 @@ def new_paper_trainer(
     calibrated: bool,
     device: str,
 ) -> PaperTrainer:
-    """A fit of the paper's kind that has not begun. Raises StageError if ImFace is asked for and can't be read."""
+    """A new trainer of method paper. Raises StageError if prior is imface and its checkpoint can't be read."""
     torch.manual_seed(settings.seed)
     spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced")
     prior = prior_for(spec, start, settings)
@@ -158,7 +158,7 @@ def new_paper_trainer(
 
 
 def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
-    """The prior that the settings name."""
+    """The geometry prior of the settings."""
     if settings.prior == "sphere":
         return build.sphere_prior(spec)
     if settings.prior == "hull":
@@ -169,7 +169,7 @@ def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
             where="--set inverse_rendering.prior",
             value="imface without inverse_rendering.prior_file",
             limit="the path of a published checkpoint",
-            remedy="see docs/imface.md for how to get one, or take the prior hull",
+            remedy="see docs/imface.md for how to get one, or set inverse_rendering.prior=hull",
         )
     from pipeline.fields.paper.imface_layout import load_imface_state
 

@@ -340,8 +340,8 @@ def test_without_a_prior_the_grid_starts_as_a_sphere() -> None:
     ("values", "message"),
     [
         ({"preset": "paper", "refine_geometry": "off"}, "refine_geometry = off"),
-        ({"preset": "paper", "seconds": 10.0}, "seconds is for"),
-        ({"appearance": "sinusoidal"}, "for method paper"),
+        ({"preset": "paper", "seconds": 10.0}, "seconds needs"),
+        ({"appearance": "sinusoidal"}, "needs method paper"),
     ],
 )
 def test_settings_that_only_one_method_knows_are_refused(values: dict[str, Any], message: str) -> None:
