@@ -15,8 +15,10 @@ help: ## this list
 demo: $(VENV)/.ready ## sets up what is missing, then photos of a made-up head -> asset + report, checked against the truth
 	$(BIN)/neuface demo --out $(OUT)
 
-# `make test WORKERS=2`: in so many processes, each file in one of them, so that what a file's tests share is made once.
-SPREAD = $(if $(WORKERS),-n $(WORKERS) --dist loadfile)
+# So many processes run the tests; auto: one per core, at most 4, as far as the memory goes. Each file stays in one of
+# them, so that what its tests share is made once, and the files with slow tests come first (tests/support/spread.py).
+WORKERS ?= auto
+SPREAD = -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 test: $(VENV)/.ready-dev ## sets up what is missing, then every test
 	$(BIN)/python -m pytest -q --durations=10 $(SPREAD)
 
@@ -26,7 +28,7 @@ check: lint ## format, lint, types, import rules, and the tests that are quick
 lint: $(VENV)/.ready-dev ## format, lint, types and import rules
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 
 format: $(VENV)/.ready-dev ## puts the code into shape

@@ -5,18 +5,25 @@ import pipeline.threads  # noqa: F401  isort: skip
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
 
+from tests.support import spread
+
 ROOT = Path(__file__).resolve().parents[1]
-OFFLINE = {
+SETTINGS = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
     "PREFECT_LOGGING_LEVEL": "WARNING",
 }
-for _name, _value in OFFLINE.items():
+CORES = os.cpu_count() or 1
+if _workers := int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")):
+    # Workers share the cores: with threads for all of them in each, a fit waits for the others at every operation.
+    SETTINGS["OMP_NUM_THREADS"] = str(max(1, CORES // _workers))
+for _name, _value in SETTINGS.items():
     os.environ.setdefault(_name, _value)
 hypothesis.settings.register_profile("no_clock", deadline=None)  # a busy machine is no fault
 hypothesis.settings.load_profile("no_clock")
@@ -25,6 +32,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Of `-n auto`."""
+    return spread.workers()
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if hasattr(config, "workerinput"):  # not where the tests run one after the other, in the order of their files
+        spread.slow_files_first(items)
+
+
+@pytest.fixture
+def all_cores() -> Iterator[None]:
+    """torch with a thread for each core, for tests of what threads might spoil."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(max(2, CORES))
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -131,6 +131,7 @@ def error(x: F64, albedo: F64, where: np.ndarray) -> float:
     return float(np.sqrt(((albedo - smooth_albedo(x) - freckles(x))[where] ** 2).mean()))
 
 
+@pytest.mark.slow
 def test_detail_is_found_through_gloss_calibration_and_distortion(scene: Scene) -> None:
     x, albedo, support, unseen = scene.baked(scene.shot())
     seen = support > 0.5
@@ -153,6 +154,7 @@ def test_low_band_stays_the_fields_and_no_seam_shows(scene: Scene) -> None:
     assert error(x, albedo, seen) < 0.75 * error(x, smooth_albedo(x), seen)
 
 
+@pytest.mark.slow
 def test_one_bad_photo_does_little(scene: Scene) -> None:
     """A photo with a white bar across it, as of something in front of the head."""
 

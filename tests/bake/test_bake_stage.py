@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from pipeline.colour import srgb_from_linear
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from pipeline.images import read_encoded, read_exr, write_png
+from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import seen_by
 from stages.bake.stage import Config, Inputs, run
 from stages.surface.build import build as surface_build
@@ -38,11 +40,17 @@ PNG = {
 ALL = PNG | {"specular_coefficients", "lobe_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
 
 
+@cache
+def mesh_and_charts() -> tuple[Mesh, Charts]:
+    field = AnalyticField(sphere(0.08))
+    mesh = decimated(surface_build(field, 32, lambda done, total: None).mesh, 800)
+    return mesh, unwrap(mesh, UvConfig(texture_size=256, padding=2))
+
+
 @pytest.fixture
 def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
     field = AnalyticField(sphere(0.08))
-    mesh = decimated(surface_build(field, 32, lambda done, total: None).mesh, 800)
-    charts = unwrap(mesh, UvConfig(texture_size=256, padding=2))
+    mesh, charts = mesh_and_charts()
     meshes.save(tmp_path / "uv.npz", mesh, charts)
     uv = UvMesh(
         mesh=FileRef.of(tmp_path, "uv.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), charts=1,

@@ -162,6 +162,7 @@ def test_environment_picture_is_the_light(folder: Path) -> None:
     assert env[40:90, 64:128].mean() > env[40:90, 128:192].mean()
 
 
+@pytest.mark.slow
 def test_equal_arguments_give_equal_bytes(tmp_path: Path) -> None:
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         write_demo_capture(tmp_path / name, **TINY, seed=seed)

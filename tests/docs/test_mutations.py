@@ -17,7 +17,10 @@ def test_each_change_can_be_made_and_has_its_tests(mutation: Mutation) -> None:
     assert text.count(mutation.before) == 1 and mutation.before != mutation.after
     compile(text.replace(mutation.before, mutation.after), mutation.file, "exec")
     file, _, name = mutation.tests.partition("::")
-    assert f"def {name or 'test_'}" in (ROOT / file).read_text()
+    source = (ROOT / file).read_text()
+    assert f"def {name or 'test_'}" in source
+    above = source.partition(f"def {name}(")[0].rpartition("\n\n\n")[2] if name else ""
+    assert "mark.slow" not in above, "benchmarks/mutations.py runs the quick tests"
 
 
 def test_the_list_spans_the_product() -> None:

@@ -64,6 +64,7 @@ def taught(net: torch.nn.Module, loss: object, steps: int = 400) -> None:
 
 
 # ------------------------------------------------------------------ equation 6
+@pytest.mark.slow
 def test_the_direct_integral_learns_a_lobe_that_differs_from_place_to_place() -> None:
     """[NeuFace eq. 6]: F(x, wo, n) fitted to quadratures of f_s (wi . n)+, f_s = g(x) times a lobe, g from 0.3 to 1.7.
     At places and directions that it never saw, grazing ones among them, it is within a tenth."""

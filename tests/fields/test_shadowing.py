@@ -46,6 +46,7 @@ def test_a_convex_body_hides_nothing() -> None:
     assert torch.allclose(s(on_sphere(OUTER, 1.0)), torch.ones(1), atol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cut", "albedo", "bounces"), [(0.0, 0.0, 0), (0.0, 0.6, 1), (0.0, 0.6, 3), (0.03, 0.5, 2)])
 def test_a_spherical_hollow(cut: float, albedo: float, bounces: int) -> None:
     """Of a sphere's wall every point sees every part in proportion to its area, so that F, the share that is open, is
@@ -61,6 +62,7 @@ def test_a_spherical_hollow(cut: float, albedo: float, bounces: int) -> None:
     assert (2 * fine - coarse).mean().item() == pytest.approx(expected, rel=0.025)
 
 
+@pytest.mark.slow
 def test_light_from_above_does_not_reach_below_an_edge() -> None:
     """The hollow turned away from the light: nothing arrives but what is scattered."""
     light = torch.zeros(9, 3)
@@ -69,6 +71,7 @@ def test_light_from_above_does_not_reach_below_an_edge() -> None:
     assert float(dark.mean()) < 0.5 * float(bright.mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.0, 1e-12, 1e5])
 def test_no_light_and_much_light(level: float) -> None:
     ratio = solved(geometry(0.0), 0.9, WHITE * level).ratio

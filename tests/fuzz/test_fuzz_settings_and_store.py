@@ -118,6 +118,7 @@ def test_damaged_records_of_the_store(stored: SimpleNamespace, how: list) -> Non
     assert all(isinstance(f, str) for names in lineage(path).values() for f in names)
 
 
+@pytest.mark.slow
 @given(how=nonsense)
 @fuzzed
 def test_nonsense_in_the_records_of_the_store(stored: SimpleNamespace, how: list) -> None:

@@ -36,6 +36,7 @@ def by_clock() -> Trainer:
     return t
 
 
+@pytest.mark.slow
 def test_the_fit_ends_with_its_time(ticking: None) -> None:
     t = by_clock()
     assert t.share() == 0 and t.total() > 0
@@ -44,6 +45,7 @@ def test_the_fit_ends_with_its_time(ticking: None) -> None:
     assert t.choices is not None and t.shadows_solved == 3 and t.level == 1
 
 
+@pytest.mark.slow
 def test_an_interrupted_fit_has_the_rest_of_its_time(ticking: None, tmp_path: Path) -> None:
     whole = by_clock()
     run_fit(whole, hooks())

@@ -72,6 +72,7 @@ def test_a_glossy_ball_needs_one(glossy: Choices) -> None:
     assert float(glossy.facts["specular"]["error_without"]) > 3 * float(glossy.facts["specular"]["error_with"])
 
 
+@pytest.mark.slow
 def test_a_lobe_that_is_small_beside_what_stays_unexplained_is_none() -> None:
     """The same lobe with and without noise, which its own errors are far below."""
     faint, noise = gloss(4, 0.03), np.random.default_rng(0)
@@ -85,6 +86,7 @@ def test_a_lobe_that_is_small_beside_what_stays_unexplained_is_none() -> None:
     assert not got.specular and cross_validation.more(*lobe) > 2 * cross_validation.NEGLIGIBLE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("band", [1, 4, 7])
 def test_the_light_has_the_order_that_the_lobe_shows(band: int) -> None:
     """A light of bands 0 and l needs order l, and never less than diffuse shading does."""
@@ -96,6 +98,7 @@ def test_cameras_of_one_colour_need_no_matrices(dull: Choices, glossy: Choices) 
     assert not dull.calibrated and not glossy.calibrated
 
 
+@pytest.mark.slow
 def test_cameras_of_several_colours_do() -> None:
     def gain(view: int) -> F64:
         return np.array([[1.08, 1.0, 0.95], [0.95, 1.02, 1.05], [1.0, 0.93, 1.0]][view % 3])
@@ -111,6 +114,7 @@ def veil(view: int) -> float:
     return 0.06 * math.sin(1 + 2.4 * view)
 
 
+@pytest.mark.slow
 def test_exposures_are_seen_behind_added_light() -> None:
     """Photos taken automatically, against a light that shines into the lens now and then: offsets do better than gains,
     but no lobe makes whole photos brighter like that."""
@@ -131,6 +135,7 @@ def test_gains_are_found() -> None:
     assert np.allclose(found[1::2] / found[::2], 1.1 / 0.9, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_relief_is_there_where_the_prior_is_wrong(dull: Choices) -> None:
     assert not dull.refine_geometry
     assert chosen(Ball(), radius=RADIUS + 0.006).refine_geometry
@@ -162,6 +167,7 @@ def test_bases_stay_where_noise_hides_what_they_do() -> None:
 
 
 # ------------------------------------------------------------------ settings
+@pytest.mark.slow
 def test_settings_are_never_overruled() -> None:
     got = chosen(
         Ball(), specular="on", rank=2, light_order=8, calibration="on", refine_geometry="on"

@@ -21,6 +21,7 @@ from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.objective import calibrated_colours, terms
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, factor_for, image_rays
+from tests.support.spread import made_once
 
 RADIUS, SIDE = 0.1, 64
 SMALL = Config(
@@ -79,11 +80,15 @@ def hooks(path: Path | None = None, stop: Callable[[], bool] = lambda: False) ->
     return Hooks(lambda *a, **k: None, stop, path)
 
 
-@pytest.fixture(scope="module")
-def fitted() -> Trainer:
+def fit_of_the_ball(_: Path) -> Trainer:
     t = trainer()
     run_fit(t, hooks())
     return t
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    return made_once(tmp_path_factory, "fit_of_the_ball", fit_of_the_ball)
 
 
 def test_the_ball_is_found(fitted: Trainer) -> None:
@@ -109,6 +114,7 @@ def test_the_fit_finds_out_what_the_ball_requires(fitted: Trainer) -> None:
     )
 
 
+@pytest.mark.slow
 def test_shading_goes_to_the_light(fitted: Trainer) -> None:
     """The ball's radiance is a (0.7 + 0.3 n_y), for which E = pi c_0 Y_0 + 2 pi / 3 c_1 Y_1 y: c_1 / c_0 = 0.371. Left
     to itself the fit keeps its even light and paints the shading onto the ball."""
@@ -124,6 +130,7 @@ def test_shading_goes_to_the_light(fitted: Trainer) -> None:
     assert slope(free)[0] < 0.28
 
 
+@pytest.mark.slow
 def test_a_fit_repeats_bit_by_bit(fitted: Trainer) -> None:
     again = trainer()
     run_fit(again, hooks())
@@ -131,7 +138,8 @@ def test_a_fit_repeats_bit_by_bit(fitted: Trainer) -> None:
         assert torch.equal(a, b), name
 
 
-def test_a_calibrated_fit_repeats_bit_by_bit() -> None:
+@pytest.mark.slow
+def test_a_calibrated_fit_repeats_bit_by_bit(all_cores: None) -> None:
     """The colour matrices are shared by many rays: their gradient's sum must not depend on timing."""
     short = SMALL.changed(steps=40, batch=4096)
     states = []
@@ -168,6 +176,7 @@ def test_calibration_applies_each_views_matrix() -> None:
     assert not a.grad[3].any()
 
 
+@pytest.mark.slow
 def test_three_interruptions_change_nothing(fitted: Trainer, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
     for stop_at in (20, 75, 150):  # in the first level, across the refinement, in the second
@@ -184,8 +193,9 @@ def test_three_interruptions_change_nothing(fitted: Trainer, tmp_path: Path) -> 
 def test_a_torn_or_foreign_checkpoint_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"torn")
-    assert not trainer().load(path)
-    trainer().save(path)
+    t = trainer()
+    assert not t.load(path)
+    t.save(path)
     assert trainer().load(path)
     assert not trainer(SMALL.changed(seed=7)).load(path)
 
@@ -316,6 +326,7 @@ def test_objective_reaches_every_parameter() -> None:
         assert p.grad is not None and float(p.grad.abs().sum()) > 0, name
 
 
+@pytest.mark.slow
 def test_calibration_takes_the_cameras_gains() -> None:
     t = trainer(calibrated=True, gains=lambda i: 1.2 if i % 2 else 0.8)
     t.settings = SMALL.changed(lr_appearance=0.03)
@@ -442,6 +453,7 @@ def test_shading_every_sample_is_the_mean_of_the_samples(fitted: Trainer) -> Non
     assert float((every.total - once.total).abs().median()) < 0.01 * float(once.total.mean())
 
 
+@pytest.mark.slow
 def test_short_products_find_the_same_ball() -> None:
     """bfloat16 for the networks alone: finite, and the surface where float32 has it."""
     t = trainer(SMALL.changed(precision="bfloat16"))

@@ -19,7 +19,8 @@ from stages.inverse_rendering.judge import Fitted, findings
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.residuals import LabelError, ViewError, photo_noise, view_errors
-from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks, trainer
+from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, fit_of_the_ball, hooks, trainer
+from tests.support.spread import made_once
 
 REF = FileRef(path="a.png", sha256="0" * 64, size=1)
 FACTS = {
@@ -176,10 +177,8 @@ def measured(t: Trainer, views: list[PhotoView] | None = None, **more: Any) -> t
 
 
 @pytest.fixture(scope="module")
-def ball() -> Trainer:
-    t = trainer()
-    run_fit(t, hooks())
-    return t
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
+    return made_once(tmp_path_factory, "fit_of_the_ball", fit_of_the_ball)
 
 
 def test_a_fit_keeps_its_history(ball: Trainer) -> None:
@@ -243,6 +242,7 @@ def test_a_mask_with_a_bright_piece_too_much_is_no_wrong_photo(ball: Trainer) ->
         assert (e.square > 20 * e.covered) == (e.index == 4) and e.psnr > 25
 
 
+@pytest.mark.slow
 def test_own_colours_are_taken_off() -> None:
     """A fit that has learnt the photos' gains of .7 to 1.3, measured with them and without."""
     t = trainer(calibrated=True, gains=lambda i: 0.7 + 0.055 * i)

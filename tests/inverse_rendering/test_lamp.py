@@ -154,6 +154,7 @@ def test_harmonics_agree_with_the_projects() -> None:
     assert np.allclose(harmonics(d, ORDER), sh.sh_basis(torch.from_numpy(d), ORDER).numpy(), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_fit_takes_the_light_over() -> None:
     """A glossy ball: the light is put in, the lobe begins anew, and the fit goes on with both; a checkpoint knows."""
     from stages.inverse_rendering.model_selection import restored
@@ -182,7 +183,14 @@ def test_a_fit_takes_the_light_over() -> None:
     assert np.isfinite(t.loss)
 
 
-@pytest.mark.parametrize("changes", [{"light_from": "uniform_albedo"}, {"basis_inputs": "paper"}, {"specular": "off"}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"light_from": "uniform_albedo"},
+        pytest.param({"basis_inputs": "paper"}, marks=pytest.mark.slow),
+        {"specular": "off"},
+    ],
+)
 def test_where_the_lobe_is_not_asked(changes: dict[str, Any]) -> None:
     from tests.inverse_rendering.test_evidence import trainer
     from tests.support.balls import Ball, gloss

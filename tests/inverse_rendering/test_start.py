@@ -70,6 +70,7 @@ def test_masks_that_agree_stay_the_same_objects() -> None:
     assert all(a is b for a, b in zip(found.alphas, ALPHAS, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", ["torso", "head"])
 def test_a_mask_that_lacks_a_part_cuts_nothing_off(lost: str) -> None:
     alphas = [a.copy() for a in ALPHAS]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.maths import microfacet
+from pipeline.transforms import F64
 
 
 def ggx_energy(alpha: float) -> float:
@@ -90,23 +91,31 @@ def test_split_albedo_at_its_extremes() -> None:
     assert a[0, 1] == pytest.approx(1, abs=1e-3) and b[0, 1] == pytest.approx(0, abs=1e-3)  # a mirror, seen straight on
 
 
-@pytest.mark.parametrize("kappa", [2.5, 5.0, 10.0, 20.0, 40.0, 80.0])
-def test_alpha_is_the_width_that_blurs_light_of_order_10_alike(kappa: float) -> None:
-    """A GGX lobe sampled by its visible normals at normal incidence, against the model's attenuation: the alpha with
-    the smallest squared difference under light whose bands hold power like 1 / (2 l + 1)."""
+@pytest.fixture(scope="module")
+def attenuations() -> tuple[F64, F64]:
+    """Values of alpha, and for each what a GGX lobe, sampled by its visible normals at normal incidence, leaves of the
+    bands 1 to 10."""
     from scipy.special import eval_legendre
 
     u = (np.arange(20_000) + 0.5) / 20_000
-    bands = np.arange(1, 11)
-    lobe = np.exp(-bands * (bands + 1) / 2 / kappa)
 
-    def attenuation(alpha: float) -> np.ndarray:
+    def attenuation(alpha: float) -> F64:
         z = np.sqrt((1 - u) / (1 + (alpha**2 - 1) * u))  # h.n of the distribution of normals, seen along n
         out = 2 * z * z - 1
         tangent = np.sqrt(np.maximum(1 / np.maximum(out, 1e-6) ** 2 - 1, 0))
         weight = np.where(out > 0, 2 / (1 + np.sqrt(1 + (alpha * tangent) ** 2)), 0.0)
-        return np.array([(eval_legendre(band, out) * weight).sum() / weight.sum() for band in bands])
+        return np.array([(eval_legendre(band, out) * weight).sum() / weight.sum() for band in range(1, 11)])
 
     found = np.linspace(0.03, 0.9, 400)
-    misfit = [((attenuation(float(x)) - lobe) ** 2 / (2 * bands + 1)).sum() for x in found]
+    return found, np.stack([attenuation(float(x)) for x in found])
+
+
+@pytest.mark.parametrize("kappa", [2.5, 5.0, 10.0, 20.0, 40.0, 80.0])
+def test_alpha_is_the_width_that_blurs_light_of_order_10_alike(kappa: float, attenuations: tuple[F64, F64]) -> None:
+    """The lobes against the model's attenuation: the alpha with the smallest squared difference under light whose
+    bands hold power like 1 / (2 l + 1)."""
+    found, left = attenuations
+    bands = np.arange(1, 11)
+    lobe = np.exp(-bands * (bands + 1) / 2 / kappa)
+    misfit = ((left - lobe) ** 2 / (2 * bands + 1)).sum(1)
     assert float(microfacet.alpha_from_kappa(kappa)) == pytest.approx(found[int(np.argmin(misfit))], abs=0.016)

@@ -62,6 +62,7 @@ def test_given_without_cameras_is_a_usage_error(tmp_path: Path, capture_of, plac
         place(capture_of(tmp_path / "c"), method="given")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["head_a", "head_b"])
 def test_shared_captures(name: str, repo: Path, capture_of, place) -> None:
     folder = repo.parent / "shared" / "captures" / name

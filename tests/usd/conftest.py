@@ -9,6 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from support.spread import made_once  # noqa: E402
 from support.synthetic_asset import SyntheticInputs, write_inputs  # noqa: E402
 
 from pipeline.contract import Context  # noqa: E402
@@ -16,7 +17,7 @@ from pipeline.contract import Context  # noqa: E402
 
 @pytest.fixture(scope="session")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> SyntheticInputs:
-    return write_inputs(tmp_path_factory.mktemp("inputs"))
+    return made_once(tmp_path_factory, "usd_inputs", write_inputs)
 
 
 @pytest.fixture(scope="session")
@@ -24,8 +25,10 @@ def exported(inputs: SyntheticInputs, tmp_path_factory: pytest.TempPathFactory):
     """(folder, UsdAsset) of one run of the stage."""
     from stages.usd.stage import STAGE, Config, Inputs
 
-    folder = tmp_path_factory.mktemp("exported")
-    context = Context(folder / "work", folder / "scratch")
-    named = {n: getattr(inputs, n) for n in Inputs.__slots__}
-    asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), context)
-    return folder / "work", asset
+    def export(folder: Path):
+        context = Context(folder / "work", folder / "scratch")
+        named = {n: getattr(inputs, n) for n in Inputs.__slots__}
+        asset = STAGE.run(Inputs(**named), Config(preview_size=64, environment_width=128), context)
+        return folder / "work", asset
+
+    return made_once(tmp_path_factory, "usd_exported", export)

@@ -66,6 +66,7 @@ def test_dense_mesh_keeps_its_points_and_takes_the_charts(exported, inputs: Synt
     assert np.abs(st[inner, 0] - (0.02 + 0.96 * (longitude[inner] / (2 * np.pi) + 0.5))).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_dense_mesh_is_left_out_where_nobody_wants_it(inputs: SyntheticInputs, tmp_path: Path) -> None:
     run_stage(inputs, tmp_path / "work", render_views=False, high=False)
     assert not (tmp_path / "work/asset/high.usdc").exists()
@@ -73,6 +74,7 @@ def test_a_dense_mesh_is_left_out_where_nobody_wants_it(inputs: SyntheticInputs,
     assert sorted(stage.GetDefaultPrim().GetVariantSet("lod").GetVariantNames()) == ["proxy", "render"]
 
 
+@pytest.mark.slow
 def test_only_what_the_user_said_is_recorded(exported, inputs: SyntheticInputs, tmp_path: Path) -> None:
     plain = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
     assert "capture" not in plain.GetDefaultPrim().GetAssetInfo()
@@ -165,6 +167,7 @@ def test_obj_reads_back(exported) -> None:
     assert names and all((folder / n).is_file() for n in names)
 
 
+@pytest.mark.slow
 def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
     import cv2
 
@@ -179,6 +182,7 @@ def test_large_maps_are_shrunk_for_phones(tmp_path: Path) -> None:
     assert read[5, 5].tolist() == [0, 0, 0] and read[5, 2000].tolist() == [64, 128, 255]
 
 
+@pytest.mark.slow
 def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path) -> None:
     """The fit's own share of the light stands where the export's would."""
     from stages.usd.render.exported import load_exported
@@ -195,6 +199,7 @@ def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path)
     assert not (tmp_path / "work/asset/textures/head_occlusion.exr").exists()
 
 
+@pytest.mark.slow
 def test_acescg_albedo_on_request(exported, tmp_path: Path) -> None:
     """The same colours in other primaries; what the networks read stays linear Rec.709."""
     import OpenEXR

@@ -128,6 +128,7 @@ def test_compiled_lamps_are_the_formula() -> None:
     np.testing.assert_allclose(specular, (share * lobe) @ flux, rtol=0.03, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_ball_in_even_light_is_its_albedo_and_its_lobe() -> None:
     """Radiance 1 from everywhere: a / pi * pi + rho c . B."""
     made = asset(coefficients=np.full((8, 8, 1), 0.1, np.float32), inv_kappa=np.full((8, 8, 1), 0.1, np.float32))

@@ -127,6 +127,7 @@ def test_cameras_see_points_where_the_photos_do(exported, inputs: SyntheticInput
         assert near < depth.min() < depth.max() < far
 
 
+@pytest.mark.slow
 def test_two_exports_have_the_same_bytes(inputs: SyntheticInputs, tmp_path: Path, monkeypatch) -> None:
     """In other folders, and years apart by the clock."""
     import time
@@ -203,6 +204,7 @@ def test_package_aligns_names_of_any_length(tmp_path: Path, length: int) -> None
             assert content[start : start + info.file_size] == z.read(info)
 
 
+@pytest.mark.slow
 def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
     """A viewer that shows proxies would otherwise show nothing."""
     run_stage(write_inputs(tmp_path / "in", proxy=False, held_out=()), tmp_path / "work", usdz=False)
@@ -212,6 +214,7 @@ def test_without_proxy_the_mesh_has_default_purpose(tmp_path: Path) -> None:
     assert not (tmp_path / "work/asset/head.usdz").exists()
 
 
+@pytest.mark.slow
 def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
     asset = run_stage(write_inputs(tmp_path / "in", scale=2), tmp_path / "work")
     assert [(v.index, v.scale) for v in asset.views] == [(3, 2), (9, 2)]
@@ -222,6 +225,7 @@ def test_held_out_views_have_the_predictions_size(tmp_path: Path) -> None:
     assert png.shape == (60, 48, 4)
 
 
+@pytest.mark.slow
 def test_without_held_out_views_a_few_fitted_ones_are_rendered(tmp_path: Path) -> None:
     asset = run_stage(write_inputs(tmp_path / "in", held_out=()), tmp_path / "work")
     assert [(v.index, v.scale) for v in asset.views] == [(0, 1), (6, 1), (12, 1)]
@@ -237,6 +241,7 @@ def test_large_fitted_views_are_rendered_smaller() -> None:
     assert spread((), 3) == []
 
 
+@pytest.mark.slow
 def test_name_goes_into_prim_files_and_textures(inputs: SyntheticInputs, tmp_path: Path) -> None:
     asset = run_stage(inputs, tmp_path / "work", name="anna_02", render_views=False)
     assert asset.root == "asset/anna_02.usd"

@@ -154,6 +154,7 @@ def test_bubble_is_cut_off() -> None:
     assert meshes.topology(kept, len(kept_vertices)).manifold and len(kept) == len(mesh.faces)
 
 
+@pytest.mark.slow
 def test_deviation_of_shifted_spheres() -> None:
     """A sphere moved by e is away by e |cos| / 1 in the mean: half of e."""
     mesh = surface_build(AnalyticField(sphere()), 40, quiet).mesh

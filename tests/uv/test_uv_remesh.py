@@ -79,6 +79,7 @@ def test_few_triangles_are_kept_and_twice_is_the_same(dense: Mesh) -> None:
     assert np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
 
 
+@pytest.mark.slow
 def test_charts_on_even_triangles(dense: Mesh) -> None:
     made = build(
         dense,

@@ -45,7 +45,8 @@ def sound(mesh: Mesh, charts: Charts) -> Quality:
     return q
 
 
-@pytest.mark.parametrize("noise, most", [(0.5, 40), pytest.param(1.5, 200, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise, most", [(0.5, 40), (1.5, 200)])
 def test_a_surface_in_shreds_gets_few_charts_that_all_have_texels(noise: float, most: int) -> None:
     mesh = shredded(3, noise)
     q = sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
@@ -68,6 +69,7 @@ def test_faces_without_area_do_not_break_the_charts() -> None:
     sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
 
 
+@pytest.mark.slow
 def test_a_chart_that_collapsed_to_a_line_is_laid_flat_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a real run died of: st without area on a part of the surface."""
     mesh = surface_build(AnalyticField(sphere()), 16, quiet).mesh
@@ -96,12 +98,14 @@ def test_faces_smaller_than_a_tenth_of_a_square_millimetre_are_packed_too() -> N
     assert (raster.layers(raster.texel_corners(charts, 2048), 2048) > 1).sum() == 0
 
 
+@pytest.mark.slow
 def test_good_charts_are_left_as_they_are() -> None:
     mesh = decimate.decimated(surface_build(AnalyticField(bumpy_head()), 48, quiet).mesh, 3000)
     charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=4))
     assert unwrap._with_texels(charts, mesh, Config(texture_size=512, padding=4), unwrap.Tiling()) is charts
 
 
+@pytest.mark.slow
 def test_fragments_are_given_to_a_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = shredded(3, 0.8)
     smooth = mesh.vertices.astype(np.float64)
@@ -114,6 +118,7 @@ def test_fragments_are_given_to_a_neighbour(monkeypatch: pytest.MonkeyPatch) -> 
     assert sorted(set(merged[2].tolist())) == list(range(int(merged[2].max()) + 1))
 
 
+@pytest.mark.slow
 def test_a_decimation_that_opens_the_mesh_is_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
     dense = surface_build(AnalyticField(sphere()), 24, quiet).mesh
     simplified = decimate._simplified
@@ -131,6 +136,7 @@ def test_a_decimation_that_opens_the_mesh_is_handed_on(monkeypatch: pytest.Monke
     )
 
 
+@pytest.mark.slow
 def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
     mesh = surface_build(AnalyticField(bumpy_head()), 48, quiet).mesh
     meshes.save(tmp_path / "surface.npz", mesh)

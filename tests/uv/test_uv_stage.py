@@ -38,6 +38,7 @@ def inputs(tmp_path: Path) -> Inputs:
     return Inputs(Located(artifact, tmp_path), None, None, masks)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_run_writes_mesh_and_proxy(inputs: Inputs, tmp_path: Path) -> None:
     uv = run(inputs, Config(target_faces=2000, proxy_faces=300, texture_size=512), Context(tmp_path, tmp_path))
     mesh, charts = meshes.load(tmp_path / uv.mesh.path), meshes.load_charts(tmp_path / uv.mesh.path)

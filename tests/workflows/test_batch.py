@@ -446,6 +446,7 @@ def test_the_page_escapes_and_links(tree: Path) -> None:
     assert [r["state"] for r in table] == ["failed", "done", "done", "done", "done"]
 
 
+@pytest.mark.slow
 def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: Path) -> None:
     """7,180 captures: the page is written every few seconds while the batch runs. Ten times the captures of another
     table may take thirty times as long on a busy machine; work that grows with their square would take a hundred."""

@@ -56,7 +56,7 @@ class Server:
 
 @pytest.fixture
 def serving(monkeypatch: pytest.MonkeyPatch) -> Any:
-    for name, value in {"ASK": 0.01, "RENEW": 0.02, "GIVE_BACK": 0.3, "AWAY": 0.2}.items():
+    for name, value in {"ASK": 0.01, "RENEW": 0.02}.items():
         monkeypatch.setattr(concurrency, name, value)
 
     def begin(*script: Exception) -> Server:
@@ -78,7 +78,7 @@ AWAY, TAKEN = httpx.ConnectError("refused"), refused(423)
 def test_a_slot_is_waited_for_kept_and_given_back(serving: Any) -> None:
     server = serving(TAKEN, AWAY, refused(503), TAKEN)
     with concurrency.slot("gpus", lambda: False):
-        assert server.asked == ["take"] * 5
+        assert [a for a in server.asked if a != "renew"] == ["take"] * 5  # on a busy machine renewing has begun
         wait_for(lambda: server.asked.count("renew") >= 2)
     assert server.asked[-1] == "give back"
     seen = len(server.asked)
@@ -97,7 +97,11 @@ def test_a_server_that_is_away_costs_neither_the_slot_nor_the_fit(serving: Any) 
     assert server.asked[-3:] == ["give back"] * 3
 
 
-def test_a_server_that_stays_away_is_not_waited_for_for_ever(serving: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_server_that_stays_away_is_not_waited_for_for_ever(
+    serving: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"GIVE_BACK": 0.3, "AWAY": 0.2}.items():
+        monkeypatch.setattr(concurrency, name, value)
     server = serving()
     with concurrency.slot("gpus", lambda: False):
         server.script = [AWAY] * 10_000

@@ -55,6 +55,7 @@ def test_schedule() -> None:
     assert found == [1, 1, 0.5, 0.5, 0.25, 1 / 32, 1 / 64, 1 / 64]
 
 
+@pytest.mark.slow
 def test_rates_of_the_parts(tmp_path: Path) -> None:
     """ImFace's networks at 1 %, its codes and all else at the full rate; the hull's samples are no parameters."""
     torch.save({"decoder": published(ours(False), "2022")}, tmp_path / "envs_last.pth")
@@ -67,7 +68,7 @@ def test_rates_of_the_parts(tmp_path: Path) -> None:
     assert names == []
 
 
-@pytest.mark.parametrize("prior", ["hull", "sphere", "imface"])
+@pytest.mark.parametrize("prior", ["hull", "sphere", pytest.param("imface", marks=pytest.mark.slow)])
 def test_every_prior_fits_saves_and_loads(prior: str, tmp_path: Path) -> None:
     """Steps move every parameter, the file gives the same field back, and the stages after the fit can ask it."""
     torch.save({"decoder": published(ours(True), "2022")}, tmp_path / "envs_last.pth")
@@ -269,6 +270,7 @@ SYSTEMS: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_system_fits_saves_and_loads(name: str, tmp_path: Path) -> None:
     """One code, other settings: each learns the ball, every parameter of it moves, and its file gives it back."""
