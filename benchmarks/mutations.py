@@ -89,7 +89,7 @@ MUTATIONS = (
              "tests/uv/test_uv_build.py::test_packing_turns_without_mirroring"),
     Mutation("stages/bake/texels.py", "np.where(landed[:, None], gradient, n)", "np.where(landed[:, None], n, n)",
              "tests/bake/test_bake_maps.py::test_normal_map_gives_back_the_gradient"),
-    Mutation("pipeline/visibility.py", 'found["primID"] >= 0', 'found["primID"] > 0',
+    Mutation("pipeline/ray_casting.py", 'found["primID"] >= 0', 'found["primID"] > 0',
              "tests/bake/test_bake_sight.py::test_distances_to_a_mesh_by_hand"),
     # ---------------------------------------------------------------- USD and report
     Mutation("stages/usd/write/light.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",

@@ -1,1 +1,1 @@
-"""The core of NeuFace Asset: contract, store, artifacts, conventions, maths. Knows neither stages nor workflows."""
+"""The core of NeuFace Asset: contract, store, artifacts, conventions, maths. Imports neither stages nor workflows."""

@@ -1,10 +1,10 @@
-"""What the stages hand to each other: frozen manifests that name files by content.
+"""The artifacts that stages exchange: frozen manifests that refer to files by content.
 
-An artifact is a pydantic model saved as `manifest.json` beside its files. It holds figures and `FileRef`s, never
-arrays and never absolute paths, so that two runs with the same content have the same manifest, wherever they lie.
+An artifact is a pydantic model saved as `manifest.json` beside its files. It contains figures and `FileRef`s, but no
+arrays and no absolute paths, so that two runs with the same content have the same manifest in any folder.
 
-Frames: every matrix reads `<to>_from_<from>`. Asset coordinates are right-handed, +Y up, origin at the centre of the
-region of interest, metres (nominal metres where `metric` is false).
+Frames: every matrix is named `<to>_from_<from>`. Asset coordinates are right-handed, +Y up, origin at the centre of the
+region of interest, metres (an assumed scale if `metric` is false).
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class Artifact(BaseModel):
         return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
 
     def digest(self) -> str:
-        """sha256 of the canonical manifest, and through its FileRefs of every byte that it names."""
+        """sha256 of the canonical manifest, and through its FileRefs of the content of all its files."""
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()
 
 
 class FileRef(Artifact):
-    """A file of an artifact: where it lies in the artifact's folder and what is in it."""
+    """A file of an artifact: path in the artifact's folder, hash and size."""
 
     path: RelativePath
     sha256: str
@@ -72,7 +72,7 @@ A = TypeVar("A", bound=Artifact, covariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Located(Generic[A]):
-    """An artifact and the folder that its files are in. Only the artifact counts for the content key."""
+    """An artifact and the folder of its files. Only the artifact enters the content key."""
 
     artifact: A
     folder: Path
@@ -89,11 +89,11 @@ CaptureKind = Literal[
 
 
 class CaptureSource(Artifact):
-    """What was found in the user's folder, by content; the folder itself is not part of it.
+    """The files in the user's folder, by content; the folder itself is not part of it.
 
-    photos: or the one film, for a video. cameras: the files that describe cameras, for the kinds that have them.
-    plates: photos of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the
-    face along +Z, where a file beside the capture says it. passed_over: names of pictures whose format is not read.
+    photos: or the single video file. cameras: files that describe cameras, for the kinds that have them. plates: photos
+    of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the face along +Z, if
+    a file beside the capture contains it. passed_over: names of pictures whose format is not supported.
     """
 
     kind: CaptureKind
@@ -106,7 +106,7 @@ class CaptureSource(Artifact):
 
 
 class GivenCamera(Artifact):
-    """A camera that came with the capture, in the capture's own world.
+    """A camera that came with the capture, in the capture's own coordinates.
 
     K: pixels, centre of the first pixel at (0.5, 0.5). cam_from_world: OpenCV axes. distortion: k1 k2 p1 p2 k3.
     """
@@ -117,12 +117,12 @@ class GivenCamera(Artifact):
 
 
 class CaptureView(Artifact):
-    """One photo. `index` is the number that the user knows it by; `holdout` keeps it from every fit; `plate` shows the
-    same view without the subject.
+    """One photo. `index`: its number for the user; `holdout`: excluded from every fit; `plate`: the same view without
+    the subject.
 
-    place_m: east, north and up in metres of the capture's first photo with a GPS position. clipped: picture of the
-    pixels (255) whose value is at the end of the file's range, and so only a lower bound. exposure: what a grey's
-    linear value is proportional to, against the capture's middle photo, from EXIF; 1 where that does not tell.
+    place_m: east, north and up in metres, relative to the capture's first photo with a GPS position. clipped: mask
+    (255) of the pixels at the end of the file's range, whose value is only a lower bound. exposure: relative to the
+    median photo of the capture, from EXIF; linear values are proportional to it; 1 if unknown.
     """
 
     index: int
@@ -142,12 +142,12 @@ class CaptureView(Artifact):
 
 
 class ChartFound(Artifact):
-    """The colour chart as one camera saw it, in the photo where it fits best.
+    """The colour checker as seen by one camera, in the photo with the best fit.
 
-    camera_group: as CaptureView has it. corners: (4, 2) pixels around the chart, from the first patch's (dark skin).
-    matrix: 3 x 3, reflectance of the chart from the photo's linear colours as it came, over its exposure. way: how much
-    of it was free. error: root mean square over patches left out, relative. white: linear colour that a perfect white
-    at the chart's place has in the photo.
+    camera_group: as in CaptureView. corners: (4, 2) pixels around the checker, starting at the first patch (dark skin).
+    matrix: 3 x 3, from the photo's original linear colours, divided by its exposure, to reflectance of the checker.
+    way: its degrees of freedom. error: relative root mean square error on patches that were left out. white: linear
+    colour of a perfect white in place of the checker in the photo.
     """
 
     camera_group: str
@@ -162,8 +162,9 @@ class ChartFound(Artifact):
 
 
 class ColourChart(Artifact):
-    """The colour chart of a capture, to whose white all photos were brought. photos: names of those that show it.
-    level: linear value, over the photo's exposure, of a perfect white at the chart's place in the capture's files."""
+    """The colour checker of a capture, by which all photos were white-balanced. photos: names of those that show it.
+    level: linear value, divided by the photo's exposure, of a perfect white in place of the checker, in the original
+    files."""
 
     photos: tuple[str, ...]
     level: float
@@ -171,9 +172,9 @@ class ColourChart(Artifact):
 
 
 class Capture(Artifact):
-    """The photos that take part, checked and in one place. colours_drift: the camera set white balance or exposure
-    anew for each photo, so that one colour is not one value. metres_from_world: see CaptureSource. chart: None where
-    none is seen, or none was looked for."""
+    """The imported photos, checked. colours_drift: white balance or exposure differ between the photos, so that one
+    colour has several values. metres_from_world: see CaptureSource. chart: None if no colour checker was found, or the
+    search is off."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
@@ -187,7 +188,7 @@ class Capture(Artifact):
 
 # ------------------------------------------------------------------ poses
 class Camera(Artifact):
-    """A solved or given camera, in asset coordinates.
+    """A camera from structure from motion or from the capture, in asset coordinates.
 
     K: pixels, centre of the first pixel at (0.5, 0.5). world_from_cam: OpenCV axes (x right, y down, z forward).
     distortion: k1 k2 p1 p2 k3. Photos are never resampled: rays go through the exact inverse of the distortion.
@@ -206,11 +207,10 @@ class CameraSet(Artifact):
     """Cameras around the subject.
 
     capture_from_asset: 4x4 similarity, column vectors. roi_radius: asset units, around the origin. view_errors_px: mean
-    reprojection error of each view, by its photo's name. scale: where the unit is from, in words; metric: whether that
-    makes it metres. left_out: why each of the `unregistered` photos has no place, in plain words, where that is known.
-    groups: numbers of photos that fit among themselves, of solved cameras: first that of the cameras, then the others,
-    the largest first. seen_directions: how many fitted views see what faces each
-    direction (pipeline.directions).
+    reprojection error of each view, by its photo's name. scale: source of the unit, as text; metric: whether the unit
+    is metres. left_out: for `unregistered` photos the reason, as text, if it is known. groups: sizes of the groups of
+    photos that structure from motion could connect: first that of the cameras, then the others, the largest first.
+    seen_directions: number of fitted views that see surface facing each direction (pipeline.directions).
     """
 
     source: Literal["given", "colmap"]
@@ -232,17 +232,17 @@ class CameraSet(Artifact):
 
 # ------------------------------------------------------------------ masks
 class Cut(Artifact):
-    """A plane: points with normal . x > offset lie beyond it. normal: unit, asset coordinates."""
+    """A plane: points with normal . x > offset are cut off. normal: unit, asset coordinates."""
 
     normal: tuple[float, float, float]
     offset: float
 
 
 class Extent(Artifact):
-    """The part of space that the asset is made of: an ellipsoid less what lies beyond its cuts, asset coordinates.
+    """The part of space that the asset covers: an ellipsoid, cut by planes, asset coordinates.
 
-    axes: unit vectors in rows (to the person's left, up, to the front); radii along them. head: length from chin to
-    the top of the forehead, by which all margins are measured.
+    axes: unit vectors in rows (to the person's left, up, to the front); radii: along them. head: length from chin to
+    the top of the forehead, the unit of all margins.
     """
 
     centre: tuple[float, float, float]
@@ -253,11 +253,12 @@ class Extent(Artifact):
 
 
 class ViewMask(Artifact):
-    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: agreement with the other views' hull.
+    """Soft alpha of one photo, 8-bit PNG at the photo's size. hull_iou: IoU with the visual hull of the other views.
 
-    labels: where face or hair was found, PNG of codes, whose names MaskSet.label_names has. labelled: the names of
-    those in this photo, the background not among them. asked: 8-bit PNG at the photo's size, white where the photo
-    shows the subject inside its extent, or background; what is black is neither fitted nor scored. None: all is asked.
+    labels: PNG of codes, if face or hair was found; MaskSet.label_names has their names. labelled: names of the labels
+    in this photo, without the background. asked: pixels that count, 8-bit PNG at the photo's size: white where the
+    photo shows the subject inside its extent, or background; black pixels are neither fitted nor scored. None: all
+    count.
     """
 
     index: int
@@ -271,13 +272,13 @@ class ViewMask(Artifact):
 
 
 class MaskSet(Artifact):
-    """Which pixels show the subject. `dropped`: views whose mask disagrees with all others; not fitted. label_names: of
-    the codes 0, 1, ... in the views' labels.
+    """The masks of the subject. `dropped`: views whose mask disagrees with all others; not fitted. label_names: of the
+    codes 0, 1, ... in the views' labels.
 
-    landmarks: the face in space, None where fewer than three fitted photos agree on one. npz: views (N,) indices of
-    the fitted photos with a face, uv (N, 468, 2) pixels there, xyz (468, 3) asset coordinates, error_px (N,) median
-    distance of a photo's landmarks from where xyz projects to, kept (N,) photos that agree (pipeline.faces). extent:
-    the part of the subject that the asset is made of; None for objects, of which all in the region of interest is.
+    landmarks: 3D face landmarks, None if fewer than three fitted photos agree on a face. npz: views (N,) indices of the
+    fitted photos with a face, uv (N, 468, 2) pixels there, xyz (468, 3) asset coordinates, error_px (N,) median
+    reprojection error of each photo's landmarks, kept (N,) photos that agree (pipeline.faces). extent: the part of the
+    subject that the asset covers; None for objects: everything in the region of interest.
     """
 
     masks: tuple[ViewMask, ...]
@@ -291,9 +292,9 @@ class MaskSet(Artifact):
 
 # ------------------------------------------------------------------ inverse rendering
 class HeldOutView(Artifact):
-    """A prediction from the fitted field, linear Rec.709 RGBA, premultiplied: EXR, and PNG for people.
+    """A prediction from the fitted field, linear Rec.709 RGBA, premultiplied: EXR, and PNG for viewing.
 
-    response: rows of the matrix that took the model's colours to those of the photo's camera; it is in both files.
+    response: rows of the matrix from the model's colours to those of the photo's camera; it is applied in both files.
     """
 
     index: int
@@ -304,7 +305,7 @@ class HeldOutView(Artifact):
 
 
 class FittedFace(Artifact):
-    """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). Figures are from the fit itself."""
+    """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit."""
 
     field: FileRef
     light: FileRef
@@ -325,8 +326,8 @@ class FittedFace(Artifact):
 # ------------------------------------------------------------------ mesh
 class Surface(Artifact):
     """Zero set of the SDF as triangles. npz: vertices (V, 3) float32, normals (V, 3) float32, faces (F, 3) int32.
-    trimmed: share of its area that no photo saw and that was cut off. handles_cut: small handles that were opened and
-    closed; handles_left: those that are too wide for a fault."""
+    trimmed: share of its area that no photo shows and that was cut off. handles_cut: number of handles that were
+    removed; handles_left: number of those that are too wide to be noise."""
 
     mesh: FileRef
     vertices: int
@@ -345,11 +346,11 @@ class Surface(Artifact):
 class UvMesh(Artifact):
     """A mesh with charts. npz: vertices (V, 3), normals (V, 3), faces (F, 3), uvs (U, 2) float32, uv_faces (F, 3).
 
-    UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys less the uvs. stretch: L2, stretch_max:
-    Linf of [Sander 2001]. seam_front_mm: length of seams where the surface looks to the front. deviation: of the mesh
-    and of the proxy from the dense mesh. tiles: UDIM tiles (pipeline.tiles) that the charts lie in; tile_utilisation:
-    share of each under charts, where there are several, and utilisation their mean. face_share: of the area under
-    charts that belongs to the face; None where no face is known.
+    UV origin bottom left. `proxy`: a coarser mesh without UVs, same npz keys without the uvs. stretch: L2, stretch_max:
+    Linf of [Sander 2001]. seam_front_mm: length of seams where the surface faces the front. deviation: of the mesh and
+    of the proxy from the dense mesh. tiles: number of UDIM tiles (pipeline.tiles); tile_utilisation: share of each tile
+    under charts, if there are several; utilisation: their mean. face_share: share of the area under charts that belongs
+    to the face; None if the face is unknown.
     """
 
     mesh: FileRef
@@ -374,7 +375,7 @@ class UvMesh(Artifact):
 
 # ------------------------------------------------------------------ maps
 class TextureMap(Artifact):
-    """One map. `files` by what follows its name: "exr", "png"; "1001.exr", "1002.exr", ... where it has tiles
+    """One map. `files` by the end of their name: "exr", "png"; "1001.exr", "1002.exr", ... if it has tiles
     (pipeline.tiles). space: "srgb_png" (EXR linear) or "raw"."""
 
     name: str
@@ -387,13 +388,13 @@ class TextureMap(Artifact):
 
 
 class TextureSet(Artifact):
-    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1); with several UDIM tiles each map has `tiles`
-    files of that size (but for tables, which no texture coordinate looks up). zero_set_rms_mm: root mean square
-    distance of the mesh from the SDF's zero set, over the texels that have one near them; lod_rms_mm: that of each
-    level of detail, over its area. coverage: share of all texels under charts. figures: shares of the covered
-    texels that no photo saw (`unseen`), whose albedo was clamped (`albedo_clamped`), that have photo detail
-    (`detail_support`); mean edge of a texel and median edge of the photos' finest pixel on the surface (`texel_mm`,
-    `photo_pixel_mm`). regions: share of the surface's area by the name of its region; empty without labelled photos."""
+    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1). With several UDIM tiles each map has `tiles`
+    files of that size (except lookup tables). zero_set_rms_mm: root mean square distance of the mesh from the SDF's
+    zero set, over texels near it; lod_rms_mm: that of each level of detail, over its area. coverage: share of all
+    texels under charts. figures: shares of the covered texels that no photo shows (`unseen`), whose albedo was clamped
+    (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a texel and median edge of the photos'
+    finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of the surface's area by region name;
+    empty without labelled photos."""
 
     size: int
     tiles: int = 1
@@ -410,9 +411,9 @@ class TextureSet(Artifact):
 
 # ------------------------------------------------------------------ asset and report
 class UsdAsset(Artifact):
-    """The exported component. `root` is the file to open; `files` are all of it, relative paths kept.
+    """The exported component. `root`: the file to open; `files`: all files, with relative paths.
 
-    figures: what the export measured on its maps, by name. stated: author, licence, consent, as the user gave them.
+    figures: measurements of the export, by name. stated: author, licence and consent, as given by the user.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""pycolmap, less its handler of signals.
+"""pycolmap without its signal handlers.
 
-Its import installs a handler for SIGTERM that prints a stack of C++ functions and kills the process, in place of the
-handler that stops a run in order. `from pipeline.colmap import pycolmap` puts the handlers back that were there.
+Importing pycolmap replaces the handler for SIGTERM, which stops a run in order, by one that prints a C++ stack and
+kills the process. `from pipeline.colmap import pycolmap` restores the previous handlers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _SIZE = 1024  # bytes, more than any platform's struct sigaction
 
 @contextmanager
 def kept_handlers() -> Iterator[None]:
-    """Restore, as the C library knows them, the handlers of the signals that stop a run."""
+    """Restore the C library's handlers of the signals that stop a run."""
     libc = ctypes.CDLL(None)
     before = {n: ctypes.create_string_buffer(_SIZE) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     for number, action in before.items():

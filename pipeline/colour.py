@@ -1,7 +1,7 @@
 """The only place where colour spaces are converted.
 
-Radiance, albedo and every mean or sum of them are linear Rec.709. sRGB encoding appears in 8- and 16-bit files, and
-in losses and metrics that compare as people see.
+Radiance, albedo and every mean or sum of them are linear Rec.709. sRGB encoding is used in 8- and 16-bit files, and in
+losses and metrics that model human perception.
 
 Symbols: primaries and white as chromaticities (x, y); XYZ with Y = 1 for white.
 
@@ -35,10 +35,10 @@ def _namespace(x: Any) -> Any:
 
 
 def srgb_from_linear(x: T) -> T:
-    """Encode linear values. Domain: all reals; [0, 1] maps to [0, 1], negatives go on along the linear toe.
+    """Encode linear values of any shape. Domain: all reals; [0, 1] maps to [0, 1], negative values use the linear part.
 
-    Not clamped, so that a loss keeps its gradient above 1. The power's argument is kept above the toe's end, because
-    its derivative at 0 is infinite and would reach the gradient through `where`.
+    Not clamped, so that a loss keeps its gradient above 1. The argument of the power is kept above the linear part,
+    because the power's derivative at 0 is infinite and would reach the gradient through `where`.
     """
     xp: Any = _namespace(x)
     v: Any = x
@@ -48,7 +48,7 @@ def srgb_from_linear(x: T) -> T:
 
 
 def linear_from_srgb(x: T) -> T:
-    """Decode sRGB values; inverse of `srgb_from_linear` on all reals."""
+    """Decode sRGB values of any shape; inverse of `srgb_from_linear` on all reals."""
     xp: Any = _namespace(x)
     v: Any = x
     high = xp.clip(v, 0.04045, None) if xp is np else v.clamp(min=0.04045)
@@ -57,7 +57,7 @@ def linear_from_srgb(x: T) -> T:
 
 
 def acescg_from_linear(x: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
-    """(..., 3) ACEScg of linear Rec.709, the white of one taken to the white of the other."""
+    """(..., 3) ACEScg of linear Rec.709 (..., 3), with adaptation of the white."""
     return np.asarray(np.asarray(x, np.float64) @ rgb_from_rgb(ACESCG, REC709).T, np.float32)
 
 
@@ -77,13 +77,13 @@ def _xyz(x: float, y: float) -> npt.NDArray[np.float64]:
 
 
 def _xyz_from_rgb(c: Chromaticities) -> npt.NDArray[np.float64]:
-    """(3, 3): the columns are the primaries, scaled so that equal parts make white."""
+    """(3, 3): the columns are the primaries, scaled so that their sum is white."""
     columns = np.stack([_xyz(*c[i : i + 2]) for i in (0, 2, 4)], 1)
     return np.asarray(columns * np.linalg.solve(columns, _xyz(c[6], c[7])), np.float64)
 
 
 def as_photographed(rgba: npt.NDArray[np.float32], response: Sequence[Sequence[float]]) -> npt.NDArray[np.float32]:
-    """Linear RGBA (..., 4) with a camera's colour response, rows of 3 x 3, applied to its colours."""
+    """Linear RGBA (..., 4) after a camera's colour response, rows of a 3 x 3 matrix."""
     out = np.array(rgba, np.float32)
     out[..., :3] = rgba[..., :3] @ np.asarray(response, np.float32).T
     return out

@@ -1,7 +1,7 @@
 """The stage contract: a stage is a pure function from artifacts and a config to an artifact.
 
-`key` is a hash of content (stage, version, config, the inputs' manifests), never of paths or times. `execute` looks
-the key up in the store, runs the stage into a partial folder if it is not there, and seals the result by one rename.
+`key` is a hash of content (stage, version, config, the inputs' manifests), never of paths or times. `execute` looks up
+the key in the store. If it is missing, it runs the stage in a partial folder and completes the result by one rename.
 """
 
 from __future__ import annotations
@@ -32,50 +32,50 @@ log = logging.getLogger(__name__)
 
 
 class StageConfig(BaseModel):
-    """Base of every stage's settings. All of it is in the key: what can't change the result does not belong here."""
+    """Base of every stage's settings. All fields enter the key: only settings that affect the result belong here."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
     def setting_names(cls) -> tuple[str, ...]:
-        """What a user may set: every field but those that the stage fills in by itself."""
+        """The settings for users: every field except those that the stage fills in itself."""
         return tuple(
             name for name, field in cls.model_fields.items() if not any(isinstance(m, FilledIn) for m in field.metadata)
         )
 
     def changed(self, **values: object) -> Self:
-        """A copy with other values, as dataclasses.replace makes one: what code sets is not held against the limits.
+        """A copy with other values, like dataclasses.replace: the values are not compared with the limits.
 
         Raises:
-            TypeError: a name that is no setting.
+            TypeError: a name is not a setting.
         """
         unknown = values.keys() - type(self).model_fields.keys()
         if unknown:
-            raise TypeError(f"no settings of {type(self).__module__}: {', '.join(sorted(unknown))}")
+            raise TypeError(f"not settings of {type(self).__module__}: {', '.join(sorted(unknown))}")
         return self.model_copy(update=values)
 
 
 class Progress(Protocol):
-    """Told how far a stage is: `done` of `total`, and figures worth showing (loss, psnr, ...)."""
+    """Callback for the progress of a stage: `done` of `total`, and figures to show (loss, psnr, ...)."""
 
     def __call__(self, done: int, total: int, message: str = "", **figures: float) -> None: ...
 
 
 def no_progress(done: int, total: int, message: str = "", **figures: float) -> None:
-    """A Progress that shows nothing."""
+    """A Progress that does nothing."""
 
 
 def never_cancelled() -> bool:
-    """A cancel check for runs that nobody can stop."""
+    """A cancel check for runs that can't be cancelled."""
     return False
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a stage gets besides inputs and config.
+    """The environment of a stage, besides inputs and config.
 
-    workdir: empty, becomes the artifact's folder. scratch: survives a killed run with the same key (checkpoints).
-    device: "cpu" or "cuda"; it may change digits, never meaning, so it is recorded and not part of the key.
+    workdir: empty, becomes the artifact's folder. scratch: for checkpoints; it is kept if a run with the same key is
+    killed. device: "cpu" or "cuda"; it only changes rounding, so it is recorded but not part of the key.
     """
 
     workdir: Path
@@ -86,11 +86,11 @@ class Context:
     log: logging.Logger = field(default_factory=lambda: logging.getLogger("neuface"))
 
     def file(self, path: Path | str) -> FileRef:
-        """The reference to a file that was written into workdir."""
+        """A reference to a file in workdir."""
         return FileRef.of(self.workdir, path)
 
     def check(self) -> None:
-        """Raise Cancelled if the user asked to stop."""
+        """Raise Cancelled if the user stopped the run."""
         if self.cancelled():
             raise Cancelled("stopped by the user; finished stages and checkpoints are kept")
 
@@ -102,7 +102,7 @@ O = TypeVar("O", bound=Artifact)  # noqa: E741
 
 @dataclass(frozen=True, slots=True)
 class Stage(Generic[I, C, O]):
-    """A step of the pipeline. Bump `version` when the meaning of its output changes."""
+    """A step of the pipeline. Increase `version` when the meaning of its output changes."""
 
     name: str
     version: int
@@ -114,7 +114,7 @@ class Stage(Generic[I, C, O]):
 
 @dataclass(frozen=True, slots=True)
 class Done(Generic[O]):
-    """A finished stage: its artifact, where it is, and what it took."""
+    """A finished stage: its artifact, its folder, and the record of the run (time, memory, versions)."""
 
     stage: str
     key: str
@@ -124,7 +124,7 @@ class Done(Generic[O]):
 
 
 def inputs_from(stage: Stage[I, C, O], finished: Mapping[str, Located[Artifact]]) -> I:
-    """A stage's inputs, picked by name from the artifacts of the stages before it."""
+    """A stage's inputs, selected by name from the artifacts of the stages before it."""
     return stage.inputs(**{f.name: finished[f.name] for f in dataclasses.fields(stage.inputs)})  # type: ignore[arg-type]
 
 
@@ -145,11 +145,11 @@ def execute(
     progress: Progress = no_progress,
     cancelled: Callable[[], bool] = never_cancelled,
 ) -> Done[O]:
-    """Run a stage, or hand back what the store has of it.
+    """Run a stage, or return its result from the store.
 
     Raises:
-        StageError: bad input or a disk fault; nothing half-written stays.
-        Cancelled: the user stopped it; checkpoints in scratch stay.
+        StageError: invalid input or a disk error; incomplete results are removed.
+        Cancelled: the user stopped it; checkpoints in scratch are kept.
     """
     k = key(stage, inputs, config)
     with store.lock(stage.name, k), _disk_faults(store.root):
@@ -200,12 +200,12 @@ def _folders(store: Store, stage: str, k: str) -> Iterator[tuple[Path, Path]]:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident size of this process so far, in MB."""
+    """Peak resident memory of this process, in MB."""
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result may depend on."""
+    """Versions of the software that a result may depend on."""
     names = ("neuface-asset", "torch", "numpy", "pycolmap", "opencv-contrib-python-headless", "xatlas", "usd-core")
     found = {"python": platform.python_version()}
     for name in names:

@@ -1,7 +1,7 @@
-"""Which directions around the subject the cameras see, on a grid of elevation and azimuth.
+"""Counts how many cameras see surface that faces each direction, on a grid of elevation and azimuth.
 
-Asset coordinates: azimuth around +Y from +Z (the face, where it is known) towards +X (the person's own left), elevation
-above the horizon, degrees. A direction stands for a piece of surface that faces it.
+Asset coordinates: azimuth around +Y from +Z (the face, if it is known) towards +X (the person's own left), elevation
+above the horizon, degrees. A direction represents a piece of surface that faces it.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ Bool = npt.NDArray[np.bool_]
 Counts = tuple[tuple[int, ...], ...]
 
 ROWS, COLUMNS = 12, 24  # bins of 15 degrees; row 0 is at the top, the front is between columns 11 and 12
-STEEP = 60.0  # degrees from its normal at which a piece of surface is still seen well enough to be fitted
-BAND = 45.0  # degrees: above is the top, below what looks at the floor
+STEEP = 60.0  # degrees from its normal up to which a piece of surface is seen well enough to be fitted
+BAND = 45.0  # degrees of elevation: above is the top, below is the underside
 FRONT = 60.0  # degrees to both sides
 
 
 def elevations() -> F64:
-    """(ROWS,) middles of the rows in degrees, from the top."""
+    """(ROWS,) elevations of the rows' centres in degrees, from the top."""
     return 90.0 - (np.arange(ROWS) + 0.5) * 180.0 / ROWS
 
 
 def azimuths() -> F64:
-    """(COLUMNS,) middles of the columns in degrees, from -180 (the back) over 0 (the front)."""
+    """(COLUMNS,) azimuths of the columns' centres in degrees, from -180 (the back) over 0 (the front)."""
     return (np.arange(COLUMNS) + 0.5) * 360.0 / COLUMNS - 180.0
 
 
 def grid() -> F64:
-    """(ROWS, COLUMNS, 3) unit vectors of the bins' middles."""
+    """(ROWS, COLUMNS, 3) unit vectors of the bins' centres."""
     e, a = np.meshgrid(np.radians(elevations()), np.radians(azimuths()), indexing="ij")
     return np.stack([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)], -1)
 
@@ -47,14 +47,14 @@ def view_directions(cameras: Sequence[Camera]) -> F64:
 
 
 def count_seen(directions: F64) -> Counts:
-    """How many of the views (N, 3) see what faces each bin, at most STEEP degrees from its normal; what hides it is
-    not known here. (ROWS, COLUMNS)."""
+    """(ROWS, COLUMNS) number of views (N, 3) within STEEP degrees of the normal of surface that faces each bin.
+    Occlusion is not considered."""
     near = grid() @ directions.T >= np.cos(np.radians(STEEP)) - 1e-9
     return tuple(tuple(int(n) for n in row) for row in near.sum(-1))
 
 
 def parts() -> dict[str, Bool]:
-    """(ROWS, COLUMNS) bins of each part of a head that people have a name for. They may overlap."""
+    """(ROWS, COLUMNS) masks of the named parts of a head. They may overlap."""
     e, a = np.meshgrid(elevations(), azimuths(), indexing="ij")
     band = np.abs(e) <= BAND
     return {
@@ -68,18 +68,18 @@ def parts() -> dict[str, Bool]:
 
 
 def around() -> Bool:
-    """(ROWS, COLUMNS) bins within BAND of the horizon: what every photographer can reach."""
+    """(ROWS, COLUMNS) mask of the bins within BAND of the horizon, which every photographer can reach."""
     return np.broadcast_to((np.abs(elevations()) <= BAND)[:, None], (ROWS, COLUMNS))
 
 
 def share_seen(counts: Counts, where: Bool, views: int = 1) -> float:
-    """Share of the sphere's area within the bins `where` that at least so many views see."""
+    """Share of the area of the bins `where` (ROWS, COLUMNS) that at least `views` views see."""
     weight = np.cos(np.radians(elevations()))[:, None] * where
     return float((weight * (np.array(counts) >= views)).sum() / weight.sum())
 
 
 def spread(directions: F64) -> float:
-    """Degrees between the two views (N, 3) that are farthest apart."""
+    """Largest angle between two of the views (N, 3), degrees."""
     if len(directions) < 2:
         return 0.0
     return float(np.degrees(np.arccos((directions @ directions.T).clip(-1, 1).min())))

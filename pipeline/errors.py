@@ -1,7 +1,7 @@
-"""Errors that a user reads.
+"""Errors for users.
 
-A failure names five things: what is wrong, where, the value found, the limit it broke and what to do about it.
-Programming errors stay ordinary Python exceptions; only what a user can meet and mend is raised from here.
+An error has five parts: what is wrong, where, the value found, the limit, and what to do. Programming errors are
+ordinary Python exceptions; only errors that a user can cause and correct are raised from here.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import errno
 import os
 from pathlib import Path
 
-MAX_LETTERS = 1000  # of one line of a message
+MAX_LETTERS = 1000  # characters in one line of a message
 
 
 class NeufaceError(Exception):
@@ -20,13 +20,13 @@ class NeufaceError(Exception):
 
 
 class StageError(NeufaceError):
-    """A stage can't go on. Exit code 1.
+    """A stage can't continue. Exit code 1.
 
     Args:
         what: what is wrong, a short clause ("camera matrix K is singular").
-        where: file, view, setting or stage that it concerns.
-        value: what was found.
-        limit: what would have been acceptable.
+        where: file, view, setting or stage.
+        value: the value found.
+        limit: what is accepted.
         remedy: what the user can do.
     """
 
@@ -41,7 +41,7 @@ class StageError(NeufaceError):
 
 
 def _cut(text: str) -> str:
-    """What came from a file may have any length, and letters that can't be written."""
+    """Shorten text and escape characters that can't be printed: it may come from a file."""
     text = text.encode("utf-8", "backslashreplace").decode()
     return text if len(text) <= MAX_LETTERS else f"{text[: MAX_LETTERS // 2]} ... {text[-MAX_LETTERS // 4 :]}"
 
@@ -53,11 +53,11 @@ class UsageError(StageError):
 
 
 class DiskError(StageError):
-    """A disk that is full, read-only, forbidden or failing: somebody has to mend it. Exit code 1."""
+    """The disk is full, read-only or failing, or access is denied; somebody must correct this. Exit code 1."""
 
 
 class TimeLimitError(StageError):
-    """A stage took longer than it may. Exit code 1."""
+    """A stage exceeded its time limit. Exit code 1."""
 
 
 class Cancelled(NeufaceError):
@@ -71,10 +71,13 @@ def _rebuild(kind: type[StageError], what: str, fields: dict[str, str]) -> Stage
 
 
 _DISK_REMEDIES = {
-    errno.ENOSPC: ("no space is left on the disk", "free space on this disk, or choose another with --out or --store"),
+    errno.ENOSPC: (
+        "no space is left on the disk",
+        "free space on this disk, or choose another one with --out or --store",
+    ),
     errno.EDQUOT: ("the disk quota is used up", "free space, or choose another disk with --out or --store"),
-    errno.EFBIG: ("a file is larger than may be written here", "raise the limit (ulimit -f), or choose another disk"),
-    errno.EIO: ("the disk fails to read or write", "look at the disk, or choose another with --out or --store"),
+    errno.EFBIG: ("a file is larger than the limit for files", "raise the limit (ulimit -f), or choose another disk"),
+    errno.EIO: ("the disk has a read or write error", "check the disk, or choose another one with --out or --store"),
     errno.EROFS: ("the disk is read-only", "choose a writable folder with --out or --store"),
     errno.EACCES: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
     errno.EPERM: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
@@ -82,11 +85,11 @@ _DISK_REMEDIES = {
 }
 
 
-_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # of a copy, the target is at fault
+_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)  # when copying, these are errors of the target
 
 
 def stage_error_from_os_error(error: OSError, where: Path | str) -> StageError | None:
-    """The user's message for a disk fault, or None when it is not one that a user can mend."""
+    """The error for a user, or None if the user can't correct it."""
     if error.errno == errno.ENAMETOOLONG:
         return _name_too_long(os.fsdecode(error.filename or where))
     closed = _unreadable(error)
@@ -106,7 +109,7 @@ def stage_error_from_os_error(error: OSError, where: Path | str) -> StageError |
 
 
 def _unreadable(error: OSError) -> Path | None:
-    """The file or folder that this user may not read, if that is the fault; None if it is one of writing."""
+    """The file or folder that this user may not read; None if the error is about writing."""
     if error.errno not in (errno.EACCES, errno.EPERM) or not isinstance(error.filename, str | bytes | Path):
         return None
     path = Path(os.fsdecode(error.filename))

@@ -1,11 +1,11 @@
-"""The part of the subject that the asset is made of: of a person the head, the neck and where the shoulders begin.
+"""The part of the subject that the asset covers: for a person the head, the neck and the beginning of the shoulders.
 
 Symbols: h length from the chin to the top of the forehead (the landmarks'); s(x) distance outside the extent, negative
 inside, asset units: the larger of the ellipsoid's and the planes'.
 
-What lies beyond is not asked for: photos show it, but it is neither fitted nor scored, and the mesh ends there. All
-stages share the one solid, with these margins: photos are asked inside ASKED h, so that what a hull a little too thick
-puts inside really is; the mesh is cut at the solid itself; the fit reaches GROWN h farther, so that it ends in no rim.
+Everything outside is neither fitted nor scored, and the mesh ends there. All stages use the same solid, with these
+margins: pixels count from ASKED h inside it, because a visual hull is a little too thick; the mesh is cut at the solid
+itself; the fit reaches GROWN h further, so that it has no rim at the cut.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from pipeline.hull import BAND_CELLS, Hull
 
 F64 = npt.NDArray[np.float64]
 
-BELOW = 0.95  # h from the chin down to the cut: a neck is 0.5 h long; skin that an open collar shows goes on
-MIDDLE = (0.0, 0.0, -0.55)  # h from between the eyes to the middle of the extent: left, up, to the front
-RADIUS = 1.65  # h: leaves 0.8 h around a head for hair, and as much of the shoulders as the cut
-# The same of the head and neck alone, against which the rest of the subject is weighed.
+BELOW = 0.95  # h from the chin down to the cut: a neck is 0.5 h long; an open collar shows more skin
+MIDDLE = (0.0, 0.0, -0.55)  # h from the point between the eyes to the centre of the extent: left, up, to the front
+RADIUS = 1.65  # h: leaves 0.8 h around a head for hair, and includes some of the shoulders
+# The same for the head and neck alone, with which the rest of the subject is compared.
 HEAD_BELOW, HEAD_RADIUS = 0.6, 1.4
-CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.55)  # h: a ball that no head is smaller than, and its middle as above
+CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.55)  # h: radius of a ball inside every head, and its centre as above
 ASKED, GROWN = 0.04, 0.1  # h
 
 
 def head_extent(frame: HeadFrame, below_chin: float = BELOW, radius: float = RADIUS) -> Extent:
-    """The extent of a person from the head's axes. below_chin, radius: see BELOW and RADIUS."""
+    """The extent of a person from the head's frame. below_chin, radius: see BELOW and RADIUS."""
     h, axes = frame.height, frame.axes
     centre = frame.eyes + h * np.asarray(MIDDLE) @ axes
     down = -axes[1]
@@ -42,26 +42,26 @@ def head_extent(frame: HeadFrame, below_chin: float = BELOW, radius: float = RAD
 
 
 def core(extent: Extent) -> tuple[F64, float]:
-    """Middle (3,) and radius of a ball inside every head."""
+    """Centre (3,) and radius of a ball inside every head."""
     axes = np.asarray(extent.axes, np.float64)
     away = (np.asarray(CORE_MIDDLE) - np.asarray(MIDDLE)) * extent.head
     return np.asarray(extent.centre, np.float64) + away @ axes, CORE * extent.head
 
 
 def signed(extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0) -> F64:
-    """(N,) s at points (N, 3), of the solid grown by `grown`; about a distance for radii that are not equal."""
+    """(N,) s at points (N, 3), for the solid grown by `grown`; an approximate distance if the radii differ."""
     return signed_and_gradient(extent, points, grown)[0]
 
 
 def signed_and_gradient(
     extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0
 ) -> tuple[F64, F64]:  # fmt: skip
-    """s (N,) and its gradient (N, 3), of unit length."""
+    """s (N,) at points (N, 3) and its gradient (N, 3), of unit length."""
     axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
     local = (np.asarray(points, np.float64) - np.asarray(extent.centre)) @ axes.T
     first = np.linalg.norm(local / radii, axis=1)
     second = np.maximum(np.linalg.norm(local / radii**2, axis=1), 1e-12)
-    # at the middle both vanish and the distance is the smallest radius
+    # at the centre both are 0 and the distance is the smallest radius
     value = np.where(first > 1e-9, first * (first - 1) / second, -radii.min())
     slope = local / radii**2 / second[:, None]
     gradient = np.where(first[:, None] > 1e-9, slope, [0.0, 1.0, 0.0]) @ axes
@@ -75,7 +75,7 @@ def signed_and_gradient(
 
 
 def bounds(extent: Extent, grown: float = 0.0) -> tuple[F64, F64]:
-    """(3,) corners of the box around the ellipsoid, and below of the planes that are square to an axis of it."""
+    """(3,) corners of the bounding box of the ellipsoid, reduced by the planes that are perpendicular to an axis."""
     axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
     centre = np.asarray(extent.centre, np.float64)
     reach = np.sqrt(((axes * radii[:, None]) ** 2).sum(0)) + grown

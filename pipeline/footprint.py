@@ -1,9 +1,9 @@
-"""How large the photos' pixels are on a surface, and how large a texture's texels.
+"""Size of the photos' pixels on a surface, and of a texture's texels.
 
     footprint(x) = min over the views that face x of  z b / (f (n . wo))
 
-Symbols: z depth, f focal length in pixels, b pixels along the side of a block that is taken as one. Visibility is not
-tested: a hidden view can only make the median look finer, which costs texels or time, but no detail.
+Symbols: z depth, f focal length in pixels, b pixels along the side of a block that counts as one pixel. Visibility is
+not tested: an occluded view can only lower the median, which costs texels or time, but no detail.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from pipeline.artifacts import Camera
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, project
 
-MIN_COSINE = 0.35  # flatter views smear a pixel over too much surface
+MIN_COSINE = 0.35  # at smaller cosines a pixel covers too much surface
 MAX_POINTS = 10_000
 
 
 def edges(
     points: F64, normals: F64, K: F64, world_from_cam: F64, distortion: F64, size: tuple[int, int], block: int = 1
 ) -> F64:
-    """(N,) edge of one view's pixel at points (N, 3) with unit normals, in their unit; infinite where the view's frame
-    (columns, rows) does not hold the point or it does not face the camera."""
+    """(N,) edge of one view's pixel at points (N, 3) with unit normals (N, 3), in their unit; infinite if the point is
+    outside the view's frame (columns, rows) or does not face the camera."""
     away = world_from_cam[:3, 3] - points
     cosine = (away * normals).sum(1) / np.linalg.norm(away, axis=1)
     uv, depth = project(K, inverse_rigid(world_from_cam), distortion, points)
@@ -35,7 +35,7 @@ def edges(
 
 
 def pixel(mesh: Mesh, cameras: Iterable[Camera]) -> float | None:
-    """Median over the surface of the edge of the finest pixel that faces it, in the mesh's unit; None if none does."""
+    """Median over the surface of the edge of the finest pixel, in the mesh's unit; None if no camera sees it."""
     step = max(1, -(-len(mesh.faces) // MAX_POINTS))
     faces = mesh.faces[::step]
     area = meshes.area_vectors(mesh.vertices, faces)
@@ -54,7 +54,7 @@ def pixel(mesh: Mesh, cameras: Iterable[Camera]) -> float | None:
 
 
 def fine_texel(mesh: Mesh, charts: Charts, size: int) -> float:
-    """Edge of a texel where charts are densest: a tenth of the surface has smaller ones. As `texel` otherwise."""
+    """As `texel`, but the 10th percentile over the surface: the edge of a texel in the finest charts."""
     area = meshes.areas(mesh.vertices, mesh.faces)
     uv = charts.uvs.astype(np.float64)[charts.faces]
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]

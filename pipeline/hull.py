@@ -1,13 +1,13 @@
-"""Visual hull of silhouettes: the largest body that every photo's mask allows.
+"""Visual hull of silhouettes: the largest solid that is consistent with all masks.
 
 Symbols
     alpha     (H, W) in [0, 1], 1 = subject; a pixel belongs to the subject where alpha >= 0.5
     level(p)  the (max_outside + 1)-largest, over the views that see p, of d_i(project_i(p)) * depth_z / focal:
-              how far p lies outside view i's silhouette (negative: inside), in asset units
+              distance of p outside view i's silhouette (negative: inside), in asset units
     d_i       signed distance to the contour in view i, pixels (pipeline.silhouettes)
 
-`level` is 1-Lipschitz up to perspective, which lets coarse cells be settled as a whole, and its zero set is the hull
-to a fraction of a voxel. A view in whose frame a point does not fall has no opinion about that point.
+`level` is 1-Lipschitz up to perspective, so that coarse cells can be decided as a whole. Its zero set is the hull to a
+fraction of a voxel. A view does not vote on points outside its frame.
 
 Source: Laurentini, The visual hull concept for silhouette-based image understanding (1994).
 """
@@ -34,7 +34,7 @@ Bool = npt.NDArray[np.bool_]
 S = TypeVar("S", bound=np.generic)
 
 BAND_CELLS = 2.0  # `level` is exact within this many cells of the hull's surface and clamped beyond
-CHUNK = 1 << 15  # points projected at a time: their temporaries stay in the processor's cache
+CHUNK = 1 << 15  # points projected at a time: the temporary arrays fit in the processor's cache
 MAX_VOXELS = 512**3
 
 
@@ -42,9 +42,9 @@ MAX_VOXELS = 512**3
 class Hull:
     """Voxels indexed [ix, iy, iz], centres at lo + (i + 0.5) * cell, asset coordinates.
 
-    occupied: (X, Y, Z), conservative: level <= half a cell, so that parts thinner than a voxel stay.
+    occupied: (X, Y, Z), conservative: level <= half a cell, which keeps parts thinner than a voxel.
     level: (X, Y, Z) asset units, negative inside, clamped to +-BAND_CELLS * cell; its zero set is the unbiased surface.
-    seen: (X, Y, Z) number of views that saw the voxel (until it was carved).
+    seen: (X, Y, Z) number of views that see the voxel (counted until it is carved).
     """
 
     occupied: Bool
@@ -60,7 +60,7 @@ class Hull:
         return out
 
     def centres(self, where: Bool) -> F64:
-        """(N, 3) centres of the voxels where a (X, Y, Z) mask holds."""
+        """(N, 3) centres of the voxels where a mask (X, Y, Z) is True."""
         out: F64 = self.lo + (np.argwhere(where) + 0.5) * self.cell
         return out
 
@@ -80,13 +80,13 @@ def visual_hull(
     """Carve the box [lo, hi] with silhouettes.
 
     Args:
-        cameras, alphas: the voting views; an alpha (H, W) may have any size, it spans the camera's whole frame.
+        cameras, alphas: the views; an alpha (H, W) covers the camera's whole frame at any resolution.
         lo, hi: (3,) corners, asset units; the grid covers at least the box.
         cell: voxel edge, asset units.
         min_views: voxels that fewer views see are empty.
-        max_outside: how many views may call a voxel background before it is carved (0: the plain hull).
-        outside_share: nor may more than this share of the views that see it, so that corners of space in which few
-            views meet are not kept by lenience.
+        max_outside: a voxel is carved if more views than this show it as background (0: the exact hull).
+        outside_share: it is also carved if more than this share of the views that see it do so; this matters where
+            only few views see a voxel.
 
     Raises:
         StageError: no views, an empty box, or too many voxels.
@@ -103,7 +103,7 @@ def visual_hull(
     while True:
         index = np.argwhere(open_)
         points = lo + (index + 0.5) * (cell * factor)
-        # 1.2: depth varies inside a coarse cell and lenses stretch, so the Lipschitz constant is a little above 1
+        # 1.2: depth varies inside a coarse cell and lenses distort, so the Lipschitz constant is a little above 1
         reach = 0.0 if factor == 1 else 1.2 * np.sqrt(3) / 2 * cell * factor
         found, count, settled = _consult(views, points, reach, band, (min_views, max_outside, outside_share))
         at = tuple(index.T)
@@ -155,7 +155,8 @@ def _doubled(array: npt.NDArray[S], shape: tuple[int, ...]) -> npt.NDArray[S]:
 def _consult(
     views: list[Silhouette], points: F64, reach: float, band: float, rule: tuple[int, int, float]
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
-    """Level (N,) clamped to the band, views that saw it (N,), and whether it holds for everything within `reach`."""
+    """Level (N,) clamped to the band, number of views that see the point (N,), and whether the sign of the level holds
+    for everything within `reach` (N,)."""
     parts = [_consult_chunk(views, points[i : i + CHUNK], reach, band, rule) for i in range(0, len(points), CHUNK)]
     if not parts:
         return np.zeros(0, np.float32), np.zeros(0, np.int16), np.zeros(0, bool)
@@ -168,7 +169,7 @@ def _consult_chunk(
 ) -> tuple[F32, npt.NDArray[np.int16], Bool]:
     min_views, max_outside, share = rule
     n, far = len(points), reach + band
-    # largest levels first, over the views that see the whole neighbourhood and over those that may see some of it
+    # largest levels first, over the views that see the whole neighbourhood, and over those that may see a part of it
     sure = np.full((max_outside + 1, n), -np.inf, np.float32)
     maybe = sure.copy() if reach else sure
     seen, glimpsed = np.zeros(n, np.int16), np.zeros(n, np.int16)
@@ -180,7 +181,7 @@ def _consult_chunk(
         _insert(sure, live, np.where(whole, value, -np.inf))
         if reach:
             _insert(maybe, live, np.where(part, value, -np.inf))
-        if i % 4 == 3:  # carved for good: no other view can bring it back
+        if i % 4 == 3:  # already carved: no other view can change that
             live = live[sure[-1, live] <= far]
     lenient, column = np.minimum(max_outside, (share * seen).astype(np.intp)), np.arange(n)
     level = sure[lenient, column]
@@ -192,7 +193,7 @@ def _consult_chunk(
 
 
 def _insert(top: F32, at: npt.NDArray[np.intp], value: npt.NDArray[np.floating]) -> None:
-    """Keep rows of `top` sorted downwards while `value` goes in and the smallest falls out."""
+    """Insert `value` into rows of `top`, which are sorted in descending order, and drop the smallest."""
     value = value.astype(np.float32)
     for row in top:
         old = row[at]
@@ -200,7 +201,7 @@ def _insert(top: F32, at: npt.NDArray[np.intp], value: npt.NDArray[np.floating])
         value = np.minimum(old, value)
 
 
-# ------------------------------------------------------------------ what is done with a hull
+# ------------------------------------------------------------------ functions of a hull
 def hull_bounds(
     cameras: Sequence[Camera],
     alphas: Sequence[F32],
@@ -212,13 +213,13 @@ def hull_bounds(
     max_outside: int = 0,
     keep: Callable[[Hull], Hull] = lambda hull: hull,
 ) -> tuple[F64, F64]:
-    """(3,) lower and upper corner of the subject in the cube of half-edge 1.6 * roi_radius. keep: the part of the hull
-    that counts (pipeline.extent).
+    """(3,) lower and upper corner of the subject's bounding box in the cube of half-edge 1.6 * roi_radius. keep:
+    selects the part of the hull that counts (pipeline.extent).
 
     `margin` is added on every side, as a fraction of the longest edge; the box stays inside the cube.
 
     Raises:
-        StageError: nothing is left of the subject.
+        StageError: the visual hull is empty.
     """
     edge = 1.6 * roi_radius
     whole = visual_hull(
@@ -228,10 +229,10 @@ def hull_bounds(
     body = subject_pieces(hull.occupied, hull.lo + 0.5 * hull.cell, hull.cell)
     if not body.any():
         raise StageError(
-            "no part of space is inside all silhouettes",
+            "the visual hull is empty: no part of space is inside all masks",
             where="visual hull",
             value="empty",
-            limit=f"a body that at least {min_views} views see",
+            limit=f"a solid that at least {min_views} views see",
             remedy="check the masks (is the subject white?), the poses, and the region of interest",
         )
     index = np.argwhere(body)
@@ -243,9 +244,9 @@ def hull_bounds(
 def hull_sdf(hull: Hull) -> F32:
     """(X, Y, Z) signed distance at voxel centres, asset units, negative inside.
 
-    The distance to where the surface crosses the nearest voxel that it crosses; near the surface `level` where it is
-    smaller, because it knows the surface between those points. An empty hull is positive everywhere (the grid's
-    diagonal), a full one negative.
+    It is the distance to the surface point in the nearest voxel that the surface crosses. Near the surface it is
+    `level` where that is smaller, because it is also exact between those points. An empty hull is positive everywhere
+    (the grid's diagonal), a full one negative.
     """
     inside = hull.level <= 0
     diagonal = float(np.linalg.norm(hull.hi - hull.lo))
@@ -275,7 +276,7 @@ def _mean_crossings(hull: Hull) -> F64:
 
 
 def surface_points(hull: Hull) -> F64:
-    """(N, 3) points on the hull's surface: where `level` changes sign between neighbouring voxels, interpolated."""
+    """(N, 3) points on the hull's surface: interpolated sign changes of `level` between neighbouring voxels."""
     found = []
     for axis in range(3):
         a = np.moveaxis(hull.level, axis, 0)
@@ -292,8 +293,8 @@ def surface_points(hull: Hull) -> F64:
 def render_silhouette(hull: Hull, camera: Camera, height: int, width: int) -> F32:
     """(height, width) soft silhouette in [0, 1] of the hull in the camera's whole frame, distortion included.
 
-    Points on the surface and inside voxels are projected and the gaps between them closed. A closing leaves the
-    outermost points where they are, so the outline is right to about a tenth of a voxel's footprint.
+    Points on the surface and inside voxels are projected, and gaps between them are filled by a morphological closing.
+    It does not move the outermost points, so the outline is accurate to about a tenth of a voxel's footprint.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Reading and writing pictures. Arrays are RGB(A), row 0 on top; each function says what is linear."""
+"""Reading and writing pictures. Arrays are RGB(A), row 0 on top; each docstring states whether values are linear."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from pipeline.errors import StageError
 from pipeline.picture_size import declared_size_of
 
 F32 = npt.NDArray[np.float32]
-SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps stay equal bytes
-ROWS_TEXELS = 1 << 20  # converted at once
-WRITERS = 8  # threads that compress an EXR, at most; its bytes do not depend on them
+SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps have equal bytes
+ROWS_TEXELS = 1 << 20  # texels converted at once
+WRITERS = 8  # largest number of threads that compress an EXR; its bytes do not depend on it
 MAX_BYTES = 1 << 32  # that many pixels of RGBA in 32-bit floats, uncompressed
 SMALL, DENSEST = 1 << 22, 10_000  # pixels; per byte: a white PNG of one bit a pixel has 8,000
 KINDS = (np.uint8, np.uint16, np.float32, np.float64)
 MARKS = (b"\x89PNG", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"RIFF", b"#?")  # RIFF: WebP is 16383 wide
-MAX_PIXELS = 1 << 28  # the largest map, larger than any camera's frame: beyond it a file is a mistake or a bomb
+MAX_PIXELS = 1 << 28  # the largest map; no camera has more. A larger file is a mistake or a decompression bomb
 
 
 def read_encoded(path: Path) -> npt.NDArray[Any]:
-    """(H, W, C) as stored, RGB order. Raises StageError if the file is empty, corrupt or absurdly large."""
+    """(H, W, C) values as stored, RGB order. Raises StageError if the file is empty, corrupt or far too large."""
     size = path.stat().st_size if path.is_file() else 0
     refuse_bombs(path, size)
     image = _decoded(path) if size else None
@@ -37,7 +37,7 @@ def read_encoded(path: Path) -> npt.NDArray[Any]:
             where=path.name,
             value=f"{size} bytes, not a readable image",
             limit="a complete JPEG, PNG, TIFF or EXR file",
-            remedy="copy the file again from the camera, or take it out of the folder",
+            remedy="copy the file again from the camera, or remove it from the folder",
         )
     if image.shape[0] * image.shape[1] > MAX_PIXELS:
         raise _too_large(path, f"{image.shape[1]} x {image.shape[0]}")
@@ -46,17 +46,18 @@ def read_encoded(path: Path) -> npt.NDArray[Any]:
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}.get(image.shape[2])
     if order is None or image.dtype not in KINDS:
         raise StageError(
-            "the image's pixels are of a kind that is not read",
+            "the image's pixel format is not supported",
             where=path.name,
             value=f"{image.shape[2]} channels of {image.dtype}",
-            limit="1, 3 or 4 channels of 8 or 16 bits without sign, or of floats",
+            limit="1, 3 or 4 channels of 8- or 16-bit unsigned integers, or of floats",
             remedy="export the image again as 8- or 16-bit RGB",
         )
     return np.ascontiguousarray(image[..., order])
 
 
 def refuse_bombs(path: Path, size: int) -> None:
-    """A header that declares more than any camera has, or a file larger than any photo: nothing is decoded."""
+    """Raise StageError if a header declares more pixels than any camera has, or if a file is larger than any photo.
+    Nothing is decoded."""
     if size > MAX_BYTES:
         raise _too_large(path, f"{size / 1e9:.1f} GB")
     if size:
@@ -68,8 +69,8 @@ def refuse_bombs(path: Path, size: int) -> None:
                 "the image declares more pixels than its file can hold",
                 where=path.name,
                 value=f"{declared[0]} x {declared[1]} in {size} bytes",
-                limit=f"{DENSEST} pixels in a byte",
-                remedy="copy the file again from the camera, or take it out of the folder",
+                limit=f"{DENSEST} pixels per byte",
+                remedy="copy the file again from the camera, or remove it from the folder",
             )
 
 
@@ -79,15 +80,15 @@ def _too_large(path: Path, value: str) -> StageError:
         where=path.name,
         value=value,
         limit=f"{MAX_PIXELS / 1e6:.0f} megapixels, {MAX_BYTES / 1e9:.0f} GB",
-        remedy="scale it down",
+        remedy="reduce its resolution",
     )
 
 
 def _decoded(path: Path) -> npt.NDArray[Any] | None:
-    """(H, W) or (H, W, C) in OpenCV's order, or None. Its wheel is built without OpenEXR: those are read here."""
+    """(H, W) or (H, W, C) in OpenCV's channel order, or None. OpenCV's wheel can't read EXR: OpenEXR does it here."""
     if path.suffix.lower() != ".exr":
         data = np.fromfile(path, np.uint8)
-        if not bytes(data[:4]).startswith(MARKS):  # OpenCV knows more formats, whose sizes nobody checked
+        if not bytes(data[:4]).startswith(MARKS):  # OpenCV supports more formats, but their size was not checked
             return None
         try:
             return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -123,7 +124,7 @@ def read_alpha(path: Path) -> F32:
 
 
 def write_png(path: Path, image: npt.NDArray[Any], bits: int = 8, *, signed: bool = False) -> None:
-    """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] as they are (no transfer curve).
+    """Write (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) values in [0, 1] without a transfer curve.
 
     signed: values in [-1, 1], stored as v / 2 + 1 / 2.
     """
@@ -139,7 +140,7 @@ def write_png_from_linear(path: Path, image: F32) -> None:
 def _whole(
     image: npt.NDArray[Any], bits: int, shown: Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 ) -> npt.NDArray[Any]:
-    """Integers in OpenCV's order of channels, some rows at a time: a large map must not be held twice."""
+    """Integers in OpenCV's channel order, converted some rows at a time, so that a large map is not in memory twice."""
     data = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
     peak, kind = (255, np.uint8) if bits == 8 else (65535, np.uint16)
     order = [2, 1, 0, 3][: data.shape[2]] if data.ndim == 3 else None
@@ -171,7 +172,7 @@ def write_exr(
 ) -> None:
     """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ...
 
-    primaries: recorded in pictures with channels R, G, B; None where these are no colour (normals). units: recorded if
+    primaries: recorded in pictures with channels R, G, B; None if they are not a colour (normals). units: recorded if
     given ("mm").
     """
     import OpenEXR
@@ -198,7 +199,7 @@ def write_exr(
     try:
         OpenEXR.File(header, planes).write(str(path))
     finally:
-        OpenEXR.set_global_thread_count(0)  # a process that forks must not find a pool whose threads are gone
+        OpenEXR.set_global_thread_count(0)  # after a fork, the threads of a pool would be missing
 
 
 def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:
@@ -223,5 +224,5 @@ def shrink(image: F32, factor: int) -> F32:
 
 
 def shrink_whole(image: F32, factor: int) -> F32:
-    """The same without the last columns and rows that fill no block."""
+    """As `shrink`, without the last columns and rows that do not fill a block."""
     return shrink(image[: image.shape[0] // factor * factor, : image.shape[1] // factor * factor], factor)

@@ -1,4 +1,4 @@
-"""The least cut of a graph: its nodes parted in two so that what is cut, and what is decided against, costs least."""
+"""The minimum cut of a graph: divides the nodes into two sides at the least total cost of edges and nodes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-ENDLESS = 2**30  # a pull that no cut outweighs
+ENDLESS = 2**30  # a pull that is larger than any cut
 
 
 def least_cut(a: I64, b: I64, cost: I32, pull: I32) -> Bool:
-    """(N,) which nodes are on the first side.
+    """(N,) mask of the nodes on the first side.
 
-    a, b: (E,) nodes of an edge; cost: (E,) >= 0 of cutting it. pull: (N,) cost of having a node on the second side
-    where positive, on the first where negative. Nodes that cost the same on both sides are on the second.
+    a, b: (E,) nodes of an edge; cost: (E,) >= 0 of cutting it. pull: (N,) cost of a node on the second side if
+    positive, on the first side if negative. Nodes with equal cost on both sides are on the second.
 
-    Source: Ford and Fulkerson 1956, the flow by SciPy. Costs in sum above 2^31 overflow: keep them below.
+    Source: Ford and Fulkerson 1956; the maximum flow is computed by SciPy. The sum of the costs must stay below 2^31.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, maximum_flow

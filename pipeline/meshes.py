@@ -1,7 +1,7 @@
-"""Triangle meshes as plain arrays: files, normals and the checks that say whether a mesh is a closed surface.
+"""Triangle meshes as plain arrays: files, normals and checks of the topology.
 
 Symbols: V vertices (V, 3), F faces (F, 3) vertex indices, counter-clockwise seen from outside. Lengths are in the
-caller's unit. Nothing here changes a mesh; that is the work of the stages.
+caller's unit.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Charts:
 
 @dataclass(frozen=True, slots=True)
 class Topology:
-    """How a mesh hangs together. `watertight`: every edge has two faces that run along it in opposite directions."""
+    """Topology of a mesh. `watertight`: every edge has two faces, which use it in opposite directions."""
 
     watertight: bool
     boundary_edges: int
@@ -80,7 +80,7 @@ def load_charts(path: Path) -> Charts:
 
 
 def area_vectors(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
-    """(F, 3): along each face's normal, as long as its area."""
+    """(F, 3) vectors along each face's normal, with its area as length."""
     a, b, c = np.asarray(vertices, np.float64)[faces].transpose(1, 0, 2)
     out: F64 = 0.5 * np.cross(b - a, c - a)
     return out
@@ -93,7 +93,7 @@ def areas(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
 
 
 def volume(vertices: npt.NDArray[np.floating], faces: Faces) -> float:
-    """Signed volume of a closed mesh: positive when its faces look outward."""
+    """Signed volume of a closed mesh: positive if its faces point outward."""
     a = np.asarray(vertices, np.float64)[faces[:, 0]]
     return float((a * area_vectors(vertices, faces)).sum() / 3)
 
@@ -106,7 +106,7 @@ def vertex_normals(vertices: npt.NDArray[np.floating], faces: Faces) -> F32:
 
 
 def unit(v: npt.NDArray[np.floating]) -> F64:
-    """(N, 3) vectors at length one; zero vectors become +y, because a normal must have a direction."""
+    """(N, 3) vectors normalised; zero vectors become +y, because a normal needs a direction."""
     w = np.asarray(v, np.float64)
     length = np.linalg.norm(w, axis=1)
     out: F64 = np.where((length > 1e-30)[:, None], w / np.maximum(length, 1e-30)[:, None], [0.0, 1.0, 0.0])
@@ -120,8 +120,8 @@ def edges(faces: Faces) -> Indices:
 
 
 def paired_edges(faces: Faces, count: int) -> tuple[Indices, Indices, int]:
-    """Rows (P,), (P,) of `edges`: the two sides of each edge that two faces share, ordered by the edge's lower and then
-    higher vertex. And the most faces at one edge. Row r is of face r % F. `count`: vertices."""
+    """Rows (P,), (P,) of `edges`: the two sides of each edge that two faces share, sorted by the edge's lower, then its
+    higher vertex; and the largest number of faces at one edge. Row r belongs to face r % F. `count`: vertices."""
     e = edges(faces)
     code = np.minimum(e[:, 0], e[:, 1]) * count + np.maximum(e[:, 0], e[:, 1])
     order = np.argsort(code, kind="stable")
@@ -140,7 +140,7 @@ def edge_lengths(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
 
 
 def component_of_face(faces: Faces, count: int) -> Indices:
-    """(F,) label of each face's component; faces belong together when they share a vertex. `count`: vertices."""
+    """(F,) connected component of each face; faces are connected if they share a vertex. `count`: vertices."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -151,7 +151,7 @@ def component_of_face(faces: Faces, count: int) -> Indices:
 
 
 def topology(faces: Faces, count: int) -> Topology:
-    """Check a mesh of `count` vertices. Empty meshes are neither watertight nor manifold."""
+    """The topology of a mesh with `count` vertices. Empty meshes are neither watertight nor manifold."""
     if len(faces) == 0:
         return Topology(False, 0, 0, 0, 0, 0)
     e = edges(faces)
@@ -176,7 +176,7 @@ def topology(faces: Faces, count: int) -> Topology:
 def _pinched(faces: Faces, count: int, order: Indices, same: Mask) -> Indices:
     """Vertices whose faces form more than one fan (two cones that touch at their tips).
 
-    Corners of faces are joined across shared edges; a vertex with one fan has all its corners in one group.
+    Corners of faces are joined across shared edges; all corners of a vertex with one fan are then in one group.
     order: of `edges`, so that equal undirected edges are neighbours; same: (3 F - 1,) whether the next one is equal.
     """
     from scipy.sparse import coo_array
@@ -200,17 +200,17 @@ def _pinched(faces: Faces, count: int, order: Indices, same: Mask) -> Indices:
 
 
 def compact(vertices: npt.NDArray[np.floating], faces: Faces) -> tuple[npt.NDArray[np.floating], Faces, Indices]:
-    """Drop vertices that no face uses. Returns vertices, faces and (V',) which old vertex each new one was."""
+    """Drop vertices that no face uses. Returns vertices (V', 3), faces (F, 3) and old indices (V',) of the vertices."""
     used = np.bincount(faces.ravel(), minlength=len(vertices)) > 0
     new = np.cumsum(used) - 1
     return vertices[used], new[faces].astype(np.int32), np.flatnonzero(used)
 
 
 def split_apart(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
-    """Sheets that touch along a crowded edge or in a point, each with vertices of its own there.
+    """Split sheets that touch at an edge with more than two faces or in a point; each gets vertices of its own there.
 
-    Collapsing edges pinches thin handles until two sheets share an edge. Corners of faces stay one vertex where they
-    are neighbours across an edge of two faces; elsewhere they become several at the same place.
+    Collapsing edges pinches thin handles until two sheets share an edge. Corners of faces keep a common vertex if they
+    are neighbours across an edge of two faces; else they become several vertices at the same position.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -1,4 +1,4 @@
-"""The one place that uses pymeshlab (GPL-3): its filters on a mesh of ours. All else works without it."""
+"""The only module that uses pymeshlab (GPL-3): it runs its filters on a mesh. All other modules work without it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces
 
-Filters = Callable[[Any, Any], None]  # of the library and the MeshSet that is worked on
+Filters = Callable[[Any, Any], None]  # arguments: the library, and the MeshSet to change
 
 
 def filtered(vertices: F64, faces: Faces, filters: Filters, refused: Callable[[str], StageError]) -> tuple[F64, Faces]:
-    """Vertices (V', 3) and faces (F', 3) after the filters. refused: the error to raise, from what went wrong: the
-    library is missing, or a filter can't take the mesh."""
+    """Vertices (V', 3) and faces (F', 3) after the filters. refused: returns the error to raise, given the reason: the
+    library is missing, or a filter failed."""
     try:
         import pymeshlab
     except ImportError as e:

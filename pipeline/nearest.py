@@ -1,4 +1,4 @@
-"""Cells of a grid without a value take that of the nearest cell with one."""
+"""Fills cells of a grid without a value with that of the nearest cell with one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Indices = npt.NDArray[np.int64]
 
 
 def nearest_known(known: npt.NDArray[np.bool_]) -> Indices:
-    """An array like `known`, of any dimension: flat index of the nearest known cell, its own where known.
+    """Flat index of the nearest known cell, in the shape of `known` (any dimension); a known cell's own index.
 
     At least one cell must be known.
     """
@@ -20,6 +20,6 @@ def nearest_known(known: npt.NDArray[np.bool_]) -> Indices:
 
 
 def filled(values: npt.NDArray[np.float32], known: npt.NDArray[np.bool_]) -> npt.NDArray[np.float32]:
-    """values (*known.shape, ...) with unknown cells filled."""
+    """values (*known.shape, ...) with the unknown cells filled."""
     flat = values.reshape(known.size, *values.shape[known.ndim :])
     return np.asarray(flat[nearest_known(known)], np.float32)

@@ -1,8 +1,8 @@
-"""OpenCV's networks for code that runs in several threads.
+"""OpenCV's networks in several threads.
 
-A network holds the buffers of its last run, so each thread has its own. They are read one at a time: of 60 processes in
-which eight threads read at once one died (OpenCV 5.0.0), and a run was ended by an importer that did not know its
-operators yet ("Unsupported operator type RELU").
+A network contains the buffers of its last run, so each thread has its own. Only one is read at a time: in one of 60
+processes, eight threads that read at once caused a crash (OpenCV 5.0.0), and one run failed because the importer had
+not registered its operators ("Unsupported operator type RELU").
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _reading = threading.Lock()
 
 
 def network(path: Path, read: Callable[[str], Any]) -> Any:
-    """This thread's network of a file, read by `read` (cv2.dnn.readNet...) when it is asked for first."""
+    """This thread's network of a file. On first use it is read by `read` (cv2.dnn.readNet...)."""
     nets: dict[Path, Any] = _local.__dict__.setdefault("nets", {})
     if path not in nets:
         with _reading:

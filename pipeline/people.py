@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pipeline.artifacts import MaskSet
 
-FACES = 3  # photos with a face from which the subject is a person: one alone may be a mistake
+FACES = 3  # number of photos with a face from which the subject is a person: a single one may be a false detection
 
 
 def shows_person(masks: MaskSet) -> bool:

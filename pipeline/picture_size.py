@@ -1,7 +1,7 @@
-"""How large a picture says it is, from its header alone: a bomb is refused before anything is decoded.
+"""The size of a picture from its header, so that a decompression bomb is rejected before it is decoded.
 
-A file of a few kilobytes can declare a picture that fills the memory. Only headers are read here, and no length in
-them is trusted beyond the bytes that are there. Sources: PNG (ISO 15948), JPEG (T.81), TIFF 6.0, OpenEXR file layout.
+A file of a few kilobytes can declare a picture that fills the memory. Only headers are read here, and lengths in them
+are compared with the size of the file. Sources: PNG (ISO 15948), JPEG (T.81), TIFF 6.0, OpenEXR file layout.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MAX_TAGS, _HEAD = 1000, 65_536
 
 
 def declared_size(data: Data) -> tuple[int, int] | None:
-    """(width, height) as the header of a PNG, JPEG, TIFF, EXR or Radiance file has it; None if none is found."""
+    """(width, height) in the header of a PNG, JPEG, TIFF, EXR or Radiance file; None if it is not found."""
     try:
         if data[:8] == b"\x89PNG\r\n\x1a\n":
             return struct.unpack_from(">II", data, 16)
@@ -33,13 +33,13 @@ def declared_size(data: Data) -> tuple[int, int] | None:
             return _exr(data)
         if data[:2] == b"#?":
             return _radiance(data)
-    except (struct.error, ValueError, IndexError):  # the header ends before it should: the decoder will say so
+    except (struct.error, ValueError, IndexError):  # the header is truncated: the decoder will report it
         return None
     return None
 
 
 def declared_size_of(path: Path) -> tuple[int, int] | None:
-    """`declared_size` of a file, of which no more than the header is read; None of an empty one."""
+    """`declared_size` of a file, of which only the header is read; None for an empty file."""
     if not path.stat().st_size:
         return None
     with path.open("rb") as f, mmap(f.fileno(), 0, access=ACCESS_READ) as data:
@@ -89,7 +89,7 @@ def _big_tiff(data: Data, order: str) -> tuple[int, int] | None:
 
 
 def _radiance(data: Data) -> tuple[int, int] | None:
-    """Lines of text up to an empty one, then the size."""
+    """Size in a Radiance header: lines of text up to an empty one, then the size."""
     size = re.search(rb"\n\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n", data[:_HEAD])
     return (int(size[2]), int(size[1])) if size else None
 

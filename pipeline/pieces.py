@@ -1,8 +1,8 @@
-"""Which pieces of a volume belong to the subject: what the cameras look at, and not simply what is largest.
+"""Selects the connected components of a volume that belong to the subject: those that the cameras look at.
 
-A shirt that only a few cameras see may reach to the edge of the volume and hold more voxels than the head. So a voxel
-counts the less the farther it lies from the origin of asset coordinates, where the views meet. All pieces that count
-for something are kept: one wrong mask may cut a body in two, and the photos can still join what is kept.
+A shirt in only a few photos may reach the edge of the volume and have more voxels than the head. So the weight of a
+voxel falls with its distance from the origin of asset coordinates, where the views meet. All components with enough
+weight are kept: one wrong mask may split the subject, and the fit can still join the parts.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import numpy.typing as npt
 from scipy import ndimage
 
 Bool = npt.NDArray[np.bool_]
-MIN_WEIGHT = 0.3  # of the weight of the chief piece: lighter pieces are dropped
-SPREAD = 0.25  # of the volume's longest side: the distance from the origin at which a voxel counts an eighth
+MIN_WEIGHT = 0.3  # of the weight of the heaviest component: lighter ones are dropped
+SPREAD = 0.25  # of the volume's longest side: distance from the origin at which a voxel's weight is an eighth
 
 
 def subject_pieces(inside: Bool, lo: npt.ArrayLike, cell: float, least: float = MIN_WEIGHT) -> Bool:
-    """(X, Y, Z) the 6-connected pieces of a volume that belong to the subject; an empty volume stays empty.
+    """(X, Y, Z) the 6-connected components of a volume that belong to the subject; an empty volume stays empty.
 
     Args:
-        inside: (X, Y, Z); the node [i, j, k] lies at lo + cell * (i, j, k).
+        inside: (X, Y, Z); the node [i, j, k] is at lo + cell * (i, j, k).
         lo: (3,) asset units. cell: edge of a voxel, asset units.
-        least: pieces with less than this share of the chief piece's weight are dropped. A voxel at distance d from the
-            origin weighs (1 + (d / s)^2)^-3, s being SPREAD times the volume's longest side.
+        least: components with less than this share of the heaviest component's weight are dropped. The weight of a
+            voxel at distance d from the origin is (1 + (d / s)^2)^-3, s = SPREAD times the volume's longest side.
     """
     label, count = ndimage.label(inside)
     if count <= 1:
@@ -39,7 +39,7 @@ def subject_pieces(inside: Bool, lo: npt.ArrayLike, cell: float, least: float = 
 
 
 def filled(solid: Bool) -> Bool:
-    """A volume without its cavities: empty space that does not reach the border of the grid becomes solid."""
+    """A volume (X, Y, Z) with filled cavities: empty space not connected to the border of the grid becomes solid."""
     empty, _ = ndimage.label(~solid)
     sides = [np.take(empty, end, axis).ravel() for axis in range(3) for end in (0, -1)]
     border = np.unique(np.concatenate(sides))

@@ -1,11 +1,11 @@
-"""Which texel of a texture belongs to which triangle.
+"""Rasteriser: assigns the texels of a texture to triangles.
 
 Symbols
     size    texels along each side of the square texture
     x, y    texel coordinates: x = u size, y = (1 - v) size; a texel's centre is at +0.5, row 0 on top
     d       distance (texels) from a texel's centre to the triangle, 0 inside
 
-The loops over triangles are compiled (raster_kernels); a band of rows bounds the memory.
+The loops over triangles are compiled (raster_kernels). Work on bands of rows limits the memory.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Texels and the triangle nearest to each: texel (N,) = row * size + column, ascending and unique; face (N,);
-    weights (N, 3) barycentric of the triangle's point nearest to the texel's centre; distance (N,) texels."""
+    """Texels and the nearest triangle of each: texel (N,) = row * size + column, ascending and unique; face (N,);
+    weights (N, 3) barycentric, of the triangle's point nearest to the texel's centre; distance (N,) texels."""
 
     texel: Indices
     face: Indices
@@ -39,22 +39,22 @@ def texel_corners(charts: Charts, size: int) -> F64:
 
 
 def in_texels(uv: F64, size: int) -> F64:
-    """(..., 2) texture coordinates in texels."""
+    """(..., 2) texture coordinates (..., 2) converted to texels."""
     return np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], -1)
 
 
 def doubled_areas(corners: F64) -> F64:
-    """(F,) twice the signed area, positive where the triangle turns the same way as from x to y."""
+    """(F,) twice the signed area of triangles (F, 3, 2), positive for an orientation from x to y."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     out: F64 = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     return out
 
 
 def rasterise(corners: F64, size: int, first: int, last: int, reach: float = 0.75) -> Hits:
-    """Texels of rows first..last-1 whose centre is at most `reach` texels from a triangle.
+    """Texels of rows first..last-1 whose centre is at most `reach` texels from a triangle of corners (F, 3, 2).
 
-    With a reach of 0.71 or more every texel that a chart touches is among them. Where triangles compete, the nearest
-    wins, then the one with the lower index.
+    A reach of 0.71 or more includes every texel that a chart touches. Of several triangles the nearest is taken, then
+    the one with the lower index.
     """
     from pipeline import raster_kernels
 
@@ -70,9 +70,9 @@ def rasterise(corners: F64, size: int, first: int, last: int, reach: float = 0.7
 
 
 def layers(corners: F64, size: int, margin: float = 1e-3) -> npt.NDArray[np.uint8]:
-    """(size, size) how many triangles hold each texel's centre, those nearer than `margin` texels to it left out.
+    """(size, size) number of triangles (F, 3, 2) that contain each texel's centre, at least `margin` texels inside.
 
-    A texel with two of them lies under two places of the surface.
+    A texel with two of them belongs to two places on the surface.
     """
     from pipeline import raster_kernels
 

@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-STRIPE = 8  # rows that one thread works off
+STRIPE = 8  # rows per task of a thread
 
 
 @njit(error_model="numpy", cache=True)
 def _nearest(px, py, corner, inverse, weights):
-    """Distance of a point to a triangle (3, 2), 0 inside; writes the weights of the triangle's nearest point."""
+    """Distance of a point to a triangle (3, 2), 0 inside. Writes the barycentric weights of the nearest point."""
     inside = inverse != 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -44,7 +44,7 @@ def _nearest(px, py, corner, inverse, weights):
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def nearest_triangles(corners, candidates, size, first, last, reach, distance, face, weights):
-    """For every texel of rows first..last-1 the nearest triangle within `reach`, the first of those equally near.
+    """For every texel of rows first..last-1 find the nearest triangle within `reach`; of equals, the first one.
 
     corners (F, 3, 2) texels; candidates (T,) ascending. Writes distance (R, size), inf where there is none; face
     (R, size); weights (R, size, 3).

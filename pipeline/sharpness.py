@@ -1,4 +1,4 @@
-"""How sharp a photo is, by a figure that photos of one capture can be compared with."""
+"""Sharpness of a photo, comparable between photos of one capture."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy.typing as npt
 
 
 def detail(grey: npt.NDArray[np.uint8]) -> float:
-    """Energy of the finest structures against that of ones a few times coarser: what a blur takes away.
+    """Energy of the finest structures over that of a few times coarser ones, in a grey photo (H, W). Blur lowers it.
 
-    E[(I - G1 I)^2] / E[(G1 I - G4 I)^2], G a Gaussian of so many pixels; the ratio does not depend on contrast, and
-    little on how much of the frame is plain.
+    E[(I - G1 I)^2] / E[(G1 I - G4 I)^2], Gn a Gaussian of n pixels. The ratio does not depend on contrast, and hardly
+    on the share of uniform areas.
     """
     image = grey.astype(np.float32)
     fine, coarse = (np.asarray(cv2.GaussianBlur(image, (0, 0), s), np.float32) for s in (1.0, 4.0))

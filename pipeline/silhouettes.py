@@ -1,6 +1,6 @@
-"""Silhouettes as signed distances: how far a point in space lies outside what one view shows of the subject.
+"""Silhouettes as signed distances: how far a point in space is outside the silhouette of one view.
 
-A pixel belongs to the subject where alpha >= 0.5; the contour is placed to a fraction of a pixel by the soft alpha.
+A pixel belongs to the subject where alpha >= 0.5; the soft alpha gives the contour to a fraction of a pixel.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ Bool = npt.NDArray[np.bool_]
 
 BLUR = 0.7  # pixels, against the staircase of hard masks
 SPREAD = float(np.sqrt(BLUR**2 + 1 / 12))  # of an edge seen through the blur and a pixel's square
-NEAR = 1.2  # pixels from the contour up to which the blurred alpha tells the distance
+NEAR = 1.2  # pixels from the contour up to which the distance is computed from the blurred alpha
 
 
 @dataclass(frozen=True, slots=True)
 class Silhouette:
-    """A view made ready for lookups. distance: (h, w) signed pixels of the photo, on a grid of size / (sx, sy)."""
+    """A view prepared for lookups. distance: (h, w) signed, in pixels of the photo, on a grid of size / (sx, sy)."""
 
     K: F64
     cam_from_world: F64
@@ -38,7 +38,8 @@ class Silhouette:
 
 
 def silhouette(camera: Camera, alpha: F32, about: F64, cell: float) -> Silhouette:
-    """Signed distances of one view, on a grid no finer than the voxels can use (a third of their footprint)."""
+    """Signed distances of one view, on a grid no finer than needed (a third of a voxel's footprint). alpha (H, W);
+    about (3,): where the footprint is measured; cell: edge of a voxel."""
     import cv2
 
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
@@ -65,7 +66,7 @@ def silhouette(camera: Camera, alpha: F32, about: F64, cell: float) -> Silhouett
 
 
 def lens_radius(camera: Camera) -> float:
-    """Radius on the z = 1 plane that holds the whole frame, with a little room."""
+    """Radius on the z = 1 plane that includes the whole frame, with a small margin."""
     K, w, h = matrix(camera.K), camera.width, camera.height
     edge = np.array([(x, y) for x in (0, w / 2, w) for y in (0, h / 2, h)], np.float64)
     flat = np.asarray(np.linalg.solve(K[:2, :2], (edge - K[:2, 2]).T).T, np.float64)
@@ -76,10 +77,10 @@ def lens_radius(camera: Camera) -> float:
 def signed_pixels(alpha: F32) -> F32:
     """(H, W) distance to the subject's contour in pixels, negative inside.
 
-    Near the contour from the blurred alpha: a straight edge seen through a pixel's square (variance 1/12 across any
-    direction) and a Gaussian is close to a normal distribution's integral, whose inverse is the distance. Farther away
-    the distance to the nearest pixel on the other side, less that pixel's own. Where the blur would move a pixel to
-    the other side (thin parts) its distance is 0. Without any pixel on the other side: the image's diagonal.
+    Near the contour it is computed from the blurred alpha: a straight edge after a pixel's box filter (variance 1/12 in
+    any direction) and a Gaussian blur is close to the integral of a normal distribution; its inverse is the distance.
+    Further away it is the distance to the nearest pixel on the other side, minus that pixel's own. Where the blur would
+    move a pixel to the other side (thin parts) it is 0. If there is no pixel on the other side, it is the diagonal.
     """
     import cv2
 
@@ -95,14 +96,14 @@ def signed_pixels(alpha: F32) -> F32:
     out = np.where(inside, np.minimum(out, 0), np.maximum(out, 0)).astype(np.float32)
     beyond = np.abs(out).clip(0, 0.7)
     for side, sign in ((inside, -1), (~inside, 1)):
-        # two pixels about equally near may lie differently far behind the contour: the median mends single ones
+        # two pixels at similar distances may be at different depths behind the contour: the median removes outliers
         far = np.asarray(cv2.medianBlur(_to_other_side(beyond, ~side), 3), np.float32)
         out = np.where(side & ~near, sign * far, out)
     return out
 
 
 def _to_other_side(beyond: F32, other: Bool) -> F32:
-    """Distance (H, W) to the nearest pixel of `other`, less how far that pixel is behind the contour; >= 0."""
+    """Distance (H, W) to the nearest pixel of `other`, minus its distance behind the contour; >= 0."""
     import cv2
 
     distance, label = cv2.distanceTransformWithLabels(
@@ -114,7 +115,8 @@ def _to_other_side(beyond: F32, other: Bool) -> F32:
 
 
 def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Bool]:
-    """How far points are outside the silhouette (N,), asset units; sees all within reach?; sees any of it?"""
+    """Distance (N,) of points (N, 3) outside the silhouette, asset units; whether the view sees all within `reach`
+    (N,); whether it sees any of it (N,)."""
     uv, z = project(view.K, view.cam_from_world, view.distortion, points)
     front = z > 1e-9
     uv = np.where(front[:, None], uv, -1e9)
@@ -129,7 +131,7 @@ def outside(view: Silhouette, points: F64, reach: float) -> tuple[F32, Bool, Boo
 
 
 def _lookup(image: F32, at: F64) -> F32:
-    """Bilinear values of (H, W) at (N, 2) positions in [0, 1] across and down, clamped to the outermost pixels."""
+    """Bilinear values (N,) of (H, W) at positions (N, 2) in [0, 1] (right, down), clamped to the outermost pixels."""
     h, w = image.shape
     x = (at[:, 0] * w - 0.5).clip(0, w - 1.001)
     y = (at[:, 1] * h - 0.5).clip(0, h - 1.001)

@@ -1,10 +1,10 @@
 """Content-addressed store of finished artifacts.
 
-Layout: `<root>/<stage>/<key>/` is finished and holds `manifest.json`, the artifact's files and `run.json`;
-`<key>.partial-*` is being written; `<key>.scratch/` holds checkpoints of work under way; `.locks/<stage>-<key>` is
-held while one process works on the key; `.lineage/<stage>-<key>.json` names what it was made from, so that all that
-came from one folder of photos can be found (docs/privacy.md). Only a rename turns a partial folder into a finished
-one, so that a process killed at any moment leaves nothing that could be taken for finished.
+Layout: `<root>/<stage>/<key>/` is finished and contains `manifest.json`, the artifact's files and `run.json`;
+`<key>.partial-*` is being written; `<key>.scratch/` contains checkpoints of unfinished work; `.locks/<stage>-<key>` is
+locked while one process works on the key; `.lineage/<stage>-<key>.json` lists the inputs, so that all results of one
+folder of photos can be found (docs/privacy.md). A partial folder becomes a finished one only by a rename, so that a
+killed process never leaves an incomplete result that looks finished.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 A = TypeVar("A", bound=Artifact)
 LINEAGE = ".lineage"
 MANIFEST, RUN = "manifest.json", "run.json"
-MAX_BYTES = 1 << 28  # of a manifest: beyond it the file is something else
+MAX_BYTES = 1 << 28  # of a manifest: a larger file is not one
 MAX_SECONDS = 1e9
 LONGEST_PATH = 250  # bytes: the stages write names of a few dozen
 
@@ -40,62 +40,64 @@ class Store:
     """Finished artifacts under `root`, found by stage name and content key."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root.absolute()  # a stage joins paths below it: a relative one would be joined twice
+        self.root = root.absolute()  # stages join paths below it; a relative path would be joined twice
 
     # ---------------------------------------------------------------- where things are
     def folder(self, stage: str, key: str) -> Path:
-        """The finished artifact's folder (which may not exist yet)."""
+        """Folder of the finished artifact; it may not exist yet."""
         return self.root / stage / key
 
     def scratch(self, stage: str, key: str) -> Path:
-        """Checkpoints of unfinished work on this key."""
+        """Folder of the checkpoints of unfinished work on this key."""
         return self.root / stage / f"{key}.scratch"
 
     # ---------------------------------------------------------------- reading
     def load(self, stage: str, key: str, kind: type[A]) -> Located[A] | None:
-        """The finished artifact, or None. One that does not match its hashes is set aside and reported."""
+        """The finished artifact, or None. One that does not match its hashes is removed, with a warning."""
         folder = self.folder(stage, key)
         if not folder.is_dir():
             return None
         try:
             artifact = self.manifest(stage, key, kind)
         except (OSError, ValidationError) as e:
-            self._discard(folder, f"manifest unreadable: {e}")
+            self._discard(folder, f"the manifest can't be read: {e}")
             return None
         for ref in file_refs(artifact):
             fault = _fault(folder, ref)
             if fault:
                 self._discard(folder, fault)
                 return None
-        with contextlib.suppress(OSError):  # when it was last used, for those who clear up
+        with contextlib.suppress(OSError):  # time of last use, for the clean-up
             os.utime(folder)
         return Located(artifact, folder)
 
     def manifest(self, stage: str, key: str, kind: type[A]) -> A:
-        """What the manifest says; its files are not looked at. Raises OSError or ValidationError."""
+        """The manifest; its files are not checked. Raises OSError or ValidationError."""
         path = self.folder(stage, key) / MANIFEST
         if path.stat().st_size > MAX_BYTES:
             raise OSError(errno.EFBIG, f"more than {MAX_BYTES} bytes")
         return kind.model_validate_json(path.read_bytes())
 
     def load_run(self, stage: str, key: str) -> dict[str, object]:
-        """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is not there, or damaged."""
+        """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is missing or damaged."""
         found = _json(self.folder(stage, key) / RUN)
         seconds = found.get("seconds", 0.0)
         if isinstance(seconds, int | float) and 0 <= seconds < MAX_SECONDS:
             return found
-        log.warning("%s/%s: run.json is damaged; the times of this stage are not known", stage, key)
+        log.warning("%s/%s: run.json is damaged; the times of this stage are unknown", stage, key)
         return {}
 
     def _discard(self, folder: Path, fault: str) -> None:
-        log.warning("stored artifact %s/%s is damaged (%s); it is made anew", folder.parent.name, folder.name, fault)
+        log.warning(
+            "stored artifact %s/%s is damaged (%s) and will be computed again", folder.parent.name, folder.name, fault
+        )
         shutil.rmtree(folder)
 
     # ---------------------------------------------------------------- writing
     def trace(self, stage: str, key: str, folders: Mapping[str, Path]) -> None:
-        """Note what a key is made from: `stage/key` of other artifacts, absolute folders for the user's own files.
+        """Record the inputs of a key: `stage/key` of other artifacts, absolute folders for the user's own files.
 
-        The same photos may lie in several folders: each is kept. Call with the lock held.
+        The same photos may be in several folders; all of them are recorded. Call with the lock held.
         """
         path = self.root / LINEAGE / f"{stage}-{key}.json"
         known = lineage(path)
@@ -112,7 +114,7 @@ class Store:
 
     @contextmanager
     def lock(self, stage: str, key: str) -> Iterator[None]:
-        """Exclusive work on one key. The kernel lets go of it when the process dies, however it dies."""
+        """Lock one key. The kernel releases the lock when the process ends, however it ends."""
         folder = self.root / ".locks"
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -122,11 +124,11 @@ class Store:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
             yield
-        finally:  # the file stays: removing it would let a waiter and a newcomer hold two different locks
+        finally:  # the file is kept: else a waiting process and a new one could hold two different locks
             handle.close()
 
     def begin(self, stage: str, key: str) -> Path:
-        """An empty partial folder. Call with the lock held: leftovers of dead processes are swept here."""
+        """Create an empty partial folder. Call with the lock held: it removes partial folders of dead processes."""
         for stale in (self.root / stage).glob(f"{key}.partial-*"):
             shutil.rmtree(stale)
         partial = self.root / stage / f"{key}.partial-{uuid.uuid4().hex[:8]}"
@@ -134,14 +136,14 @@ class Store:
         return partial
 
     def forget(self, stage: str, key: str) -> None:
-        """Take out what is stored under a key, finished or not, so that it is made anew."""
+        """Delete everything stored under a key, so that it is computed again."""
         with self.lock(stage, key):
             for folder in (self.folder(stage, key), self.scratch(stage, key)):
                 if folder.is_dir():
                     shutil.rmtree(folder)
 
     def finish(self, stage: str, key: str, partial: Path, artifact: A, run: dict[str, object]) -> Located[A]:
-        """Seal a partial folder: every named file there and on disk, then one rename."""
+        """Complete a partial folder: check that all files exist, flush them to disk, rename the folder."""
         for ref in file_refs(artifact):
             fault = _fault(partial, ref)
             if fault:
@@ -158,13 +160,13 @@ class Store:
 
 
 def lineage(path: Path) -> dict[str, list[str]]:
-    """What a key was made from; empty where it is not known."""
+    """The inputs of a key; empty if unknown."""
     found = _json(path)
     return {k: v for k, v in found.items() if isinstance(v, list) and all(isinstance(x, str) for x in v)}
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file; empty where there is none."""
+    """A JSON object from a file; empty if there is none."""
     try:
         found = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES else {}
     except (OSError, ValueError, RecursionError):
@@ -173,7 +175,7 @@ def _json(path: Path) -> dict[str, Any]:
 
 
 def file_refs(model: BaseModel) -> Iterator[FileRef]:
-    """Every FileRef anywhere inside a model."""
+    """Every FileRef inside a model, at any depth."""
     if isinstance(model, FileRef):
         yield model
         return
@@ -203,7 +205,7 @@ def _fault(folder: Path, ref: FileRef) -> str | None:
 
 
 def sync(path: Path) -> None:
-    """Flush a file or folder to the disk, so that a power cut after the rename finds it whole."""
+    """Flush a file or folder to the disk, so that it is complete after a power failure."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

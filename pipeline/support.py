@@ -1,7 +1,7 @@
-"""What a subject stands on: a table or a floor among the sparse points of structure from motion.
+"""Finds the support of a subject, a table or a floor, in the sparse points of structure from motion.
 
-Symbols: points (N, 3), origin in the middle of the region of interest, R its radius; plane n . x = o with n towards the
-cameras. A support is a plane that many points lie on, with none beneath and all cameras above.
+Symbols: points (N, 3), origin at the centre of the region of interest, R its radius; plane n . x = o with n towards the
+cameras. A support is a plane with many points on it, almost none below it, and the cameras above it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from pipeline.transforms import F64
 
 TRIES = 600
-THICK, CLEAR = 0.015, 0.03  # R: a support's points lie so near it; what is higher is not it
-MIN_ON, MAX_BENEATH, MIN_ABOVE = 0.08, 0.05, 0.95  # shares: of points on it, beneath it, of cameras above it
+THICK, CLEAR = 0.015, 0.03  # R: points within THICK belong to the support; points above CLEAR do not
+MIN_ON, MAX_BENEATH, MIN_ABOVE = 0.08, 0.05, 0.95  # shares: of points on it and below it, of cameras above it
 MIN_POINTS = 200
 EVEN, ONE_SIDED = 0.25, 0.6  # spread of cameras around a floor's normal: least ratio of its axes, greatest mean
 
@@ -28,9 +28,9 @@ class Support:
 
 
 def find_support(points: F64, centres: F64, radius: float, seed: int) -> Support | None:
-    """The plane that most points lie on among those with nothing beneath and the cameras above, or None.
+    """The plane with most points on it that has almost none below and the cameras above, or None.
 
-    centres: (C, 3) of the cameras. The same seed gives the same plane.
+    points (N, 3); centres (C, 3): of the cameras. The same seed gives the same plane.
     """
     if len(points) < MIN_POINTS:
         return None
@@ -48,15 +48,16 @@ def find_support(points: F64, centres: F64, radius: float, seed: int) -> Support
         beneath = float((height < -3 * THICK * radius).mean())
         if on > most and beneath <= MAX_BENEATH and float(((centres - a) @ n > 0).mean()) >= MIN_ABOVE:
             best, most = Support(n, float(a @ n)), on
-    # a subject that is all there is has no support: its own flat side would pass for one
+    # if there are no other points, a flat side of the subject could be mistaken for a support
     above = 0 if best is None else int((points @ best.normal - best.offset > CLEAR * radius).sum())
     return best if above >= MIN_POINTS else None
 
 
 def is_level(support: Support, centres: F64) -> bool:
-    """Whether a support is a floor or a table and no wall: people walk around what stands on a table, and along a wall.
+    """Whether a support is a floor or a table and not a wall: cameras are all around a table, but on one side of a
+    wall.
 
-    Across the normal, the directions to the cameras (C, 3) must spread to all sides and cancel out.
+    In the support's plane, the directions to the cameras (C, 3) must spread to all sides and their mean be near 0.
     """
     across = centres - np.outer(centres @ support.normal, support.normal)
     length = np.linalg.norm(across, axis=1)

@@ -1,14 +1,14 @@
-"""Tangent frames of a mesh with charts: what a normal map's x and y mean.
+"""Tangent frames of a mesh with charts, which define x and y of a normal map.
 
 Symbols
     N       interpolated vertex normal, unit
     T       direction of growing u, orthogonal to N, unit
     B       s cross(N, T), direction of growing v; s = -1 in mirrored charts
 
-As MikkTSpace has it: a face's direction of growing u is projected onto the plane of each corner's normal, normalised,
+As in MikkTSpace: a face's direction of growing u is projected onto the plane of each corner's normal, normalised,
 weighted by the corner's angle and summed over the corners that share position, normal, texture coordinate and s.
-Differs: T is made orthogonal to the interpolated N and both are normalised, as real-time and path-traced shaders do,
-where MikkTSpace leaves them as interpolated.
+Differs: T is made orthogonal to the interpolated N and both are normalised, as real-time and path-traced shaders do;
+MikkTSpace uses them as interpolated.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from pipeline.meshes import F32, F64, Charts, Indices, Mesh
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """tangent (F, 3, 3) unit, one a corner; sign (F,) the chart's handedness."""
+    """tangent (F, 3, 3) unit, one per corner; sign (F,) handedness of the chart."""
 
     tangent: F32
     sign: F32
 
 
 def frames(mesh: Mesh, charts: Charts) -> Frames:
-    """Tangents at every corner. A corner without a direction (no chart area around it) gets any one."""
+    """Tangents at every corner. A corner without a direction (no texture area around it) gets an arbitrary one."""
     x = mesh.vertices.astype(np.float64)[mesh.faces]
     t = charts.uvs.astype(np.float64)[charts.faces]
     n = mesh.normals.astype(np.float64)[mesh.faces]
@@ -66,7 +66,7 @@ def at(frame: Frames, mesh: Mesh, face: Indices, weights: npt.NDArray[np.floatin
 
 
 def mixed(corners: npt.NDArray[Any], weights: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """(M, C) values of corners (M, 3, C) by barycentric weights (M, 3). Faster than a product and its sum."""
+    """(M, C) values of corners (M, 3, C), weighted by barycentric weights (M, 3). Faster than a product and sum."""
     return np.asarray(np.einsum("mic,mi->mc", corners, weights))
 
 
@@ -76,7 +76,7 @@ def dot(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _angle(x: F64, normal: F64, i: int) -> F64:
-    """(F,) angle at corner i, between the sides as seen along the corner's normal."""
+    """(F,) angle at corner i, between the sides projected along the corner's normal."""
     sides = []
     for j in (1, 2):
         side = x[:, (i + j) % 3] - x[:, i]
@@ -86,7 +86,7 @@ def _angle(x: F64, normal: F64, i: int) -> F64:
 
 
 def _any_across(n: F64) -> F64:
-    """(M, 3) some unit vectors orthogonal to n."""
+    """(M, 3) arbitrary unit vectors orthogonal to n (M, 3)."""
     axis = np.eye(3)[np.abs(n).argmin(1)] if len(n) else np.zeros((0, 3))
     return _unit(np.cross(axis, n))
 

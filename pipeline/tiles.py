@@ -1,8 +1,8 @@
-"""UDIM tiles: unit squares of texture space side by side, each with maps of its own.
+"""UDIM tiles: unit squares of texture space side by side, each with its own maps.
 
-Tile t holds the coordinates t <= u <= t + 1, 0 <= v <= 1 and is numbered 1001 + t. All tiles lie in one row, so that
-there are at most ten: 1011 lies above 1001. No chart reaches across a border. A map of several tiles is NAME.1001.exr,
-NAME.1002.exr, ..., and NAME.<UDIM>.exr where all of them are meant; of a single tile it is NAME.exr.
+Tile t has the coordinates t <= u <= t + 1, 0 <= v <= 1 and the number 1001 + t. All tiles are in one row, so there are
+at most ten: 1011 is above 1001. No chart crosses a border. A map with several tiles is NAME.1001.exr, NAME.1002.exr,
+..., and NAME.<UDIM>.exr refers to all of them; a map with a single tile is NAME.exr.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ TOKEN = "<UDIM>"
 
 
 def form(kind: str, tile: int, tiles: int) -> str:
-    """What follows "NAME." in the name of a tile's file: "exr" where there is one tile only, else "1001.exr"."""
+    """End of the name of a tile's file, after "NAME.": "exr" if there is only one tile, else "1001.exr"."""
     return kind if tiles == 1 else f"{FIRST + tile}.{kind}"
 
 
 def of_face(charts: Charts) -> Indices:
-    """(F,) the tile of each face, from the middle of its corners."""
+    """(F,) tile of each face, by the mean of its corners."""
     middle = charts.uvs.astype(np.float64)[charts.faces][..., 0].mean(1)
     return np.asarray(np.floor(middle).clip(0), np.int64)
 
 
 def count(charts: Charts) -> int:
-    """How many tiles, from the first to the last one with a face."""
+    """Number of tiles, up to the last one with a face."""
     return int(of_face(charts).max()) + 1
 
 

@@ -1,4 +1,4 @@
-"""The only place where frames and pixel conventions are converted, and where cameras project.
+"""The only module that converts frames and pixel conventions and projects through cameras.
 
 Symbols: `<to>_from_<from>` matrices act on column vectors. Cameras have OpenCV axes (x right, y down, z forward).
 Image positions `uv` are in pixels from the image's corner: the first pixel's centre is (0.5, 0.5).
@@ -59,8 +59,8 @@ def similarity(scale: float, rotation: F64, translation: F64) -> F64:
 
 
 def umeyama(source: F64, target: F64) -> F64:
-    """4x4 similarity with the least squared distance from source (N, 3) to target (N, 3) [Umeyama 1991]; of scale 0
-    where the source is one point."""
+    """4x4 similarity with the least squared distance from source (N, 3) to target (N, 3) [Umeyama 1991]; its scale is 0
+    if the source is one point."""
     a, b = source - source.mean(0), target - target.mean(0)
     u, values, vt = np.linalg.svd(b.T @ a)
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -70,20 +70,20 @@ def umeyama(source: F64, target: F64) -> F64:
 
 
 def rescale_camera(to_from_world: F64, world_from_cam: F64) -> F64:
-    """A camera's rigid pose after its world went through a similarity (scale moves the centre, not the axes)."""
+    """A camera's rigid 4x4 pose after a similarity of its world (the scale moves the centre, not the axes)."""
     scale = float(np.cbrt(np.linalg.det(to_from_world[:3, :3])))
     turned = to_from_world[:3, :3] / scale @ world_from_cam[:3, :3]
     return rigid(turned, to_from_world[:3, :3] @ world_from_cam[:3, 3] + to_from_world[:3, 3])
 
 
 def apply(m: F64, points: npt.NDArray[np.floating]) -> F64:
-    """(N, 3) points through a 4x4 affine matrix."""
+    """(N, 3) points (N, 3) transformed by a 4x4 affine matrix."""
     out: F64 = np.asarray(points, np.float64) @ m[:3, :3].T + m[:3, 3]
     return out
 
 
 def distort(xy: F64, d: F64) -> F64:
-    """(N, 2) positions on the z = 1 plane as the lens shows them."""
+    """(N, 2) positions (N, 2) on the z = 1 plane after lens distortion d."""
     k1, k2, p1, p2, k3 = d
     x, y = xy[:, 0], xy[:, 1]
     r2 = x * x + y * y
@@ -117,7 +117,7 @@ def undistort(xy: F64, d: F64) -> F64:
 
 
 def project(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np.floating]) -> tuple[F64, F64]:
-    """Image positions (N, 2) and depth_z (N,) of world points. Behind the camera (depth_z <= 0) uv is NaN."""
+    """Image positions (N, 2) and depth_z (N,) of world points (N, 3). Behind the camera (depth_z <= 0) uv is NaN."""
     p = apply(cam_from_world, points)
     z = p[:, 2]
     safe = np.where(z > 1e-9, z, np.nan)
@@ -128,7 +128,9 @@ def project(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np
 def rays(K: F64, world_from_cam: F64, distortion: F64, uv: F64) -> tuple[F64, F64]:
     """Origin (3,) and unit directions (N, 3), in the world, through image positions uv (N, 2)."""
     inverse, u, v = np.linalg.inv(K[:2, :2]), uv[:, 0] - K[0, 2], uv[:, 1] - K[1, 2]
-    x, y = (row[0] * u + row[1] * v for row in inverse)  # by columns: a product of 2 x 2 and (2, N) is slow in BLAS
+    x, y = (
+        row[0] * u + row[1] * v for row in inverse
+    )  # by columns, because BLAS is slow for products of 2 x 2 and (2, N)
     if np.any(distortion):
         x, y = undistort(np.stack([x, y], -1), distortion).T
     length = np.sqrt(x * x + y * y + 1)
@@ -138,7 +140,7 @@ def rays(K: F64, world_from_cam: F64, distortion: F64, uv: F64) -> tuple[F64, F6
 
 
 def pixel_centres(width: int, height: int, step: int = 1) -> F64:
-    """(H * W, 2) image positions of pixel centres, row by row; with `step`, of step x step blocks' centres."""
+    """(H * W, 2) image positions of pixel centres, row by row; with `step`, of the centres of step x step blocks."""
     u = (np.arange(width // step) + 0.5) * step
     v = (np.arange(height // step) + 0.5) * step
     grid = np.stack(np.meshgrid(u, v), -1)

@@ -1,4 +1,4 @@
-"""Types of settings that carry a unit: `neuface settings` and docs/settings.md read it from the field."""
+"""Types of settings with a unit; `neuface settings` and docs/settings.md show the unit."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import Annotated
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """The unit of a setting's number, as it is shown."""
+    """The unit of a setting's number, as shown to users."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class FilledIn:
-    """Marks a field that the stage fills in by itself, so that it enters the key: the hash of a named file, say. It is
-    no setting: it is listed nowhere, and --set refuses it."""
+    """Marks a field that the stage fills in itself, so that it enters the key, for example the hash of a file. It is
+    not a setting: it is not listed, and --set rejects it."""
 
 
 Pixels = Annotated[int, Unit("pixels")]

@@ -1,8 +1,8 @@
-"""How good a result is: each stage measures, compares with limits, and says in a sentence what to do.
+"""Quality of a result: each stage compares measured figures with limits and states what to do.
 
-A `Finding` is one measured figure against its limits. The verdict of a stage is the worst of its findings, that of an
-asset the worst of all stages. `good`: nothing to do. `usable`: an artist can work with it, something is worse than it
-could be. `unusable`: do not hand it on.
+A `Finding` is one measured figure with its limits. The verdict of a stage is the worst of its findings; that of an
+asset is the worst of all stages. `good`: nothing to do. `usable`: an artist can work with it, but a figure misses its
+limit. `unusable`: do not use or deliver it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ LEVELS: tuple[Level, ...] = ("good", "usable", "unusable")  # from best to worst
 
 
 class Finding(BaseModel):
-    """One measured figure of a stage and what follows from it.
+    """One measured figure of a stage and its level.
 
-    check: its name, lower case with underscores, the same in every run. value: as measured, in `unit`. limit: what
-    `good` needs, in words and figures ("at least 0.9"). said: one plain sentence with the figure. remedy: what to do,
-    for levels other than good. views: names of the photos that it concerns, the worst first.
+    check: its name, lower case with underscores, the same in every run. value: as measured, in `unit`. limit: the limit
+    for `good`, as text ("at least 0.9"). said: message, one plain sentence with the figure. remedy: what to do, for
+    levels other than good. views: names of the affected photos, the worst first.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -43,7 +43,7 @@ class Finding(BaseModel):
 
     @property
     def sentence(self) -> str:
-        """What was found, in which photos, and what to do."""
+        """The message, the affected photos, and what to do."""
         named = f" ({', '.join(self.views[:5])}{', ...' if len(self.views) > 5 else ''})" if self.views else ""
         what = f"{self.said.rstrip('.')}{named}."
         return f"{what} What to do: {self.remedy.rstrip('.')}." if self.remedy and self.level != "good" else what
@@ -51,9 +51,9 @@ class Finding(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a figure must reach to be good, and to be usable; equal where there is nothing between.
+    """The limits of a figure for good and for usable; if they are equal, there is no level between.
 
-    lower: the figure must be at least so large (else: at most). A figure that is not finite is unusable.
+    lower: the limits are lower limits (else upper ones). A figure that is not finite is unusable.
     """
 
     good: float
@@ -63,7 +63,7 @@ class Limits:
     def __post_init__(self) -> None:
         ordered = self.usable <= self.good if self.lower else self.usable >= self.good
         if not ordered:
-            raise ValueError(f"usable ({self.usable}) must be no stricter than good ({self.good})")
+            raise ValueError(f"usable ({self.usable}) must not be stricter than good ({self.good})")
 
     def level(self, value: float) -> Level:
         """The level of one figure."""
@@ -75,14 +75,14 @@ class Limits:
         return "usable" if sign * value >= sign * self.usable else "unusable"
 
     def words(self, unit: str = "") -> str:
-        """What `good` needs: "at least 0.9"."""
+        """The limit for `good`: "at least 0.9"."""
         return f"at {'least' if self.lower else 'most'} {self.good:g}{' ' + unit if unit else ''}"
 
 
 def judged(
     check: str, value: float, limits: Limits, said: str, remedy: str, *, unit: str = "", views: Sequence[str] = ()
 ) -> Finding:
-    """The finding of one figure. views: kept for levels other than good alone."""
+    """The finding of one figure. remedy, views: kept only for levels other than good."""
     level = limits.level(float(value))
     return Finding(
         check=check,
@@ -97,14 +97,14 @@ def judged(
 
 
 def worst(findings: Iterable[Finding | Level]) -> Level:
-    """The worst level of findings or levels; good where there are none."""
+    """The worst level of findings or levels; good if there are none."""
     levels = [f if isinstance(f, str) else f.level for f in findings]
     return max(levels, key=LEVELS.index, default="good")
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What several stages found, together. findings: by the stage's name, in the order of the stages."""
+    """The findings of several stages. findings: by the stage's name, in the order of the stages."""
 
     findings: Mapping[str, tuple[Finding, ...]]
 
@@ -115,23 +115,23 @@ class Verdict:
 
     @property
     def stages(self) -> dict[str, Level]:
-        """Each stage's worst."""
+        """The worst level of each stage."""
         return {name: worst(found) for name, found in self.findings.items()}
 
     def in_order(self) -> list[tuple[str, Finding]]:
-        """(stage, finding) of all, in the order of the stages."""
+        """All findings as (stage, finding), in the order of the stages."""
         return [(name, f) for name, found in self.findings.items() for f in found]
 
     def troubles(self) -> list[tuple[str, Finding]]:
-        """Those that are not good, the worst first, else in the order of the stages."""
+        """Findings that are not good, the worst first, then in the order of the stages."""
         return sorted((x for x in self.in_order() if x[1].level != "good"), key=lambda x: -LEVELS.index(x[1].level))
 
     def reasons(self) -> tuple[str, ...]:
-        """A sentence for each trouble: what is wrong, in which photos, and what to do."""
+        """One sentence per finding that is not good: what is wrong, in which photos, what to do."""
         return tuple(f"{name}: {finding}" for name, finding in self.troubles())
 
     def record(self, *, every: bool = False) -> dict[str, Any]:
-        """As plain values for JSON; with every finding, or with the troubles alone."""
+        """The verdict as plain values for JSON; with every finding, or only with those that are not good."""
         listed = self.in_order() if every else self.troubles()
         return {
             "level": self.level,
@@ -141,14 +141,14 @@ class Verdict:
 
 
 def verdict_of(artifacts: Mapping[str, Any]) -> Verdict:
-    """The verdict of finished artifacts by their stages' names. One without findings is good."""
+    """The verdict of finished artifacts, by stage name. An artifact without findings is good."""
     return Verdict({name: tuple(getattr(a, "findings", ())) for name, a in artifacts.items()})
 
 
 def verdict_of_inputs(inputs: Any, **own: Iterable[Finding]) -> Verdict:
-    """The verdict of a stage's inputs (a dataclass of located artifacts) and of what the stage itself found.
+    """The verdict of a stage's inputs (a dataclass of located artifacts) and of the stage's own findings.
 
-    own: the findings by the name of that stage, which has made no artifact yet.
+    own: those findings, by the name of the stage, which has no artifact yet.
     """
     before = {f.name: getattr(inputs, f.name).artifact for f in dataclasses.fields(inputs)}
     return Verdict({**verdict_of(before).findings, **{name: tuple(found) for name, found in own.items()}})

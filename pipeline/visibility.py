@@ -1,4 +1,4 @@
-"""Which places of a mesh the fitted photos see."""
+"""Visibility of mesh points in the fitted photos."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Camera, CameraSet, Capture, FittedFace, Located, MaskSet
 from pipeline.meshes import F64, Mask, Mesh
+from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, matrix, project
 
-EMBREE_SIZE = 100.0  # embree has absolute tolerances: the mesh is scaled to about this size
-LIFT = 2e-3  # of the mesh's size: rays start this far above it, so that facets don't shade themselves
-OPAQUE = 0.5
+LIFT = 2e-3  # of the mesh's size: rays start this far above it, against self-occlusion of facets
+MIN_ALPHA = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A fitted photo, its camera and, if there are such, its mask, its clipped pixels and its labels."""
+    """A fitted photo and its camera; its mask, clipped pixels and labels, if they exist."""
 
     camera: Camera
     mask: Path | None
@@ -33,7 +33,7 @@ class View:
 def seen_by(
     fitted: FittedFace, poses: CameraSet, masks: Located[MaskSet], capture: Located[Capture]
 ) -> tuple[View, ...]:
-    """The views that the field was fitted to, in the order of its colour responses. None that was held out."""
+    """The views that the field was fitted to, in the order of its colour responses, without held-out views."""
     used = set(fitted.fitted_views) - {v.index for v in capture.artifact.views if v.holdout}
     cut = {m.index: m for m in masks.artifact.masks}
     shot = {v.index: v for v in capture.artifact.views}
@@ -51,38 +51,24 @@ def seen_by(
     return tuple(view(c) for c in poses.cameras if c.index in used)
 
 
-class Occluder:
-    """Whether the mesh is in the way. Embree, single precision."""
+class Occluder(RayCaster):
+    """Whether a mesh occludes points."""
 
     def __init__(self, mesh: Mesh) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
-        self.span = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-9)
-        self._scale = EMBREE_SIZE / self.span
-        self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, (mesh.vertices * self._scale).astype(np.float32), mesh.faces)
+        super().__init__(mesh.vertices, mesh.faces)
 
     def distance(self, origin: F64, directions: F64) -> F64:
-        """(N,) to the mesh along unit directions (N, 3) from one origin (3,); infinite where they miss it."""
+        """(N,) distance to the mesh along unit directions (N, 3) from one origin (3,), infinite for no hit."""
         return self.distances(np.broadcast_to(origin, directions.shape), directions)
 
-    def distances(self, origins: F64, directions: F64) -> F64:
-        """(N,) to the mesh along unit directions (N, 3), each from its own origin (N, 3); infinite where they miss."""
-        starts = np.ascontiguousarray((origins * self._scale).astype(np.float32))
-        found = self._scene.run(starts, np.ascontiguousarray(directions, np.float32), output=True)
-        return np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
-
     def blocks(self, origins: F64, directions: F64) -> Mask:
-        """(N,) True where a ray meets the mesh."""
-        o = np.ascontiguousarray(origins * self._scale, np.float32)
-        found = np.asarray(self._scene.run(o, np.ascontiguousarray(directions, np.float32)))
-        out: Mask = found >= 0
+        """(N,) True where the ray from an origin (N, 3) along its direction (N, 3) hits the mesh."""
+        out: Mask = self.first_faces(origins, directions) >= 0
         return out
 
 
 def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occluder) -> F64:
-    """(N,) the cosines towards all views that see each point, summed."""
+    """(N,) sum of the cosines towards all views that see each point. points, normals (N, 3)."""
     total = np.zeros(len(points))
     for view in views:
         total += view_cosines(view, points, normals, occluder)[0]
@@ -90,7 +76,8 @@ def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occl
 
 
 def view_cosines(view: View, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
-    """(N,) cosine towards the camera where the view sees the point, else 0; (N, 2) where in the photo, in pixels."""
+    """(N,) cosine towards the camera if the view sees the point, else 0; (N, 2) position in the photo, pixels. points,
+    normals (N, 3)."""
     camera = view.camera
     world_from_cam = matrix(camera.world_from_cam)
     away = world_from_cam[:3, 3] - points
@@ -101,7 +88,7 @@ def view_cosines(view: View, points: F64, normals: F64, occluder: Occluder) -> t
         framed = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
     live = np.flatnonzero((cosine > 0) & framed)
     if view.mask is not None:
-        live = live[picked(_alpha(view.mask), camera, uv[live]) > OPAQUE]
+        live = live[picked(_alpha(view.mask), camera, uv[live]) > MIN_ALPHA]
     start = points[live] + LIFT * occluder.span * normals[live]
     out = np.zeros(len(points))
     if len(live):
@@ -110,7 +97,7 @@ def view_cosines(view: View, points: F64, normals: F64, occluder: Occluder) -> t
 
 
 def picked(image: npt.NDArray[Any], camera: Camera, uv: F64) -> npt.NDArray[Any]:
-    """(N, ...) values of a picture (H, W, ...) of the whole photo, at its positions (N, 2) inside the frame."""
+    """(N, ...) values of a picture (H, W, ...) of the whole photo at positions uv (N, 2), pixels of the photo."""
     scale = np.array([image.shape[1] / camera.width, image.shape[0] / camera.height])
     column, row = np.minimum((uv * scale).astype(np.int64), [image.shape[1] - 1, image.shape[0] - 1]).T
     return np.asarray(image[row, column])

@@ -1,8 +1,8 @@
-"""Run one stage alone, without Prefect, from what the store holds of the stages before it.
+"""Run one stage alone, without Prefect. The results of the stages before it are read from the store.
 
     python -m stages NAME CAPTURE --out DIR [--store DIR] [--preset P] [--set stage.key=value] [...]
 
-For work on a stage: a debugger and a profiler see plain function calls.
+For work on a stage: everything runs as plain function calls, which suits a debugger and a profiler.
 """
 
 import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads torch)
@@ -24,7 +24,7 @@ from stages.registry import REGISTRY, SOURCE
 
 
 def before(name: str) -> list[Stage[Any, Any, Any]]:
-    """The stages that a stage's inputs come from, and theirs, in order."""
+    """All stages that a stage depends on, in the order in which they run."""
     by_name = {s.name: s for s in REGISTRY}
     wanted, found = [name], set()
     while wanted:
@@ -38,10 +38,10 @@ def before(name: str) -> list[Stage[Any, Any, Any]]:
 def run_one(
     name: str, source: Located[Any], configs: Mapping[str, StageConfig], store: Store, device: str, again: bool = False
 ) -> Done[Any]:
-    """Run the stage `name`; the ones before it must be in the store.
+    """Run the stage `name`; the results of the stages before it must be in the store.
 
     Raises:
-        StageError: one before it is not there, or the stage's own.
+        StageError: the result of a stage before it is missing, or the stage itself fails.
     """
     finished: dict[str, Located[Artifact]] = {SOURCE: source}
     for stage in before(name):
@@ -64,7 +64,7 @@ def run_one(
 
 
 class Lines:
-    """Progress as a line every two seconds."""
+    """Prints the progress as one line every two seconds."""
 
     def __init__(self, stage: str) -> None:
         self.stage, self.last = stage, 0.0
@@ -78,12 +78,12 @@ class Lines:
 
 
 def parser() -> argparse.ArgumentParser:
-    """The command line."""
+    """The parser of the command line."""
     p = argparse.ArgumentParser(prog="python -m stages", description="Run one stage alone, without Prefect.")
     p.add_argument("name", help="one of: " + ", ".join(s.name for s in REGISTRY))
     p.add_argument("capture", type=Path, help="the capture's folder")
     p.add_argument("--out", type=Path, required=True, help="as in `neuface run`: the store is OUT/.store")
-    p.add_argument("--store", type=Path, help="another store")
+    p.add_argument("--store", type=Path, help="folder of another store")
     p.add_argument("--preset", default=DEFAULT_PRESET, help=", ".join(PRESETS))
     p.add_argument("--holdout")
     p.add_argument("--asset-name", help="the asset's name")
@@ -96,7 +96,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code as in `neuface`: 0 done, 1 failed, 2 wrong usage."""
+    """Return the exit code, as `neuface` does: 0 done, 1 failed, 2 wrong usage."""
     options = parser().parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", stream=sys.stderr)
     try:

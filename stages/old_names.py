@@ -1,6 +1,6 @@
-"""Names of settings and values that an earlier version had: accepted for one release, with a hint in place of an error.
+"""Old names of settings and values. They are accepted for one release, with a warning instead of an error.
 
-Remove this release's entries when the next one is out.
+Remove the entries of this release when the next one is published.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 log = logging.getLogger("neuface.settings")
 
-# stage.old -> the new name in the same stage; none that names a file, which workflows/server/access.py would not find
+# stage.old -> new name in the same stage. Never a setting that names a file: workflows/server/access.py would miss it
 RENAMED: dict[str, str] = {
     "capture.chart": "colour_checker",
     "poses.patience": "attempts",
@@ -27,7 +27,7 @@ RENAMED_VALUES: dict[str, dict[str, str]] = {
     "inverse_rendering.light_from": {"even": "uniform_albedo"},
     "uv.remesh": {"even": "uniform"},
 }
-REMOVED = frozenset(  # constants of the code by now: nobody set them
+REMOVED = frozenset(  # now constants in the code
     {
         "poses.shared_intrinsics",
         "poses.refine_focal",
@@ -50,31 +50,35 @@ REMOVED = frozenset(  # constants of the code by now: nobody set them
 
 
 def without_old_names(stage: str, values: Mapping[str, Any], names: Collection[str], origin: str) -> dict[str, Any]:
-    """The values of a stage by today's names. names: those of today, which are never taken for old ones. A value under
-    today's name wins over one under the old. origin: where the user wrote them, for the hint."""
+    """The values of a stage by the current names of its settings. names: the current names; none of them is read as an
+    old name. If both names are given, the current one wins. origin: where the user wrote them, for the warning."""
     out = {k: _todays_value(f"{stage}.{k}", v, origin) for k, v in values.items() if k in names}
     for name in values.keys() - out.keys():
         path = f"{stage}.{name}"
         if path in RENAMED:
-            _hint(f"{origin} {path} is called {stage}.{RENAMED[path]} now; the old name will go in the next release")
+            _hint(
+                f"{origin} {path} is now named {stage}.{RENAMED[path]}; the next release will not accept the old name"
+            )
             out.setdefault(RENAMED[path], values[name])
         elif path in REMOVED:
-            _hint(f"{origin} {path} is no longer a setting; ignored (`neuface settings {stage}` lists those there are)")
+            _hint(
+                f"{origin} {path} is no longer a setting and was ignored; `neuface settings {stage}` lists the settings"
+            )
         else:
             out[name] = values[name]
     return out
 
 
 def _todays_value(path: str, value: Any, origin: str) -> Any:
-    """The value under its name of today."""
+    """The current name of a value."""
     new = RENAMED_VALUES.get(path, {}).get(value) if isinstance(value, str) else None
     if new is None:
         return value
-    _hint(f"{origin} {path}={value} is called {path}={new} now; the old name will go in the next release")
+    _hint(f"{origin} {path}={value} is now named {path}={new}; the next release will not accept the old name")
     return new
 
 
 @cache
 def _hint(text: str) -> None:
-    """Once in a process: a run puts its settings together more than once."""
+    """Warn once in a process: a run merges its settings more than once."""
     log.warning(text)

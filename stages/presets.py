@@ -1,7 +1,7 @@
-"""Every stage's settings from a preset, a file and single values: the one place where they are put together.
+"""Merges the settings of every stage from a preset, a settings file and --set. This is the only place that does so.
 
-Order, the later one wins: the stages' own defaults, the preset, what a budget pays for, the options that concern
-several stages (holdout, name, seed), the file, the single values.
+Order, the later one wins: the defaults of the stages, the preset, the settings that a time budget chose, the options
+of several stages (holdout, name, seed), the settings file, --set.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "uv": {"target_faces": 100_000},
         "bake": {"size": 4096},
     },
-    # Not a point on that curve: the paper's own model and schedule, for comparison (docs/model.md). For a GPU.
+    # Not part of that scale: the paper's own model and schedule, for comparison (docs/model.md). For a GPU.
     "paper": {
         "inverse_rendering": {"preset": "paper"},
         "surface": {"resolution": 320},
@@ -66,10 +66,11 @@ def configs_for(
     registry: Iterable[Stage[Any, Any, Any]] | None = None,
     planned: Settings | None = None,
 ) -> dict[str, StageConfig]:
-    """The checked settings of every stage, by the stage's name. planned: what a budget pays for, over the preset.
+    """The validated settings of every stage, by the stage's name. planned: settings chosen for a time budget; they
+    override the preset.
 
     Raises:
-        UsageError: an unknown preset, stage or key, or a value outside its limits; says which and what is possible.
+        UsageError: unknown preset, stage or setting, or a value outside its limits. The message lists what is allowed.
     """
     stages = {s.name: s for s in (_registry() if registry is None else registry)}
     known(preset, PRESETS, what="unknown preset", where="--preset")
@@ -83,7 +84,7 @@ def configs_for(
             known(stage, stages, what="unknown stage", where=f"{origin} {stage}")
             if not isinstance(values, Mapping):
                 raise UsageError(
-                    "settings of a stage must be a table",
+                    "the settings of a stage must be a table",
                     where=f"{origin} {stage}",
                     value=repr(values),
                     limit="key = value under the stage's name",
@@ -99,7 +100,7 @@ def configs_for(
 
 
 def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
-    """UDIM tiles are counted for the size that is baked, unless uv.tile_size was said."""
+    """The number of UDIM tiles is computed for bake.size, unless uv.tile_size is set."""
     uv, bake = merged.get("uv", {}), merged.get("bake", {})
     if uv.get("tiles") == "auto" and "tile_size" not in uv and "size" in bake:
         uv["tile_size"] = bake["size"]
@@ -114,7 +115,7 @@ def _registry() -> tuple[Stage[Any, Any, Any], ...]:
 def _shared(
     stages: Mapping[str, Stage[Any, Any, Any]], holdout: str | None, name: str | None, seed: int | None
 ) -> dict[str, dict[str, Any]]:
-    """Options that belong to whichever stage has a setting of that name."""
+    """Options that apply to every stage with a setting of that name."""
     given = {"holdout": holdout, "name": name, "seed": seed}
     found: dict[str, dict[str, Any]] = {}
     for stage in stages.values():
@@ -143,7 +144,7 @@ def _checked(stage: Stage[Any, Any, Any], values: Mapping[str, Any]) -> StageCon
 
 
 def known(word: str, choices: Iterable[str], *, what: str, where: str) -> None:
-    """Pass, if `word` is one of `choices`; else a UsageError that lists them and guesses which was meant."""
+    """Raise a UsageError if `word` is not one of `choices`. The message lists them and suggests a similar one."""
     listed = list(choices)
     if word in listed:
         return
@@ -154,14 +155,14 @@ def known(word: str, choices: Iterable[str], *, what: str, where: str) -> None:
 
 # ------------------------------------------------------------------ what users write
 def parse_sets(pairs: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """`stage.key=value` strings. A value in brackets, or null, is read as JSON; all else by the setting's own type."""
+    """Parse `stage.key=value`. A value in brackets, or null, is read as JSON; any other by the setting's own type."""
     found: dict[str, dict[str, Any]] = {}
     for pair in pairs:
         path, equals, text = pair.partition("=")
         stage, dot, key = path.strip().partition(".")
         if not (equals and dot and stage and key):
             raise UsageError(
-                "a single setting can't be read",
+                "a --set option can't be parsed",
                 where="--set",
                 value=pair,
                 limit="stage.key=value",
@@ -181,10 +182,10 @@ def _value(text: str) -> Any:
 
 
 def read_config_file(path: Path) -> dict[str, dict[str, Any]]:
-    """Settings from a .toml or .json file: one table for each stage.
+    """Read settings from a .toml or .json file: one table for each stage.
 
     Raises:
-        UsageError: the file is missing, of another kind, or can't be parsed.
+        UsageError: the file is missing, has another format, or can't be parsed.
     """
     kinds = {".toml": tomllib.loads, ".json": json.loads}
     try:
@@ -194,7 +195,7 @@ def read_config_file(path: Path) -> dict[str, dict[str, Any]]:
     except KeyError:
         fault = f"a {path.suffix or 'nameless'} file"
     except RecursionError:
-        fault = "tables too deep in each other"
+        fault = "tables are nested too deeply"
     except (OSError, ValueError) as e:
         fault = str(e)[:200]
     else:

@@ -1,7 +1,7 @@
-"""The stages, in the order they run. Importing this is cheap: each stage loads its libraries when it works.
+"""The stages, in the order in which they run. This module imports fast: each stage loads its libraries when it runs.
 
-To add a stage, write `stages/<name>/stage.py` and put its STAGE where it belongs in REGISTRY; its inputs are wired by
-the names of their fields (see CONTRIBUTING.md).
+To add a stage, write `stages/<name>/stage.py` and add its STAGE to REGISTRY at the right place. The names of its input
+fields determine from which stages the inputs come (see CONTRIBUTING.md).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from stages.surface.stage import STAGE as SURFACE
 from stages.usd.stage import STAGE as USD
 from stages.uv.stage import STAGE as UV
 
-SOURCE = "source"  # what the user's folder holds: the input of the first stage, made by no stage
-FIT = INVERSE_RENDERING.name  # what a GPU, a slot and a budget are for
+SOURCE = "source"  # contents of the user's folder: the input of the first stage
+FIT = INVERSE_RENDERING.name  # the stage that uses the GPU, its concurrency limit and the time budget
 
 REGISTRY: tuple[Stage[Any, Any, Any], ...] = (
     CAPTURE,

@@ -1,6 +1,6 @@
-"""Every setting of every stage: meaning, unit, what it may be, default, and its value in each preset.
+"""Every setting of every stage: meaning, unit, allowed values, default, and value in each preset.
 
-Read from the stages' configs alone; `neuface settings` and docs/settings.md show the same.
+All of it is read from the stages' configs. `neuface settings` and docs/settings.md show it.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ class Setting:
 
     @property
     def key(self) -> str:
-        """What stands before the = of --set."""
+        """The part before the = of --set."""
         return f"{self.stage}.{self.name}"
 
     def differing(self) -> dict[str, Any]:
-        """The presets whose value is not the default."""
+        """Presets with another value than the default, and that value."""
         return {preset: value for preset, value in self.presets.items() if value != self.default}
 
     def record(self) -> dict[str, Any]:
-        """As JSON."""
+        """The setting as plain values for JSON."""
         return {"key": self.key, **asdict(self)}
 
 
 def all_settings(registry: Iterable[Stage[Any, Any, Any]] | None = None) -> tuple[Setting, ...]:
-    """Of all stages, in the order in which they run."""
+    """The settings of all stages, in the order in which the stages run."""
     stages = _registry() if registry is None else tuple(registry)
     filled = {preset: configs_for(preset, {}, registry=stages) for preset in PRESETS}
     return tuple(
@@ -63,10 +63,10 @@ def all_settings(registry: Iterable[Stage[Any, Any, Any]] | None = None) -> tupl
 
 
 def found(word: str, registry: Iterable[Stage[Any, Any, Any]] | None = None) -> tuple[Setting, ...]:
-    """Those of a stage (masks), one (masks.method), or those of a name in all stages (method).
+    """The settings of a stage (masks), one setting (masks.method), or all settings of one name (method).
 
     Raises:
-        UsageError: there is no such stage or setting; says what there is, and what may have been meant.
+        UsageError: there is no such stage or setting. The message lists the existing ones and suggests a similar one.
     """
     stages = _registry() if registry is None else tuple(registry)
     settings = all_settings(stages)
@@ -83,7 +83,7 @@ def found(word: str, registry: Iterable[Stage[Any, Any, Any]] | None = None) -> 
 
 
 def value_in_words(value: Any) -> str:
-    """A value as --set takes it; a text without letters as quotes, which would not be seen."""
+    """A value as --set takes it; an empty text as two quotes, because it would be invisible."""
     if isinstance(value, str):
         return value or '""'
     return json.dumps(value)
@@ -105,7 +105,7 @@ def _settings_of(stage: Stage[Any, Any, Any], presets: Mapping[str, StageConfig]
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:
-    """Type and limits of a JSON schema in words."""
+    """Type and limits of a JSON schema, as text."""
     if "anyOf" in schema:
         return ", or ".join(_allowed(part) for part in schema["anyOf"])
     if "enum" in schema or "const" in schema:
@@ -114,7 +114,7 @@ def _allowed(schema: Mapping[str, Any]) -> str:
     if kind == "array":
         return f"{len(schema['prefixItems'])} numbers in brackets"
     if kind == "string":
-        return f"text of up to {schema['maxLength']} letters" if "maxLength" in schema else "text"
+        return f"text of up to {schema['maxLength']} characters" if "maxLength" in schema else "text"
     return {"boolean": "true or false", "integer": "whole number", "number": "number"}[kind] + _limits(schema)
 
 
@@ -123,7 +123,7 @@ def _either(words: list[str]) -> str:
 
 
 def _limits(schema: Mapping[str, Any]) -> str:
-    """Of a number, as what follows its type."""
+    """The limits of a number, as text that follows its type."""
     if "minimum" in schema and "maximum" in schema:
         text = f", {_number(schema['minimum'])} to {_number(schema['maximum'])}"
     else:

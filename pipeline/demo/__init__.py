@@ -1,1 +1,1 @@
-"""The demo capture: a sculpted head with known skin, light and cameras, and a path of its own to its photos."""
+"""The demo capture: a modelled head with known skin, light and cameras, and its own renderer."""

@@ -1,4 +1,4 @@
-"""Reflection of the demo skin, integrated by sampling. Independent of the product's own model.
+"""Reflection of the demo skin, integrated by sampling. Independent of the model that is fitted.
 
 Symbols (all directions unit, in the local frame whose z axis is the normal)
     wo, wi  towards the eye and towards the light
@@ -10,7 +10,7 @@ Symbols (all directions unit, in the local frame whose z axis is the normal)
     specular = mean_i F(wo.h) G2 / G1 L(wi)           h ~ visible normals (Heitz 2018), wi = reflect(wo, h)
 
 G2 is Smith's height-correlated masking. One bounce; the two lobes are added without coupling.
-Samples come from a low-discrepancy net, shifted by a random rotation for each pixel.
+Samples are a low-discrepancy net of points, with a random shift for each pixel.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def cube_directions(cells: int) -> F64:
     """Unit directions (6, n, n, 3) of the table's nodes, n = cells + 1.
 
     Face 2 k is +axis k and face 2 k + 1 is -axis k; the other two axes follow in rising order. Nodes lie on
-    the cube's edges too, so that no face ever needs its neighbour.
+    the cube's edges too, so that no face needs its neighbour.
     """
     line = np.linspace(-1.0, 1.0, cells + 1)
     u, v = np.meshgrid(line, line, indexing="ij")
@@ -135,7 +135,7 @@ def specular_sample(
 def local_frame(n: F64, v: F64) -> tuple[Triple, Triple, Triple, Triple]:
     """Tangent, bitangent and normal of a shading point, and the eye's direction in that frame.
 
-    At a silhouette the smooth normal may lean away from the eye; it is then bent back to a grazing angle.
+    At a silhouette the normal may point away from the eye; it is then rotated to a grazing angle.
     """
     nx, ny, nz = n[0], n[1], n[2]
     cosine = nx * v[0] + ny * v[1] + nz * v[2]
@@ -197,7 +197,7 @@ def shade(normal: F64, to_eye: F64, albedo: F64, f0: F64, a: F64, shift: F64, po
     cos, sin = np.cos(2.0 * math.pi * points[:, 1]), np.sin(2.0 * math.pi * points[:, 1])
     for i in range(count):
         t, b, n, wo = local_frame(normal[i], to_eye[i])
-        # Turning the net by an angle needs one sine for the point, not one for the sample.
+        # Shifting the net by an angle needs one sine per point, not one per sample.
         c0, s0 = math.cos(2.0 * math.pi * shift[i, 1]), math.sin(2.0 * math.pi * shift[i, 1])
         dr, dg, db, sr, sg, sb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for s in range(samples):

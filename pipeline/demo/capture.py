@@ -1,4 +1,4 @@
-"""Write the demo capture: photos and cameras in FaceScape's format, with the truth beside them.
+"""Write the demo capture: photos and cameras in FaceScape's format, and the ground truth.
 
 Folder
     {i}.png            8-bit sRGB, black background
@@ -40,11 +40,11 @@ F64 = npt.NDArray[np.float64]
 Progress = Callable[[int, int, str], None]
 
 VERSION = 1
-"""Raised whenever the same arguments give another capture."""
+"""Increased whenever the same arguments give another capture."""
 
 MARKER = "demo.json"
 EXPOSURE = 0.52
-"""Scale of the studio light: it sets the photos' brightness, as a camera's exposure would."""
+"""Scale of the studio light: it sets the photos' brightness, like a camera's exposure."""
 
 _ENV_HEIGHT = 128
 _TRUTH_STEP = 0.0027  # metres; gives some 60 000 faces
@@ -53,7 +53,7 @@ _TRUTH_EVERY, _TRUTH_AT = 5, 2
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Everything that decides the bytes of a capture."""
+    """Everything that determines the bytes of a capture."""
 
     views: int
     size: int
@@ -79,18 +79,18 @@ def write_demo_capture(
     shadows: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Write the demo capture to `folder`, or return at once if it already holds the one asked for.
+    """Write the demo capture to `folder`, or return at once if it already contains the requested one.
 
     `views` photos of `size` x `size` pixels; `samples` (a power of two) light samples for each lobe in each
     quarter pixel; `mesh_step` metres, the grid of the traced mesh; `progress(done, total, what)`.
-    A folder holding anything else is refused, not overwritten.
+    A folder with any other content is not overwritten: FileExistsError.
     """
     request = Request(views, size, samples, mesh_step, seed, shadows)
     _check(request)
     if is_complete(folder, request):
         return
     if folder.exists() and any(folder.iterdir()):
-        raise FileExistsError(f"{folder} holds something else than this demo capture; choose another folder")
+        raise FileExistsError(f"{folder} is not empty and does not contain this demo capture; choose another folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
     try:
@@ -103,7 +103,7 @@ def write_demo_capture(
 
 
 def is_complete(folder: Path, request: Request) -> bool:
-    """Whether `folder` holds exactly the capture of `request`."""
+    """Whether `folder` contains exactly the capture of `request`."""
     try:
         marker = json.loads((folder / MARKER).read_text())
     except (OSError, ValueError):
@@ -113,11 +113,11 @@ def is_complete(folder: Path, request: Request) -> bool:
 
 def _check(request: Request) -> None:
     if request.views < 1 or request.size < 8:
-        raise ValueError(f"a demo capture needs a view and 8 pixels, not {request.views} and {request.size}")
+        raise ValueError(f"a demo capture needs at least 1 view and 8 pixels, not {request.views} and {request.size}")
     if request.samples < 1 or request.samples & (request.samples - 1):
         raise ValueError(f"samples must be a power of two, not {request.samples}")
     if not 2e-4 <= request.mesh_step <= 8e-3:
-        raise ValueError(f"mesh_step must be within 0.2 and 8 mm, not {request.mesh_step * 1000:g} mm")
+        raise ValueError(f"mesh_step must be between 0.2 and 8 mm, not {request.mesh_step * 1000:g} mm")
 
 
 def _write(folder: Path, request: Request, progress: Progress) -> None:
@@ -127,7 +127,7 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     cameras = rig_cameras(request.views, request.size, request.seed)
     _write_json(folder / "params.json", facescape_params(cameras))
     total = request.views + 1
-    progress(0, total, "sculpting the head")
+    progress(0, total, "modelling the head")
     mesh = _head_mesh(request.mesh_step)
     truth = mesh if request.mesh_step >= _TRUTH_STEP else _head_mesh(_TRUTH_STEP)
     _write_mesh(folder / "truth" / "mesh_gt.ply", truth)

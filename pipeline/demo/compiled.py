@@ -1,4 +1,4 @@
-"""A typed door to numba: `compiled` turns a plain function into machine code that releases the GIL."""
+"""Typed wrapper of numba: `compiled` compiles a function to machine code that releases the GIL."""
 
 from __future__ import annotations
 
@@ -15,5 +15,5 @@ def compiled(function: Function) -> Function:
     # Exact IEEE arithmetic (no fastmath): equal arguments must give equal bytes.
     try:
         return cast(Function, numba.njit(nogil=True, cache=True)(function))
-    except RuntimeError:  # numba found no place for its cache, as in a read-only installation
+    except RuntimeError:  # numba found no writable folder for its cache, for example in a read-only installation
         return cast(Function, numba.njit(nogil=True)(function))

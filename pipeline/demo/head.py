@@ -1,8 +1,8 @@
-"""The demo head: a sculpture of smooth ellipsoids and tubes, as a signed distance.
+"""The demo head: smooth ellipsoids and tubes, combined as a signed distance.
 
 World frame: metres, right-handed, +Y up, +Z out of the face, +X to the head's left; the origin lies
 between the eyes' height and the middle of the skull. Inside, shapes are written in millimetres.
-The distance is negative inside, exact on the surface to first order, and its gradient norm stays near one.
+The distance is negative inside, exact on the surface to first order, and its gradient norm is near one.
 
     f(p) = (((skull + face + neck) - sockets + lids + nose + lips ...) + ears) and above the neck's cut
 

@@ -1,7 +1,7 @@
 """Triangle meshes of a signed distance, by marching cubes in a narrow shell around its zero level.
 
-Lengths are metres. Vertices are projected onto the zero level, so that the mesh errs only by the sag
-of its flat faces (about step^2 / 8 R for a radius of curvature R).
+Lengths are metres. Vertices are projected onto the zero level, so that the only error of the mesh is the
+sag of its flat faces (about step^2 / 8 R for a radius of curvature R).
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _project(points: F64, distance_and_gradient: Callable[[F64], tuple[F64, F64]
 
 
 def _largest(vertices: F64, faces: Faces) -> Mesh:
-    """The piece with most vertices: a coarse grid may break crumbs off a crease finer than itself."""
+    """The component with most vertices: a coarse grid may produce fragments at fine creases."""
     count = len(vertices)
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
     graph = coo_array((np.ones(len(edges), dtype=np.int8), edges.T), shape=(count, count))
@@ -107,6 +107,6 @@ def _largest(vertices: F64, faces: Faces) -> Mesh:
 
 
 def _outward(vertices: F64, faces: Faces) -> Faces:
-    """Turn all faces round if the enclosed volume is negative."""
+    """Flip all faces if the enclosed volume is negative."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return faces if np.einsum("ni,ni->", a, np.cross(b, c)) > 0.0 else np.ascontiguousarray(faces[:, ::-1])

@@ -74,7 +74,7 @@ class Hits:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What a picture needs: the mesh in embree, the light's table, the net (4 S, 2), and the seed."""
+    """Data for rendering: the mesh in Embree, the light's table, the net of samples (4 S, 2), and the seed."""
 
     embree: Any
     table: F32
@@ -87,14 +87,14 @@ def scene_from_mesh(mesh: Mesh, coefficients: F64, samples: int, seed: int, shad
     """Build the scene. `samples`, a power of two, counts the samples of each lobe in a quarter pixel."""
     embree = EmbreeScene()
     TriangleMesh(embree, mesh.vertices[mesh.faces].astype(np.float32))
-    # Every aligned quarter of the net is a net itself, so the four corners of a pixel complete one another.
+    # Every aligned quarter of the net is a net too, so the four corners of a pixel have complementary samples.
     net = np.asarray(qmc.Sobol(2, scramble=False).random(4 * samples), dtype=np.float64)
     table = brdf.cube_table(lambda w: light.radiance(coefficients, w), _TABLE_CELLS)
     return Scene(embree, table, net, seed, shadows)
 
 
 def render(scene: Scene, camera: Camera, stream: int) -> Picture:
-    """Render one picture; `stream` names its random numbers (the view's number, say)."""
+    """Render one picture; `stream` selects its random numbers, for example the view's number."""
     pixels = camera.size * camera.size
     shift = np.random.default_rng((scene.seed, stream)).random((pixels, 2))
     radiance, albedo, normal = (np.zeros((pixels, 3)) for _ in range(3))

@@ -13,7 +13,7 @@ from pipeline.demo.render import Camera
 F64 = npt.NDArray[np.float64]
 
 TARGET = np.array([0.0, -0.026, 0.005])
-"""Where the cameras look, up to some centimetres of carelessness."""
+"""The point that the cameras look at, with random offsets of some centimetres."""
 
 FIELD = 0.325
 """Height of the world that a picture shows at the target's distance, metres."""

@@ -1,4 +1,4 @@
-"""Distance shapes with their gradients, and the smooth joints between them.
+"""Signed distances of shapes with their gradients, and smooth joints between them.
 
 Symbols
     p       points, (3, N), in the length unit of the caller
@@ -6,8 +6,8 @@ Symbols
     g       gradient of d with respect to the caller's points, (3, N)
     k       width of a smooth joint: the two surfaces influence each other where |a - b| < k
 
-Every shape returns its value and, when its frame asks for it, its exact gradient, so that a whole
-sculpture is differentiated in one pass (forward mode) without finite differences.
+Every shape returns its value and, if its frame requests it, its exact gradient. So the whole head is
+differentiated in one pass (forward mode) without finite differences.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ F64 = npt.NDArray[np.float64]
 Vector = Sequence[float]
 
 _TINY = 1e-12
-_NOTHING: F64 = np.empty((3, 0))  # stands for a gradient that was not asked for
+_NOTHING: F64 = np.empty((3, 0))  # in place of a gradient that was not requested
 
 
 @dataclass(frozen=True, slots=True)
 class Distance:
-    """A sampled distance: `value` (N,), and `gradient` (3, N) or None when it was not asked for."""
+    """A sampled distance: `value` (N,), and `gradient` (3, N), or None if it was not requested."""
 
     value: F64
     gradient: F64 | None

@@ -1,1 +1,1 @@
-"""Faces in photos, found offline by two small networks (models/NOTICE)."""
+"""Face detection in photos, offline, by two small networks (models/NOTICE)."""

@@ -1,11 +1,11 @@
-"""Where a face is in a photo, and 468 points on it: a detector, then landmarks in the upright square around its find.
+"""Detects a face in a photo and 468 landmarks on it: a detector, then a landmark network on an upright square.
 
 Positions are in pixels of the photo, the first pixel's centre at (0.5, 0.5); left and right are the person's own.
 
-The detector (models/NOTICE) takes 128 x 128 RGB in [-1, 1] and answers for 896 places, two on each cell of a grid of
-16 x 16 and six on each of 8 x 8: a logit, and a box and six points as offsets from the cell's middle in pixels of its
-input. The landmark network takes 192 x 192 RGB in [0, 1] and gives points in pixels of its input, and a logit of
-whether there is a face at all.
+The detector (models/NOTICE) takes 128 x 128 RGB in [-1, 1] and has 896 outputs, two for each cell of a 16 x 16 grid and
+six for each cell of an 8 x 8 grid: a logit, and a box and six points as offsets from the cell's centre, in pixels of
+its input. The landmark network takes 192 x 192 RGB in [0, 1] and returns points in pixels of its input, and a logit for
+the presence of a face.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ F64 = npt.NDArray[np.float64]
 
 MODELS = Path(__file__).parent / "models"
 DETECTOR_SIDE, LANDMARK_SIDE = 128, 192
-SURE, PRESENT = 0.6, 0.8  # probabilities from which a find, and landmarks, count
-ROOM = 0.75  # half-edge of the landmarks' square in edges of the found box
+SURE, PRESENT = 0.6, 0.8  # least probabilities of a detection, and of landmarks
+ROOM = 0.75  # half-edge of the landmarks' square, in edges of the detected box
 RIGHT_EYE = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246)  # along the lids
 LEFT_EYE = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
 
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """points: (468, 2) pixels. sure: probability that they are those of a face."""
+    """points: (468, 2) pixels. sure: probability that they are on a face."""
 
     points: F64
     sure: float
 
     @property
     def pupils(self) -> tuple[F64, F64]:
-        """(2,) each: the middles between the corners of the right and of the left eye."""
+        """(2,) each: centres of the right and of the left eye, between the eye corners."""
         right, left = ((self.points[eye[0]] + self.points[eye[8]]) / 2 for eye in (RIGHT_EYE, LEFT_EYE))
         return np.asarray(right), np.asarray(left)
 
@@ -48,7 +48,7 @@ class Face:
 def find_face(image: U8, x: float, y: float, half: float, roll: float = 0.0) -> Face | None:
     """The face in the square of half-edge `half` around (x, y) of a photo (H, W, 3) 8-bit sRGB, or None.
 
-    roll: radians, by which the person's up is turned from the photo's, clockwise positive.
+    roll: angle of the person's up direction in the photo, radians, clockwise positive.
     """
     photo_from_net = _square(x, y, half, roll, DETECTOR_SIDE)
     logits, found = _detected(image, photo_from_net)
@@ -67,9 +67,9 @@ def find_face(image: U8, x: float, y: float, half: float, roll: float = 0.0) -> 
 def face_boxes(
     image: U8, x: float, y: float, half: float, least: float, roll: float = 0.0
 ) -> list[tuple[F64, float]]:  # fmt: skip
-    """Middle (2,) and edge of each face in the square, pixels of the photo, the surest first; see `find_face`.
+    """Centre (2,) and edge of each face in the square, pixels of the photo, the most probable first; see `find_face`.
 
-    least: probability from which one counts. Of finds that overlap by half the surest is kept.
+    least: least probability. Of detections that overlap by half, the most probable is kept.
     """
     photo_from_net = _square(x, y, half, roll, DETECTOR_SIDE)
     logits, found = _detected(image, photo_from_net)
@@ -86,7 +86,7 @@ def face_boxes(
 
 
 def _detected(image: U8, photo_from_net: F64) -> tuple[Any, Any]:
-    """Logits and offsets of the detector for the square that `photo_from_net` says."""
+    """Logits and offsets of the detector for the square given by `photo_from_net`."""
     picture = _sampled(image, photo_from_net, DETECTOR_SIDE) * 2 - 1
     return _run("face_detection_short_range", picture, ("classificators", "regressors"))
 
@@ -102,7 +102,7 @@ def _landmarks(image: U8, centre: F64, half: float, roll: float) -> Face | None:
 
 
 def _square(x: float, y: float, half: float, roll: float, side: int) -> F64:
-    """(2, 3) photo from net, both with the first pixel's centre at (0, 0)."""
+    """(2, 3) affine matrix, photo from net, both with the first pixel's centre at (0, 0)."""
     c, s = np.cos(roll) * 2 * half / side, np.sin(roll) * 2 * half / side
     turn = np.array([[c, -s], [s, c]])
     shift = np.array([x - 0.5, y - 0.5]) - turn @ np.array([side / 2 - 0.5] * 2)
@@ -110,7 +110,7 @@ def _square(x: float, y: float, half: float, roll: float, side: int) -> F64:
 
 
 def _sampled(image: U8, photo_from_net: F64, side: int) -> npt.NDArray[np.float32]:
-    """(side, side, 3) in [0, 1]; what lies beyond the photo is black."""
+    """(side, side, 3) in [0, 1]; black outside the photo."""
     scale = float(np.hypot(*photo_from_net[:, 0]))
     source = cv2.GaussianBlur(image, (0, 0), 0.4 * scale) if scale > 1.3 else image  # against aliasing
     out = cv2.warpAffine(source, photo_from_net, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
@@ -118,7 +118,7 @@ def _sampled(image: U8, photo_from_net: F64, side: int) -> npt.NDArray[np.float3
 
 
 def _cells() -> F64:
-    """(896, 2) middles of the detector's cells, pixels of its input."""
+    """(896, 2) centres of the detector's cells, pixels of its input."""
     out = []
     for count, each in ((16, 2), (8, 6)):
         grid = (np.arange(count) + 0.5) * DETECTOR_SIDE / count
@@ -135,5 +135,7 @@ def _run(name: str, picture: npt.NDArray[np.float32], outputs: tuple[str, str]) 
     """Two outputs of a network for a picture (S, S, 3)."""
     net = network(MODELS / f"{name}.tflite", cv2.dnn.readNetFromTFLite)
     net.setInput(np.ascontiguousarray(picture.transpose(2, 0, 1)[None]))
-    first, second = (np.array(net.forward(o), np.float32) for o in outputs)  # the second is no output by its file
+    first, second = (
+        np.array(net.forward(o), np.float32) for o in outputs
+    )  # the file does not declare the second as output
     return first, second

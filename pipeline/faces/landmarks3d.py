@@ -1,11 +1,11 @@
-"""A face's landmarks in space, from where photos show them, and the head's axes that follow from them.
+"""3D face landmarks, triangulated from photos, and the head's axes computed from them.
 
 Symbols: N photos, L = 468 landmarks; uv (N, L, 2) pixels; x_l (3,) landmarks in the cameras' world; r_nl the distance
-in pixels between x_l seen by photo n and uv_nl, over the face's size in that photo.
+in pixels between x_l projected into photo n and uv_nl, over the face's size in that photo.
 
-Two photos hypothesise the face; the hypothesis that most photos agree with stands (RANSAC over pairs, all of them or
-an even choice, so that nothing is random). Each landmark is then the point nearest to the rays of the photos that
-agree, with weights that fall with the residual (Cauchy): a landmark on the far cheek is guessed, and slides.
+Each pair of photos gives a hypothesis of the face; the one with which most photos agree is used (RANSAC over all pairs,
+or an evenly spaced subset, without randomness). Each landmark is then the point nearest to the rays of the photos that
+agree, with weights that fall with the residual (Cauchy), because landmarks on a hidden cheek are guessed.
 
     x_l = argmin sum_n w_nl / d_n^2 |(1 - a a^T)(x - c_n)|^2,    w_nl = 1 / (1 + (r_nl / s)^2)
 """
@@ -27,14 +27,14 @@ F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 
 MIN_PHOTOS = 3  # fewer can agree by chance
-MET = 0.06  # of the face's size in a photo: median residual from which it shows another face, or none
+MET = 0.06  # of the face's size in a photo: a larger median residual means another face, or none
 SOFT = 0.02  # s: the network's own scatter on sharp frontal photos is about 1 % of the face
 ROUNDS = 10
 MAX_PAIRS = 150
-SPREAD = 2.8  # of a face's landmarks: its whole size over the median distance from their middle
-WIDE = np.radians(4.0)  # rays of two photos must part by so much to say how far away the face is
+SPREAD = 2.8  # size of a face over the median distance of its landmarks from their mean
+WIDE = np.radians(4.0)  # least angle between the rays of two photos to determine the depth of the face
 TOP, CHIN = 10, 152  # upper end of the forehead and lower end of the chin, in the middle
-SIDES = ((33, 263), (133, 362), (61, 291), (127, 356), (234, 454), (58, 288))  # right and left of the same place
+SIDES = ((33, 263), (133, 362), (61, 291), (127, 356), (234, 454), (58, 288))  # right and left landmark of each pair
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class HeadFrame:
 
 @dataclass(frozen=True, slots=True)
 class _Sights:
-    """Rays of all photos: centres (N, 3), directions (N, L, 3), and what is needed to project."""
+    """Rays of all photos: centres (N, 3), directions (N, L, 3), and the cameras' data for projection."""
 
     cameras: Sequence[Camera]
     uv: F64
@@ -78,7 +78,7 @@ class _Sights:
 
 
 def triangulate(cameras: Sequence[Camera], uv: F64) -> Landmarks | None:
-    """The face that most photos show. uv: (N, L, 2). None if fewer than MIN_PHOTOS agree on one."""
+    """The face on which most photos agree. uv: (N, L, 2). None if fewer than MIN_PHOTOS agree on one."""
     if len(cameras) < MIN_PHOTOS:
         return None
     found = [rays(matrix(c.K), matrix(c.world_from_cam), np.array(c.distortion), p)
@@ -103,7 +103,7 @@ def triangulate(cameras: Sequence[Camera], uv: F64) -> Landmarks | None:
 
 
 def residuals(cameras: Sequence[Camera], uv: F64, xyz: F64) -> F64:
-    """(N, L) pixels between landmarks as photos show them and xyz (L, 3) projected; infinite behind the camera."""
+    """(N, L) pixels between landmarks uv (N, L, 2) and projections of xyz (L, 3); infinite behind the camera."""
     out = []
     for c, at in zip(cameras, uv, strict=True):
         seen, z = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), xyz)
@@ -113,7 +113,7 @@ def residuals(cameras: Sequence[Camera], uv: F64, xyz: F64) -> F64:
 
 
 def _best_pair(seen: _Sights) -> Bool | None:
-    """(N,) photos that agree with the face of the pair of photos that most agree with, the closest of equals."""
+    """(N,) photos that agree with the best pair of photos: most photos, with small residuals."""
     pairs = [p for p in combinations(range(len(seen.cameras)), 2) if _parted(seen, np.array(p))]
     pairs = pairs[:: -(-len(pairs) // MAX_PAIRS)] if pairs else []
     few = np.linspace(0, seen.uv.shape[1] - 1, min(seen.uv.shape[1], 32)).astype(int)
@@ -124,7 +124,7 @@ def _best_pair(seen: _Sights) -> Bool | None:
         weight[list(pair)] = 1
         xyz = _points(some, weight)
         off = np.median(residuals(some.cameras, some.uv, xyz), 1) / _size(some, xyz)
-        agree = off <= 1.5 * MET  # of two photos alone a face is not yet as good as it can be
+        agree = off <= 1.5 * MET  # a face from only two photos is less accurate
         score = float((1 - (off[agree] / (1.5 * MET)) ** 2).sum())
         if agree.sum() >= MIN_PHOTOS and (best is None or score > best[0]):
             best = score, agree
@@ -132,15 +132,15 @@ def _best_pair(seen: _Sights) -> Bool | None:
 
 
 def _parted(seen: _Sights, which: npt.NDArray[np.integer]) -> bool:
-    """Whether the middle rays of some photos part by WIDE."""
+    """Whether the mean rays of two of the photos differ by at least WIDE."""
     middle = seen.direction[which].mean(1)
     middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     return bool(len(which) > 1 and (middle @ middle.T).min() <= np.cos(WIDE))
 
 
 def _size(seen: _Sights, xyz: F64) -> F64:
-    """(N,) about how large the face is in each photo, pixels: as its points in space say, or as the photo does, the
-    smaller, so that neither a face that was seen wrongly nor points far apart can choose their own measure."""
+    """(N,) approximate size of the face in each photo, pixels: from its 3D points or from its landmarks in the photo,
+    the smaller one, so that neither wrong landmarks nor scattered points can raise their own tolerance."""
     middle = np.median(xyz, 0)
     radius = float(np.median(np.linalg.norm(xyz - middle, axis=1)))
     distance = np.linalg.norm(seen.centre - middle, axis=1)
@@ -150,20 +150,20 @@ def _size(seen: _Sights, xyz: F64) -> F64:
 
 
 def _points(seen: _Sights, weight: F64) -> F64:
-    """(L, 3) points nearest to the rays, weights (N, L); NaN where the rays of a landmark are as good as parallel."""
+    """(L, 3) points nearest to the rays, with weights (N, L); NaN where the rays of a landmark are nearly parallel."""
     a = seen.direction
     across = np.eye(3) - a[..., :, None] * a[..., None, :]
     start = np.einsum("nl,nlij->lij", weight, across)
     middle = np.einsum("nl,nlij,nj->li", weight, across, seen.centre)
     first = _solved(start, middle)
-    # pixels and not metres: a far camera sees a given miss as smaller
+    # in pixels, not metres: the same error is smaller in the photo of a distant camera
     distance = np.linalg.norm(seen.centre[:, None] - np.nan_to_num(first), axis=2)
     w = weight / np.maximum(distance, 1e-9) ** 2 * seen.focal[:, None] ** 2
     return _solved(np.einsum("nl,nlij->lij", w, across), np.einsum("nl,nlij,nj->li", w, across, seen.centre))
 
 
 def _solved(A: F64, b: F64) -> F64:
-    """(L, 3) A^-1 b, NaN where A is as good as singular."""
+    """(L, 3) A^-1 b, NaN where A is nearly singular."""
     scale = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-300)
     normed = A / scale[:, None, None]
     good = np.linalg.eigvalsh(normed)[:, 0] > 1e-6
@@ -185,13 +185,14 @@ def head_frame(xyz: F64) -> HeadFrame:
 
 
 def off_frame(frame: HeadFrame, left_up_front: F64 | None = None) -> float:
-    """Degrees by which the head's front or up, whichever is more, differs from those of a frame; of the asset's."""
+    """Angle in degrees between the head's front or up direction (the larger one) and that of a frame (default: that of
+    asset coordinates)."""
     wanted = np.eye(3) if left_up_front is None else left_up_front
     cosine = np.einsum("ij,ij->i", frame.axes[1:], wanted[1:]).clip(-1, 1)
     return float(np.degrees(np.arccos(cosine)).max())
 
 
 def load_landmarks(path: Path) -> F64:
-    """xyz (468, 3) of the file that the masks hand on."""
+    """xyz (468, 3) of the file MaskSet.landmarks."""
     with np.load(path, allow_pickle=False) as data:
         return np.asarray(data["xyz"], np.float64)

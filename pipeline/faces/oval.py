@@ -1,4 +1,4 @@
-"""Which part of a surface is the face: what lies behind the landmarks' outline and looks to the front.
+"""The part of a surface that is the face: inside the outline of the landmarks, and facing the front.
 
 Symbols: landmarks (L, 3) and the head's axes from them (pipeline.faces.landmarks3d); h chin to top of the forehead.
 """
@@ -11,13 +11,13 @@ import numpy.typing as npt
 from pipeline.faces.landmarks3d import head_frame
 from pipeline.meshes import F64, Mask
 
-DEEP = 0.15  # h: how far before or behind the landmarks' own depths the surface may lie
-FACING = 0.0  # cosine to the front from which a place looks there
+DEEP = 0.15  # h: largest distance of the surface before or behind the landmarks' depths
+FACING = 0.0  # least cosine to the front of a point that faces it
 
 
 def on_face(points: F64, normals: npt.NDArray[np.floating], landmarks: F64) -> Mask:
-    """(N,) whether places (N, 3) with normals (N, 3) are in the face: inside the outline of its landmarks as seen from
-    the front, at about their depth, and not looking back."""
+    """(N,) whether points (N, 3) with normals (N, 3) are in the face: inside the outline of its landmarks (L, 3) seen
+    from the front, at about their depth, and not facing back."""
     from scipy.spatial import ConvexHull
 
     frame = head_frame(landmarks)

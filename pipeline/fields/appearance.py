@@ -18,11 +18,11 @@ from pipeline.fields.encodings import HashEncoding
 SKIN_F0 = 0.03  # reflectance at normal incidence; index of refraction 1.42
 START_RHO = 0.05
 LESSONS, LESSON_RATE = 500, 1e-2
-TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: skin's middle
+TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: typical for skin
 
 
 def mlp(width_in: int, width: int, depth: int, width_out: int) -> nn.Sequential:
-    """`depth` hidden ReLU layers."""
+    """MLP with `depth` hidden ReLU layers."""
     layers: list[nn.Module] = []
     for i in range(depth):
         layers += [nn.Linear(width_in if i == 0 else width, width), nn.ReLU()]
@@ -30,7 +30,7 @@ def mlp(width_in: int, width: int, depth: int, width_out: int) -> nn.Sequential:
 
 
 def start_heads(last: nn.Linear, albedo: tuple[float, float, float]) -> None:
-    """Set the last layer so that the field starts as skin of one colour and ordinary gloss."""
+    """Initialise the last layer so that the field starts as skin of one colour and typical gloss."""
     with torch.no_grad():
         last.weight *= 0.1
         last.bias[:3] = torch.logit(torch.tensor(albedo))
@@ -40,7 +40,7 @@ def start_heads(last: nn.Linear, albedo: tuple[float, float, float]) -> None:
 
 
 def restart_lobe(last: nn.Linear, rho: float) -> None:
-    """Set the last layer so that the lobe is everywhere skin's usual one again; the albedo stays."""
+    """Reset the last layer so that the lobe is the typical one of skin everywhere; the albedo is kept."""
     with torch.no_grad():
         last.weight[3:] = 0.0
         last.bias[3] = math.log(rho / (1 - rho))
@@ -49,7 +49,7 @@ def restart_lobe(last: nn.Linear, rho: float) -> None:
 
 
 def heads(raw: Tensor, positive: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """albedo, rho, c, 1/kappa from the last layer's outputs: sigmoid, sigmoid, softplus (or as it is), softplus."""
+    """albedo, rho, c, 1/kappa from the outputs of the last layer: sigmoid, sigmoid, softplus (or none), softplus."""
     return (
         torch.sigmoid(raw[:, :3]),
         torch.sigmoid(raw[:, 3]),
@@ -61,7 +61,7 @@ def heads(raw: Tensor, positive: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 class SpatialField(nn.Module):
     """x (N, 3) -> albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], 1/kappa (N,).
 
-    Differs: a hash encoding and a small ReLU network stand for the paper's sinusoidal MLP (about 10 times faster a
+    Differs: a hash encoding and a small ReLU network replace the paper's sinusoidal MLP (about 10 times faster per
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.
     """
 
@@ -82,15 +82,16 @@ class SpatialField(nn.Module):
         start_heads(last, albedo)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Material at x."""
+        """Material at x (N, 3)."""
         return heads(self.net(self.encoding(x)), self.positive)
 
 
 class IntegratedBasis(nn.Module):
     """(wo, n, wo . n) -> B (N, k) >= 0. [NeuFace eq. 9]
 
-    Differs: with `cosine_only` the network sees wo . n alone. An isotropic lobe's integral depends on nothing else;
-    the paper's inputs also let it depend on where wo and n point in the world, which no texture can carry.
+    Differs: with `cosine_only` the input of the network is only wo . n. The integral of an isotropic lobe depends on
+    nothing else; with the paper's inputs it also depends on the directions in the world, which no texture can
+    represent.
     """
 
     def __init__(self, rank: int, width: int, depth: int, cosine_only: bool) -> None:
@@ -110,13 +111,13 @@ class IntegratedBasis(nn.Module):
         return last.out_features
 
     def forward(self, wo: Tensor, n: Tensor) -> Tensor:
-        """B at unit directions, (N, 3) each; wo . n is taken as >= 0, which visible points have."""
+        """B (N, k) at unit directions, (N, 3) each; wo . n is clamped to >= 0, as at visible points."""
         cosine = (wo * n).sum(-1, keepdim=True).clamp(min=0)
         out: Tensor = functional.softplus(self.net(cosine if self.cosine_only else torch.cat([wo, n, cosine], -1)))
         return out
 
     def learn(self, target: Callable[[Tensor], Tensor]) -> None:
-        """Make the bases' sum a function of n . wo, (N,) -> (N,), as closely as they can."""
+        """Fit the sum of the bases to a function of n . wo, (N,) -> (N,)."""
         cosine = torch.linspace(0.0, 1.0, 101, device=next(self.net.parameters()).device)[:, None]
         wanted = target(cosine[:, 0])
         optimiser = torch.optim.Adam(self.net.parameters(), lr=LESSON_RATE)

@@ -1,4 +1,4 @@
-"""The parts of a model from its spec: ours, or those of a system that the paper compares.
+"""Selects the parts of a model by its spec: our own, or those of a system that the paper compares.
 
 appearance   hash | sinusoidal               the Spatial MLP
 shading      neural | phong | disney         the specular term [NeuFace section 5.2]
@@ -6,7 +6,7 @@ light        sh | cubemap
 integral     low_rank | direct | feature     the material integral [NeuFace eq. 6], [NeuFace eq. 8]
 geometry     grid | displaced                a spline grid, or a prior and a displacement [NeuFace eq. 17]
 
-The first of each is ours. All others are in pipeline.fields.paper, which is loaded only where one of them is asked for.
+The first of each is ours. All others are in pipeline.fields.paper, which is loaded only if one of them is selected.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ OURS = {"appearance": "hash", "shading": "neural", "light": "sh", "integral": "l
 
 
 def system_of(spec: FaceSpec) -> System:
-    """The makers of a model's parts. The one door to pipeline.fields.paper."""
+    """The constructors of a model's parts. The only use of pipeline.fields.paper."""
     if all(getattr(spec, part) == name for part, name in OURS.items()):
         return System(makers.geometry, makers.spatial, makers.basis, makers.light, makers.shading)
     from pipeline.fields.paper.build import compared

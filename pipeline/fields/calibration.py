@@ -11,10 +11,10 @@ WIDTH, EMBEDDING = 32, 8
 
 
 class Calibration(nn.Module):
-    """A_n = I + M_n - mean of all M_n, M_n a small network on a learnt embedding: (views, 3, 3).
+    """A_n = I + M_n - mean of all M_n: (views, 3, 3). M_n is a small network on a learnt embedding.
 
-    The last layer starts at zero, so that every A_n starts at the identity. The mean is taken off because albedo,
-    light and the A_n share one free colour transform; fixing the mean A at I leaves it to the light.
+    The last layer is initialised to zero, so that every A_n starts at the identity. The mean is subtracted because one
+    colour transform is ambiguous between albedo, light and the A_n; with the mean A fixed at I, it is in the light.
     """
 
     def __init__(self, views: int) -> None:
@@ -28,7 +28,7 @@ class Calibration(nn.Module):
             last.bias.zero_()
 
     def forward(self) -> Tensor:
-        """All A_n."""
+        """All A_n, (views, 3, 3)."""
         m = self.net(self.embedding).reshape(-1, 3, 3)
         out: Tensor = torch.eye(3, device=m.device) + m - m.mean(0)
         return out

@@ -1,8 +1,8 @@
-"""Multi-resolution hash encoding of positions: dense tables while they fit, hashed ones beyond.
+"""Multi-resolution hash encoding of positions: dense tables for coarse levels, hashed ones for fine levels.
 
-Symbols: level i has nodes every h_i = coarse * ratio^-i; a position reads 2 features a level, trilinearly from its 8
-corners. Corners of a hashed level go to (i ^ 2654435761 j ^ 805459861 k) mod 2^log2_size; collisions are left to the
-fit, where a surface uses but a thin shell of the volume.
+Symbols: level i has nodes every h_i = coarse * ratio^-i; a position has 2 features per level, interpolated trilinearly
+from its 8 corners. A corner of a hashed level has the index (i ^ 2654435761 j ^ 805459861 k) mod 2^log2_size.
+Collisions are not resolved; they matter little, because a surface uses only a thin shell of the volume.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class HashEncoding(nn.Module):
         return FEATURES * len(self.offset)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features at x, differentiable in the table and in x."""
+        """Features (N, 2 L) at x (N, 3), differentiable in the table and in x."""
         out: Tensor = _Hash.apply(x, self.table, self) if kernels.compiled(x) else self.reference(x)  # type: ignore[no-untyped-call]
         return out * self.window
 
     def open_levels(self, share: float) -> None:
-        """Let the coarsest `share` of the levels through, the last of them in part; finer ones give 0."""
+        """Use only the coarsest `share` of the levels, the last of them in part; finer ones give 0."""
         count = len(self.offset)
         level = torch.arange(count, device=self.window.device).repeat_interleave(FEATURES)
         self.window.copy_((share * count - level).clamp(0, 1))
@@ -88,7 +88,7 @@ class HashEncoding(nn.Module):
         return torch.cat(columns, -1)
 
     def tables(self) -> tuple[Any, ...]:
-        """What the compiled kernels read."""
+        """Input of the compiled kernels."""
         return (
             self.offset.numpy(),
             self.size.numpy(),

@@ -1,6 +1,6 @@
-"""The whole model as one module, its file, and the fitted face in plain arrays.
+"""The whole model as one module, its file, and the fitted face as plain arrays.
 
-File: npz with `spec` (JSON, utf-8 bytes) and one array a parameter or buffer, by its name in the module.
+File: npz with `spec` (JSON, utf-8 bytes) and one array per parameter or buffer, by its name in the module.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Shaded:
 
 
 class FaceModel(nn.Module):
-    """Geometry, appearance, light and calibration of one capture. `beta` is the Laplace density's width.
+    """Geometry, appearance, light and calibration of one capture. `beta` is the width of the Laplace density.
 
-    `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and bounces only where `shadowing` is on.
-    The order in which the parts are made is the order of the random draws that they start from, and of the file.
+    `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and interreflections only if `shadowing`
+    is on. The order in which the parts are constructed determines their random initialisation and the file.
     """
 
     beta: Tensor
@@ -61,7 +61,7 @@ class FaceModel(nn.Module):
         self.shading = system.shading(spec, self.basis, self.light)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
-        self.uniform_albedo = False  # one albedo for all, while the light is found
+        self.uniform_albedo = False  # one albedo for all points, while the light is estimated
         self.register_buffer("beta", torch.tensor(geometry.cell))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
@@ -79,12 +79,12 @@ class FaceModel(nn.Module):
         return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
 
     def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
-        """L_d under what arrives of the light, (N, 3)."""
+        """L_d (N, 3), including shadows if they are modelled."""
         open_light = brdf.lambertian(albedo, self.light.irradiance(n))
         return open_light if self.shadowing is None else open_light * self.shadowing(x)
 
     def solve_shadows(self) -> None:
-        """Bring the shadows up to date with the surface, the albedo and the light found so far."""
+        """Update the shadows for the present surface, albedo and light."""
         if self.shadowing is not None:
             index, x, n = near_surface(self.shadowing, self.geometry)
             with torch.no_grad():
@@ -99,13 +99,13 @@ class FaceModel(nn.Module):
 
 
 def load_model(path: Path, device: str = "cpu") -> FaceModel:
-    """Rebuild a model from its file. Raises StageError if the file is of another format or a shape is wrong."""
+    """Load a model from its file. Raises StageError if the file has another format or a shape is wrong."""
     with np.load(path, allow_pickle=False) as file:
         spec: dict[str, Any] = json.loads(bytes(file["spec"]).decode())
         arrays = {k: torch.from_numpy(file[k]) for k in file.files if k != "spec"}
     if spec.pop("format", None) != FORMAT:
         raise StageError(
-            "the fitted field is of another format",
+            "the fitted field has another format",
             where=path.name,
             value=spec.get("format"),
             limit=f"format {FORMAT}",
@@ -127,7 +127,7 @@ class FittedField:
 
     @property
     def bounds(self) -> tuple[F32, F32]:
-        """Box in which the SDF is defined."""
+        """(3,) corners of the box in which the SDF is defined."""
         lo, hi = self.model.geometry.box()
         return lo.cpu().numpy(), hi.cpu().numpy()
 
@@ -160,7 +160,7 @@ class FittedField:
         return tuple(np.concatenate(p) for p in zip(*out, strict=True))
 
     def sdf_and_gradient(self, points: F32) -> tuple[F32, F32]:
-        """(N,) and (N, 3)."""
+        """SDF (N,) and gradient (N, 3) at points (N, 3)."""
         s, g = self._map(self.model.geometry, points)
         return s, g
 
@@ -169,15 +169,15 @@ class FittedField:
         return self.sdf_and_gradient(points)[0]
 
     def material(self, points: F32) -> Material:
-        """Appearance at points. Without a lobe its strength is 0 and its shape, which nothing was fitted to, the usual
-        one: a map of chance values would come to light as soon as somebody adds a gloss."""
+        """Appearance at points (N, 3). Without a lobe its strength is 0 and its shape, which was not fitted, is the
+        typical one: random values would become visible if somebody raised the strength later."""
         albedo, rho, c, inv_kappa = self._map(self.model.spatial, points)
         if not self.model.spec.specular:
             rho, c, inv_kappa = np.zeros_like(rho), np.ones_like(c), np.full_like(inv_kappa, TYPICAL_INV_KAPPA)
         return Material(albedo, rho, self.model.shading.coefficients(c), inv_kappa)
 
     def irradiance_ratio(self, points: F32) -> F32:
-        """(N, 3)."""
+        """(N, 3) see pipeline.fields.protocol.Field."""
         shadowing = self.model.shadowing
         if shadowing is None:
             return np.ones((len(points), 3), np.float32)

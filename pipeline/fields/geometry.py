@@ -1,12 +1,12 @@
 """The SDF as a spline grid, refined coarse to fine and optimised in a narrow band.
 
 Symbols: values (X, Y, Z) spline coefficients at lo + i cell, asset units (pipeline.maths.sdf). The band is the set of
-coefficients within BAND cells of the zero set; only they have optimiser state that moves. Beyond it the values are
-distances by an exact transform, made anew at each refinement, so that rays can step over empty space.
+coefficients within BAND cells of the zero set; only these are optimised. The other values are distances by an exact
+distance transform, computed at each refinement, so that rays can skip empty space.
 
-Differs from plain Adam, whose steps are as long for a coefficient that rays graze now and then as for one that many
-photos see squarely: there noise alone walks it about, and skin that few views see turns rough. Here the root of the
-band's mean second moment is added to each coefficient's own, so that a step shrinks with what is known (docs/model.md).
+Differs from plain Adam: its steps are as long for a coefficient that few rays touch as for one that many photos show,
+so that noise moves it and skin in few views becomes rough. Here the root of the band's mean second moment is added to
+that of each coefficient, so that steps are shorter where the photos give less information (docs/model.md).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ TYPICAL_EVERY = 20  # steps
 
 
 class GridSdf(nn.Module):
-    """SDF(x) and its gradient; carries the state of its own optimiser."""
+    """SDF(x) and its gradient; contains the state of its own optimiser."""
 
     values: Tensor
     lo: Tensor
@@ -49,17 +49,17 @@ class GridSdf(nn.Module):
         self.m = torch.zeros_like(values)
         self.v = torch.zeros_like(values)
         self.steps = 0
-        self.typical = 0.0  # gradient of the coefficients that rays touch, as of the last look
+        self.typical = 0.0  # gradient of the coefficients that rays touch, when last measured
         self.find_band()
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Coefficients an axis."""
+        """Coefficients along each axis."""
         x, y, z = self.values.shape
         return x, y, z
 
     def box(self) -> tuple[Tensor, Tensor]:
-        """Corners of the volume where the spline is whole (half a cell inside the outermost nodes but one)."""
+        """(3,) corners of the volume where the spline is complete (half a cell inside the second outermost nodes)."""
         n = torch.tensor(self.shape, device=self.lo.device)
         return self.lo + 0.5 * self.cell, self.lo + (n - 1.5) * self.cell
 
@@ -71,21 +71,21 @@ class GridSdf(nn.Module):
     def trace(self, o: Tensor, d: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """t, hit and SDF of the first hit or the closest approach. [NeuFace section 4.4]
 
-        Differs: factor 0.95 and not 1.2: a spline of a hull's distance may be steeper than 1, and the march finds
-        crossings by sign, so that shorter steps cost little (measured in docs/benchmarks.md).
+        Differs: factor 0.95 instead of 1.2. A spline of a hull's distance may have a slope above 1, and crossings are
+        found by the sign, so that shorter steps cost little (measured in docs/benchmarks.md).
         """
         return kernels.trace(self.values, self.lo, self.cell, o, d, near, far, min_step=0.3 * self.cell, factor=0.95)
 
     # ---------------------------------------------------------------- optimisation
     def find_band(self) -> None:
-        """Choose the coefficients that take part in the optimisation from now on."""
+        """Select the coefficients that are optimised from now on."""
         with torch.no_grad():
             inner = torch.zeros_like(self.values, dtype=torch.bool)
             inner[1:-1, 1:-1, 1:-1] = True
             near = (self.values.abs() < BAND * self.cell) & inner
-            idle = ~near  # what leaves the band forgets its momentum, so that a checkpoint of the band is all there is
+            idle = ~near  # coefficients that leave the band lose their momentum: a checkpoint contains only the band
             self.m[idle], self.v[idle] = 0, 0
-            self.sink.zero_()  # and what enters it owes nothing to gradients from before
+            self.sink.zero_()  # and coefficients that enter it start without old gradients
             self.active = torch.nonzero(near.view(-1)).squeeze(-1)
 
     def step(self, lr: float) -> None:
@@ -97,7 +97,7 @@ class GridSdf(nn.Module):
         kernels.adam_on_band(self.values, self.sink, self.m, self.v, self.active, self.steps, lr, BETAS, eps)
 
     def _typical_gradient(self) -> float:
-        """Mean root of the second moments, as far as rays have touched their coefficients; of the first gradients."""
+        """Mean root of the second moments of the coefficients that rays touched; at first, of the gradients."""
         known = self.steps > 1
         moments = self.v.view(-1)[self.active] if known else self.sink.view(-1)[self.active].square()
         moments = moments[moments > 0]
@@ -105,15 +105,15 @@ class GridSdf(nn.Module):
         return float((moments / unbiased).sqrt().mean()) if len(moments) else 0.0
 
     def gradient_is_finite(self) -> bool:
-        """Whether the gradients gathered since the last step are. See kernels.SplineSdf for how a fault is marked."""
+        """Whether the gradients since the last step are finite. kernels.SplineSdf marks gradients that are not."""
         return bool(torch.isfinite(self.sink[0, 0, 0]))
 
     def drop_gradient(self) -> None:
-        """Forget the gradients gathered since the last step."""
+        """Discard the gradients since the last step."""
         self.sink.zero_()
 
     def redistance(self) -> None:
-        """Keep the subject's pieces of the zero set, fill their cavities, and make the far field a distance again."""
+        """Keep the subject's components, fill their cavities, and recompute the distances outside the band."""
         values = self.values.detach().cpu().numpy()
         solid = filled(subject_pieces(values < 0, self.lo.cpu().numpy(), self.cell))
         far = np.where(solid, -coarse_distance(solid), coarse_distance(~solid)) * np.float32(self.cell)
@@ -124,7 +124,7 @@ class GridSdf(nn.Module):
         self.find_band()
 
     def refine(self) -> None:
-        """Halve the cell: the same function on a grid of eight times the coefficients."""
+        """Halve the cell: the same function on a grid with eight times as many coefficients."""
         self.redistance()
         with torch.no_grad():
             finer = spline.refine(self.values.detach())
@@ -134,16 +134,16 @@ class GridSdf(nn.Module):
 
     # ---------------------------------------------------------------- checkpoints
     def to_device(self, device: str) -> None:
-        """Move the optimiser's state after the module."""
+        """Move the optimiser's state to the device of the module."""
         self.sink, self.m, self.v = (x.to(device) for x in (self.sink, self.m, self.v))
         self.active = self.active.to(device)
 
     def restore(self, values: Tensor) -> None:
-        """Take a grid of another size (from a checkpoint); the optimiser's state starts empty."""
+        """Set a grid of another size (from a checkpoint); the optimiser's state is reset."""
         self._set(values)
 
     def optimiser_state(self) -> dict[str, Tensor | float]:
-        """State of the band's optimiser, as far as it can move."""
+        """State of the optimiser in the band."""
         return {
             "active": self.active,
             "m": self.m.view(-1)[self.active],
@@ -163,16 +163,17 @@ class GridSdf(nn.Module):
 
 
 def grid_of(geometry: Geometry) -> GridSdf:
-    """A geometry as the grid that the fast fit refines and moves."""
+    """The geometry, if it is a GridSdf, which the fast fit refines."""
     assert isinstance(geometry, GridSdf)
     return geometry
 
 
 def coarse_distance(free: np.ndarray) -> np.ndarray:
-    """(X, Y, Z) distance in cells from free nodes to the next that is not, at least 0.5; never more than the true one.
+    """(X, Y, Z) distance in cells from nodes where `free` (X, Y, Z) to the next other node, at least 0.5; never more
+    than the true distance.
 
-    Found on every other node, which is eight times faster and at most 4 cells short: it only serves to step over empty
-    space, and too short a step costs little where too long a one would miss the surface.
+    It is computed on every second node, which is eight times faster and at most 4 cells too short. It is used to skip
+    empty space: a short step costs little, a long one would miss the surface.
     """
     padded = np.pad(free, [(0, n % 2) for n in free.shape], mode="edge")
     x, y, z = (n // 2 for n in padded.shape)

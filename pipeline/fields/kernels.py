@@ -1,6 +1,6 @@
-"""Differentiable gathers with two back ends: compiled CPU kernels where numba is installed, plain torch elsewhere.
+"""Differentiable gathers with two back ends: compiled CPU kernels if numba is installed, else plain torch.
 
-The torch path is the reference, and the only one on a GPU. Tests force it by taking `nb` away.
+The torch path is the reference, and the only one on a GPU. Tests select it by removing `nb`.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ MIN_EPS = 1e-12  # of the optimiser: distances are in metres, so that gradients 
 nb: Any
 try:
     from pipeline.fields import kernels_numba as nb
-except ImportError:  # a bare GPU machine has torch, numpy and scipy alone
+except ImportError:  # a minimal GPU machine only has torch, numpy and scipy
     nb = None
 
 
 def compiled(x: Tensor) -> bool:
-    """Whether the compiled kernels serve this tensor: float32 on the CPU, numba at hand."""
+    """Whether the compiled kernels support this tensor: float32 on the CPU, and numba is installed."""
     return nb is not None and x.device.type == "cpu" and x.dtype == torch.float32
 
 
@@ -35,9 +35,9 @@ def _np(x: Tensor) -> Any:
 class SplineSdf(torch.autograd.Function):
     """SDF and gradient of a spline grid; the gradient of the coefficients is added to `sink` (X, Y, Z).
 
-    The sink spares a dense gradient tensor a call. Positions get no gradient: samples are placed, not learnt.
-    A gradient that is not finite is not added: it marks the sink's first node, on the border where nothing is learnt,
-    with NaN, so that whoever takes the step can tell at the cost of one number.
+    The sink avoids a dense gradient tensor per call. Positions get no gradient: samples are placed, not learnt.
+    A gradient that is not finite is not added. Instead the sink's first node, which is on the border and never learnt,
+    becomes NaN, so that the optimiser can detect the error by reading one number.
     """
 
     @staticmethod
@@ -116,12 +116,12 @@ def adam_on_band(
     betas: tuple[float, float],
     eps: float = MIN_EPS,
 ) -> None:
-    """One Adam step, in place, on the coefficients named by `active` (flat indices); clears their gradient.
+    """One Adam step, in place, on the coefficients `active` (flat indices); clears their gradient.
 
-    Coefficients that no ray touched are left alone, momentum and all: a batch sees a few per cent of the band, and
-    moving the rest by old gradients costs most of the time and adds noise.
+    Coefficients that no ray touched are not changed, nor is their momentum: a batch touches a few per cent of the band,
+    and moving the others by old gradients would take most of the time and add noise.
 
-    eps is what is added to the root of the second moment, far below any useful gradient unless it is meant to damp.
+    eps is added to the root of the second moment; it is far below any useful gradient, unless it is used for damping.
     """
     b1, b2 = betas
     c1, c2 = 1 - b1**step, 1 - b2**step
@@ -141,11 +141,11 @@ def adam_on_band(
 
 
 def look_up(grey: Tensor, first: Tensor, width: Tensor, height: Tensor, view: Tensor, q: Tensor) -> Tensor:
-    """Bilinear samples (N, V, K) of photos, held at their border.
+    """Bilinear samples (N, V, K) of photos, clamped to their border.
 
-    grey: all photos' rows one after the other; first, width, height (M,) where each begins and its size in pixels.
-    view (N, V): which photo; q (N, V, 3, K): homogeneous image positions, pixel centres at +0.5. Photos have at least
-    2 x 2 pixels; a position at infinity (third coordinate 0) must not be asked for.
+    grey: the rows of all photos in one array; first, width, height (M,): offset and size in pixels of each photo.
+    view (N, V): index of the photo; q (N, V, 3, K): homogeneous image positions, pixel centres at +0.5. Photos have at
+    least 2 x 2 pixels; positions at infinity (third coordinate 0) are not allowed.
     """
     if compiled(grey) and compiled(q):
         out = torch.empty(*q.shape[:2], q.shape[3])

@@ -1,11 +1,10 @@
-"""CPU kernels for the gathers that rule the fit's cost: spline SDF, ray march, hash encoding, patches of photos.
+"""CPU kernels for the gathers that dominate the fit's time: spline SDF, ray march, hash encoding, patches of photos.
 
-Each has its reference in plain torch (pipeline.maths.sdf, pipeline.maths.tracing, pipeline.fields.encodings), and the
-tests hold them to it. A fit repeats bit by bit, for which two things are needed. Sums are done in an order that does
-not depend on timing: scatters run in parallel only over regions that can't touch (slabs of the grid, levels of the
-table). And arithmetic is strict, without `fastmath`: with it, a process that compiles a kernel and one that loads the
-same kernel from the cache round differently (seen in the first step of a fit). It costs a quarter of the kernels'
-speed.
+Each has a reference in plain torch (pipeline.maths.sdf, pipeline.maths.tracing, pipeline.fields.encodings), with which
+the tests compare it. A fit is reproducible bit by bit, for two reasons. The order of sums does not depend on timing:
+scatters run in parallel only over disjoint regions (slabs of the grid, levels of the table). And arithmetic is strict,
+without `fastmath`: with it, a process that compiles a kernel and one that loads it from the cache round differently
+(observed in the first step of a fit). This costs a quarter of the kernels' speed.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -15,13 +14,13 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-SLAB = 4  # nodes; a stencil reaches one node beyond its slab, so slabs of one parity never meet
+SLAB = 4  # nodes; a stencil reaches one node outside its slab, so slabs of one parity never overlap
 HALF, THREE_QUARTERS, ONE, ZERO = np.float32(0.5), np.float32(0.75), np.float32(1), np.float32(0)
 
 
 @njit(inline="always", error_model="numpy")
 def _axis(u, top):
-    """Nearest node kept off the border, and f in [-1/2, 1/2]."""
+    """Nearest node that is not on the border, and f in [-1/2, 1/2]."""
     node = int(np.floor(u + HALF))
     node = min(max(node, 1), top - 2)
     f = np.float32(u - np.float32(node))
@@ -148,7 +147,7 @@ def spline_backward(out, lo, inv, x, gs, gg):
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def march(values, lo, inv, o, d, t_near, t_far, factor, min_step, max_steps, refine_steps, t_out, hit, s_out):
-    """Sphere tracing, one ray a time; see pipeline.maths.tracing.sphere_trace."""
+    """Sphere tracing, one ray at a time; see pipeline.maths.tracing.sphere_trace."""
     for n in prange(o.shape[0]):
         t = t_near[n]
         s = _value(values, lo, inv, o[n, 0] + t * d[n, 0], o[n, 1] + t * d[n, 1], o[n, 2] + t * d[n, 2])

@@ -12,7 +12,7 @@ from pipeline.maths.sh import count, irradiance
 
 
 class ShLight(nn.Module):
-    """Coefficients (K, 3). Starts as an even white light of the given radiance."""
+    """Coefficients (K, 3). Initialised to a uniform white light of the given radiance."""
 
     def __init__(self, order: int, start: float) -> None:
         super().__init__()
@@ -21,18 +21,18 @@ class ShLight(nn.Module):
         self.coefficients = nn.Parameter(c)
 
     def forward(self) -> Tensor:
-        """The coefficients."""
+        """The coefficients (K, 3)."""
         return self.coefficients
 
     def uniform_gradient(self, order: int) -> None:
-        """While nothing but the light moves: the same for all colours, and no more of it than skin can show."""
+        """Restrict the gradient while only the light is optimised: equal for all colours, no orders above `order`."""
         grad = self.coefficients.grad
         if grad is not None:
             grad.copy_(grad.mean(-1, keepdim=True).expand_as(grad))
             grad[count(order) :] = 0
 
     def irradiance(self, n: Tensor) -> Tensor:
-        """E(n), (N, 3)."""
+        """E(n), (N, 3) for normals (N, 3)."""
         return irradiance(self.coefficients, n)
 
     def reflected(self, w_r: Tensor, width: Tensor, attenuation: str) -> Tensor:

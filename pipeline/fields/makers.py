@@ -1,4 +1,4 @@
-"""Our own parts of a model, each made from its spec."""
+"""Constructors of our own parts of a model, from its spec."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def spatial(spec: FaceSpec) -> SpatialField:
 
 
 def hashed(spec: FaceSpec, columns: int, positive: bool) -> SpatialField:
-    """A Spatial MLP over a hash encoding; `columns` numbers beside albedo, rho and 1/kappa."""
+    """A Spatial MLP over a hash encoding, with `columns` outputs besides albedo, rho and 1/kappa."""
     lo, hi = torch.tensor(spec.lo), torch.tensor(spec.hi)
     encoding = HashEncoding(lo, hi, spec.coarse, spec.hash_fine, spec.hash_levels, spec.hash_log2_size)
     return SpatialField(encoding, columns, spec.width, spec.depth, spec.albedo_start, positive)

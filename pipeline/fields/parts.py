@@ -1,8 +1,8 @@
-"""What the parts of a model answer, whatever they are made of, and how a system makes them.
+"""Interfaces of the parts of a model, and of the systems that construct them.
 
-Production has one implementation of each (geometry.GridSdf, appearance.SpatialField and IntegratedBasis, light.ShLight,
-shading.BasisShading). Those that the paper compares are in pipeline.fields.paper. build.system_of chooses, once, when a
-model is made. Every part is a network module: its parameters are the model's.
+Our own model has one implementation of each (geometry.GridSdf, appearance.SpatialField and IntegratedBasis,
+light.ShLight, shading.BasisShading). Those that the paper compares are in pipeline.fields.paper. build.system_of
+selects one when a model is constructed. Every part is a network module: its parameters belong to the model.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pipeline.fields.spec import FaceSpec
 
 @dataclass(frozen=True, slots=True)
 class Skin:
-    """Material at N places: albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], inv_kappa (N,)."""
+    """Material at N points: albedo (N, 3), rho (N,), c (N, k) of [NeuFace eq. 7], inv_kappa (N,)."""
 
     albedo: Tensor
     rho: Tensor
@@ -31,7 +31,7 @@ class Part(Protocol):
     """A network module."""
 
     def parameters(self, recurse: bool = True) -> Iterator[nn.Parameter]:
-        """What is learnt of it."""
+        """The learnt parameters."""
         ...
 
 
@@ -80,7 +80,7 @@ class Light(Part, Protocol):
         ...
 
     def uniform_gradient(self, order: int) -> None:
-        """Make the gradient that of a white light of this order."""
+        """Restrict the gradient to that of a white light of this order."""
         ...
 
     def irradiance(self, n: Tensor) -> Tensor:
@@ -93,7 +93,7 @@ class Light(Part, Protocol):
 
 
 class Shading(Protocol):
-    """How skin reflects the light, and what of that a texture can hold."""
+    """How skin reflects the light, and the part of it that textures can represent."""
 
     @property
     def rank(self) -> int:
@@ -119,7 +119,7 @@ class Shading(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """How a model's parts are made. geometry: from a saved model's arrays, by their names there, and its cell."""
+    """Constructors of a model's parts. geometry: from the arrays of a saved model, by name, and its cell."""
 
     geometry: Callable[[FaceSpec, Mapping[str, Tensor], float], Geometry]
     spatial: Callable[[FaceSpec], Spatial]

@@ -1,6 +1,7 @@
-"""What the stages after the fit may ask of a fitted field, in plain arrays.
+"""Interface of a fitted field for the stages after the fit, in plain arrays.
 
-Points are (N, 3) in asset coordinates. Calls are chunked inside: any N is fine. Nothing here keeps gradients.
+Points are (N, 3) in asset coordinates. Calls are split into chunks inside, so any N is possible. There are no
+gradients.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Material:
 
 
 class Field(Protocol):
-    """A fitted face (see pipeline.fields.face.load_face) or any stand-in with the same questions."""
+    """A fitted face (see pipeline.fields.face.load_face), or a replacement with the same interface."""
 
     @property
     def bounds(self) -> tuple[F32, F32]:
@@ -64,8 +65,8 @@ class Field(Protocol):
         ...
 
     def irradiance_ratio(self, points: F32) -> F32:
-        """(N, 3) what arrives at the surface of what would without shadows and bounces; 1 where they are not modelled.
-        Holds under the captured light."""
+        """(N, 3) irradiance at the surface over that without shadows and interreflections; 1 if they are not modelled.
+        For the captured light."""
         ...
 
     def basis(self, wo: F32, normal: F32) -> F32:

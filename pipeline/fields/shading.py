@@ -1,4 +1,4 @@
-"""The specular term as neural bases under the captured light, which is what an asset is baked from."""
+"""The specular term with neural bases under the captured light, from which the asset is baked."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class BasisShading:
         return self.basis.rank
 
     def diffuse_albedo(self, skin: Skin) -> Tensor:
-        """As it is."""
+        """The albedo (N, 3), unchanged."""
         return skin.albedo
 
     def specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor) -> Tensor:
@@ -31,7 +31,7 @@ class BasisShading:
         return brdf.specular(skin.rho, self.basis.integral(x, skin.c, wo, n), incident)
 
     def coefficients(self, c: F32) -> F32:
-        """As they are."""
+        """The coefficients (N, k), unchanged."""
         return c
 
     def bases(self, wo: Tensor, n: Tensor) -> Tensor:

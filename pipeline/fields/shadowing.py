@@ -1,4 +1,4 @@
-"""Shadows and bounces: how much of the open irradiance arrives at a point of the surface.
+"""Shadows and interreflections: share of the unoccluded irradiance that arrives at a point of the surface.
 
     E(x) = integral over the hemisphere of n:  V L(w) cos + (1 - V) L_o(y) cos,     s(x) = E(x) / E_open(n)
 
@@ -6,10 +6,11 @@ Symbols: V 1 where the ray x + t w leaves the volume, else it hits y; L the SH l
 diffuse radiance that leaves y; E_open the same integral with V = 1. s is stored per colour on a coarse grid around the
 surface; the diffuse term is a / pi s(x) E_open(n), with E_open from the closed form and the fine normal.
 
-Differs: [NeuFace eq. 16] has s = 1, and its albedo takes up the shadows under chin, brow and nose. s needs no gradient:
-it is solved anew a few times during the fit from the surface, skin and light found so far, and converges with them.
+Differs: [NeuFace eq. 16] has s = 1, so that its albedo contains the shadows under chin, brow and nose. s needs no
+gradient: it is recomputed a few times during the fit from the present surface, skin and light, and converges with them.
 
-Source: the rendering equation (Kajiya 1986) by a fixed set of directions; bounces as in radiosity, one pass a bounce.
+Source: the rendering equation (Kajiya 1986) with a fixed set of directions; bounces as in radiosity, one pass per
+bounce.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from pipeline.maths.tracing import box_interval
 from pipeline.nearest import filled
 
 CELLS = 64  # of the grid along the longest side
-NEAR_CELLS = 1.8  # nodes within this of the surface are solved: every corner of a cell that the surface crosses
-LIFT_CELLS = 1.0  # of the SDF's: rays start above the surface, so that its own roughness casts no shadow
+NEAR_CELLS = 1.8  # nodes within this distance of the surface are solved: all corners of cells that it crosses
+LIFT_CELLS = 1.0  # cells of the SDF: rays start this far above the surface, so that its noise casts no shadow
 RANGE = (0.02, 2.0)  # of s
 RAYS = 1 << 18  # at a time
 
@@ -39,7 +40,7 @@ F64 = npt.NDArray[np.float64]
 
 
 class Shadowing(nn.Module):
-    """s(x) on a grid of nodes at lo + i cell. All ones until it is solved."""
+    """s(x) on a grid of nodes at lo + i cell. 1 everywhere until it is solved."""
 
     ratio: Tensor
     lo: Tensor
@@ -65,7 +66,7 @@ class Shadowing(nn.Module):
 
 
 def trilinear(grid: Tensor, lo: Tensor, cell: float, x: Tensor) -> Tensor:
-    """(N, C) values of a grid (C, X, Y, Z) with nodes at lo + i cell, constant beyond its faces."""
+    """(N, C) values at x (N, 3) of a grid (C, X, Y, Z) with nodes at lo + i cell, constant outside it."""
     top = torch.tensor(grid.shape[1:], device=x.device) - 1
     at = 2 * (x - lo) / (cell * top) - 1
     found = functional.grid_sample(
@@ -86,8 +87,8 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """What reaches M points. open, sky (M, 3): irradiance with and without what the surface blocks. Blocked rays:
-    point (R,), where they end (R, 3), weight (R,) = cos dw."""
+    """Light that reaches M points. open, sky (M, 3): irradiance without and with occlusion by the surface. Blocked
+    rays: index of the point (R,), hit position (R, 3), weight (R,) = cos dw."""
 
     open: F64
     sky: F64
@@ -125,7 +126,7 @@ def near_surface(shadowing: Shadowing, geometry: Geometry) -> tuple[Tensor, Tens
         s, _ = geometry(nodes)
         index = torch.nonzero(s.abs() < NEAR_CELLS * shadowing.cell).squeeze(-1)
         x = nodes[index]
-        for _ in range(3):  # Newton: the far field is a distance of the coarse kind
+        for _ in range(3):  # Newton steps, because the far field is a coarse distance
             s, g = geometry(x)
             x = x - (s / (g * g).sum(-1).clamp(min=0.25)).clamp(-shadowing.cell, shadowing.cell)[:, None] * g
         s, g = geometry(x)
@@ -147,7 +148,7 @@ def arrivals(geometry: Geometry, surface: Surface, light: Tensor, directions: in
         o = x[point] + LIFT_CELLS * geometry.cell * n[point]
         near, far = box_interval(o, d[way], *geometry.box())
         t, hit, s = geometry.trace(o, d[way], near, far)
-        hit = hit | (s <= 0)  # in a crease the lifted start may lie in the opposite wall
+        hit = hit | (s <= 0)  # in a crease the lifted start may be inside the opposite wall
         free = weight.clone()
         free[point[hit], way[hit]] = 0
         end = (o + t[:, None] * d[way])[hit]
@@ -167,7 +168,7 @@ def arrivals(geometry: Geometry, surface: Surface, light: Tensor, directions: in
 
 
 def fibonacci(count: int) -> Tensor:
-    """(count, 3) unit directions that share the sphere evenly."""
+    """(count, 3) unit directions, evenly distributed on the sphere."""
     i = torch.arange(count, dtype=torch.float64) + 0.5
     z = 1 - 2 * i / count
     angle = math.pi * (3 - math.sqrt(5)) * i
@@ -176,12 +177,12 @@ def fibonacci(count: int) -> Tensor:
 
 
 def _ratio(arriving: F64, opened: F64, floor: float) -> F64:
-    """Their quotient; 1 where there is no light at all."""
+    """Their quotient; 1 where there is no light."""
     return np.asarray(((arriving + floor) / (opened + floor)).clip(*RANGE), np.float64)
 
 
 def _spread(shadowing: Shadowing, index: Tensor, values: F64) -> Tensor:
-    """A grid (3, X, Y, Z) with values (M, 3) at the solved nodes and at every other node that of the nearest."""
+    """A grid (3, X, Y, Z) with values (M, 3) at the solved nodes; other nodes take the value of the nearest one."""
     shape = tuple(shadowing.ratio.shape[1:])
     flat = index.cpu().numpy()
     known = np.zeros(math.prod(shape), bool)

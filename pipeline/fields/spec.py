@@ -1,7 +1,7 @@
-"""What a fitted face is made of, as plain values: enough to build its modules before their parameters are read.
+"""Specification of a fitted face as plain values, to construct its modules before their parameters are read.
 
-The names are those of the fit's settings (stages.inverse_rendering.config), which say what each means. Three have older
-names in the file, which stay, so that a field that was fitted can be read.
+The names are those of the fit's settings (stages.inverse_rendering.config), where they are described. Three have older
+names in the file, which are kept, so that earlier fitted fields can be read.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ TRIPLES = ("lo", "hi", "albedo_start", "prior_centre")
 
 @dataclass(frozen=True, slots=True)
 class FaceSpec:
-    """What is needed to build the modules before their parameters are read."""
+    """The values that determine the modules and their shapes."""
 
     lo: tuple[float, float, float]
     hi: tuple[float, float, float]
@@ -53,7 +53,7 @@ class FaceSpec:
     displacement_width: int = 256
 
     def stored(self) -> dict[str, Any]:
-        """Its values by their names in the file."""
+        """The values by their names in the file."""
         return {IN_FILE.get(name, name): value for name, value in asdict(self).items()}
 
     @classmethod

@@ -1,1 +1,1 @@
-"""Functional mathematics, one object a file. Tensors in, tensors out: no modules, no files, no settings."""
+"""Mathematical functions, one subject per file. Tensors in, tensors out: no modules, no files, no settings."""

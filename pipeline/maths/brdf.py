@@ -47,6 +47,6 @@ def light_integral(w_r: Tensor, inv_kappa: Tensor, light: Tensor, attenuation: s
 
 @full_precision
 def specular(rho: Tensor, cb: Tensor, incident: Tensor) -> Tensor:
-    """L_s = rho (c . B) L(w_r), (N, 3). [NeuFace eq. 12], `incident` from `light_integral`. The material's
-    and the light's integrals taken apart: [NeuFace eq. 5]."""
+    """L_s = rho (c . B) L(w_r), (N, 3). [NeuFace eq. 12], `incident` from `light_integral`. The integrals
+    of material and light are separated: [NeuFace eq. 5]."""
     return (rho * cb)[:, None] * incident

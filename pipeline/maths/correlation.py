@@ -1,7 +1,7 @@
-"""How alike patches of photos are, whatever each photo's brightness and contrast.
+"""Similarity of patches of photos, independent of brightness and contrast (NCC).
 
-Symbols: patches (..., K) of K samples; floor is the standard deviation below which a patch counts as flat (the sensor's
-noise), in the photos' own unit.
+Symbols: patches (..., K) of K samples; floor is the standard deviation below which a patch is flat (sensor noise), in
+the photos' unit.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ FLOOR = 2e-3
 
 
 def standardised(patches: Tensor, floor: float = FLOOR) -> Tensor:
-    """Patches (..., K) without their mean, of length 1; of less where their deviation is not far above `floor` > 0.
+    """Patches (..., K) with their mean removed and length 1, or less if their deviation is not far above `floor` > 0.
 
     The product of two of them is their normalised cross-correlation [Lewis, Fast Normalized Cross-Correlation, 1995],
-    drawn towards 0 for flat patches, whose correlation would be the noise's.
+    reduced towards 0 for flat patches, whose correlation would be that of the noise.
     """
     centred = patches - patches.mean(-1, keepdim=True)
     length = centred.square().sum(-1, keepdim=True).sqrt()
@@ -27,8 +27,8 @@ def standardised(patches: Tensor, floor: float = FLOOR) -> Tensor:
 def agreement(patches: Tensor, seen: Tensor, floor: float = FLOOR) -> Tensor:
     """(N,) in [-1, 1]: mean correlation of the first view's patch with the better half of the other views'.
 
-    patches (N, V, K); seen (N, V) bool, the seen ones first in each row. The better half, because what hides a point
-    from a few views must not hide it from the vote. -2 where fewer than three views see the point.
+    patches (N, V, K); seen (N, V) bool, the seen ones first in each row. Only the better half, because a point may be
+    occluded in some views. -2 where fewer than three views see the point.
     """
     unit = standardised(patches, floor)
     product = (unit[:, :1] * unit[:, 1:]).sum(-1)

@@ -1,4 +1,4 @@
-"""A cube map as a function on the sphere: where its texels look, and a lookup without seams.
+"""A cube map as a function on the sphere: directions of its texels, and a seamless lookup.
 
 Symbols: R texels along a face's edge, T = 6 R^2 texels in all, face by face (+x -x +y -y +z -z), rows before columns;
 (u, v) in [-1, 1] on a face. Directions are (N, 3), of any length but 0.
@@ -56,7 +56,8 @@ def _on_faces(size: int, pad: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def padded(size: int) -> Tensor:
-    """Texel of every place on faces with a border of one, which is the neighbouring face's: (6, R + 2, R + 2)."""
+    """Index of the texel at every position of the faces, with a border of one texel of the neighbouring faces:
+    (6, R + 2, R + 2)."""
     face, u, v = project(_on_faces(size, 1).reshape(-1, 3))
     column, row = (((t + 1) * size / 2).floor().long().clamp(0, size - 1) for t in (u, v))
     return ((face * size + row) * size + column).reshape(6, size + 2, size + 2)
@@ -99,7 +100,7 @@ def lookup(levels: Tensor, d: Tensor, level: Tensor) -> Tensor:
 
 
 def blur(size: int, kernel: Tensor) -> Tensor:
-    """Rows that average a map with a zonal kernel given at every pair of texels (T, T): weights times solid angle, each
-    row summing to 1, so that an even light stays as it is."""
+    """(T, T) matrix that blurs a map with a zonal kernel, given at every pair of texels (T, T): kernel times solid
+    angle, normalised to rows that sum to 1, so that a uniform light does not change."""
     w = kernel * solid_angles(size).to(kernel)
     return w / w.sum(-1, keepdim=True)

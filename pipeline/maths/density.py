@@ -16,7 +16,7 @@ from pipeline.maths.precision import full_precision
 def laplace_density(s: Tensor, beta: Tensor) -> Tensor:
     """sigma = Psi_beta(-s) / beta, Psi the CDF of the zero-mean Laplace distribution. [NeuFace section 4.4]
 
-    Both branches see |s|, so that the one not taken can't overflow and send NaN through the gradient of `where`.
+    Both branches use |s|, so that the one not taken can't overflow and give NaN in the gradient of `where`.
     """
     tail = 0.5 * torch.exp(-s.abs() / beta)
     return torch.where(s >= 0, tail, 1 - tail) / beta
@@ -26,8 +26,9 @@ def laplace_density(s: Tensor, beta: Tensor) -> Tensor:
 def ray_weights(sigma: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
     """Weights w_i = T_i (1 - exp(-sigma_i delta_i)) and total optical depth: (N, S), (N, S) -> (N, S), (N,).
 
-    The quadrature of [NeuFace eq. 18]; opacity is 1 - exp(-tau) = sum w. The depth before a sample is summed without
-    it: sum less itself would be 0 instead of 1e-3 before an interval of depth 1e10, and the weights would exceed 1.
+    The quadrature of [NeuFace eq. 18]; opacity is 1 - exp(-tau) = sum w. The depth before a sample is an exclusive sum:
+    an inclusive sum minus the sample would be 0 instead of 1e-3 before an interval of depth 1e10, and the weights would
+    exceed 1.
     """
     depth = sigma * delta
     before = torch.cumsum(torch.nn.functional.pad(depth[..., :-1], (1, 0)), -1)
@@ -49,9 +50,9 @@ def crossing_weights(s: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
 
     Differs: the Laplace density of [NeuFace section 4.4] makes a grazing ray opaque already beta ln(L / 1.4 beta)
     outside the zero set (L its path near the surface: 2 mm for beta = 0.6 mm), so that silhouettes pull the surface
-    in by as much. Here transmittance depends on the closest approach alone, as in NeuS: a ray that touches the zero
-    set has opacity 1/2 whatever its length, and the mean hit lies on the zero set. Each interval's weight is shared
-    by its two ends, so that means over samples are means at the middles.
+    in by as much. Here transmittance depends only on the closest approach, as in NeuS: a ray that touches the zero
+    set has opacity 1/2 for any length, and the mean hit lies on the zero set. Each interval's weight is divided
+    between its two ends, so that means over samples are means at the midpoints.
 
     tau = -ln T is ln 2 - s / beta inside: the mask's gradient doesn't vanish for a ray deep in the solid.
     """
@@ -63,7 +64,7 @@ def crossing_weights(s: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
     return shared, -torch.log(t[:, -1])
 
 
-OPAQUE = 3.5  # optical depth from which a ray counts as covered: opacity 0.97
+OPAQUE = 3.5  # optical depth from which a ray is covered: opacity 0.97
 
 
 @full_precision
@@ -73,9 +74,9 @@ def opacity_cross_entropy(tau: Tensor, alpha: Tensor) -> Tensor:
         alpha * -log(1 - e^-tau) + (1 - alpha) * tau,    the first term 0 from tau = OPAQUE on
 
     Written in tau: -log(1 - opacity) is tau itself, so that the gradient doesn't vanish where opacity saturates.
-    tau is kept above 1e-4, where the first term's derivative 1 / tau would otherwise grow without bound. The cut at
-    OPAQUE: samples end a little behind the surface, so that tau is capped there; every ray through the solid would
-    go on asking for more and, being far more than those at the silhouette, swell the surface.
+    tau is kept above 1e-4, because the first term's derivative 1 / tau is unbounded. Reason for the limit OPAQUE:
+    samples end a little behind the surface, which limits tau; without it every ray through the solid would demand more,
+    and, because these are far more than the rays at the silhouette, inflate the surface.
     """
     t = tau.clamp(min=1e-4)
     covered = torch.where(tau < OPAQUE, -torch.log(-torch.expm1(-t)), torch.zeros_like(t))

@@ -13,8 +13,8 @@ from pipeline.maths.precision import full_precision
 def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
     """|I - I_bar|, mean over channels: (N, 3) linear, (N, 3) encoded -> (N,). [NeuFace eq. 21]
 
-    Differs: compared as sRGB, the metric's and the eye's scale, while the model stays linear; in linear values the
-    loss would be ruled by highlights.
+    Differs: sRGB values are compared, as in the metrics and close to perception, while the model is linear; in linear
+    values highlights would dominate the loss.
     """
     return (srgb_from_linear(predicted) - target_srgb).abs().mean(-1)
 
@@ -23,7 +23,7 @@ def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
 def white_light(coefficients: Tensor) -> Tensor:
     """|L_i - mean over RGB of L_i|, on the SH coefficients: (K, 3) -> (K,). [NeuFace eq. 22]
 
-    Differs: per coefficient and not per ray; the light does not depend on the ray, and the basis is orthonormal.
+    Differs: per coefficient instead of per ray; the light does not depend on the ray, and the basis is orthonormal.
     """
     return (coefficients - coefficients.mean(-1, keepdim=True)).abs().mean(-1)
 
@@ -38,9 +38,9 @@ def specular_energy(specular: Tensor) -> Tensor:
 def shininess_prior(inv_kappa: Tensor, typical: float) -> Tensor:
     """ln^2(s / s_0): (N,) -> (N,), s = 1 / kappa. Not in the paper.
 
-    Differs: the photos fix only the product of the light's band l and exp(-l (l + 1) s / 2), so that a duller skin
-    under a sharper light looks the same, and without a gauge s runs to 0 everywhere. A weak pull of its mean towards
-    skin's usual width leaves the differences between places to the photos.
+    Differs: the photos determine only the product of the light's band l and exp(-l (l + 1) s / 2): rougher skin under a
+    sharper light looks the same, and without a prior s goes to 0 everywhere. A weak prior on its mean, at the typical
+    width of skin, leaves the differences between points to the photos.
     """
     return torch.log(inv_kappa.clamp(min=1e-6) / typical) ** 2
 
@@ -49,9 +49,9 @@ def shininess_prior(inv_kappa: Tensor, typical: float) -> Tensor:
 def albedo_sparsity(albedo: Tensor) -> Tensor:
     """|ln a - median of ln a|, mean over channels: (N, 3) in [0, 1] -> (N,). Not in the paper.
 
-    Differs: the photos fix only the product a E(n), and on a still head under still light any shading can hide in the
-    albedo. Of all splits this prefers the one where skin is as even as it can be, so that the light explains what
-    depends on the normal. By the median and without a square: lips, brows and beard may differ as much as they like.
+    Differs: the photos determine only the product a E(n), so that on a still head under still light the albedo can
+    contain any shading. This prior prefers the most uniform albedo, so that the light explains what depends on the
+    normal. It uses the median and no square, so that it hardly penalises lips, brows and beard.
     """
     log = torch.log(albedo.clamp(min=1e-3))
     return (log - log.detach().median(0).values).abs().mean(-1)
@@ -69,7 +69,7 @@ def eikonal(gradient: Tensor, squared: bool = True) -> Tensor:
 
 @full_precision
 def displacement(d: Tensor) -> Tensor:
-    """|D(x)|: the third term of [NeuFace eq. 24]."""
+    """|D(x)|, elementwise: the third term of [NeuFace eq. 24]."""
     return d.abs()
 
 
@@ -81,6 +81,6 @@ def embedding(z: Tensor) -> Tensor:
 
 @full_precision
 def normal_consistency(n: Tensor, n_near: Tensor) -> Tensor:
-    """1 - n . n' at a point and a jittered neighbour: (N, 3), (N, 3) -> (N,). Not in the paper: it stands for the
-    smoothness that the paper's MLP has by itself and a grid has not."""
+    """1 - n . n' at a point and a jittered neighbour: (N, 3), (N, 3) -> (N,). Not in the paper: it replaces the
+    smoothness that the paper's MLP has and a grid does not have."""
     return 1 - (n * n_near).sum(-1)

@@ -1,4 +1,4 @@
-"""What NeuFace's lobe is called in the words of standard shaders.
+"""Conversion of NeuFace's lobe to GGX and F0 of standard shaders.
 
 Symbols
     kappa   concentration of the vMF lobe [NeuFace eq. 10]; inv_kappa = 1 / kappa is what the field stores
@@ -27,9 +27,9 @@ def alpha_from_kappa(kappa: Reals) -> F64:
 
         alpha = 0.5407 (kappa - 1.517)^-0.486
 
-    A fit to GGX lobes sampled by their visible normals and attenuated at order 10, off by at most 0.015 in the range
-    (least squares under light whose bands hold power like 1 / (2 l + 1); other weights move it by up to 0.03).
-    Differs from the small-angle form alpha = 0.707 / sqrt(kappa), which is 0.2 off at kappa = 2.
+    A fit to GGX lobes sampled by their visible normals and attenuated at order 10; its error is at most 0.015 in the
+    range (least squares under light whose bands have power like 1 / (2 l + 1); other weights change it by up to 0.03).
+    Differs from the small-angle form alpha = 0.707 / sqrt(kappa), whose error is 0.2 at kappa = 2.
     """
     k = np.clip(np.asarray(kappa, np.float64), *KAPPA_RANGE)
     out: F64 = 0.5407 * (k - 1.517) ** -0.486
@@ -51,7 +51,7 @@ def f0_from_lobe(strength: Reals, inv_kappa: Reals) -> F64:
 
         F0 = F / E_ss(alpha),  F = rho c . B(n, n)
 
-    strength: F >= 0, negative values are taken as 0. Not clamped above, so that a fit gone wrong shows.
+    strength: F >= 0, negative values count as 0. Not clamped above, so that a failed fit is visible.
     """
     alpha = alpha_from_kappa(1 / np.maximum(np.asarray(inv_kappa, np.float64), 1e-6))
     out: F64 = np.maximum(np.asarray(strength, np.float64), 0) / energy(alpha)
@@ -59,7 +59,7 @@ def f0_from_lobe(strength: Reals, inv_kappa: Reals) -> F64:
 
 
 # ------------------------------------------------------------------ reflectance along other directions than the normal
-AZIMUTHS, RADII = 24, 24  # of the visible normals that stand for all; the sums are good to 1e-3
+AZIMUTHS, RADII = 24, 24  # of the sampled visible normals; the sums have errors of 1e-3
 
 
 def split_albedo(cosine: Reals, alpha: Reals) -> tuple[F64, F64]:
@@ -96,14 +96,14 @@ def _disc() -> list[tuple[float, float]]:
 
 
 def _visible_normal(v: F64, alpha: F64, r: float, turn: float) -> F64:
-    """One visible normal for every view direction v (..., 3): the disc is seen from v in the stretched frame."""
+    """One visible normal for every view direction v (..., 3), from a point of the disc in the stretched frame."""
     s = np.stack([alpha * v[..., 0], np.zeros_like(alpha), v[..., 2]], -1)
     s /= np.linalg.norm(s, axis=-1, keepdims=True)
     t1, t2 = r * np.cos(turn), r * np.sin(turn)
     lean = 0.5 * (1 + s[..., 2])
     t2 = (1 - lean) * np.sqrt(1 - t1 * t1) + lean * t2
     up = np.sqrt(np.maximum(1 - t1 * t1 - t2 * t2, 0))
-    # v has no y, so the frame across it is y and (-s_z, 0, s_x)
+    # v has no y component, so the axes orthogonal to it are y and (-s_z, 0, s_x)
     h = np.stack([-t2 * s[..., 2] + up * s[..., 0], np.full_like(up, t1), t2 * s[..., 0] + up * s[..., 2]], -1)
     h = np.stack([alpha * h[..., 0], alpha * h[..., 1], np.maximum(h[..., 2], 1e-9)], -1)
     return np.asarray(h / np.linalg.norm(h, axis=-1, keepdims=True))

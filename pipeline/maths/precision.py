@@ -1,7 +1,7 @@
 """Full precision inside a network that runs in half precision.
 
-Products of radiance (up to 1e5) with harmonics that nearly cancel lose all their digits in bfloat16, and autocast
-would put every matrix product there. The functions of this package opt out: networks may run in half precision, the
+Products of radiance (up to 1e5) with harmonics that nearly cancel lose all their digits in bfloat16, and autocast would
+use it for every matrix product. The functions of this package disable it: networks may run in half precision, the
 physics runs in float32.
 """
 

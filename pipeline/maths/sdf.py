@@ -1,8 +1,9 @@
 """A signed distance as a uniform quadratic B-spline, in plain torch. The reference for pipeline.fields.kernels.
 
-Symbols: coefficients v (X, Y, Z) sit at nodes lo + i h. At u = (x - lo) / h with nearest node i and f = u - i in
+Symbols: coefficients v (X, Y, Z) are at nodes lo + i h. At u = (x - lo) / h with nearest node i and f = u - i in
 [-1/2, 1/2], the three weights an axis are (1/2 - f)^2 / 2, 3/4 - f^2, (1/2 + f)^2 / 2. Value and gradient are C1 and
-C0, from one gather of 27 coefficients; a trilinear grid's normals jump at cell borders, which highlights show.
+C0, from one gather of 27 coefficients. (The normals of a trilinear grid are discontinuous, which is visible in
+highlights.)
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ def axis_weights(f: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def locate(x: Tensor, lo: Tensor, cell: float, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Nearest node (N, 3) int64, kept one node off the border, and f (N, 3). Beyond the border f is clamped, so that
-    the value stays that of the border: distances there are not wanted."""
+    """Nearest node (N, 3) int64, at least one node from the border, and f (N, 3). Outside the grid f is clamped, so
+    that the value is that of the border; distances there are not needed."""
     u = (x - lo) / cell
     top = torch.tensor(shape, device=x.device) - 2
     node = torch.minimum(torch.round(u).long().clamp(min=1), top)

@@ -18,7 +18,7 @@ from pipeline.maths.sh_recurrence import recurrence
 
 try:
     from pipeline.maths import sh_compiled as compiled
-except ImportError:  # a bare GPU machine has torch alone
+except ImportError:  # a minimal GPU machine only has torch
     compiled = None  # type: ignore[assignment]
 
 ORDER = 10  # [NeuFace eq. 2]
@@ -30,7 +30,7 @@ def count(order: int) -> int:
 
 
 def order_of(coefficients: Tensor) -> int:
-    """Order L of ((L + 1)^2, ...) coefficients; ValueError if the length is no square."""
+    """Order L of ((L + 1)^2, ...) coefficients; ValueError if the length is not a square."""
     order = math.isqrt(coefficients.shape[0]) - 1
     if count(order) != coefficients.shape[0]:
         raise ValueError(f"{coefficients.shape[0]} SH coefficients; expected a square number (L + 1)^2")
@@ -84,9 +84,9 @@ def _associated(z: Tensor, order: int) -> list[Tensor]:
 
 @lru_cache(maxsize=32)
 def clamped_cosine(order: int = ORDER) -> Tensor:
-    """Lambda_l of the half-cosine lobe, one a coefficient: ((order + 1)^2,) float64. [NeuFace eq. 15]
+    """Lambda_l of the half-cosine lobe, one per coefficient: ((order + 1)^2,) float64. [NeuFace eq. 15]
 
-    Differs: the equation's cases leave l = 1 to a branch of its own and give 0 for other odd l; written here per l.
+    Differs: the equation has a separate case for l = 1 and gives 0 for other odd l; here it is written per l.
     """
     values: list[float] = []
     for l in range(order + 1):  # noqa: E741
@@ -115,7 +115,7 @@ def radiance(c: Tensor, d: Tensor) -> Tensor:
 
 @full_precision
 def band_radiance(c: Tensor, d: Tensor) -> Tensor:
-    """Each band's share of L(d): (N, L + 1, 3). Compiled for float32 on the CPU where numba is installed; else one
+    """Contribution of each band to L(d): (N, L + 1, 3). Compiled for float32 on the CPU if numba is installed, else one
     matrix product for all bands."""
     order = order_of(c)
     if compiled is not None and d.dtype == c.dtype == torch.float32 and d.device.type == "cpu":

@@ -1,8 +1,9 @@
-"""Compiled twin of the light contractions in pipeline.maths.sh, for float32 on the CPU.
+"""Compiled version of the light contractions in pipeline.maths.sh, for float32 on the CPU.
 
-bands[n, l, c] = sum_m coefficients[l m, c] Y_lm(d_n), with derivatives by the coefficients and by d. m runs outside and
-l inside, so that Q_l^m needs only its two predecessors; the innermost loop runs over LANES directions and vectorises.
-Sums over directions are taken in fixed chunks, so that results do not depend on the number of threads.
+bands[n, l, c] = sum_m coefficients[l m, c] Y_lm(d_n), with derivatives by the coefficients and by d. The outer loop is
+over m and the inner one over l, so that Q_l^m needs only its two predecessors; the innermost loop is over LANES
+directions and vectorises. Directions are summed in fixed chunks, so that results do not depend on the number of
+threads.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -72,8 +73,8 @@ def _forward(c, d, q0, a, b, out):
 
 @njit(inline="always", error_model="numpy")
 def _sum(v):
-    """Sum of LANES numbers, which it overwrites. Halved by hand: arithmetic is strict (pipeline.fields.kernels_numba),
-    so that the compiler may not split a sum to vectorise it."""
+    """Sum of LANES numbers, which are overwritten. The pairwise sum is explicit: arithmetic is strict
+    (pipeline.fields.kernels_numba), so the compiler must not reorder a sum to vectorise it."""
     for i in range(64):
         v[i] += v[i + 64]
     for i in range(32):
@@ -87,7 +88,7 @@ def _sum(v):
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def _backward(c, d, q0, a, b, g, grad_d, grad_c):
-    """grad_d (N, 3); grad_c (blocks, K, 3), one share a block."""
+    """Write grad_d (N, 3), and grad_c (blocks, K, 3), one partial sum per block."""
     order = q0.shape[0] - 1
     for block in prange(grad_c.shape[0]):
         first = block * LANES

@@ -1,4 +1,4 @@
-"""Factors of the associated Legendre recurrence: shared by pipeline.maths.sh and its compiled twin."""
+"""Factors of the associated Legendre recurrence, shared by pipeline.maths.sh and pipeline.maths.sh_compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GGX under an environment, split into a blurred light and a table [Karis 2013], for [NeuFace section 5.2].
+"""Split sum: GGX under an environment map as a blurred light times a table [Karis 2013], for [NeuFace section 5.2].
 
 Symbols: n.v cosine to the viewer; alpha GGX width; F0 reflectance at normal incidence (Schlick);
     int f_GGX (n.l) dl = F0 A(n.v, alpha) + B(n.v, alpha)
@@ -18,9 +18,9 @@ ALPHA_MIN = 0.02
 
 
 def ggx_kernel(cosine: Tensor, alpha: float) -> Tensor:
-    """The blur of a light by a GGX lobe seen along its own axis (n = v = r): D(h) (n.l), unnormalised.
+    """Kernel (any shape) that blurs a light by a GGX lobe viewed along its axis (n = v = r): D(h) (n.l), unnormalised.
 
-    h lies half way, so that n.h = sqrt((1 + cos) / 2).
+    h is the half vector, so n.h = sqrt((1 + cos) / 2).
     """
     half = (1 + cosine) / 2
     d = 1 / (half * (alpha * alpha - 1) + 1) ** 2
@@ -37,7 +37,7 @@ def smith(cosine: Tensor, alpha: Tensor) -> Tensor:
 def table() -> Tensor:
     """A and B at n.v = (i + 1/2) / SIZE and alpha = (j + 1/2) / SIZE: (SIZE, SIZE, 2) float32.
 
-    By half vectors drawn from D (n.h) on a fixed lattice; heights correlated.
+    By half vectors sampled from D (n.h) on a fixed lattice; height-correlated masking.
     """
     at = (torch.arange(SIZE, dtype=torch.float64) + 0.5) / SIZE
     nv, alpha = torch.meshgrid(at, at, indexing="ij")

@@ -38,8 +38,8 @@ def sphere_trace(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """t of the hit or of the closest approach, whether it is a hit, and the SDF there: (N,) each.
 
-    Steps by factor * sdf [NeuFace section 4.4: 1.2], at least `min_step`, so that a grazing ray can't stall; the sign
-    change is then refined by the secant rule. Rays that begin inside are no hits (the paper's 'unhit').
+    The step is factor * sdf [NeuFace section 4.4: 1.2], but at least `min_step`, so that grazing rays advance. The sign
+    change is refined by the secant method. Rays that start inside are not hits (the paper's 'unhit').
     """
     t = t_near.clone()
     s = sdf(o + t[:, None] * d)
@@ -68,8 +68,8 @@ def sphere_trace(
 def _secant(
     sdf: Callable[[Tensor], Tensor], o: Tensor, d: Tensor, t0: Tensor, s0: Tensor, t1: Tensor, s1: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Root between t0 (outside) and t1 (inside) by the Illinois rule: regula falsi that halves the value at an end
-    which stays twice running, so that it can't creep in from one side."""
+    """Root between t0 (outside) and t1 (inside) by the Illinois method: regula falsi that halves the value at an end
+    that is kept twice in a row, so that it does not converge slowly from one side."""
     t, s = t1, s1
     last = torch.zeros_like(s)
     for _ in range(REFINE_STEPS):
@@ -87,7 +87,7 @@ def sphere_interval(o: Tensor, d: Tensor, centre: Tensor, radius: float) -> tupl
     """t at which rays enter and leave a sphere, from t = 0 on: (N,), (N,); t_far <= t_near where they miss it."""
     to = o - centre
     b = (to * d).sum(-1)
-    across = (to - b[:, None] * d).square().sum(-1)  # not |to|^2 - b^2, whose digits cancel for a far camera
+    across = (to - b[:, None] * d).square().sum(-1)  # not |to|^2 - b^2, which loses precision for a distant camera
     half = torch.sqrt((radius * radius - across).clamp(min=0))
     miss = across >= radius * radius
     near, far = (-b - half).clamp(min=0), -b + half
@@ -110,9 +110,9 @@ def aggressive_trace(
 
         t <- t + factor * clamp(SDF, -truncation, truncation)   until |SDF| < threshold
 
-    Steps may be negative: a step of 1.2 that went through the surface comes back. Unhit: rays that enter where the SDF
-    is negative (the prior's back space), that leave the interval, or that have not converged after `steps`; they
-    report their closest approach. The clamp keeps a first step from jumping over a thin head.
+    Steps may be negative: a step with factor 1.2 that passed the surface returns. Unhit: rays that enter where the SDF
+    is negative (behind the prior's surface), that leave the interval, or that have not converged after `steps`; for
+    these the closest approach is returned. The clamp prevents a first step over a thin head.
     """
     t = t_near.clone()
     s = sdf(o + t[:, None] * d)

@@ -12,7 +12,7 @@ from torch import Tensor
 from pipeline.maths.precision import full_precision
 
 EXTRA_ORDERS = 8  # error below 4e-8 over all s in float64, 1e-6 in float32
-MIN_ORDER = 10  # lower ones start as high as this: 8 orders above order 1 the start's own error is 1.4e-6
+MIN_ORDER = 10  # lower orders use this one: starting 8 orders above order 1 would have an error of 1.4e-6
 
 
 @full_precision
@@ -33,17 +33,16 @@ def attenuation_exact(inv_kappa: Tensor, order: int) -> Tensor:
 
         r_l = A_l / A_{l-1} = 1 / ((2 l + 1) s + r_{l+1}),    A_l = r_1 ... r_l
 
-    Run downward (upward it explodes), started a few orders above with
+    The recursion runs downward (upward it is unstable). It starts a few orders higher with
 
         r_N = 1 / (N s + sqrt(1 + N (N + 1) s^2 (1 + s / (1 + s))))
 
     which agrees with the exact ratio up to s^3 (r_l = 1 - l s + l (l - 1) s^2 / 2 + l (l - 1) s^3 / 2 + ...) and is
-    bounded where s is large and the recursion forgets its start. Every term is positive and finite, and so is its
-    derivative.
+    bounded where s is large, where the start has no influence. Every term and its derivative is positive and finite.
     """
     s = inv_kappa
     top = max(order, MIN_ORDER) + EXTRA_ORDERS
-    t = s.clamp(max=1e9)  # its square must not overflow; what is beyond is forgotten after one step
+    t = s.clamp(max=1e9)  # its square must not overflow; for larger s the start has no influence
     r = 1 / ((top + 1) * s + torch.sqrt(1 + (top + 1) * (top + 2) * t * t * (1 + t / (1 + t))))
     ratios = []
     for l in range(top, 0, -1):  # noqa: E741

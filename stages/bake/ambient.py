@@ -1,8 +1,8 @@
-"""Ambient occlusion: how much of an even sky each place of the surface sees.
+"""Ambient occlusion: share of a uniform sky that each point of the surface sees.
 
     ao(x) = 1 / pi integral over the hemisphere of V(x, w) max(n . w, 0) dw
 
-V: 1 where a ray from x leaves the head. By rays spread as the cosine, so that it is the share of those that leave.
+V: 1 where a ray from x leaves the head, else 0. The rays are cosine-distributed, so ao is the share of them that leave.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ RAYS = 96
 
 
 def ambient(mesh: Mesh, occluder: Occluder, step: Callable[[int, int], None]) -> F32:
-    """(V,) in [0, 1] at the mesh's vertices; 1 where nothing is in the way."""
+    """(V,) ambient occlusion in [0, 1] at the mesh's vertices; 1 where nothing blocks the sky."""
     n = mesh.normals.astype(np.float64)
     across = np.cross(n, np.eye(3)[np.abs(n).argmin(1)])
     across /= np.linalg.norm(across, axis=1, keepdims=True)

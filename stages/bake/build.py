@@ -1,4 +1,4 @@
-"""The whole way from a field and a mesh with charts to arrays of maps, tile by tile."""
+"""From a field and a mesh with charts to arrays of maps, tile by tile."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ from stages.bake.texels import Known, Samples, place, points, sample
 log = logging.getLogger("neuface.bake")
 
 BAND = 262_144  # texels baked at once
-NEAREST_BAND = 1 << 24  # texels whose nearest chart is looked for at once: around each band some are looked at again
-SPARSE = 512  # texels along a side of the points that the detail's low band is made from; fewer in each of many tiles
+NEAREST_BAND = 1 << 24  # texels per band in the search for the nearest covered texel; bands overlap
+SPARSE = 512  # texels along a side of the coarse texture at which the detail's low band is sampled; less per tile
 FEW_TEXELS = 100
-DENSER = 0.8  # of the mean texel: charts with smaller ones were made larger on purpose, the face's
+DENSER = 0.8  # of the mean texel: if the finest charts have smaller texels, they were enlarged on purpose (the face)
 
 Step = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Baked:
-    """One tile. Samples of the covered texels; `texel` (N,) their flat indices. `nearest` (H, W): row in `texel` for
-    each texel.
+    """One tile. samples: of the covered texels; texel (N,): their flat indices; nearest (H, W): row in `texel` of the
+    nearest covered texel.
 
-    confidence (S, S) and votes for the regions at their own size; lut (1, 64, k); regions: area (m^2) of the surface by
-    the code of its region, empty where no photo has labels.
+    confidence (S, S) and votes for the regions have a size of their own; lut (1, 64, k); regions: area (m^2) of the
+    surface by region code, empty if no photo has labels.
     """
 
     size: int
@@ -58,22 +58,22 @@ class Baked:
     regions: dict[int, float]
 
     def covered(self) -> Mask:
-        """(H, W) texels that a chart touches."""
+        """(H, W) mask of the texels that a chart touches."""
         return _covered(self.texel, self.size)
 
 
 @dataclass(frozen=True, slots=True)
 class Photos:
-    """What the photo detail needs beside the views: the fitted colour responses (views, 3, 3), and how the fit
-    attenuated the light's bands."""
+    """Data for the photo detail besides the views: the fitted colour responses (views, 3, 3), and the attenuation of
+    the light's bands in the fit."""
 
     responses: F64
     attenuation: str
 
 
 class Baker:
-    """What all tiles have in common, found once: the light that reaches the mesh, what the photos see of it, and the
-    low bands of their detail. `tile` may then be called for each of `tiles`."""
+    """Computes once what all tiles share: ambient occlusion, visibility in the photos, and the low bands of the photo
+    detail. `tile` may then be called for each of `tiles`."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Baker:
         photos: Photos | None = None,
         scratch: Path | None = None,
     ) -> None:
-        """`photos`: add their fine detail to the albedo. `scratch`: a folder for arrays larger than the memory."""
+        """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
@@ -99,10 +99,10 @@ class Baker:
         self.detailed = self._found is not None
 
     def tile(self, number: int) -> Baked:
-        """Bake every texel that a chart of this tile touches.
+        """Bake all texels that a chart of this tile touches.
 
         Raises:
-            StageError: no chart has area, or the field is not finite on the mesh.
+            StageError: the charts cover no texels, or the field is not finite on the mesh.
         """
         size, step = self._size, self._step
         mesh, charts = tiles.single_tile(*self._whole, number)
@@ -118,7 +118,7 @@ class Baker:
                 where="uv",
                 value=f"{len(texel)} of {size * size}",
                 limit=f"at least {least}",
-                remedy="run the uv stage again, or choose a larger bake.size",
+                remedy="run the uv stage again, or raise bake.size",
             )
         side = min(size, _per_tile(SIGHT, self.tiles))
         seen = sighted(
@@ -138,7 +138,7 @@ class Baker:
 
 
 def _per_tile(side: int, count: int) -> int:
-    """Texels along the side of each of `count` tiles that together are about as many as in one of `side`."""
+    """Side of each of `count` tiles that together have about as many texels as one tile of `side`."""
     return int(np.ceil(side / np.sqrt(count)))
 
 
@@ -170,7 +170,7 @@ def _detail(
 
 
 def _spread(field: Field, mesh: Mesh, charts: Charts, sparse: int) -> detail.Points:
-    """Points of a tile's surface, a texel of a small texture apart."""
+    """Points of a tile's surface: those of the texels of a coarse texture."""
     hits = raster.rasterise(raster.texel_corners(charts, sparse), sparse, 0, sparse)
     at = place(field, mesh, tangents.frames(mesh, charts), hits)
     x = at.x.astype(np.float32)
@@ -200,7 +200,7 @@ def _bands(
 
 
 def bands(size: int, texels: int | None = None) -> Iterator[tuple[int, int]]:
-    """First and last row (exclusive) of the bands that a picture is worked off in, of BAND texels or as asked."""
+    """First and last row (exclusive) of the bands of a picture, with about `texels` (default BAND) texels each."""
     rows = max(1, (texels or BAND) // size)
     for first in range(0, size, rows):
         yield first, min(first + rows, size)
@@ -213,7 +213,7 @@ def _covered(texel: Indices, size: int) -> Mask:
 
 
 def _nearest(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.int32]:
-    """(H, W) row in `texel` of the covered texel nearest to each, band by band."""
+    """(H, W) row in `texel` of the nearest covered texel, computed band by band."""
     covered = _covered(texel, size)
     row = blank(scratch, (size * size,), np.int32)
     row[texel] = np.arange(len(texel), dtype=np.int32)

@@ -1,13 +1,12 @@
-"""How well the photos saw each texel.
+"""How well the photos see each texel.
 
-Symbols: w = sum over fitted views of max(cos, 0) V, with V = 1 where the view sees the point (inside the photo, inside
-its mask, nothing in between, and not at the end of the sensor's range) and cos between the normal and the direction to
-the camera.
+Symbols: w = sum over fitted views of max(cos, 0) V. V = 1 if the view sees the point: inside the photo, inside its
+mask, not occluded, not clipped. cos: between the normal and the direction to the camera.
 
     confidence = 1 - 2^-w
 
-so that one photo from straight ahead gives 0.5, four give 0.94, and none gives 0. A clipped pixel tells only how bright
-the place is at least: the fit leaves it out, and so it adds nothing here.
+One photo from straight ahead gives 0.5, four give 0.94, none gives 0. Clipped pixels do not count, as in the fit: their
+value is only a lower bound.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ from pipeline.nearest import filled
 from pipeline.visibility import Occluder, View, picked, view_cosines
 from stages.bake.regions import Poll, Votes
 
-SIZE = 512  # texels: visibility has no finer detail than the photos' geometry, and rays cost
+SIZE = 512  # texels: visibility has little fine detail, and rays are expensive
 
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
-    """confidence (S, S) at S = min(size, SIZE), gutters filled from the nearest chart; votes for the regions at the
-    same places, None where no photo has labels."""
+    """confidence (S, S), S = min(size, SIZE), texels between charts filled from the nearest chart; votes for the
+    regions at the same size, None if no photo has labels."""
 
     confidence: F32
     votes: Votes | None
@@ -43,7 +42,7 @@ def sighted(
     step: Callable[[int, int], None],
     occluder: Occluder | None = None,
 ) -> Sighted:
-    """What the views see of the texture. occluder: of the whole mesh, where this is one tile of it."""
+    """Confidence and votes of the views. occluder: of the whole mesh, if this is one tile of it."""
     small = min(size, SIZE)
     hits = raster.rasterise(raster.texel_corners(charts, small), small, 0, small)
     weights = hits.weights.astype(np.float64)[..., None]
@@ -69,7 +68,7 @@ def sighted(
 
 
 def unclipped(view: View, cosine: F64, uv: F64) -> F64:
-    """(N,) the cosines (N,) of a view's sights, 0 where its photo is clipped at uv (N, 2)."""
+    """(N,) cosines (N,) of the points that a view sees, set to 0 where its photo is clipped at uv (N, 2) pixels."""
     if view.clipped is None:
         return cosine
     from pipeline.images import read_alpha

@@ -1,19 +1,18 @@
-"""Fine detail of the albedo from the photos: what they show beyond the field, in the band that the field lacks.
+"""Fine detail of the albedo from the photos: the high-frequency part that the field does not resolve.
 
 Symbols
     a       albedo of the field; S = irradiance_ratio E(n) / pi, radiance of a surface of albedo 1 under its light
     g_v     specular radiance towards camera v
-    a_v     albedo as photo v has it: (A_v^-1 I_v - g_v) / S        [NeuFace eq. 4, 12, 16, 19] solved for it
+    a_v     albedo according to photo v: (A_v^-1 I_v - g_v) / S     [NeuFace eq. 4, 12, 16, 19] solved for it
     r_v     a_v - a, the residual
     F r     mean of r over the surface with a kernel of width WIDTH, over what photo v sees
     h       robust mean over photos of r_v - F r_v, s their root mean square difference from it, W their weight
 
     added = h / (1 + (s / DISAGREEMENT)^2) W / (W + HALF_WEIGHT)
 
-Each photo loses its own low band before photos are blended: errors of the light, the lobe, the exposure and the shadows
-stay out of the albedo, and there is no seam where the set of photos changes. A clipped pixel has no say, as in the fit.
-Where photos disagree (ears, nostrils, a
-wrong surface) or hardly see the place, less is added.
+The low band of each photo is removed before blending. So errors of the light, the lobe, the exposure and the shadows
+do not enter the albedo, and there is no seam where the set of photos changes. Clipped pixels are ignored, as in the
+fit. Less is added where photos disagree (ears, nostrils, a wrong surface) or hardly see the point.
 """
 
 from __future__ import annotations
@@ -33,15 +32,16 @@ from stages.bake.detail_views import Photos
 from stages.bake.smooth import Smoother
 
 WIDTH = 0.004  # metres: what the field itself resolves
-EDGES = 1.5  # mean edges of the mesh: the low band lives on its vertices, so that WIDTH is at least that
+EDGES = 1.5  # mean edges of the mesh: least WIDTH, because the low band is stored at vertices
 DISAGREEMENT = 0.015  # of albedo
-HALF_WEIGHT = 0.1  # of one sharp photo from straight ahead
-MIN_LIGHT = 0.1  # of the mean of S over all directions: darker places tell nothing of the albedo
+HALF_WEIGHT = 0.1  # weight (1: one sharp photo from straight ahead) at which half of the detail is added
+MIN_LIGHT = 0.1  # of the mean of S over all directions: darker places do not determine the albedo
 
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """N points of the surface. x, n (N, 3); corner (N, 3) vertices and their weights; albedo, shade (N, 3): a, S."""
+    """N points of the surface. x, n (N, 3); corner, weights (N, 3): vertices and barycentric weights; albedo, shade
+    (N, 3): a, S."""
 
     x: F64
     n: F64
@@ -52,7 +52,7 @@ class Points:
 
 
 def joined(parts: Sequence[Points]) -> Points:
-    """All points of several tiles."""
+    """The points of several tiles as one set."""
     if len(parts) == 1:
         return parts[0]
     return Points(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Points)})
@@ -60,14 +60,14 @@ def joined(parts: Sequence[Points]) -> Points:
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """What the fine band is made from. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices."""
+    """Data for the fine band. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices."""
 
     photos: Photos
     gloss: F32
     low: F32
 
     def added(self, p: Points) -> tuple[F32, F32]:
-        """(N, 3) what photos add to the albedo, and (N,) their weight: 1 for one sharp photo from straight ahead."""
+        """(N, 3) detail to add to the albedo, and (N,) weight: 1 for one sharp photo from straight ahead."""
         mean, support = np.zeros((len(p.x), 3), np.float32), np.zeros((len(p.x), 2), np.float32)
         photos = self.photos
         kernels.fine(
@@ -82,7 +82,7 @@ class Detail:
 def prepare(
     field: Field, mesh: Mesh, sparse: Points, photos: Photos, attenuation: str, step: Callable[[int, int], None]
 ) -> Detail:
-    """The low bands, from points spread over the surface about as densely as vertices."""
+    """Compute the low bands, from points about as dense as the vertices."""
     gloss = _gloss(field, mesh, photos, attenuation)
     x = mesh.vertices.astype(np.float64)[mesh.faces]
     edge = float(np.linalg.norm(x[:, 1] - x[:, 0], axis=1).mean())
@@ -102,7 +102,7 @@ def prepare(
 
 
 def shade(light: F32, normals: F64, ratio: F32) -> F32:
-    """(N, 3) S. Dark places are held up, so that noise there is not blown up."""
+    """(N, 3) S for normals (N, 3) and irradiance ratio (N, 3). Its lower limit avoids amplified noise in the dark."""
     coefficients = torch.from_numpy(np.asarray(light, np.float32))
     e = sh.irradiance(coefficients, torch.from_numpy(np.ascontiguousarray(normals, np.float32))).numpy()
     # the mean of E over all normals is pi times that of the radiance, c_00 Y_00

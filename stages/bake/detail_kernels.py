@@ -1,17 +1,16 @@
-"""Compiled inner loops of the photo detail: what each photo shows under a point of the surface, and their robust mean.
+"""Compiled inner loops of the photo detail: lookup of a surface point in each photo, and the robust mean over photos.
 
-Photos lie one after the other in one flat array as the square root of linear radiance in 16 bits, so that dark skin
-keeps its steps and decoding is one product. A camera is a row of numbers:
+All photos are in one flat array, as the square root of linear radiance in 16 bits: dark skin keeps its precision, and
+decoding is one product. A camera is a row of numbers:
 
     0..11   rows of [R t], camera from asset          18..21  columns and rows of the photo, of its depth picture
     12..17  fx, skew, cx, fy, cy, pixels of depth per pixel of the photo
     22..26  k1 k2 p1 p2 k3                            27..29  camera's centre
-    30..38  colours before the calibration from colours after it, row by row
+    30..38  inverse of the colour response, row by row
     39      radiance of code 65535                    40      weight of the photo: its sharpness
-    41, 42  where its pixels and its depths start
+    41, 42  offsets of its pixels and its depths
 
-`clipped` has a number for every pixel, not 0 where the photo tells only how bright the place is at least; it is empty
-where no pixel of any photo is.
+`clipped` has one number per pixel, not 0 where the pixel is clipped; it is empty if no photo has clipped pixels.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -21,20 +20,20 @@ import numpy as np
 from numba import njit, prange
 
 ROW = 43
-MAX_PHOTOS = 8  # photos that have a say in one texel: those of the largest weight
-MIN_COSINE = 0.2  # photos that look along the surface further than that have no say
-DEPTH_SLACK = 0.0015  # of the distance: how far behind the depth picture still counts as the same place
-MIN_SPREAD = 0.004  # of albedo: differences below it are noise of the photos
-OUTLIER = 0.25  # of albedo: no detail of a skin differs more from its surroundings
-HUBER = 1.5  # spreads beyond which a photo counts as an outlier
+MAX_PHOTOS = 8  # photos that are used for one texel: those of the largest weight
+MIN_COSINE = 0.2  # photos at more grazing angles are ignored
+DEPTH_SLACK = 0.0015  # of the distance: depth tolerance of the visibility test
+MIN_SPREAD = 0.004  # of albedo: smaller differences are noise of the photos
+OUTLIER = 0.25  # of albedo: no detail of skin differs more from its surroundings
+HUBER = 1.5  # spreads from which a photo is an outlier
 ROUNDS = 3
-BLOCK = 1024  # points worked off in a row
+BLOCK = 1024  # points per block
 
 
 @njit(error_model="numpy", cache=True)
 def _look(camera, depth, clipped, x, n):
-    """cosine, distance, column, row of point x with normal n in a photo; cosine 0 where the photo does not see it, or
-    one of the four pixels that its colour would be mixed from is clipped."""
+    """Cosine, distance, column and row of point x with normal n in a photo. The cosine is 0 if the photo does not see
+    the point, or if one of the four pixels of the bilinear lookup is clipped."""
     dx, dy, dz = camera[27] - x[0], camera[28] - x[1], camera[29] - x[2]
     height = dx * n[0] + dy * n[1] + dz * n[2]
     if height <= 0:
@@ -59,7 +58,7 @@ def _look(camera, depth, clipped, x, n):
         return 0.0, distance, 0.0, 0.0
     i, j = int(column * camera[17]), int(row * camera[17])
     i, j = min(i, int(camera[20]) - 1), min(j, int(camera[21]) - 1)
-    # within one pixel of the depth picture a tilted surface comes nearer and goes further
+    # the depth of a tilted surface varies within one pixel of the depth picture
     slack = 1 + DEPTH_SLACK + np.sqrt(max(1 - cosine * cosine, 0.0)) / (cosine * camera[12] * camera[17])
     if distance > depth[int(camera[42]) + j * int(camera[20]) + i] * slack:
         return 0.0, distance, 0.0, 0.0
@@ -73,7 +72,7 @@ def _look(camera, depth, clipped, x, n):
 
 @njit(error_model="numpy", cache=True)
 def _colour(camera, pixels, column, row, out):
-    """Writes the linear colour (3,) at a place of a photo, before its calibration; bilinear between pixel centres."""
+    """Write the linear colour (3,) at a position in a photo, without its colour response; bilinear."""
     x, y = column - 0.5, row - 0.5
     x0, y0 = int(x), int(y)
     fx, fy = x - x0, y - y0
@@ -92,8 +91,8 @@ def _colour(camera, pixels, column, row, out):
 
 @njit(error_model="numpy", cache=True)
 def residual(camera, pixels, depth, clipped, x, n, corner, weights, gloss, albedo, shade, out, cosines):
-    """One photo's albedo less the field's at N points (N, 3), no larger than OUTLIER, and the cosines (N,), 0 where it
-    does not see them.
+    """One photo's albedo minus the field's at N points (N, 3), clamped to OUTLIER, and the cosines (N,), 0 where it
+    does not see the points.
 
     gloss (V, 3): specular radiance at the mesh's vertices; corner, weights (N, 3); shade (N, 3): radiance of albedo 1.
     """
@@ -112,11 +111,11 @@ def residual(camera, pixels, depth, clipped, x, n, corner, weights, gloss, albed
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
-    """The finest band at N points: a robust mean over photos of their albedo less the field's, without their low band.
+    """The finest band at N points: robust mean over photos of their albedo minus the field's, without their low band.
 
     gloss, low (views, V, 3): specular radiance, and the low band of the photo's residual, at the mesh's vertices.
-    Writes out (N, 3), and support (N, 2): the summed weights, 1 for one sharp photo from straight ahead, and the
-    root mean square by which photos differ from their mean.
+    Writes out (N, 3), and support (N, 2): the sum of the weights (1 for one sharp photo from straight ahead), and the
+    root mean square difference of the photos from their mean.
     """
     for block in prange((len(x) + BLOCK - 1) // BLOCK):
         rows = slice(block * BLOCK, min((block + 1) * BLOCK, len(x)))
@@ -128,7 +127,7 @@ def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, alb
 
 @njit(error_model="numpy", cache=True)
 def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
-    """A block of `fine`: a function of its own, because the compiler takes long over bodies of parallel loops."""
+    """A block of `fine`. It is a function of its own because the bodies of parallel loops compile slowly."""
     values, chosen, found = np.empty((MAX_PHOTOS, 3)), np.empty(MAX_PHOTOS), np.empty(3)
     views, places = np.empty(MAX_PHOTOS, np.int64), np.empty((MAX_PHOTOS, 2))
     for i in range(len(x)):
@@ -138,7 +137,7 @@ def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, al
             cosine, distance, column, row = _look(camera, depth, clipped, x[i], n[i])
             if cosine == 0:
                 continue
-            # what a photo resolves across the line of sight falls with the cosine and the distance
+            # the resolution of a photo on the surface falls with the cosine and the distance
             w = cosine * camera[40] / distance
             w = w * w * w * w
             slot = count
@@ -178,7 +177,7 @@ def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, al
 
 @njit(error_model="numpy", cache=True)
 def _weighted_median(values, weights, count, k):
-    """The median of a column of values, the lower one between two: the value with half of the weight up to it."""
+    """Weighted median of a column of values; between two, the lower one."""
     half, best = 0.0, np.inf
     for j in range(count):
         half += 0.5 * weights[j]
@@ -194,7 +193,7 @@ def _weighted_median(values, weights, count, k):
 
 @njit(error_model="numpy", cache=True)
 def _robust_mean(values, weights, count, out):
-    """Writes the Huber mean (3,) of values (count, 3), not all of weight 0: their weighted median, then reweighted."""
+    """Write the Huber mean (3,) of values (count, 3): weighted median, then reweighting. A weight must be above 0."""
     for k in range(3):
         centre = _weighted_median(values, weights, count, k)
         spread, total = 0.0, 0.0
@@ -215,7 +214,7 @@ def _robust_mean(values, weights, count, out):
 
 @njit(error_model="numpy", cache=True)
 def splat(corner, weights, values, share, sums, total):
-    """Adds values (N, 3) with their shares (N,) to the corners' vertices: sums (V, 3), total (V,). In order."""
+    """Add values (N, 3) times share (N,) to the vertices `corner` (N, 3), in order: sums (V, 3), total (V,)."""
     for i in range(len(corner)):
         if share[i] > 0:
             for j in range(3):

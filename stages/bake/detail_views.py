@@ -1,6 +1,6 @@
-"""Photos, their depths and cameras in the flat arrays that stages.bake.detail_kernels reads.
+"""Photos, their depths and cameras as the flat arrays that stages.bake.detail_kernels reads.
 
-Only fitted views come here: a photo that was held out must not find its way into a map.
+Only fitted views are used: a held-out photo must not enter a map.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from pipeline.transforms import inverse_rigid, matrix, rays
 from pipeline.visibility import Occluder, View
 from stages.bake import detail_kernels as kernels
 
-DEPTH_SIDE = 768  # pixels of a depth picture's longer side, at most: rays cost
-JUMP = 12.0  # pixels of depth over a pixel's neighbours, from which a place is the edge of something
-OPAQUE = 0.99  # of a mask: the edge of the head mixes with what is behind it
+DEPTH_SIDE = 768  # largest side of a depth picture in pixels: rays are expensive
+JUMP = 12.0  # depth difference between neighbours, in pixel sizes, that marks a depth edge
+MIN_ALPHA = 0.99  # of a mask: pixels at the edge of the head contain background
 CODE = 65535.0
 
 U8 = npt.NDArray[np.uint8]
@@ -29,8 +29,8 @@ U16 = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Photos:
-    """cameras (views, ROW) as detail_kernels describes them; pixels (P, 3); depth (D,) metres, 0 where a photo is of no
-    use; clipped (P,), empty where nothing is."""
+    """cameras (views, ROW) as in detail_kernels; pixels (P, 3); depth (D,) metres, 0 where a photo must not be used;
+    clipped (P,), empty if no pixel is clipped."""
 
     cameras: F64
     pixels: U16
@@ -41,7 +41,8 @@ class Photos:
 def read_photos(
     views: Sequence[View], responses: F64, mesh: Mesh, texel: float, step: Callable[[int, int], None]
 ) -> Photos:
-    """All fitted photos, no finer than `texel` (metres of surface), and what each of them sees of the mesh.
+    """Read all fitted photos, not finer than `texel` (metres on the surface), and compute the depth of the mesh in
+    each.
 
     responses (views, 3, 3): the fitted colour response A_n of each photo. [NeuFace eq. 19]
     """
@@ -72,14 +73,14 @@ def read_photos(
 
 
 def _clipped(view: View, shape: tuple[int, ...], factor: int) -> U8:
-    """(h w,) 1 where a block of `factor` x `factor` photo pixels holds a clipped one, which the fit leaves out too."""
+    """(h w,) 1 where a block of `factor` x `factor` photo pixels contains a clipped pixel."""
     if view.clipped is None:
         return np.zeros(shape[0] * shape[1], np.uint8)
     return (shrink_whole(read_alpha(view.clipped), factor) > 0).astype(np.uint8).ravel()
 
 
 def _factor(view: View, mesh: Mesh, texel: float) -> int:
-    """Photo pixels along the side of a block that is no wider than a texel where the camera is nearest."""
+    """Side of the largest block of photo pixels that is not wider than a texel at the point nearest to the camera."""
     origin = matrix(view.camera.world_from_cam)[:3, 3]
     distance = float(np.linalg.norm(mesh.vertices - origin, axis=1).min())
     return max(1, int(texel * matrix(view.camera.K)[0, 0] / max(distance, 1e-9)))
@@ -109,7 +110,7 @@ def _row(
 
 
 def _depth(view: View, alpha: F32, occluder: Occluder) -> F32:
-    """(h, w) distance to the mesh through each pixel's centre; 0 beside the mesh, beyond the mask and near edges."""
+    """(h, w) distance to the mesh through each pixel's centre; 0 outside the mesh or the mask, and near depth edges."""
     camera = view.camera
     shrunk = max(1, -(-max(camera.width, camera.height) // DEPTH_SIDE))
     h, w = camera.height // shrunk, camera.width // shrunk
@@ -121,13 +122,13 @@ def _depth(view: View, alpha: F32, occluder: Occluder) -> F32:
     window = np.ones((3, 3), np.uint8)
     jump = JUMP * shrunk / matrix(camera.K)[0, 0]
     uneven = cv2.dilate(far, window) - cv2.erode(far, window) > jump * far
-    solid = cv2.erode(cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA), window) > OPAQUE
+    solid = cv2.erode(cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA), window) > MIN_ALPHA
     return np.where(solid & ~uneven & np.isfinite(distance), far, 0).astype(np.float32)
 
 
 def _sharpness(pixels: list[U16], cameras: F64) -> F64:
-    """(views,) how sharp each photo is, the sharpest third 1: the strength of its finest differences over that of
-    differences twice as wide, which falls with blur whatever the photo shows."""
+    """(views,) sharpness of each photo, 1 for the sharpest third: the strength of the finest differences over that of
+    differences twice as wide. The ratio falls with blur and hardly depends on the content."""
     found = []
     for codes, camera in zip(pixels, cameras, strict=True):
         green = codes[:, 1].reshape(int(camera[19]), int(camera[18])).astype(np.float32)

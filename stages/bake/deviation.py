@@ -1,8 +1,8 @@
-"""How far a mesh lies from the zero set of the field.
+"""Distance of a mesh from the zero set of the field.
 
     |d(x)| / |grad d(x)|    first-order distance of x from the zero set
 
-over four points of every triangle, by area. Where the field's box cuts the solid there is no zero set: left out.
+at four points of every triangle, weighted by area. The cap, where the field's box cuts the solid, is left out.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from pipeline.fields.protocol import Field
 from pipeline.meshes import Mesh
 
 INSIDE = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]], np.float64)
-WALL_CELLS = 1.5  # of the field's cells: nearer to the box's walls lies the cap
+WALL_CELLS = 1.5  # cells of the field: points nearer to the box belong to the cap
 
 
 def zero_set_rms(field: Field, mesh: Mesh) -> float:
-    """Root mean square distance (m); 0 for a mesh that is all cap."""
+    """Root mean square distance (m); 0 for a mesh that is only cap."""
     weights = INSIDE / INSIDE.sum(1, keepdims=True)
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     points = np.einsum("sc,fcx->fsx", weights, corners).reshape(-1, 3)

@@ -1,6 +1,6 @@
-"""Texels between the charts take the value of the nearest covered one, everywhere.
+"""Dilation: every texel between the charts takes the value of the nearest covered texel.
 
-With that no mip level can mix a chart with black: each coarse texel is a mean of chart values, also far from charts.
+So no mip level mixes a chart with black: each coarse texel is a mean of chart values.
 """
 
 from __future__ import annotations
@@ -8,13 +8,14 @@ from __future__ import annotations
 from pipeline.meshes import Indices, Mask
 from pipeline.nearest import nearest_known
 
-HALO = 512  # rows above and below a band in which the nearest texel is looked for
+HALO = 512  # rows above and below a band that are searched for the nearest texel
 
 
 def nearest_rows(covered: Mask, first: int, last: int) -> Indices:
-    """(last - first, W) flat index of the nearest covered texel for rows first..last-1, its own where covered.
+    """(last - first, W) flat index of the nearest covered texel for rows first..last-1; a covered texel's own index.
 
-    Looks at most HALO rows beyond the band, further only where these hold none. At least one texel must be covered.
+    covered (H, W). The search goes HALO rows beyond the band, further only if these have no covered texel. At least one
+    texel must be covered.
     """
     width = covered.shape[1]
     low, high = max(0, first - HALO), min(len(covered), last + HALO)

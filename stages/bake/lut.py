@@ -1,10 +1,10 @@
-"""The learned basis as a table over n.v, which a shader can look up.
+"""The learned basis as a lookup table over n.v, for shaders.
 
 Symbols: B_j(wo, n) basis of [NeuFace eq. 9]. The table holds its mean over directions at a fixed cosine c:
 
     lut_j(c) = mean over n uniform on the sphere, wo uniform on the cone n.wo = c, of B_j(wo, n)
 
-The residual says how much the basis depends on more than n.v: the standard deviation over directions over the mean.
+The residual measures how much the basis depends on more than n.v: standard deviation over directions, over the mean.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from pipeline.meshes import F32, F64
 
 COLUMNS = 64
 NORMALS = 256  # spread evenly on the sphere
-TURNS = 8  # of wo around each normal
+TURNS = 8  # directions wo around each normal
 
 
 def basis_lut(field: Field) -> tuple[F32, float]:
-    """(1, COLUMNS, k) means at n.v = (i + 0.5) / COLUMNS, and the residual, a mean over bases and columns."""
+    """(1, COLUMNS, k) means at n.v = (i + 0.5) / COLUMNS, and the residual, averaged over bases and columns."""
     n = fibonacci_sphere(NORMALS)
     axis = np.eye(3)[np.abs(n).argmin(1)]
     across = np.cross(n, axis)

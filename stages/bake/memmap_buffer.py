@@ -1,4 +1,4 @@
-"""Arrays that grow in files: what a large map needs is bounded by the disk and not by the memory."""
+"""Growing arrays in memory-mapped files: large maps are limited by the disk, not by the memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = npt.NDArray[Any]
 
 
 class MemmapBuffer:
-    """Named arrays, appended to row by row. The files have no names and vanish with the process."""
+    """Named arrays to which rows are appended. Their files have no names and are removed when the process ends."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -23,7 +23,7 @@ class MemmapBuffer:
         self._rows: dict[str, int] = {}
 
     def append(self, rows: Mapping[str, Array]) -> None:
-        """Add rows; each array keeps its name, type and width."""
+        """Append rows; each array keeps its name, type and width."""
         for name, values in rows.items():
             if name not in self._files:
                 self._files[name] = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (closed with the process)
@@ -32,7 +32,7 @@ class MemmapBuffer:
             self._rows[name] += len(values)
 
     def arrays(self) -> dict[str, Array]:
-        """What was appended, mapped into memory."""
+        """The arrays, mapped into memory."""
         out: dict[str, Array] = {}
         for name, file in self._files.items():
             kind, width = self._kinds[name]
@@ -43,7 +43,7 @@ class MemmapBuffer:
 
 
 def blank(folder: Path | None, shape: tuple[int, ...], kind: type[np.generic]) -> Array:
-    """A writable array in a file without a name, zero everywhere."""
+    """A writable array of zeros in a file without a name."""
     file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
     file.truncate(int(np.prod(shape)) * np.dtype(kind).itemsize)
     return np.memmap(file, np.dtype(kind), "r+", shape=shape)

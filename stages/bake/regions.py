@@ -1,8 +1,8 @@
-"""Which region of a head each texel belongs to: the photos' labels, voted on.
+"""The region of the head that each texel belongs to, by a vote of the photos' labels.
 
-Every fitted photo with labels votes for the label of the pixel under a place that it sees, with the cosine between
-the normal and the direction to the camera. The label with the most votes wins, the lower code where two have as many.
-Labels are whole numbers in one picture a photo (pipeline.artifacts.ViewMask); what they mean does not matter here.
+Every fitted photo with labels votes for the label of the pixel at a point that it sees. The weight is the cosine
+between the normal and the direction to the camera. The label with the most votes wins; in a tie, the lower code. Labels
+are integers in one picture per photo (pipeline.artifacts.ViewMask); their meaning does not matter here.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from pipeline.meshes import F32, F64, Charts, Indices, Mesh
 from pipeline.visibility import View, picked
 
 U8 = npt.NDArray[np.uint8]
-GRID = 8192  # texels along the side of the texture in which triangles' middles are looked up
-FEW_VOTES = 1e-3  # one photo that sees the place from the very side
+GRID = 8192  # texels along the side of the texture in which the triangles' centroids are looked up
+FEW_VOTES = 1e-3  # one photo at a very grazing angle
 
 
 @dataclass(frozen=True, slots=True)
 class Votes:
-    """codes (L,) of the labels that were voted for, ascending, none of them 0; image (S, S, L) their votes."""
+    """codes (L,) of the labels with votes, ascending, without 0; image (S, S, L): their votes."""
 
     codes: U8
     image: F32
 
     def winners(self, texel: Indices, size: int) -> U8:
-        """(N,) codes of texels, given by row * size + column; 0 without votes. Votes are linear between places."""
+        """(N,) codes of texels, given by row * size + column; 0 without votes. Votes are interpolated linearly."""
         side = len(self.image)
         row, column = (np.clip((i + 0.5) * side / size - 0.5, 0, side - 1) for i in np.divmod(texel, size))
         top, left = row.astype(np.int64), column.astype(np.int64)
@@ -45,8 +45,8 @@ class Votes:
 
 
 def areas(mesh: Mesh, charts: Charts, votes: Votes | None) -> dict[int, float]:
-    """Area of the surface by the code of its region, 0 where no photo with labels sees it. Each triangle counts with
-    the label under its middle."""
+    """Area (m^2) of the surface by region code; code 0: no photo with labels sees it. Each triangle has the label at
+    its centroid."""
     area = meshes.areas(mesh.vertices, mesh.faces)
     if votes is None:
         return {0: float(area.sum())}
@@ -58,14 +58,14 @@ def areas(mesh: Mesh, charts: Charts, votes: Votes | None) -> dict[int, float]:
 
 
 class Poll:
-    """Gathers votes at `count` places."""
+    """Collects votes at `count` points."""
 
     def __init__(self, count: int) -> None:
         self._count = count
         self._votes: dict[int, F64] = {}
 
     def ask(self, view: View, cosine: F64, uv: F64) -> None:
-        """A view that sees places with cosines (N,), 0 where it does not, at pixels (N, 2)."""
+        """Add the votes of a view: cosines (N,) of the points, 0 where it does not see them, at pixels uv (N, 2)."""
         if view.labels is None:
             return
         seen = np.flatnonzero(cosine)
@@ -76,7 +76,7 @@ class Poll:
                 self._votes.setdefault(int(code), np.zeros(self._count))[seen[mine]] += cosine[seen[mine]]
 
     def result(self, spread: Callable[[F64], F32]) -> Votes | None:
-        """The votes, as a picture that `spread` makes from (N, L); None without any."""
+        """The votes as a picture, which `spread` makes from (N, L); None if there are none."""
         if not self._votes:
             return None
         codes = sorted(self._votes)

@@ -1,6 +1,6 @@
-"""Means and continuations over a mesh's surface, by heat flow on its vertices.
+"""Smoothing and harmonic continuation on a mesh, by heat diffusion on its vertices.
 
-Symbols: M vertex areas (m^2); K the cotangent Laplacian, its weights held above zero so that means stay means.
+Symbols: M vertex areas (m^2); K the cotangent Laplacian, with weights above zero, so that results stay weighted means.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ def laplacian(mesh: Mesh) -> tuple[F64, Any]:
 
 
 class Smoother:
-    """Means over a mesh with a kernel of standard deviation `width` (m): (M + width^2 / 4 K)^-1 M, twice."""
+    """Smooths with a kernel of standard deviation `width` (m): (M + width^2 / 4 K)^-1 M, applied twice."""
 
     def __init__(self, mesh: Mesh, width: float) -> None:
         self._mass, k = laplacian(mesh)
         self._solve = splu(csc_array(diags_array(self._mass) + width**2 / 4 * k))
 
     def __call__(self, values: F64) -> F64:
-        """(V, C) smoothed."""
+        """(V, C) smoothed values (V, C)."""
         for _ in range(2):
             values = self._solve.solve(self._mass[:, None] * values)
         return values
 
     def mean(self, values: F64, weights: F64) -> F64:
-        """(V, C) mean of values (V, C) by weights (V,); about 0 far from all weights."""
+        """(V, C) local mean of values (V, C) with weights (V,); about 0 far from all weights."""
         both = self(np.concatenate([values * weights[:, None], weights[:, None]], 1))
         return np.asarray(both[:, :-1] / np.maximum(both[:, -1:], 1e-9))
 
 
 def continued(mesh: Mesh, values: F64, known: Mask) -> F64:
-    """(V, C) values (V, C) at known vertices (V,), and between them the smoothest continuation: K u = 0.
+    """(V, C) values (V, C) at known vertices (V,), and the harmonic continuation (K u = 0) at the others.
 
-    Pieces without any known vertex take the mean of all.
+    Components without a known vertex take the mean of all known values.
     """
     if known.all() or not known.any():
         return values

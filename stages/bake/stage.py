@@ -1,4 +1,4 @@
-"""Bake stage: the fitted field on the texels of the UV mesh, TextureSet out."""
+"""Bake stage: evaluates the fitted field at the texels of the UV mesh; the output is a TextureSet."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ F64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The mesh, the field, the cameras and masks that say which texels were seen, and the photos with their detail."""
+    """The mesh, the field, the cameras and masks for the visibility of texels, and the photos for the fine detail."""
 
     surface: Located[Surface]
     uv: Located[UvMesh]
@@ -30,14 +30,14 @@ class Inputs:
 
 
 class Config(StageConfig):
-    """Size of the maps and what goes into them."""
+    """Settings of the bake stage."""
 
     size: Texels = Field(1024, ge=256, le=16384, description="width and height of the maps in texels")
     detail: bool = Field(True, description="add the fine detail of the fitted photos to the albedo")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
-    """Bake every map. Raises StageError when the mesh has no charts or the field is not finite on it."""
+    """Bake every map. Raises StageError if the mesh has no charts or the field is not finite on it."""
     from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
     from pipeline.people import shows_person
@@ -79,7 +79,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     levels = {"render": mesh, "high": meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))}
     if uv.artifact.proxy is not None:
         levels["proxy"] = meshes.load(uv.path(uv.artifact.proxy))
-    # every texel between the charts is filled, so the padding reaches across the whole picture
+    # every texel between the charts is filled, so the padding is the whole picture
     return TextureSet(
         size=config.size,
         tiles=baker.tiles,
@@ -96,15 +96,15 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
 
 
 def region_shares(areas: Mapping[int, float], names: Sequence[str]) -> dict[str, float]:
-    """Shares of the surface by the name of its region; areas by code. Code 0: no photo has a label of the place."""
+    """Shares of the surface by region name. areas: by code; code 0: no photo has a label there."""
     total = sum(areas.values())
     named = {code: "unlabelled" if code == 0 else names[code] if code < len(names) else str(code) for code in areas}
     return {named[code]: round(areas[code] / total, 6) for code in sorted(areas)}
 
 
 def responses(field: object, exposures: Sequence[float]) -> F64:
-    """(views, 3, 3) e_n A_n of each photo: its exposure, by which the fit divided it, and the fitted A_n, the identity
-    for fields that have none. [NeuFace eq. 19]"""
+    """(views, 3, 3) e_n A_n of each photo: its exposure, by which the fit divided it, times the fitted A_n (the
+    identity for fields without one). [NeuFace eq. 19]"""
     e = np.asarray(exposures, np.float64)[:, None, None]
     model = getattr(field, "model", None)
     if model is None:
@@ -113,7 +113,7 @@ def responses(field: object, exposures: Sequence[float]) -> F64:
 
 
 def attenuation(face: FittedFace) -> str:
-    """How the fit attenuated the light's bands; the paper's exponential where its model does not say."""
+    """Name of the light's attenuation in the fit; the paper's exponential if the model does not have the entry."""
     return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
 
 

@@ -1,4 +1,4 @@
-"""What the texels of one tile, or of all, amount to: figures and warnings for the report."""
+"""Statistics of the texels of one tile or of all: figures and warnings for the report."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from pipeline.maths import microfacet
 from stages.bake import detail
 from stages.bake.texels import Samples
 
-MANY_LOST = 0.02  # share of texels off the zero set, beyond the cap of a bust
+MANY_LOST = 0.02  # share of texels off the zero set that causes a warning; the cap of a neck has less
 MANY_CLAMPED = 0.001
-RESIDUAL = 0.1  # of the basis: from here on the table is only an approximation worth a word
-SHARP_KAPPA = 50.0  # light of order 10 can't tell sharper lobes apart
-SOME = 0.01  # share of texels from which on a lobe that maps can't hold is worth a word
+RESIDUAL = 0.1  # of the basis table: a larger one causes a warning
+SHARP_KAPPA = 50.0  # light of order 10 does not resolve sharper lobes
+SOME = 0.01  # share of texels with lobes that the maps can't represent that causes a warning
 
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Counts of texels: `room` all, `texels` those under charts, and of these those that landed on the zero set, whose
-    squared distances (m^2) sum to `squares`, that are unseen, clamped, have photo detail (`detailed`), sharp or rough
-    lobes."""
+    """Counts of texels. room: all; texels: those under charts; of these: landed (on the zero set), unseen, clamped,
+    detailed (with photo detail), and those with sharp or rough lobes. squares: sum of the squared distances (m^2) of
+    the landed ones."""
 
     room: int
     texels: int
@@ -41,39 +41,39 @@ class Statistics:
 
     @property
     def deviation(self) -> float:
-        """Root mean square distance (m) of the mesh from the zero set, where there is one."""
+        """Root mean square distance (m) of the mesh from the zero set, over the texels that landed."""
         return float(np.sqrt(self.squares / self.landed)) if self.landed else 0.0
 
     def figures(self, *, detail: bool) -> dict[str, float]:
-        """For the report; `detail`: whether photos had a say."""
+        """Figures for the report; `detail`: whether photo detail was used."""
         out = {"unseen": self.unseen / self.texels, "albedo_clamped": self.clamped / self.texels}
         if detail:
             out["detail_support"] = self.detailed / self.texels
         return {k: round(v, 6) for k, v in out.items()}
 
     def warnings(self, residual: float, views: int) -> tuple[str, ...]:
-        """What is out of the ordinary. residual: of the basis table; views: that the texture was made from."""
+        """Warnings. residual: of the basis table; views: number of photos that were used."""
         out = []
         lost, sharp, rough, clamped = (
             n / self.texels for n in (self.texels - self.landed, self.sharp, self.rough, self.clamped)
         )
         if lost > MANY_LOST:
             out.append(
-                f"{lost:.1%} of the texels lie where the fitted surface does not reach (the flat cut of the neck, or a "
-                "mesh that does not belong to this field)"
+                f"the fitted surface does not reach {lost:.1%} of the texels (flat cut of the neck, or a mesh that "
+                "does not belong to this field)"
             )
         if residual > RESIDUAL:
-            out.append(f"basis_lut.exr is a mean over directions: the learned basis varies by {residual:.0%} around it")
+            out.append(f"basis_lut.exr is a mean over directions; the learned basis varies by {residual:.0%} around it")
         if sharp > SOME:
             out.append(
-                f"{sharp:.0%} of the texels have kappa above {SHARP_KAPPA:.0f}: light of order 10 can't tell such "
-                "lobes apart"
+                f"{sharp:.0%} of the texels have kappa above {SHARP_KAPPA:.0f}; light of order 10 does not resolve "
+                "such lobes"
             )
         if rough > SOME:
-            out.append(f"{rough:.0%} of the texels are rougher than the roughness map can say")
+            out.append(f"{rough:.0%} of the texels are rougher than the maximum of the roughness map")
         if clamped > MANY_CLAMPED:
             out.append(
-                f"the albedo of {clamped:.1%} of the texels was outside of what skin can be and was clamped "
+                f"the albedo of {clamped:.1%} of the texels was outside the physical range and was clamped "
                 "(clamped.png shows where)"
             )
         if views == 0:
@@ -82,7 +82,7 @@ class Statistics:
 
 
 def statistics_of(s: Samples, size: int) -> Statistics:
-    """Of one tile with `size` texels along its side."""
+    """Statistics of one tile with `size` texels along its side."""
     d = s.displacement[s.landed].astype(np.float64)
     return Statistics(
         room=size * size,
@@ -98,5 +98,5 @@ def statistics_of(s: Samples, size: int) -> Statistics:
 
 
 def together(parts: Sequence[Statistics]) -> Statistics:
-    """Of all tiles."""
+    """Statistics of all tiles."""
     return Statistics(**{f.name: sum(getattr(p, f.name) for p in parts) for f in fields(Statistics)})

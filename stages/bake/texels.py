@@ -1,10 +1,10 @@
-"""The field on texels: where each lies on the true surface, and what the skin is like there.
+"""Samples the field at texels: their points on the true surface, and the material there.
 
 Symbols
     p       point of the UV mesh under a texel's centre
     N       interpolated vertex normal at p
     t       signed distance (m) along N from the mesh to the zero set of the SDF d
-    x       p + t N, where everything is evaluated
+    x       p + t N, the point at which everything is evaluated
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
 
 NEWTON_STEPS = 3
-MIN_SLOPE = 0.3  # of d along N: a flatter surface is not approached faster than that
-REACH_CELLS = 1.5  # of the field's cells: the decimated mesh is never further from the zero set than that
-MIN_FACING = 0.3  # cosine between the mesh's normal and the field's gradient where a texel lands
+MIN_SLOPE = 0.3  # of d along N: lower limit of the slope in Newton's step
+REACH_CELLS = 1.5  # cells of the field: the decimated mesh is never further from the zero set
+MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradient at x
 ARRIVED_CELLS = 1e-3  # |d| below this many cells needs no further step: 2 micrometres
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
-MIN_Z = 0.05  # of a tangent-space normal: shaders can't use normals that look into the surface
+MIN_Z = 0.05  # of a tangent-space normal: shaders can't use normals that point into the surface
 ALBEDO_RANGE = (0.005, 0.95)  # soot and fresh snow: nothing on a head is darker or brighter
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """One row a texel, in the order of its Hits. All float32.
+    """One row per texel, in the order of its Hits. All float32, but `landed` is bool.
 
-    albedo (N, 3), photo detail included; rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,);
-    irradiance_ratio (N, 3); f0 (N,); normal (N, 3) in tangent space, unit; displacement (N,) metres; ambient (N,)
-    occlusion. landed (N,): False where the mesh has no zero set near it (the cap). support (N,): weight of the photos
-    in the detail. unseen (N,): 1 where no photo saw the place. clamped (N,): how far the albedo was moved into
-    ALBEDO_RANGE, the channel that moved most.
+    albedo (N, 3), including photo detail; rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,);
+    irradiance_ratio (N, 3); f0 (N,); normal (N, 3) in tangent space, unit; displacement (N,) metres; ambient (N,):
+    ambient occlusion. landed (N,): False where no zero set is near the mesh (the cap). support (N,): weight of the
+    photos in the detail. unseen (N,): 1 where no photo shows the point. clamped (N,): largest change of an albedo
+    channel by clamping to ALBEDO_RANGE.
     """
 
     albedo: F32
@@ -61,8 +61,8 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo saw one; albedo (V, 3), where
-    unseen that of the surface around."""
+    """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; albedo (V, 3), where
+    unseen continued from the surroundings."""
 
     ambient: F32
     unseen: F32
@@ -71,8 +71,8 @@ class Known:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """Texels on the true surface. x (N, 3); world (N, 3) its unit normal; t, b, n (N, 3) the mesh's frame; moved (N,)
-    metres along n; landed (N,)."""
+    """Texels on the true surface. x (N, 3); world (N, 3): unit normal at x; t, b, n (N, 3): tangent frame of the mesh;
+    moved (N,): metres along n; landed (N,)."""
 
     x: F64
     world: F64
@@ -84,7 +84,7 @@ class Placed:
 
 
 def place(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Placed:
-    """Where the texels lie."""
+    """Find the points of the texels on the true surface."""
     weights = hits.weights.astype(np.float64)
     start = tangents.mixed(mesh.vertices.astype(np.float64)[mesh.faces[hits.face]], weights)
     t, b, n = tangents.at(frame, mesh, hits.face, weights)
@@ -94,7 +94,7 @@ def place(field: Field, mesh: Mesh, frame: Frames, hits: Hits) -> Placed:
 
 
 def points(field: Field, mesh: Mesh, hits: Hits, at: Placed, albedo: F32, ratio: F32) -> Points:
-    """The same texels as the photo detail takes them."""
+    """The same texels as input of the photo detail. albedo, ratio (N, 3)."""
     lit = shade(field.light, at.world, ratio)
     return Points(at.x, at.world, mesh.faces[hits.face], hits.weights, np.asarray(albedo, np.float32), lit)
 
@@ -102,7 +102,7 @@ def points(field: Field, mesh: Mesh, hits: Hits, at: Placed, albedo: F32, ratio:
 def sample(
     field: Field, mesh: Mesh, frame: Frames, hits: Hits, known: Known | None = None, detail: Detail | None = None
 ) -> Samples:
-    """Everything that the maps need. Raises StageError where the field is not finite."""
+    """Sample everything that the maps need. Raises StageError if the field is not finite."""
     at = place(field, mesh, frame, hits)
     x, straight = at.x.astype(np.float32), at.world.astype(np.float32)
     material = field.material(x)
@@ -143,12 +143,13 @@ def sample(
 
 
 def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
-    """Newton's method along the normal: t (N,), the gradient there (N, 3), and where the surface was reached (N,).
+    """Newton's method from start (N, 3) along normal (N, 3): t (N,), the gradient there (N, 3), and where it converged
+    (N,).
 
         t <- t - d / max(g . N, MIN_SLOPE)
 
-    clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not arrive keep t = 0; those
-    that are within ARRIVED_CELLS cells of the zero set stay where they are.
+    t is clamped to REACH_CELLS cells, so that it does not jump to another sheet. Texels that do not converge keep t =
+    0; those within ARRIVED_CELLS cells of the zero set are not moved.
     """
     reach = REACH_CELLS * field.cell
     t = np.zeros(len(start))
@@ -160,14 +161,14 @@ def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:
         slope = np.maximum(tangents.dot(gradient[on], normal[on]), MIN_SLOPE)
         t[on] = (t[on] - value[on] / slope).clip(-reach, reach)
         value[on], gradient[on] = _evaluate(field, start[on] + t[on, None] * normal[on])
-    # a wall across the normal is not the surface that this texel stands for (the rim of the neck's cut)
+    # a surface at a steep angle to the normal is not the one of this texel (the rim of the neck's cut)
     facing = tangents.dot(_unit(gradient), normal) > MIN_FACING
     landed = (np.abs(value) < LANDED_CELLS * field.cell) & facing
     return np.where(landed, t, 0.0), gradient, landed
 
 
 def in_frame(world: F64, t: F64, b: F64, n: F64) -> F32:
-    """(N, 3) directions in the frame T, B, N, kept on the outer side of the surface."""
+    """(N, 3) directions `world` (N, 3) in the frame T, B, N, kept on the outer side of the surface."""
     local = np.stack([tangents.dot(world, axis) for axis in (t, b, n)], 1)
     local[:, 2] = np.maximum(local[:, 2], MIN_Z)
     return _unit(local).astype(np.float32)

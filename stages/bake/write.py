@@ -1,7 +1,7 @@
-"""Maps to files, one after the other, so that only one full picture is held at a time.
+"""Writes the maps one after the other, so that only one full picture is in memory.
 
-Every map is float32 EXR; those that preview shaders and people look at are PNG too. Of several tiles each has its own
-files, and where one has a map all have it.
+Every map is float32 EXR; those for preview shaders and for viewing are PNG too. Each UDIM tile has its own files, and
+all tiles have the same maps.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from stages.bake.texels import Samples
 FOLDER = "textures"
 MM = 1000.0
 MIN_INV_KAPPA = 1e-6
-UNSEEN = 0.5  # value of the coverage of a chart's texel that no photo saw
-OPTIONAL = ("clamped", "region")  # maps that are kept only where there is something on them
-IN_MEMORY = 1 << 27  # numbers of a picture; a larger one is put together in a file
+UNSEEN = 0.5  # value in the map `coverage` of a covered texel that no photo shows
+OPTIONAL = ("clamped", "region")  # maps that are removed if they are empty
+IN_MEMORY = 1 << 27  # values of a picture; a larger one is assembled in a file
 
 Function = Callable[..., npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
 class MapKind:
-    """How a map is made from some of the samples' arrays (N, ...) and stored. png: bits, 0 for none; encoded: png
-    holds v/2 + 1/2. codes: values are whole numbers, in the png too. colour: its three channels are colours; units: of
-    its values, for the EXR's header."""
+    """How a map is computed from arrays (N, ...) of the samples, and how it is stored. png: bits, 0 for none; encoded:
+    the png contains v/2 + 1/2; codes: values are integers, also in the png; colour: the three channels are a colour;
+    units: of the values, for the EXR's header."""
 
     sources: tuple[str, ...]
     function: Function = lambda values: values
@@ -53,7 +53,7 @@ class MapKind:
     units: str = ""
 
     def values(self, samples: Samples, rows: Any = slice(None)) -> F32:
-        """(N, channels) of all samples, or of some rows."""
+        """(N, channels) values of all samples, or of some rows."""
         found = np.asarray(self.function(*(getattr(samples, s)[rows] for s in self.sources)), np.float32)
         return found[..., None] if found.ndim == np.ndim(samples.rho[rows]) else found
 
@@ -77,7 +77,7 @@ KINDS: dict[str, MapKind] = {
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where a tile's files go, and which of how many it is."""
+    """Folder of a tile's files, index of the tile, and number of tiles."""
 
     context: Context
     tile: int
@@ -85,7 +85,7 @@ class _Place:
 
 
 def write_maps(baked: Baked, context: Context, tile: int = 0, count: int = 1) -> dict[str, TextureMap]:
-    """Write every map of one of `count` tiles into `textures/` and describe it; figures are over covered texels."""
+    """Write every map of one of `count` tiles into `textures/` and describe it. Figures are over covered texels."""
     maps, place = {}, _Place(context, tile, count)
     for name, kind in KINDS.items():
         context.check()
@@ -108,8 +108,8 @@ def write_maps(baked: Baked, context: Context, tile: int = 0, count: int = 1) ->
 
 
 def joined(parts: Sequence[dict[str, TextureMap]], texels: Sequence[int], context: Context) -> dict[str, TextureMap]:
-    """All tiles' maps as one set; figures weighted by the texels of each tile. Optional maps with nothing on them in
-    any tile are removed."""
+    """The maps of all tiles as one set; figures are weighted by the texels of each tile. Optional maps that are empty
+    in all tiles are removed."""
     if len(parts) == 1:
         return parts[0]
     out = {}
@@ -132,7 +132,7 @@ def joined(parts: Sequence[dict[str, TextureMap]], texels: Sequence[int], contex
 
 
 def resized(image: F32, size: int) -> F32:
-    """(size, size), linear between texel centres."""
+    """(size, size) picture, interpolated linearly between texel centres of a square image (S, S)."""
     import cv2
 
     if len(image) == size:
@@ -169,7 +169,7 @@ def _region(baked: Baked, votes: Votes | None, place: _Place) -> TextureMap:
 
 
 def _picture(shape: tuple[int, int, int], folder: Path) -> F32:
-    """Channel after channel in memory, so that each is one piece for the EXR's writer, seen as (H, W, C)."""
+    """An (H, W, C) array whose channels are contiguous in memory, as the EXR writer needs them."""
     planes = (shape[2], *shape[:2])
     made = np.empty(planes, np.float32) if np.prod(shape) < IN_MEMORY else blank(folder, planes, np.float32)
     return np.moveaxis(made, 0, -1)

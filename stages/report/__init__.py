@@ -1,1 +1,1 @@
-"""Judges the result against photos that the fit has not seen, and writes one self-contained page about it."""
+"""Compares the result with the held-out photos, and writes one self-contained HTML page about it."""

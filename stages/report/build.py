@@ -1,4 +1,4 @@
-"""Puts scores and pictures together."""
+"""Assembles the scores and pictures of the page."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
 
 @dataclass(frozen=True, slots=True)
 class JudgedRow:
-    """A view's scores and the pictures of it: the images themselves are let go."""
+    """A view's scores and its pictures for the page, without the full images."""
 
     index: int
     held_out: bool
@@ -46,7 +46,7 @@ class JudgedRow:
 
 
 def build_rows(view: JudgedView, side: int) -> JudgedRow:
-    """photo | model | asset | error of the asset (of the model where there is no asset render)."""
+    """Pictures of a view: photo, model, asset, error of the asset (of the model if there is no render of the asset)."""
     pictures = [Picture(data_uri(to_bytes(encoded(view.photo)), side), "photo")]
     known = (("model", view.model, view.model_scores), ("asset", view.asset, view.asset_scores))
     renders = [(what, view.shown(image), scores) for what, image, scores in known if image is not None]
@@ -76,7 +76,7 @@ def _noted(scores: Scores | None, own_colours: bool) -> str:
 
 
 def summary(rows: list[JudgedRow]) -> dict[str, Any]:
-    """metrics.json's `holdout`: means over views, the worst view, and every view's scores."""
+    """`holdout` of metrics.json: means over views, the worst view, and the scores of every view."""
     model, asset = [r.model for r in rows if r.model], [r.asset for r in rows if r.asset]
     held_out = bool(rows) and all(r.held_out for r in rows)
     out: dict[str, Any] = {"views": len(rows), "held_out": held_out, **mean_scores(model)}
@@ -97,7 +97,7 @@ def _both(row: JudgedRow) -> dict[str, float | None]:
 def build_page(
     metrics: Mapping[str, Any], verdict: Verdict, rows: list[JudgedRow], r: Results, side: int, outlines: int
 ) -> str:
-    """The page with its pictures."""
+    """The HTML page with its pictures."""
     return render_page(
         metrics,
         Pictures(
@@ -114,7 +114,7 @@ def build_page(
 
 
 def _sides(r: Results, side: int) -> list[Picture]:
-    """The previews that came with the asset, shape and look next to each other."""
+    """The preview pictures of the asset, shape and appearance side by side."""
     found = {
         f.path.removeprefix("previews/").removesuffix(".png"): f
         for f in r.usd.artifact.files
@@ -131,7 +131,7 @@ def _sides(r: Results, side: int) -> list[Picture]:
 
 
 def _over_grey(image: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """RGB of an 8-bit RGBA picture over mid grey, which suits light and dark pages."""
+    """RGB of an 8-bit RGBA picture over mid grey, for light and dark pages."""
     if image.shape[2] < 4:
         return np.asarray(image, np.uint8)
     alpha = image[..., 3:].astype(np.float32) / 255
@@ -139,7 +139,7 @@ def _over_grey(image: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8
 
 
 def _maps(r: Results, side: int) -> list[Picture]:
-    """Every map; the tiles of one with several next to each other."""
+    """Pictures of every map; UDIM tiles are side by side."""
     out, count = [], r.bake.artifact.tiles
     kinds = [tiles.form("exr", t, count) for t in range(count)]
     for name, texture in sorted(r.bake.artifact.maps.items()):
@@ -151,18 +151,18 @@ def _maps(r: Results, side: int) -> list[Picture]:
 
 
 def _lobe_fit(r: Results, side: int) -> list[Picture]:
-    """Where a GGX lobe does not stand for the fitted one, and where kappa is a guess."""
+    """Picture of the error of GGX against the fitted lobe, and of places where the light does not determine kappa."""
     files = [f for f in r.usd.artifact.files if LOBE_FIT in f.path]
     if not files:
         return []
     picture = np.concatenate([_thinned(read_encoded(r.usd.path(f))[..., :3], side) for f in files], 1)
     off = r.usd.artifact.figures.get("ggx_residual", 0.0)
-    caption = f"GGX against the fitted lobe: red, residual ({off:.1%} in all); green, kappa not resolved"
+    caption = f"GGX against the fitted lobe. Red: residual ({off:.1%} in total); green: kappa not resolved"
     return [Picture(data_uri(picture, side), caption)]
 
 
 def _thinned(image: np.ndarray[Any, Any], side: int) -> np.ndarray[Any, Any]:
-    """Every so many rows and columns, about twice as many as are shown."""
+    """Subsampled rows and columns, about twice as many as are shown."""
     step = max(1, image.shape[0] // (2 * side))
     return np.asarray(image[::step, ::step])
 
@@ -171,5 +171,5 @@ def _light(r: Results, side: int) -> Picture | None:
     files = [f for f in r.usd.artifact.files if f.path == ENVIRONMENT]
     if not files:
         return None
-    caption = "captured light (lat-long; centre: in front of the face)"
+    caption = "captured light (lat-long; the centre is in front of the face)"
     return Picture(data_uri(light_picture(read_exr(r.usd.path(files[0]))[0][..., :3]), side), caption)

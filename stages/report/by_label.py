@@ -1,4 +1,4 @@
-"""Errors of views apart by what their photos show: face, eyes, hair, the rest of the subject."""
+"""Errors of views by the labels of their photos: face, eyes, hair, the rest of the subject."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy.typing as npt
 from stages.report.metrics import EQUAL, F32, encoded
 
 LabelErrors = dict[str, tuple[float, int]]  # by label: sum of squared differences (sRGB-encoded), number of pixels
-BODY = "body"  # the subject where no other label is: neck, cloth, and hair where no network knows it
+BODY = "body"  # the subject where there is no other label: neck, clothes, and hair that no network found
 
 
 def label_errors(
     rendered: F32, photo: F32, mask: F32, labels: npt.NDArray[np.generic], names: Sequence[str]
 ) -> LabelErrors:
-    """Of one view. rendered (H, W, 4), photo (H, W, 3) linear; mask (H, W); labels (H, W) codes."""
+    """Errors of one view. rendered (H, W, 4), photo (H, W, 3) linear; mask (H, W); labels (H, W) codes."""
     inside = mask > 0.5
     square = ((encoded(rendered[..., :3][inside]).astype(np.float64) - encoded(photo[inside])) ** 2).mean(1)
     code = np.asarray(labels[inside], np.int64)

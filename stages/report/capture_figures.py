@@ -1,4 +1,4 @@
-"""What the reconstruction started from: where the cameras stood, which photos found no place, how the masks lie.
+"""The input of the reconstruction: a drawing of the cameras, photos without a camera, outlines of the masks.
 
 The drawing is a parallel projection of asset coordinates (metres): a point p is drawn at (p . right, -p . up).
 """
@@ -33,7 +33,7 @@ KINDS = {"fitted": "#2a9d6f", "held out": "#3f7fd1", "mask dropped": "#d9822b"}
 
 @dataclass(frozen=True, slots=True)
 class CameraRow:
-    """A line of the table of cameras. error_px: mean reprojection error; hull_iou: its mask and all others."""
+    """A row of the table of cameras. error_px: mean reprojection error; hull_iou: IoU of mask and others' hull."""
 
     name: str
     kind: str
@@ -44,8 +44,8 @@ class CameraRow:
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """Everything that the page shows of it. sphere: what of the subject photos see, hidden: the parts that they do not.
-    lost: photos without a place, or left out, and why."""
+    """Data of this section of the page. sphere: directions that the photos cover; hidden: parts that they hardly cover;
+    lost: photos without a camera or left out, with the reason."""
 
     drawing: Markup
     sphere: Markup
@@ -63,7 +63,9 @@ def captured(r: Started, side: int, shown: int) -> Captured:
     kinds = _kinds(r)
     rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
     why = r.poses.artifact.left_out
-    lost = [f"{n}: no place found for it" + (f"; {why[n]}" if n in why else "") for n in r.poses.artifact.unregistered]
+    lost = [
+        f"{n}: no camera pose was found" + (f"; {why[n]}" if n in why else "") for n in r.poses.artifact.unregistered
+    ]
     lost += r.capture.artifact.left_out
     outlines = _outlines(r, side, shown)
     seen = r.poses.artifact.seen_directions
@@ -90,7 +92,7 @@ def _rows(r: Started, kinds: dict[int, str]) -> list[CameraRow]:
 
 
 def drawing(poses: Located[CameraSet], kinds: dict[int, str]) -> Markup:
-    """An inline SVG: sparse points, the region of interest and the cameras as little pyramids, from two sides."""
+    """An inline SVG: sparse points, the region of interest and the cameras as small pyramids, from two directions."""
     found = poses.artifact
     points = _points(poses)
     centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in found.cameras])
@@ -126,7 +128,7 @@ def _panel(
 
 
 def _axes(azimuth: float, elevation: float) -> tuple[F64, F64]:
-    """Right and up of a spectator in degrees around +Y from +Z, and above the horizon."""
+    """Right and up vectors (3,) of a viewpoint. azimuth: degrees around +Y from +Z; elevation: degrees."""
     a, e = np.radians([azimuth, elevation])
     right = np.array([np.cos(a), 0.0, -np.sin(a)])
     toward = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
@@ -138,12 +140,14 @@ class _Place(Protocol):
 
 
 def _pyramid(camera: Camera, length: float, place: _Place) -> list[tuple[F64, F64]]:
-    """Edges of a camera's pyramid: from the centre to the frame's corners, and around; a tick on the upper edge."""
+    """Edges of a camera's pyramid: from the centre to the corners of the frame, around the frame, a mark on its top."""
     K, pose = matrix(camera.K), matrix(camera.world_from_cam)
     w, h = camera.width, camera.height
     uv = np.array([[0, 0], [w, 0], [w, h], [0, h], [w / 2, -0.2 * h]], np.float64)
     flat = np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T
-    flat *= 0.5 / max(float(np.abs(flat[:4]).max()), 1e-9)  # all lenses drawn alike: where they look is what counts
+    flat *= 0.5 / max(
+        float(np.abs(flat[:4]).max()), 1e-9
+    )  # all focal lengths are drawn alike: only the direction matters
     corners = np.concatenate([flat, np.ones((5, 1))], 1) * length @ pose[:3, :3].T + pose[:3, 3]
     at, centre = place(corners), place(pose[None, :3, 3])[0]
     edges = [(centre, at[i]) for i in range(4)] + [(at[i], at[(i + 1) % 4]) for i in range(4)]
@@ -151,7 +155,7 @@ def _pyramid(camera: Camera, length: float, place: _Place) -> list[tuple[F64, F6
 
 
 def _points(poses: Located[CameraSet]) -> F64:
-    """(M, 3) at most SHOWN_POINTS sparse points near the subject; none for given cameras."""
+    """(M, 3) sparse points near the subject, at most SHOWN_POINTS; none for given cameras."""
     if poses.artifact.points is None:
         return np.zeros((0, 3))
     with np.load(poses.path(poses.artifact.points), allow_pickle=False) as data:
@@ -161,7 +165,7 @@ def _points(poses: Located[CameraSet]) -> F64:
 
 
 def _outlines(r: Started, side: int, shown: int) -> list[Picture]:
-    """Photos with the outline of their mask, the one that agrees least with the others first."""
+    """Photos with the outline of their mask; the one that agrees least with the others comes first."""
     views = {v.index: v for v in r.capture.artifact.views}
     masks = sorted(r.masks.artifact.masks, key=lambda m: (m.hull_iou if m.hull_iou is not None else 2.0, m.index))
     out = []
@@ -175,7 +179,7 @@ def _outlines(r: Started, side: int, shown: int) -> list[Picture]:
 
 
 def photos_named(r: Started, names: Sequence[str], side: int) -> list[Picture]:
-    """The capture's photos of these names with the outlines of their masks. A name without a photo is left out."""
+    """The photos of these names with the outlines of their masks. Names without a photo are left out."""
     views = {v.name: v for v in r.capture.artifact.views}
     masks = {m.index: m for m in r.masks.artifact.masks}
     out = []

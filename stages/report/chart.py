@@ -1,8 +1,9 @@
-"""What the colour chart says of the fit: its own errors, and whether the fitted light would light it as it was lit.
+"""Figures of the colour checker: its fit error, and a comparison of the fitted light with the light on the checker.
 
-Symbols: n normal of the chart; E(n) irradiance of the fitted light, without shadows; a perfect white sends E(n) / pi.
-In the photos it sent the chart's level. Both are alike if the chart stood in the light that fell on the head, out of
-shadows, and the fitted light has the right scale. If they are f : 1, the chart bears out f times the albedo.
+Symbols: n normal of the checker; E(n) irradiance of the fitted light, without shadows. The radiance of a perfect white
+is E(n) / pi under the fitted light, and `level` in the photos. Both are equal if the checker was in the same light as
+the head, without shadows, and the scale of the fitted light is right. If their ratio is f, the true albedo is f times
+the fitted one.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from pipeline.artifacts import Camera, CameraSet, Capture, FittedFace, Located
 from pipeline.colour import LUMA
 from pipeline.transforms import F64, matrix, undistort
 
-COLUMNS, ROWS = 6, 4  # patches are as far apart in both directions
+COLUMNS, ROWS = 6, 4  # patches have the same distance in both directions
 PLACES: F64 = np.array([[-COLUMNS, -ROWS], [COLUMNS, -ROWS], [COLUMNS, ROWS], [-COLUMNS, ROWS]], np.float64)
 
 
 class Charted(Protocol):
-    """The artifacts that this is about."""
+    """The artifacts that are read."""
 
     @property
     def capture(self) -> Located[Capture]: ...
@@ -34,13 +35,13 @@ class Charted(Protocol):
 
 
 def chart_figures(r: Charted) -> dict[str, Any]:
-    """Of each camera that saw one; `found` alone where there was none."""
+    """Figures for each camera that saw a colour checker; only `found` if there was none."""
     chart = r.capture.artifact.chart
     if chart is None:
         return {"found": 0}
     out: dict[str, Any] = {
         "found": len(chart.photos),
-        "fixes": "white balance, and the photos' unit; not the albedo's scale",
+        "fixes": "white balance and the unit of the photos, not the scale of the albedo",
     }
     cameras = {c.index: c for c in r.poses.artifact.cameras}
     path = r.inverse_rendering.path(r.inverse_rendering.artifact.light)
@@ -56,18 +57,18 @@ def chart_figures(r: Charted) -> dict[str, Any]:
 
 
 def normal_of(corners: Sequence[Sequence[float]], camera: Camera) -> F64:
-    """(3,) unit normal in asset coordinates, towards the camera, of a chart whose corners (4, 2) are seen in a photo.
+    """(3,) unit normal, in asset coordinates and towards the camera, of a checker with corners (4, 2) in pixels.
 
-    The first two columns of K^-1 H, H from the chart's plane to pixels, lie along its edges.
+    The first two columns of K^-1 H, with H from the checker's plane to pixels, are along its edges.
     """
     K, world_from_cam = matrix(camera.K), matrix(camera.world_from_cam)
     flat = np.linalg.solve(K[:2, :2], (np.array(corners, np.float64) - K[:2, 2]).T).T
     plane = undistort(np.asarray(flat, np.float64), np.array(camera.distortion, np.float64))
-    # in pixels of a nominal lens, because OpenCV solves it in float32
+    # in pixels of a nominal lens, because OpenCV computes H in float32
     H = cv2.getPerspectiveTransform(PLACES.astype(np.float32), (plane * 1e3).astype(np.float32))
     edges = np.diag([1e-3, 1e-3, 1]) @ np.asarray(H, np.float64)
     n = np.cross(edges[:, 0], edges[:, 1])
-    n *= -np.sign(n @ edges[:, 2]) / np.linalg.norm(n)  # the third column is where the chart's middle is
+    n *= -np.sign(n @ edges[:, 2]) / np.linalg.norm(n)  # the third column points to the checker's centre
     return np.asarray(world_from_cam[:3, :3] @ n, np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Figures of all stages in one plain dictionary: what metrics.json holds."""
+"""Figures of all stages as one plain dictionary: the content of metrics.json."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stages.report.chart import chart_figures
 
 
 class Started(Protocol):
-    """What the reconstruction started from."""
+    """The artifacts from which the reconstruction started."""
 
     @property
     def capture(self) -> Located[Capture]: ...
@@ -32,7 +32,7 @@ class Started(Protocol):
 
 
 class Results(Started, Protocol):
-    """The artifacts that the report is about."""
+    """All artifacts that the report reads."""
 
     @property
     def inverse_rendering(self) -> Located[FittedFace]: ...
@@ -47,12 +47,12 @@ class Results(Started, Protocol):
 
 
 def own_colours(model: Mapping[str, Mapping[str, Any]]) -> bool:
-    """Whether the fit gave every photo a colour response of its own. model: how each part of it was decided."""
+    """Whether the fit gave every photo its own colour response. model: decision on each part of the model."""
     return bool(model.get("calibration", {}).get("modelled"))
 
 
 def figures(r: Results) -> dict[str, Any]:
-    """Everything but the views' scores and the timing."""
+    """Everything except the views' scores and the timing."""
     face, surface, uv = r.inverse_rendering.artifact, r.surface.artifact, r.uv.artifact
     bake, usd = r.bake.artifact, r.usd.artifact
     cameras = r.poses.artifact
@@ -137,18 +137,18 @@ def figures(r: Results) -> dict[str, Any]:
 
 
 def warnings(r: Results) -> list[str]:
-    """What every stage had to say, in their order, and what they left out."""
+    """The warnings of all stages, in their order, and what they left out."""
     out = [f"capture: {w}" for w in r.capture.artifact.warnings]
     out += [f"capture: left out: {x}" for x in r.capture.artifact.left_out]
     out += [f"poses: {w}" for w in r.poses.artifact.warnings]
     if not r.poses.artifact.metric:
-        out.append("poses: the scale is unknown; the asset's size is nominal")
+        out.append("poses: the scale is unknown; the asset's size is an assumption")
     if r.poses.artifact.unregistered:
-        out.append(f"poses: no camera was found for {', '.join(r.poses.artifact.unregistered)}")
+        out.append(f"poses: no camera pose was found for {', '.join(r.poses.artifact.unregistered)}")
     out += [f"masks: {w}" for w in r.masks.artifact.warnings]
     if r.masks.artifact.dropped:
         out.append(
-            f"masks: views not fitted because their mask disagrees: {', '.join(map(str, r.masks.artifact.dropped))}"
+            f"masks: views not fitted, because their mask disagrees: {', '.join(map(str, r.masks.artifact.dropped))}"
         )
     for name in ("inverse_rendering", "surface", "uv", "bake", "usd"):
         out += [f"{name}: {w}" for w in getattr(r, name).artifact.warnings]

@@ -1,4 +1,4 @@
-"""The views that are judged: their photos, masks, predictions and asset renders, one at a time."""
+"""The views that are scored: photos, masks, predictions and renders of the asset, one at a time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from stages.report.collect import Results, own_colours
 from stages.report.metrics import Scores, matched, score
 
 F32 = npt.NDArray[np.float32]
-ASKED = 0.99  # share of a pixel from which it counts, as in the fit
+MIN_SHARE = 0.99  # of a pixel inside the region that counts, for the pixel to count, as in the fit
 
 
 @dataclass(frozen=True, slots=True)
 class JudgedView:
-    """One view. photo (H, W, 3), mask (H, W) of the subject in its extent, renders (H, W, 4) without what lies over the
-    subject beyond it; scores are None where there is no render.
+    """One view. photo (H, W, 3), mask (H, W) of the subject inside its extent, renders (H, W, 4) restricted to the
+    region that counts; scores are None if there is no render.
 
-    own_colours: photos differ in exposure or white balance, and nothing tells those of this one. model_labels,
-    asset_labels: errors by the photo's labels, empty where it has none.
+    own_colours: photos differ in exposure or white balance, and those of this photo are unknown. model_labels,
+    asset_labels: errors by the photo's labels, empty if it has none.
     """
 
     index: int
@@ -41,12 +41,12 @@ class JudgedView:
     asset_labels: LabelErrors = field(default_factory=dict)
 
     def shown(self, render: F32) -> F32:
-        """A render as the pictures have it: in the photo's own colours where the fit gave each photo some."""
+        """A render (H, W, 4) for the page: in the photo's colours, if the fit has a colour response per photo."""
         return matched(render, self.photo, self.mask) if self.own_colours and (self.mask > 0.5).any() else render
 
 
 def judged_views(r: Results) -> Iterator[JudgedView]:
-    """Views with a render from the model or from the asset and with a mask, in the order of their index."""
+    """Views with a mask and with a render of the model or the asset, in the order of their index."""
     predicted = {v.index: v for v in r.inverse_rendering.artifact.held_out}
     rendered = {v.index: v for v in r.usd.artifact.views}
     masks = {m.index: m for m in r.masks.artifact.masks}
@@ -67,10 +67,10 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
 
 
 def _asked(r: Results, mask: ViewMask, factor: int) -> F32:
-    """(H, W) 1 where the subject in its extent is asked, or background; (1, 1) where all is."""
+    """(H, W) 1 where pixels count: the subject inside its extent, or background; (1, 1) if all pixels count."""
     if mask.asked is None:
         return np.ones((1, 1), np.float32)
-    return np.asarray(shrink(read_alpha(r.masks.path(mask.asked)), factor) > ASKED, np.float32)
+    return np.asarray(shrink(read_alpha(r.masks.path(mask.asked)), factor) > MIN_SHARE, np.float32)
 
 
 def _by_label(r: Results, of: ViewMask, render: F32 | None, photo: F32, mask: F32, factor: int) -> LabelErrors:
@@ -82,7 +82,7 @@ def _by_label(r: Results, of: ViewMask, render: F32 | None, photo: F32, mask: F3
 
 
 def unjudged(r: Results) -> list[str]:
-    """Why a held-out view is missing from the scores."""
+    """Messages on held-out views that have no scores."""
     predicted, masks = ({v.index for v in a} for a in (r.inverse_rendering.artifact.held_out, r.masks.artifact.masks))
     out = []
     for view in r.capture.artifact.views:

@@ -1,8 +1,8 @@
-"""How close a rendered view is to its photo.
+"""Metrics of the difference between a rendered view and its photo.
 
 Symbols: rendered (H, W, 4) linear RGBA, colour premultiplied (the photo's pixel value over black); photo (H, W, 3)
-linear; mask (H, W) in [0, 1], the photo's subject. All comparisons are on sRGB-encoded values clipped to [0, 1], as
-people see them. "Full" images are weighted by their own alpha first, so that what lies behind the subject is left out.
+linear; mask (H, W) in [0, 1], the photo's subject. All metrics use sRGB-encoded values clipped to [0, 1], which is
+close to human perception. "Full" images are multiplied by their own alpha first, which removes the background.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy.typing as npt
 from pipeline.colour import srgb_from_linear
 
 F32 = npt.NDArray[np.float32]
-EQUAL = 100.0  # dB that stand for equal images, whose ratio would be infinite
+EQUAL = 100.0  # dB for equal images, in place of infinity
 
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """psnr (dB, subject's pixels only), psnr_matched (the same in the photo's own colours), psnr_full (dB),
-    ssim (-1..1), flip (0..1, 0 = equal), mask_iou (0..1)."""
+    """psnr (dB, only the subject's pixels), psnr_matched (the same after `matched`), psnr_full (dB), ssim (-1..1),
+    flip (0..1, 0 = equal), mask_iou (0..1)."""
 
     psnr: float
     psnr_matched: float
@@ -32,12 +32,12 @@ class Scores:
     mask_iou: float
 
     def json(self) -> dict[str, float | None]:
-        """Rounded to what is meaningful; what is not finite becomes None, which JSON has."""
+        """Rounded values for JSON; values that are not finite become None."""
         return {k: None if v is None or not np.isfinite(v) else round(v, 5) for k, v in asdict(self).items()}
 
 
 def score(rendered: F32, photo: F32, mask: F32) -> Scores:
-    """All metrics of one view. ValueError if the sizes differ or the mask is empty."""
+    """All metrics of one view. Raises ValueError if the sizes differ or the mask is empty."""
     if rendered.shape[:2] != photo.shape[:2] or mask.shape != photo.shape[:2]:
         raise ValueError(f"sizes differ: rendered {rendered.shape}, photo {photo.shape}, mask {mask.shape}")
     if not (mask > 0.5).any():
@@ -65,15 +65,14 @@ def psnr(a: F32, b: F32) -> float:
 
 
 def psnr_fg(rendered: F32, photo: F32, mask: F32) -> float:
-    """PSNR over the pixels with mask > 0.5, of linear images. The background can't flatter it."""
+    """PSNR of linear images over the pixels with mask > 0.5. The background can't raise it."""
     inside = mask > 0.5
     return psnr(encoded(rendered[inside]), encoded(photo[inside]))
 
 
 def matched(rendered: F32, photo: F32, mask: F32) -> F32:
-    """The render with its colours through the 3 x 3 matrix that brings the subject nearest to the photo, least squares
-    in linear light. A photo that no fit has seen has an exposure and a white balance that nothing tells.
-    [NeuFace, evaluation protocol]"""
+    """The render (H, W, 4) after the 3 x 3 colour matrix that fits its subject to the photo, by least squares in linear
+    values. The exposure and white balance of a held-out photo are unknown. [NeuFace, evaluation protocol]"""
     inside = mask > 0.5
     known, wanted = (x[inside].astype(np.float64) for x in (rendered[..., :3], photo))
     matrix = np.linalg.lstsq(known, wanted, rcond=1e-6)[0]
@@ -83,7 +82,7 @@ def matched(rendered: F32, photo: F32, mask: F32) -> F32:
 def ssim(a: F32, b: F32) -> float:
     """Structural similarity of two encoded images (H, W, 3), Gaussian window of sigma 1.5. [Wang et al. 2004]
 
-    Images smaller than the window (11 pixels) can't be compared so: NaN.
+    NaN for images smaller than the window (11 pixels).
     """
     from skimage import metrics
 
@@ -96,7 +95,7 @@ def ssim(a: F32, b: F32) -> float:
 
 
 def flip(reference: F32, test: F32) -> float | None:
-    """Mean FLIP of two encoded images [Andersson et al. 2020]; None where flip-evaluator is not installed."""
+    """Mean FLIP of two encoded images (H, W, 3) [Andersson et al. 2020]; None if flip-evaluator is not installed."""
     try:
         from flip_evaluator import evaluate
     except ImportError:
@@ -105,13 +104,13 @@ def flip(reference: F32, test: F32) -> float | None:
 
 
 def iou(alpha: F32, mask: F32) -> float:
-    """Overlap of two silhouettes at one half: intersection over union."""
+    """Intersection over union of two silhouettes (H, W), thresholded at 0.5."""
     a, b = alpha > 0.5, mask > 0.5
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
 def mean_scores(scores: list[Scores]) -> dict[str, float | None]:
-    """The mean of each metric over views; None where no view has it."""
+    """The mean of each metric over views; None if no view has it."""
     out: dict[str, float | None] = {}
     for name in Scores.__dataclass_fields__:
         values = [v for s in scores if (v := getattr(s, name)) is not None and np.isfinite(v)]

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: no scripts that run, nothing fetched from anywhere."""
+"""The HTML page: one self-contained file, without scripts that run and without network access."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TABLE = re.compile(r"(<!-- timing -->).*?(<!-- /timing -->)", re.S)
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A data URI and the words below it."""
+    """A data URI and its caption."""
 
     uri: str
     caption: str
@@ -29,7 +29,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class ViewRow:
-    """photo | model | asset | error of one view. `note` says in words how good it is."""
+    """Pictures of one view: photo, model, asset, error. `note`: name of the photo and whether it was held out."""
 
     title: str
     note: str
@@ -38,7 +38,7 @@ class ViewRow:
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """What the page shows besides figures. `scale`: the heat map's legend, from 0 to `scale_top`."""
+    """The pictures of the page. `scale`: legend of the heat map, from 0 to `scale_top`."""
 
     views: Sequence[ViewRow] = ()
     sides: Sequence[Picture] = ()
@@ -51,23 +51,23 @@ class Pictures:
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:
-    """The page from metrics.json's content and its pictures. The same input gives the same bytes."""
+    """The page from the content of metrics.json and the pictures. The same input gives the same bytes."""
     return _template().render(m=metrics, p=pictures, headline=headline(metrics), sections=sections(metrics))
 
 
 def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """(value, what it is, what it means) of the figures that matter most."""
+    """The most important figures: (value, name, explanation)."""
     h, kind = metrics["holdout"], "held-out photos" if metrics["holdout"]["held_out"] else "FITTED photos"
     out = []
     for prefix, what in (("", "model"), ("asset_", "exported asset")):
         if h.get(f"{prefix}psnr") is not None:
             out.append((f"{h[f'{prefix}psnr']:.1f} dB", f"PSNR, {what}", f"subject's pixels of {h['views']} {kind}"))
     if own_colours(metrics["model"]) and h.get("asset_psnr_matched") is not None:
-        meaning = "as before, after a 3 x 3 matrix a photo: they differ in exposure or white balance"
+        meaning = "as before, after a 3 x 3 matrix per photo, because photos differ in exposure or white balance"
         out.append((f"{h['asset_psnr_matched']:.1f} dB", "PSNR in the photos' colours, exported asset", meaning))
     for key, what, meaning in (
         ("asset_ssim", "SSIM, exported asset", "1 is equal"),
-        ("asset_flip", "FLIP, exported asset", "0 is equal, as an eye sees it"),
+        ("asset_flip", "FLIP, exported asset", "0 is equal; models human perception"),
     ):
         if h.get(key) is not None:
             out.append((f"{h[key]:.3f}", what, meaning))
@@ -90,7 +90,7 @@ def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
     ):
         out.append((title, [(_words(k), _value(v)) for k, v in metrics[key].items()]))
     if metrics["colour_chart"]["found"]:
-        out.append(("Colour chart", [(_words(k), _value(v)) for k, v in metrics["colour_chart"].items()]))
+        out.append(("Colour checker", [(_words(k), _value(v)) for k, v in metrics["colour_chart"].items()]))
     if metrics["regions"]:
         shares = [(_words(k), f"{100 * v:.1f} %") for k, v in metrics["regions"].items()]
         out.append(("Regions: share of the surface", shares))
@@ -105,7 +105,7 @@ def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]
 
 
 def with_timing(html: str, timing: Mapping[str, float]) -> str:
-    """The page with the seconds of a run: as a table, and as JSON for programs. May be applied again."""
+    """The page with the seconds of each stage, as a table and as JSON. It may be called again."""
     island = json.dumps(dict(timing)).replace("<", "\\u003c")
     rows = "".join(f"<tr><th>{escape(_words(k))}</th><td>{v:.1f} s</td></tr>" for k, v in timing.items())
     table = f"<h3>Time</h3><table>{rows}</table>" if rows else ""
@@ -129,7 +129,7 @@ def _words(key: object) -> str:
 
 
 def _value(value: object) -> str:
-    """A figure as people read it."""
+    """A figure as text."""
     if value is None:
         return "–"
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Pictures for the page, as data URIs: small, and readable on any background."""
+"""Pictures for the page, as small data URIs that work on light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from stages.report.metrics import encoded
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
-ERROR_RANGE = 0.2  # mean absolute difference of encoded values that the heat map's top colour stands for
+ERROR_RANGE = 0.2  # mean absolute difference of encoded values at the heat map's top colour
 
 
 def to_bytes(values: npt.NDArray[np.floating]) -> U8:
-    """8-bit picture of values in [0, 1]; grey becomes RGB."""
+    """8-bit picture of values (H, W, C) in [0, 1]; grey becomes RGB."""
     image = np.asarray(np.round(np.nan_to_num(values).clip(0, 1) * 255), np.uint8)
     image = image[..., None] if image.ndim == 2 else image
     return np.ascontiguousarray(np.repeat(image, 3, 2) if image.shape[2] == 1 else image)
 
 
 def data_uri(image: U8, side: int, *, lossless: bool = False) -> str:
-    """RGB or RGBA picture, no larger than `side`, as JPEG or (with alpha, or lossless) PNG."""
+    """RGB or RGBA picture (H, W, C), reduced to `side` pixels, as JPEG, or as PNG if it has alpha or is lossless."""
     h, w = image.shape[:2]
     shrink = min(1.0, side / max(h, w))
     if shrink < 1:
@@ -39,13 +39,13 @@ def data_uri(image: U8, side: int, *, lossless: bool = False) -> str:
 
 
 def error_map(rendered: F32, photo: F32, mask: F32) -> U8:
-    """Heat map of the mean absolute difference (encoded, subject against rendered subject) from 0 to ERROR_RANGE."""
+    """Heat map (H, W, 3) of the mean absolute difference of the encoded subjects, from 0 to ERROR_RANGE."""
     shown, truth = encoded(rendered[..., :3] * rendered[..., 3:]), encoded(photo * mask[..., None])
     return heat(np.abs(shown - truth).mean(-1) / ERROR_RANGE)
 
 
 def heat(values: F32) -> U8:
-    """RGB of values in [0, 1] on a perceptually even scale from black to light yellow."""
+    """RGB of values in [0, 1] on a perceptually uniform scale from black to light yellow."""
     level = np.round(values.clip(0, 1) * 255).astype(np.uint8)
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
@@ -56,19 +56,19 @@ def scale_bar() -> U8:
 
 
 def map_picture(values: F32, space: str) -> U8:
-    """A map as people can read it: colour maps encoded, normals as they are stored, others stretched to their range."""
+    """A map (H, W, C) for display: colours sRGB-encoded, normals as stored, others scaled to their range."""
     if space == "srgb_png":
         return to_bytes(encoded(values[..., :3]))
     if values.shape[2] == 3 and values.min() < -1e-3:
         return to_bytes(values * 0.5 + 0.5)
     grey = values.mean(-1)
     low, high = (float(x) for x in np.percentile(grey, [1, 99]))
-    if high - low < 1e-3 * max(abs(low), abs(high), 1e-6):  # the same everywhere: nothing to stretch
+    if high - low < 1e-3 * max(abs(low), abs(high), 1e-6):  # constant
         return to_bytes(grey if 0 <= low <= 1 else np.full_like(grey, 0.5))
     return to_bytes((grey - low) / (high - low))
 
 
 def light_picture(values: F32) -> U8:
-    """An environment scaled so that its 99th percentile is just below white."""
+    """An environment map (H, W, 3), scaled so that its 99th percentile is just below white."""
     top = float(np.percentile(values, 99))
     return to_bytes(encoded(values / max(top, 1e-12) * 0.9))

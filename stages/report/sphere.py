@@ -1,4 +1,4 @@
-"""A small sphere around the subject, from the front and from behind: what faces which direction is seen by how many."""
+"""Draws a sphere around the subject, from the front and from behind: how many photos see each surface direction."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from markupsafe import Markup
 from pipeline.directions import COLUMNS, ROWS, Counts, parts, share_seen
 
 RADIUS, GAP, FOOT = 90, 20, 22  # drawing units
-HIDDEN = 0.5  # share of a part below which it is named
-# blue against orange is told apart by people who do not tell red from green; the light steps also in grey
-LEVELS = ((0, "#d55e00", "seen by no photo"), (1, "#9ecae1", "by 1 or 2"), (3, "#2171b5", "by 3 or more"))
+HIDDEN = 0.5  # parts of which a smaller share is seen are listed
+# people with red-green colour blindness can distinguish blue and orange; the brightness differs too
+LEVELS = ((0, "#d55e00", "seen by no photo"), (1, "#9ecae1", "by 1 or 2 photos"), (3, "#2171b5", "by 3 or more"))
 
 
 def sphere(counts: Counts) -> Markup:
-    """An inline SVG of pipeline.directions' grid; empty without one."""
+    """An inline SVG of the grid of pipeline.directions; empty if there is none."""
     if not counts:
         return Markup("")
     width, height = 4 * RADIUS + 3 * GAP, 2 * RADIUS + GAP + FOOT
@@ -31,12 +31,12 @@ def sphere(counts: Counts) -> Markup:
 
 
 def legend() -> list[tuple[str, str]]:
-    """(words, colour) of each level."""
+    """(text, colour) of each level."""
     return [(words, colour) for _, colour, words in LEVELS]
 
 
 def hidden_parts(counts: Counts) -> list[str]:
-    """Names of the parts of a head of which less than half is seen, with what is."""
+    """Names of the parts of a head of which less than half is seen, with the share that is seen."""
     if not counts:
         return []
     shares = {name: share_seen(counts, where) for name, where in parts().items()}
@@ -48,7 +48,7 @@ def _middle(side: int) -> int:
 
 
 def _half(counts: Counts, side: int) -> str:
-    """The bins of one hemisphere as seen from +Z (side 0) or -Z. The person's left is on the right from the front."""
+    """The bins of one hemisphere, viewed from +Z (side 0) or -Z. From the front, the person's left is on the right."""
     out = []
     for row in range(ROWS):
         for column in range(COLUMNS):

@@ -1,4 +1,4 @@
-"""Stage report: every other stage's result becomes metrics.json and one page."""
+"""Report stage: writes metrics.json and one HTML page from the results of all other stages."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from pipeline.artifacts import (
 )
 from pipeline.contract import Context, Stage, StageConfig
 
-PICTURE_SIDE = 360  # pixels: the longer side of a picture on the page
+PICTURE_SIDE = 360  # pixels: longer side of a picture on the page
 VIEWS_SHOWN = 8  # held-out views shown as pictures; the table lists all
-MASKS_SHOWN = 24  # photos shown with their mask's outline, the worst first
+MASKS_SHOWN = 24  # photos shown with the outline of their mask, the worst first
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Everything that was made."""
+    """The artifacts of all other stages."""
 
     capture: Located[Capture]
     poses: Located[CameraSet]
@@ -38,11 +38,11 @@ class Inputs:
 
 
 class Config(StageConfig):
-    """The page has no settings."""
+    """The report has no settings."""
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Report:
-    """Score the views, gather the figures, write metrics.json and index.html."""
+    """Score the views, collect the figures, write metrics.json and index.html."""
     import json
 
     from pipeline.verdict import verdict_of_inputs

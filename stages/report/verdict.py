@@ -1,4 +1,4 @@
-"""The top of the page: how good the result is, the worst reasons with the photos that show them, and every check."""
+"""The verdict on top of the page: level, the worst findings with their photos, and a table of all checks."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from stages.report.capture_figures import photos_named
 from stages.report.collect import Started
 from stages.report.page import Picture
 
-TROUBLES_SHOWN = 6  # with their photos; the table below has all
-PHOTOS_SHOWN = 4  # of one trouble, the worst first
+TROUBLES_SHOWN = 6  # with their photos; the table has all findings
+PHOTOS_SHOWN = 4  # of one finding, the worst first
 MEANING: Mapping[Level, str] = {
     "good": "Every check is within its limits.",
-    "usable": "An artist can work with it; something is worse than it could be.",
-    "unusable": "Do not hand it on.",
+    "usable": "An artist can work with the asset, but at least one check misses its limit for good.",
+    "unusable": "Do not use or deliver this asset.",
 }
-MARKS: Mapping[Level, str] = {"good": "\u2713", "usable": "!", "unusable": "\u2715"}  # besides colour and word
+MARKS: Mapping[Level, str] = {"good": "\u2713", "usable": "!", "unusable": "\u2715"}  # in addition to colour and text
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A finding that is not good. pictures: of the photos that it names; unseen: names of those that are not shown."""
+    """A finding that is not good. pictures: photos that it names; unseen: names of further photos, not shown."""
 
     stage: str
     finding: Finding
@@ -32,7 +32,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class VerdictShown:
-    """Everything that the page shows of it. checks: (stage, finding) of all; more: troubles that only the table has."""
+    """Data of this section. checks: (stage, finding) of all; more: number of further findings that are not good."""
 
     level: Level
     meaning: str
@@ -43,7 +43,7 @@ class VerdictShown:
 
 
 def verdict_shown(verdict: Verdict, r: Started, side: int) -> VerdictShown:
-    """side: pixels of the photos' larger side."""
+    """The data of this section. side: longer side of the photos, pixels."""
     found = verdict.troubles()
     troubles = []
     for stage, f in found[:TROUBLES_SHOWN]:

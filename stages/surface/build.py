@@ -1,4 +1,4 @@
-"""The whole way from a field to a mesh: extract, keep one piece, land on the zero set, cut handles, check."""
+"""From a field to a mesh: extract, keep one component, project onto the zero set, cut handles, check."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from stages.surface.thin import thin_share
 from stages.surface.trim import trimmed
 
 log = logging.getLogger("neuface.surface")
-LARGE_SECOND = 0.05  # area of a dropped piece over the kept one's, from which it is worth a warning
-HANDLE = 0.1  # of the box's longest side: a handle with a shorter loop is a fault of the fit. Of a head, 4 cm
+LARGE_SECOND = 0.05  # of the kept component's area: a larger component that was dropped causes a warning
+HANDLE = 0.1  # of the box's longest side: a handle with a shorter loop is an error of the fit. For a head, 4 cm
 
 Sees = Callable[[Mesh], Mask]
 
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """The finished mesh and what was found on the way. cell: lattice edge; cap: share of the area on the box; trimmed:
-    share of the area that no photo saw and that was cut off; handles: how many were cut, and how many are left;
-    unshown: share of what the photos show that was on dropped pieces; thin: share of the area on flakes and needles;
-    must_close: the mesh was not meant to have a border."""
+    """The finished mesh and its figures. cell: lattice edge; cap: share of the area on the box or the extent; trimmed:
+    share of the area that no photo saw and that was cut off; handles: number cut, and number left; unshown: share of
+    the visible surface that was on dropped components; thin: share of the area on flakes and needles; must_close: the
+    mesh must not have a border."""
 
     mesh: Mesh
     topology: Topology
@@ -59,15 +59,15 @@ def build(
     vote: Votes | None = None,
     extent: Extent | None = None,
 ) -> Built:
-    """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: which vertices of a mesh
-    photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut. `vote`: how
-    much the photos show of each piece; without it the largest is kept. `extent`: the mesh is closed there.
+    """Mesh the field's zero set with `resolution` cells along the box's longest side. `sees`: returns which vertices of
+    a mesh the photos see; the rest is cut off. `handle`: handles with a loop up to this share of that side are cut.
+    `vote`: how much the photos show of each component; without it the largest is kept. `extent`: closes the mesh.
 
-    A mesh that can't be closed is handed on open, and one that is mostly box as it is: what they are worth is judged
-    by the stage.
+    A mesh that can't be closed is returned open, and one that is mostly cap is returned as it is: the checks of the
+    stage grade them.
 
     Raises:
-        StageError: no zero crossing.
+        StageError: the field has no zero crossing.
     """
     grid = extract.lattice(field, resolution, extent)
     kept = clean.one_piece(*extract.extract(field, grid, step), vote)
@@ -94,7 +94,7 @@ def build(
 
 
 def _mended(landed: Landed, opened: Opened) -> Mesh:
-    """The mesh with the field's normals, and its own where handles were cut and the zero set is elsewhere."""
+    """The mesh with the field's normals; where handles were cut, off the zero set, with the normals of its faces."""
     normals = meshes.vertex_normals(opened.vertices, opened.faces)
     kept = np.ones(len(normals), np.bool_)
     kept[opened.moved] = False
@@ -104,9 +104,9 @@ def _mended(landed: Landed, opened: Opened) -> Mesh:
 
 
 def _closed(vertices: F64, faces: Faces) -> tuple[F64, Faces, Topology, Topology | None]:
-    """The mesh, its topology (moving vertices later does not change it), and what it was before a repair.
+    """The mesh, its topology (moving vertices later does not change it), and the topology before a repair.
 
-    What can't be closed is parted where its sheets touch, so that every edge has two faces at most.
+    A mesh that can't be closed is split where its sheets touch, so that every edge has at most two faces.
     """
     found = meshes.topology(faces, len(vertices))
     if found.manifold:
@@ -127,14 +127,14 @@ def _warnings(kept: Kept, repairs: Topology | None, handles: int) -> tuple[str, 
     out = []
     if kept.second > LARGE_SECOND:
         out.append(
-            f"a second piece with {kept.second:.0%} of the head's area was dropped (of {kept.removed} pieces): look at "
-            "the masks"
+            f"{kept.removed} disconnected components were removed; the largest has {kept.second:.0%} of the head's "
+            "area: check the masks"
         )
     if repairs is not None:
         out.append(
-            f"the mesh was repaired: {repairs.boundary_edges} open and {repairs.crowded_edges} crowded edges, "
-            f"{repairs.pinched_vertices} pinched vertices"
+            f"the mesh was repaired: it had {repairs.boundary_edges} open edges, {repairs.crowded_edges} edges with "
+            f"more than two faces and {repairs.pinched_vertices} non-manifold vertices"
         )
     if handles:
-        out.append(f"handles wider than surface.handle, which were left: {handles}; charts may be many")
+        out.append(f"{handles} handles are wider than surface.handle and were kept; the mesh may need many charts")
     return tuple(out)

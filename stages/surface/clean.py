@@ -1,7 +1,7 @@
-"""From a marched mesh to a closed, outward surface on the zero set.
+"""From the result of marching cubes to one component with outward faces and vertices on the zero set.
 
-Symbols: h lattice cell; d SDF; g its gradient. A vertex lies either on the zero set of the SDF or on the cap, the
-surface where the field's box or the subject's extent cuts the solid; each is moved along its own gradient only.
+Symbols: h lattice cell; d SDF; g its gradient. A vertex lies either on the zero set of the SDF or on the cap, which is
+the surface where the field's box or the subject's extent cuts the solid. Vertices move only along their own gradient.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from stages.surface.extract import QUERY, Lattice, wall_distance
 from stages.surface.pieces import Votes, chosen
 
 NEWTON_STEPS = 3
-REACH = 0.5  # of h: a vertex of the right cell is never further away than that
-THIN = 1e-4  # of h^2: a face with less area counts as degenerate
+REACH = 0.5  # of h: a vertex is never further from its position on the surface
+THIN = 1e-4  # of h^2: a face with a smaller area is degenerate
 RELAX_STEPS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Landed:
-    """Vertices on the surface (V, 3), their outward unit normals (V, 3), and which lie on the cap (V,)."""
+    """Vertices on the surface (V, 3), their outward unit normals (V, 3), and a mask of those on the cap (V,)."""
 
     vertices: F64
     normals: F32
@@ -33,8 +33,8 @@ class Landed:
 
 @dataclass(frozen=True, slots=True)
 class Kept:
-    """The piece that is kept. removed: how many are not; second: area of the largest of them over the kept one's;
-    unshown: share of what the photos show of the surface that is theirs."""
+    """The component that is kept. removed: number of the others; second: area of the largest of them over that of the
+    kept one; unshown: share of the visible surface that is on them."""
 
     vertices: F64
     faces: Faces
@@ -44,11 +44,11 @@ class Kept:
 
 
 def one_piece(vertices: F64, faces: Faces, vote: Votes | None = None) -> Kept:
-    """Keep the piece that the photos show most of, by their votes (stages.surface.pieces); without votes the one with
-    the largest area.
+    """Keep the connected component that the photos show most of, by their votes (stages.surface.pieces); without votes
+    the one with the largest area. vertices (V, 3), faces (F, 3).
 
-    Pieces are told apart by shared vertices. Cavities (pieces that face inwards) are dropped like specks, but only
-    pieces outside compete for the second place.
+    Faces belong together if they share a vertex. Cavities (components that face inwards) are dropped like specks; only
+    components that face outwards count for `second`.
     """
     label = meshes.component_of_face(faces, len(vertices))
     label = np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1), np.int64)
@@ -65,7 +65,7 @@ def one_piece(vertices: F64, faces: Faces, vote: Votes | None = None) -> Kept:
 
 
 def land(field: Field, grid: Lattice, start: F64, steps: int = NEWTON_STEPS) -> Landed:
-    """Newton's method along the gradient, clamped to REACH * h from where the vertex started.
+    """Project points (V, 3) onto the surface: Newton's method along the gradient, at most REACH * h from the start.
 
     x <- x - d g / |g|^2
     """
@@ -82,9 +82,9 @@ def land(field: Field, grid: Lattice, start: F64, steps: int = NEWTON_STEPS) -> 
 
 
 def spread_degenerate(field: Field, grid: Lattice, landed: Landed, faces: Faces) -> Landed:
-    """Move the corners of faces without area towards the middle of their neighbours, and land them again.
+    """Move the corners of degenerate faces towards the mean of their neighbours, and project them again.
 
-    Deleting such faces would open the mesh or pinch it; moving corners along the surface keeps its topology.
+    Deleting such faces could open the mesh or make it non-manifold; moving their corners keeps the topology.
     """
     x = landed.vertices.copy()
     e = meshes.edges(faces)
@@ -105,12 +105,12 @@ def spread_degenerate(field: Field, grid: Lattice, landed: Landed, faces: Faces)
 
 
 def outward(vertices: F64, faces: Faces) -> Faces:
-    """Faces whose normals leave the solid: turned over if the mesh encloses a negative volume."""
+    """Faces (F, 3) with outward normals: all are flipped if the mesh encloses a negative volume."""
     return faces if meshes.volume(vertices, faces) >= 0 else np.ascontiguousarray(faces[:, ::-1])
 
 
 def _solid(field: Field, grid: Lattice, points: F64) -> tuple[F64, F64, Mask]:
-    """The SDF cut by the walls (see extract.cut) with its gradient, and where a wall decides."""
+    """The SDF (N,) cut by the walls (see extract.cut), its gradient (N, 3), and where the wall is the larger (N,)."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     for start in range(0, len(points), QUERY):
         part = slice(start, start + QUERY)

@@ -1,13 +1,13 @@
-"""Marching cubes on the lattice cells near the surface, in slabs, so that memory stays bounded.
+"""Marching cubes on the lattice cells near the surface, slab by slab, to limit the memory.
 
 Symbols
     h       edge of a lattice cell
     block   BLOCK^3 cells; only blocks that the surface may cross are evaluated
-    slab    a run of block layers along x that is held in memory at one time
-    g       max(sdf, wall) near the walls: the solid is cut by the field's box and the subject's extent, so that the
-            neck gets a flat cap
+    slab    block layers along x that are in memory at one time
+    g       max(sdf, wall) near the walls: the field's box and the subject's extent cut the solid, so that the neck gets
+            a flat cap
 
-The lattice is marched slab by slab and welded over slabs by the lattice edge that each vertex lies on.
+Vertices of neighbouring slabs are merged if they lie on the same lattice edge.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from pipeline.extent import signed_and_gradient
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
-BLOCK = 4  # cells: small blocks hug the surface, large ones need fewer coarse samples; 4 needs the fewest at 256
+BLOCK = 4  # cells: small blocks follow the surface, large ones need fewer coarse samples; 4 is best at 256
 SLAB_NODES = 24_000_000  # 100 MB of float32, and about three times that inside marching cubes
-QUERY = 1_000_000  # points handed to the field at once
-SAFETY = (1.2, 3.0, 8.0)  # how much steeper than a distance the SDF is allowed to be, tried in turn
-SNAP = 0.02  # of h: values nearer to zero are pushed out, so that no vertex falls on a lattice node
+QUERY = 1_000_000  # points in one call of the field
+SAFETY = (1.2, 3.0, 8.0)  # largest slope of the SDF (1 for an exact distance), tried in turn
+SNAP = 0.02  # of h: values nearer to zero are moved to +-SNAP, so that no vertex lies on a lattice node
 INSET = 0.5  # of h: the cap lies this far inside the box, between two layers of nodes
 
 Step = Callable[[int, int], None]
@@ -36,8 +36,8 @@ Step = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Lattice:
-    """nodes at lower + h * index, index < shape. `blocks`: blocks along each axis; shape = blocks * BLOCK + 1. extent:
-    the solid is cut by it as by the box."""
+    """Nodes at lower + h * index, index < shape. `blocks`: blocks along each axis; shape = blocks * BLOCK + 1. extent:
+    it cuts the solid as the box does."""
 
     lower: F64
     upper: F64
@@ -53,7 +53,7 @@ class Lattice:
 
 
 def lattice(field: Field, resolution: int, extent: Extent | None = None) -> Lattice:
-    """A lattice over the field's box with `resolution` cells along its longest side; the others are rounded up."""
+    """A lattice over the field's box with `resolution` cells along its longest side; other sides are rounded up."""
     lower, upper = (np.asarray(b, np.float64) for b in field.bounds)
     sides = upper - lower
     if not np.all(np.isfinite(sides)) or sides.min() <= 0:
@@ -90,8 +90,8 @@ def extract(field: Field, grid: Lattice, step: Step) -> tuple[F64, Faces]:
 
 
 def wall_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
-    """Distance (N,) to the inset box and the subject's extent, negative inside both, by the nearest of the box's six
-    planes and of the extent's surfaces, and its gradient (N, 3)."""
+    """Distance (N,) of points (N, 3) to the inset box and the subject's extent, negative inside both, and its gradient
+    (N, 3). It is the distance to the nearest of the box's six planes and the extent's surfaces."""
     sides = np.concatenate([grid.lower + INSET * grid.h - points, points - grid.upper + INSET * grid.h], 1)
     box, slope = sides.max(1), np.concatenate([-np.eye(3), np.eye(3)])[sides.argmax(1)]
     if grid.extent is None:
@@ -101,9 +101,9 @@ def wall_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
 
 
 def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
-    """(N,) g: the larger of SDF and wall distance within a cell of the wall, the SDF alone elsewhere.
+    """(N,) g: the larger of SDF (N,) and wall distance (N,) within a cell of the wall, elsewhere the SDF alone.
 
-    Deep inside, an SDF that is steeper than a distance would fall below the box's and lose its say.
+    Deep inside, an SDF with a slope above 1 is below the wall distance, so that the maximum would ignore it.
     """
     out: F64 = np.where(wall > -grid.h, np.maximum(value, wall), value)
     return out
@@ -112,8 +112,8 @@ def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
 def near_blocks(coarse: F32, reach: float) -> Mask:
     """(bx, by, bz): blocks that the surface may cross, from SDF values at the blocks' corners (bx + 1, ...).
 
-    No point of a block is further than half its diagonal from its nearest corner, so a distance cannot vanish in a
-    block whose corners all exceed that. `reach` is h times a factor for fields that are steeper than a distance.
+    No point of a block is further than half its diagonal from its nearest corner. So a distance has no zero in a block
+    whose corners all exceed that. `reach` is h times a factor for fields with a slope above 1.
     """
     eight = [
         coarse[i : i + coarse.shape[0] - 1, j : j + coarse.shape[1] - 1, k : k + coarse.shape[2] - 1]
@@ -129,7 +129,7 @@ def near_blocks(coarse: F32, reach: float) -> Mask:
 
 
 def solid(field: Field, points: F64, grid: Lattice) -> F32:
-    """(N,) values of g. Points beyond the box take the SDF of the nearest point of the box."""
+    """(N,) values of g at points (N, 3). Points outside the box take the SDF of the nearest point of the box."""
     out = np.empty(len(points), np.float32)
     for start in range(0, len(points), QUERY):
         p = points[start : start + QUERY]
@@ -163,7 +163,7 @@ def _no_surface(coarse: F32) -> StageError:
 
 
 def _march(field: Field, grid: Lattice, near: Mask, coarse: F32, step: Step) -> tuple[F64, Faces] | None:
-    """All slabs, welded. None when the surface leaves the near blocks, so that more of them are needed."""
+    """All slabs, merged. None if the surface leaves the near blocks, so that more of them are needed."""
     layer = grid.shape[1] * grid.shape[2] * BLOCK
     run = max(1, SLAB_NODES // layer)
     vertices: list[F64] = []
@@ -191,7 +191,7 @@ def _march(field: Field, grid: Lattice, near: Mask, coarse: F32, step: Step) -> 
 
 
 def _slab(field: Field, grid: Lattice, near: Mask, coarse: F32, first: int) -> tuple[F32, Mask]:
-    """Values of g on the nodes of some block layers, and which of them were evaluated; the others keep their sign."""
+    """Values of g on the nodes of some block layers, and which were evaluated. Of the others only the sign is right."""
     shape = tuple(n * BLOCK + 1 for n in near.shape)
     known = np.zeros(shape, np.bool_)
     for i, j, k in np.argwhere(near):
@@ -208,7 +208,7 @@ def _slab(field: Field, grid: Lattice, near: Mask, coarse: F32, first: int) -> t
 
 
 def _leaves(values: F32, known: Mask) -> bool:
-    """Whether a sign changes across a lattice edge with an end that was not evaluated: a wall that is not there."""
+    """Whether the sign changes along a lattice edge with an end that was not evaluated: a false surface."""
     inside = values < 0
     for axis in range(3):
         a, b = (
@@ -225,7 +225,7 @@ def _marching_cubes(values: F32) -> tuple[F64, Indices]:
 
     if not (values.min() < 0 < values.max()):
         return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    # "descent" gives the right-handed outward order for values that grow outwards, as the tests show
+    # "descent" gives outward faces for values that grow outwards; the tests check this
     v, f, _, _ = marching_cubes(values, 0.0, gradient_direction="descent")  # type: ignore[no-untyped-call]
     return v.astype(np.float64), f.astype(np.int64)
 
@@ -233,8 +233,8 @@ def _marching_cubes(values: F32) -> tuple[F64, Indices]:
 def edge_keys(v: F64, shape: tuple[int, int, int]) -> Indices:
     """(V,) one number for the lattice edge (or the cell's inside) that each vertex lies in.
 
-    v: (V, 3) in cells. On an edge two coordinates are whole; a vertex that disambiguates a cell has none. Snapped
-    values keep the broken coordinate well away from whole numbers.
+    v: (V, 3) in cells. On an edge two coordinates are integers; a vertex inside a cell has none. SNAP keeps the third
+    coordinate well away from integers.
     """
     low = np.floor(v + 1e-4)
     broken = (np.abs(v - np.round(v)) > 1e-4) @ np.array([1, 2, 4])
@@ -244,7 +244,7 @@ def edge_keys(v: F64, shape: tuple[int, int, int]) -> Indices:
 
 
 def weld(vertices: F64, keys: npt.NDArray[np.int64], faces: Indices) -> tuple[F64, Faces]:
-    """Merge vertices with equal keys; faces that lose a corner by it are dropped."""
+    """Merge vertices (V, 3) with equal keys (V,); faces (F, 3) that lose a corner are dropped."""
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
     f = inverse.reshape(-1)[faces]
     whole = (f[:, 0] != f[:, 1]) & (f[:, 1] != f[:, 2]) & (f[:, 2] != f[:, 0])

@@ -1,15 +1,15 @@
-"""Handles of a closed mesh: found as short loops that part nothing, cut open along them, both sides closed by a cap.
+"""Removes handles of a closed mesh: finds short non-separating loops, cuts the mesh along them, closes both sides.
 
 Symbols
     genus   number of handles, (2 pieces - euler) / 2
     T       tree of shortest paths along edges from a root (Dijkstra)
     C       spanning tree of the faces across edges that are not in T, of those whose loops are longest
-    loop    what an edge that is in neither tree closes together with T
+    loop    the cycle of an edge that is in neither tree and its two paths in T
 
-There are two loops for each handle, one around it and one through it, and no sum of some of them bounds anything
-(Eppstein 2003; Erickson and Whittlesey 2005 for the choice of C). From a root far off they take a long way round, so
-further roots lie where the first one's loops close. A set of disjoint loops that does not part the mesh may be cut
-together, and every cut takes one handle away: it either severs it or puts a skin across its hole.
+Each handle has two loops, one around it and one through it; no sum of them bounds a part of the surface (Eppstein 2003;
+Erickson and Whittlesey 2005 for the choice of C). From a distant root the loops are long detours, so further roots are
+placed where the loops of the first one close. Disjoint loops that together do not separate the mesh can be cut at the
+same time. Every cut removes one handle: it severs the handle or closes its hole.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from pipeline import meshes
 from pipeline.meshes import F64, Faces, Indices, Mask
 
 ROOTS = 8  # tried in a round, besides the first
-ROUNDS = 64  # each cuts all loops that keep clear of each other
-RINGS = 3  # of vertices around a cut that are smoothed, so that two caps come apart
+ROUNDS = 64  # each cuts all loops that are disjoint
+RINGS = 3  # of vertices around a cut that are smoothed, so that the two caps separate
 SMOOTHING = 20  # steps
 
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """A mesh with fewer handles. moved (M,): its vertices that are new or no longer where they were; cut: handles
-    that went; left: those whose loops are longer than was asked for."""
+    """A mesh with fewer handles. moved (M,): vertices that are new or were moved; cut: number of handles removed; left:
+    number of handles whose loops are longer than the limit."""
 
     vertices: F64
     faces: Faces
@@ -41,8 +41,8 @@ class Opened:
 
 @dataclass(frozen=True, slots=True)
 class Web:
-    """Edges of a closed manifold, in order: pairs (E, 2), low vertex first; length (E,); sides (E, 2), faces, low
-    first."""
+    """Edges of a closed manifold, sorted: pairs (E, 2) of vertices, lower one first; length (E,); sides (E, 2), the two
+    faces, lower one first."""
 
     pairs: Indices
     length: F64
@@ -53,23 +53,23 @@ class Web:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """Vertices (N,) in order, each joined to the next and the last to the first; the length all round."""
+    """A cycle of vertices (N,), each joined to the next and the last to the first; its total length."""
 
     vertices: Indices
     length: float
-    closing: int  # vertex of the edge in neither tree: where two ways around a handle meet
+    closing: int  # a vertex of the edge that is in neither tree
 
 
 def genus(faces: Faces, count: int) -> int:
-    """Handles of a closed manifold of one piece."""
+    """Number of handles of a closed, connected manifold: faces (F, 3), `count` vertices."""
     return (2 - meshes.topology(faces, count).euler) // 2
 
 
 def without_handles(vertices: F64, faces: Faces, longest: float) -> Opened:
-    """Cut every handle that is found to have a loop no longer than `longest`, the shortest loops first.
+    """Cut every handle for which a loop no longer than `longest` is found, the shortest loops first.
 
-    vertices (V, 3), faces (F, 3): a closed manifold of one piece. Its vertices keep their places and numbers but for
-    those near a cut; new ones come after them.
+    vertices (V, 3), faces (F, 3): a closed, connected manifold. Vertices keep their positions and indices, except near
+    a cut; new vertices are appended.
     """
     first = left = genus(faces, len(vertices))
     touched: list[Indices] = []
@@ -88,7 +88,7 @@ def without_handles(vertices: F64, faces: Faces, longest: float) -> Opened:
 
 
 def web(vertices: F64, faces: Faces) -> Web:
-    """The edges of a closed manifold."""
+    """The edges of a closed manifold: vertices (V, 3), faces (F, 3)."""
     first, second, _ = meshes.paired_edges(faces, len(vertices))
     pairs = np.sort(meshes.edges(faces)[first], axis=1)
     sides = np.sort(np.stack([first, second], 1) % len(faces), axis=1)
@@ -97,7 +97,7 @@ def web(vertices: F64, faces: Faces) -> Web:
 
 
 def loops_from(net: Web, root: int) -> list[Loop]:
-    """Two loops for each handle, the shortest first."""
+    """Two loops for each handle, the shortest first. root: a vertex."""
     distance, before = _paths(net, root)
     low, high = net.pairs.T
     in_tree = (before[low] == high) | (before[high] == low)
@@ -107,7 +107,7 @@ def loops_from(net: Web, root: int) -> list[Loop]:
 
 
 def _chosen(vertices: F64, faces: Faces, longest: float) -> list[Loop]:
-    """Loops that are short enough, share no vertex and together part nothing, the shortest first."""
+    """Loops no longer than `longest` that share no vertex and together do not separate the mesh, the shortest first."""
     net = web(vertices, faces)
     found = loops_from(net, int(net.pairs[0, 0]))
     for root in list(dict.fromkeys(loop.closing for loop in found))[:ROOTS]:
@@ -122,7 +122,7 @@ def _chosen(vertices: F64, faces: Faces, longest: float) -> list[Loop]:
 
 
 def _whole(net: Web, loops: list[Loop]) -> bool:
-    """Whether the mesh would still hang together when cut along all of these."""
+    """Whether the mesh stays connected when it is cut along all these loops."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -137,11 +137,11 @@ def _whole(net: Web, loops: list[Loop]) -> bool:
 
 
 def _paths(net: Web, root: int) -> tuple[F64, Indices]:
-    """Distance along edges from the root, and the vertex before each on the way; negative at the root."""
+    """Distance (V,) along edges from the root, and the predecessor (V,) of each vertex, negative at the root."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra
 
-    cost = np.maximum(net.length, np.finfo(np.float32).tiny)  # a stored zero would be no edge
+    cost = np.maximum(net.length, np.finfo(np.float32).tiny)  # in a sparse array, zero means no edge
     graph = coo_array((cost, (net.pairs[:, 0], net.pairs[:, 1])), shape=(net.vertices, net.vertices)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=root, return_predecessors=True)
     return distance, before.astype(np.int64)
@@ -154,9 +154,9 @@ def _rest(net: Web, in_tree: Mask, closing: F64) -> Indices:
 
     free = np.flatnonzero(~in_tree)
     rank = np.empty(len(free), np.int64)
-    rank[np.argsort(-closing[free], kind="stable")] = np.arange(1, len(free) + 1)  # all different: one tree only
+    rank[np.argsort(-closing[free], kind="stable")] = np.arange(1, len(free) + 1)  # all different: the tree is unique
     a, b = net.sides[free].T
-    # two faces may share two edges, of which the longer loop's is kept: a sparse array would add the two up
+    # two faces may share two edges; the one of the longer loop is kept, because a sparse array would sum both
     best = np.lexsort((rank, b, a))
     new = np.ones(len(best), np.bool_)
     new[1:] = (np.diff(a[best]) != 0) | (np.diff(b[best]) != 0)
@@ -169,7 +169,7 @@ def _rest(net: Web, in_tree: Mask, closing: F64) -> Indices:
 
 
 def _loop(net: Web, edge: int, distance: F64, before: Indices) -> Loop:
-    """The loop that an edge closes in T, from where the two ways part."""
+    """The loop that an edge closes in T, starting at the lowest common ancestor of its ends."""
     a, b = (int(v) for v in net.pairs[edge])
     way = [a]
     while before[way[-1]] >= 0:
@@ -183,7 +183,7 @@ def _loop(net: Web, edge: int, distance: F64, before: Indices) -> Loop:
 
 
 def _cut(vertices: F64, faces: Faces, loop: Indices) -> tuple[F64, Faces, Indices]:
-    """Open the mesh along a loop and close both sides, each by a fan around the loop's middle."""
+    """Cut the mesh along a loop and close both sides, each by a fan around the mean of the loop."""
     n, count = len(loop), len(vertices)
     faces = faces.copy()
     for i, (face, corner) in enumerate(_right_of(faces, loop)):
@@ -199,9 +199,9 @@ def _cut(vertices: F64, faces: Faces, loop: Indices) -> tuple[F64, Faces, Indice
 
 
 def _right_of(faces: Faces, loop: Indices) -> list[tuple[Indices, Indices]]:
-    """For each vertex of the loop: faces on its right hand side, and which of their corners the vertex is.
+    """For each vertex of the loop: the faces on its right, and which of their corners the vertex is.
 
-    Corners are told one by one, because a face may lie on the left of one part of a loop and on the right of another.
+    Corners are listed one by one, because a face may lie left of one part of a loop and right of another part.
     """
     near = np.flatnonzero(np.isin(faces, loop).any(1))
     ahead: dict[tuple[int, int], tuple[int, int]] = {}  # directed edge -> its face and the vertex that ends the face
@@ -229,7 +229,7 @@ def _rings(seeds: Indices, faces: Faces, count: int) -> Indices:
 
 
 def _smoothed(vertices: F64, faces: Faces, free: Indices) -> F64:
-    """Free vertices moved to the middle of their neighbours, SMOOTHING times, all at once."""
+    """Move the free vertices to the mean of their neighbours, SMOOTHING times, all at once."""
     from scipy.sparse import coo_array
 
     e = meshes.edges(faces)

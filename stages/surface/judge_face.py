@@ -1,10 +1,10 @@
-"""Whether the mesh has the face where the photos show it: landmarks found in each photo against the mesh.
+"""Checks whether the mesh has the face where the photos show it: compares the mesh with the photos' face landmarks.
 
-Symbols: u_nl landmark l in photo n, pixels; x_l the same in space, from all photos that agree (pipeline.faces); c_n the
-photo's camera; p_nl the mesh under u_nl; t_nl the distance from c_n to the mesh along the ray to x_l. Landmarks are as
-deep in the mesh as |x_l - c_n| - t_nl: more than 0 where something of the mesh hides them.
+Symbols: u_nl landmark l in photo n, pixels; x_l its 3D position, from all photos that agree (pipeline.faces); c_n the
+photo's camera; p_nl the point of the mesh under u_nl; t_nl the distance from c_n to the mesh along the ray to x_l. The
+depth of a landmark is |x_l - c_n| - t_nl: it is positive where the mesh hides the landmark.
 
-The network guesses what a turned face hides, so photos in front of the face are asked alone.
+On a turned face the network guesses the hidden landmarks, so only photos from the front are used.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pipeline.transforms import matrix, rays
 from pipeline.verdict import Finding, Limits, judged
 from pipeline.visibility import Occluder
 
-EYES, NOSE, MOUTH = (33, 133, 263, 362), (1, 4), (61, 291)  # corners of the eyes, tip, corners of the mouth
+EYES, NOSE, MOUTH = (33, 133, 263, 362), (1, 4), (61, 291)  # eye corners, nose tip, mouth corners
 BRIDGE, CHIN, LIPS = (6, 168), (152,), (0, 13, 14, 17)
 STABLE = (*EYES, *NOSE, *MOUTH, *BRIDGE, *CHIN)
 HIDDEN = {"eyes": EYES, "nose": NOSE, "mouth": (*MOUTH, *LIPS)}
@@ -33,20 +33,20 @@ OUTER = 33, 263
 OUTER_MM = 88.0  # between the outer corners of the eyes, for captures without a scale; adults have 80 to 100
 FRONT = 0.75  # cosine to the face's front: 41 degrees
 MIN_PHOTOS, MAX_PHOTOS, MAX_PAIRS = 3, 30, 200
-# On a scanned head of exact cameras the network's landmarks lie 2.2 mm from the true surface in the median, single ones
-# up to 8 mm, and reproject with 3.4 mm; where a blob of the visual hull hides the face, 58, 80 and 13 mm.
+# On a scanned head with exact cameras the landmarks are 2.2 mm (median) from the true surface, single ones up to 8 mm,
+# and reproject with 3.4 mm. Where a wrong part of the visual hull hides the face: 58, 80 and 13 mm.
 SHAPE = Limits(5.0, 12.0, lower=False)
 BURIED = Limits(8.0, 12.0, lower=False)  # single landmarks are up to 8 mm off in depth on clean head scans
 REPROJECTED = Limits(6.0, 10.0, lower=False)
 REMEDY = (
-    "the mesh does not have the face that the photos show: photograph from more directions, up to both profiles and "
-    "from above and below, with a still face, and check the masks"
+    "the mesh does not have the face that the photos show: take photos from more directions (up to both profiles, from "
+    "above and from below) with a still face, and check the masks"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Landmarks:
-    """cameras of N photos that agree on a face; uv (N, 468, 2) pixels; xyz (468, 3) asset coordinates."""
+    """Cameras of the N photos that agree on a face; uv (N, 468, 2) pixels; xyz (468, 3) asset coordinates."""
 
     cameras: Sequence[Camera]
     uv: F64
@@ -61,7 +61,7 @@ class _Inputs(Protocol):
 
 
 def face_findings(inputs: _Inputs, mesh: Mesh) -> tuple[Finding, ...]:
-    """Of the stage's inputs and its mesh; none where the photos agree on no face."""
+    """The findings for a mesh; none if the photos agree on no face."""
     masks, poses = inputs.masks, inputs.poses.artifact
     if masks.artifact.landmarks is None:
         return ()
@@ -70,7 +70,7 @@ def face_findings(inputs: _Inputs, mesh: Mesh) -> tuple[Finding, ...]:
 
 
 def read(path: Path, cameras: Mapping[int, Camera]) -> Landmarks:
-    """The photos that agree, of those that have a camera (pipeline.artifacts.MaskSet.landmarks)."""
+    """The photos that agree and have a camera (pipeline.artifacts.MaskSet.landmarks). cameras: by index."""
     with np.load(path, allow_pickle=False) as file:
         data = {k: file[k] for k in file.files}
     kept = data.get("kept", np.ones(len(data["views"]), np.bool_))
@@ -83,7 +83,7 @@ def read(path: Path, cameras: Mapping[int, Camera]) -> Landmarks:
 
 
 def judge_face(mesh: Mesh, found: Landmarks, *, metric: bool) -> tuple[Finding, ...]:
-    """Distance along the rays, depth order and reprojection; nothing where too few photos look at the face's front."""
+    """Distance along the rays, depth and reprojection; no findings if too few photos show the face from the front."""
     found = in_front(found)
     if len(found.cameras) < MIN_PHOTOS or not np.isfinite(found.xyz[list(STABLE)]).all():
         return ()
@@ -93,7 +93,7 @@ def judge_face(mesh: Mesh, found: Landmarks, *, metric: bool) -> tuple[Finding, 
 
 
 def in_front(found: Landmarks) -> Landmarks:
-    """Those of the photos that see the face from its front, an even choice where they are many."""
+    """The photos that show the face from the front; if there are many, an evenly spaced subset."""
     frame = head_frame(found.xyz)
     away = np.array([matrix(c.world_from_cam)[:3, 3] for c in found.cameras]).reshape(-1, 3) - frame.eyes
     use = np.flatnonzero(away @ frame.axes[2] > FRONT * np.linalg.norm(away, axis=1))
@@ -102,8 +102,8 @@ def in_front(found: Landmarks) -> Landmarks:
 
 
 def depths(found: Landmarks, occluder: Occluder) -> F64:
-    """(N, 468) how deep landmarks lie in the mesh, asset units: minus infinity where a ray passes it, NaN where a
-    landmark has no place."""
+    """(N, 468) depth of the landmarks in the mesh, asset units: minus infinity where the ray misses the mesh, NaN where
+    a landmark has no 3D position."""
     out = []
     for camera in found.cameras:
         centre = matrix(camera.world_from_cam)[:3, 3]
@@ -117,8 +117,8 @@ def depths(found: Landmarks, occluder: Occluder) -> F64:
 
 
 def reprojected(found: Landmarks, occluder: Occluder) -> tuple[float, float]:
-    """Median distance between the mesh under a landmark of one photo, as another photo sees it, and the landmark there:
-    pixels, and asset units at the face. Infinite where the mesh is not there."""
+    """Median reprojection error: the mesh point under a landmark of one photo is projected into another photo and
+    compared with the landmark there. In pixels, and in asset units at the face. Infinite where the mesh is missing."""
     stable = list(STABLE)
     at = [_under(c, uv[stable], occluder) for c, uv in zip(found.cameras, found.uv, strict=True)]
     middle = np.median(found.xyz[stable], 0)
@@ -135,27 +135,27 @@ def reprojected(found: Landmarks, occluder: Occluder) -> tuple[float, float]:
 
 
 def _under(camera: Camera, uv: F64, occluder: Occluder) -> F64:
-    """(L, 3) the mesh under some pixels, infinite where it is not there."""
+    """(L, 3) points of the mesh under pixels uv (L, 2), infinite where the ray misses it."""
     o, d = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), uv)
     far = occluder.distance(o, d)
     return np.asarray(np.where(np.isfinite(far)[:, None], o + np.nan_to_num(far, posinf=0.0)[:, None] * d, np.inf))
 
 
 def _depth(mm: npt.NDArray[np.float64]) -> list[Finding]:
-    """Findings of the depths (N, 468) in millimetres."""
+    """The findings for depths (N, 468) in millimetres."""
     shape = float(np.median(np.abs(mm[:, list(STABLE)])))
     where = (
-        f"lie {shape:.1f} mm from the mesh along the rays, in the median"
+        f"are {shape:.1f} mm (median) from the mesh along the rays of the photos"
         if np.isfinite(shape)
-        else "see nothing of the mesh"
+        else "are not on the mesh"
     )
     of = {name: float(np.nanmedian(mm[:, list(points)])) for name, points in HIDDEN.items()}
     deepest = max(of, key=lambda name: of[name])
     buried = max(of[deepest], 0.0)
     message = (
-        f"{deepest}: {buried:.1f} mm behind the mesh as the photos see it"
+        f"{deepest}: {buried:.1f} mm behind the mesh, seen from the photos"
         if buried > BURIED.good
-        else f"eyes, nose and mouth lie on the mesh, none more than {buried:.1f} mm behind it"
+        else f"eyes, nose and mouth are on the mesh, at most {buried:.1f} mm behind it"
         if np.isfinite(list(of.values())).all()
         else "the mesh hides no part of the face"
     )
@@ -167,9 +167,9 @@ def _depth(mm: npt.NDArray[np.float64]) -> list[Finding]:
 
 def _again(pixels: float, distance: float, mm: float) -> Finding:
     message = (
-        f"the mesh under a landmark of one photo is {pixels:.1f} pixels ({mm * distance:.1f} mm) from that landmark in "
-        "another photo, in the median"
+        f"reprojection error of the face landmarks, from one photo over the mesh into another: {pixels:.1f} pixels "
+        f"({mm * distance:.1f} mm), median"
         if np.isfinite(distance)
-        else "photos see nothing of the mesh where they show the face's landmarks"
+        else "the mesh is missing where the photos show the face landmarks"
     )
     return judged("face_reprojection_mm", mm * distance, REPROJECTED, message, REMEDY, unit="mm")

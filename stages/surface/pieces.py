@@ -1,7 +1,7 @@
-"""Which of several pieces is the subject: the one that the photos show, and not simply the largest.
+"""Chooses the connected component that is the subject: the one that the photos show most of, not the largest.
 
-A shoulder that few photos see may have more area than the head that all of them look at. Each photo has one vote, which
-it gives to the pieces by the share of its picture that they fill, behind its own mask and behind what lies in front.
+A shoulder in few photos may have more area than the head in all of them. Each photo has one vote. It is divided among
+the components by the area that each fills in the photo, inside the mask and where nothing hides it.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from pipeline import meshes
 from pipeline.meshes import F64, Faces, Indices, Mesh
 from pipeline.visibility import Occluder, View, view_cosines
 
-WORTH_ASKING = 0.02  # of the largest piece's area: smaller ones are specks, whatever the photos see of them
-MAX_VIEWS = 24  # that vote, spread evenly over all
-MAX_POINTS = 20_000  # of the surface that are looked at
+MIN_AREA = 0.02  # of the largest component's area: smaller ones are specks and get no votes
+MAX_VIEWS = 24  # photos that vote, evenly spaced
+MAX_POINTS = 20_000  # points of the surface that are tested
 
-Votes = Callable[[Mesh, Indices], F64]  # of a mesh and the piece (F,) of each face: a share for each piece
+Votes = Callable[[Mesh, Indices], F64]  # mesh, component (F,) of each face -> share of each component
 
 
 def votes(mesh: Mesh, piece: Indices, views: Sequence[View], check: Callable[[], None]) -> F64:
-    """(pieces,) mean share of the photos' pictures of the mesh that each piece fills; all 0 where no photo sees any.
+    """(pieces,) share of the votes of each component; all 0 if no photo sees any.
 
-    A point's part in a picture is its area times its cosine over the square of its distance.
+    A point's area in a photo is its area on the surface times the cosine over the squared distance.
     """
     count = int(piece.max()) + 1
     total = np.zeros(count)
@@ -46,19 +46,19 @@ def votes(mesh: Mesh, piece: Indices, views: Sequence[View], check: Callable[[],
 def chosen(
     vertices: F64, faces: Faces, piece: Indices, area: F64, solid: meshes.Mask, vote: Votes
 ) -> tuple[int, float]:
-    """The piece that is kept, and the share of the photos' pictures that goes with the others.
+    """The component that is kept, and the share of the votes of the others.
 
-    piece (F,); area, solid (pieces,): pieces that face inwards are cavities and have no vote.
+    piece (F,); area, solid (pieces,). Components that face inwards (not solid) are cavities and get no votes.
     """
     largest = int(area.argmax())
-    asked = np.flatnonzero(solid & (area > WORTH_ASKING * area[largest]))
-    if len(asked) < 2:
+    candidates = np.flatnonzero(solid & (area > MIN_AREA * area[largest]))
+    if len(candidates) < 2:
         return largest, 0.0
-    some = np.isin(piece, asked)
+    some = np.isin(piece, candidates)
     v, f, _ = meshes.compact(vertices, faces[some])
     mesh = Mesh(v.astype(np.float32), meshes.vertex_normals(v, f), f)
-    share = vote(mesh, np.searchsorted(asked, piece[some]))
+    share = vote(mesh, np.searchsorted(candidates, piece[some]))
     if not share.any():
         return largest, 0.0
     best = int(share.argmax())
-    return int(asked[best]), float(1 - share[best])
+    return int(candidates[best]), float(1 - share[best])

@@ -1,7 +1,7 @@
-"""Closing a mesh that marching cubes left open or pinched.
+"""Repairs a mesh that marching cubes left open or non-manifold.
 
-It is called only for a mesh that fails the check, which a smooth field does not produce. Without pymeshlab installed
-the stage still works, and such a mesh is refused.
+It is called only for a mesh that fails the check; a smooth field does not produce one. Without pymeshlab the stage
+still works, and such a mesh is not repaired.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pipeline.meshlab import filtered
 
 
 def repaired(vertices: F64, faces: Faces, found: Topology) -> tuple[F64, Faces]:
-    """A closed manifold mesh near the given one. Raises StageError where pymeshlab is missing or can't do it."""
+    """A closed manifold near the given mesh. Raises StageError if pymeshlab is missing or can't repair it."""
 
     def refused(reason: str) -> StageError:
         return StageError(
@@ -22,7 +22,7 @@ def repaired(vertices: F64, faces: Faces, found: Topology) -> tuple[F64, Faces]:
             where="surface",
             value=f"{found}; {reason}",
             limit="a manifold mesh",
-            remedy="change surface.resolution a little, fit for longer, or install pymeshlab where it is missing",
+            remedy="change surface.resolution a little, fit longer, or install pymeshlab if it is missing",
         )
 
     return filtered(vertices, faces, _close, refused)

@@ -17,7 +17,7 @@ MESH = "surface.npz"
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The fitted field, and what the photos that it was fitted to could see."""
+    """The fitted field, and the cameras, masks and photos that it was fitted to."""
 
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
@@ -26,7 +26,7 @@ class Inputs:
 
 
 class Config(StageConfig):
-    """How finely the zero set is sampled, and what becomes of surface that no photo saw."""
+    """Settings of the surface stage."""
 
     resolution: Cells = Field(
         256,
@@ -35,18 +35,18 @@ class Config(StageConfig):
         description="lattice cells along the longest side of the field's box; time and faces grow with its square",
     )
     unseen: Literal["closed", "trimmed"] = Field(
-        "closed", description="surface that no fitted photo saw: kept, so that the mesh is closed, or cut off"
+        "closed", description="surface that no fitted photo shows: keep it (closed mesh) or cut it off"
     )
     handle: Annotated[float, Unit("share of the box's longest side")] = Field(
         0.1,
         ge=0,
         le=10,
-        description="handles with a loop up to this share of the box's longest side are cut and closed; 0 keeps all",
+        description="handles with a loop up to this share of the box's longest side are removed; 0 keeps all",
     )
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Surface:
-    """Mesh the zero set. Raises StageError when the field has none."""
+    """Mesh the zero set. Raises StageError if the field has none."""
     from pipeline import meshes
     from pipeline.fields.face import load_face
     from pipeline.visibility import Occluder, seen_by, view_cosines

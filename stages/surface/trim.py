@@ -1,10 +1,10 @@
-"""The surface without what no photo saw.
+"""Cuts off the surface that no photo shows.
 
-Symbols: s share of a vertex's surroundings that photos see; the surface ends where s is 1/2.
+Symbols: s share of a vertex's neighbourhood that photos see; the surface ends where s is 1/2.
 
-Seen and unseen are told apart at vertices and evened out over the neighbourhood, so that specks and notches go; pieces
-and holes too small to matter are given to what surrounds them. Triangles that s = 1/2 runs through are cut there. Every
-point of the border lies inside an edge, so that no two parts of the surface touch in a point or along an edge.
+Visibility is computed at vertices and smoothed, which removes specks and notches; small components and small holes are
+removed. Triangles that the line s = 1/2 crosses are cut there. Every point of the border lies inside an edge, so that
+no two parts of the surface touch in a point or along an edge.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from pipeline.meshes import F64, Faces, Indices, Mask, Mesh
 from stages.surface import clean
 from stages.surface.extract import Lattice
 
-WIDTH = 0.03  # of the mesh's longest side: over about that far seen and unseen are evened out
-ROUNDS = (24, 800)  # of averaging over neighbours, at least and at most
-SMALL = 2e-3  # of the area: smaller holes are closed again, smaller pieces dropped
-MARGIN = 0.15  # of an edge: the border keeps that far from its ends, or slivers would be left
+WIDTH = 0.03  # of the mesh's longest side: about the width of the smoothing
+ROUNDS = (24, 800)  # smallest and largest number of averaging steps
+SMALL = 2e-3  # of the area: smaller holes are closed, smaller components dropped
+MARGIN = 0.15  # of an edge: least distance of the border from its ends, to avoid slivers
 
 
 @dataclass(frozen=True, slots=True)
 class Trimmed:
-    """What is left, and the share of the area that was cut off."""
+    """The remaining mesh, and the share of the area that was cut off."""
 
     mesh: Mesh
     share: float
@@ -40,7 +40,7 @@ def trimmed(field: Field, grid: Lattice, mesh: Mesh, seen: Mask) -> Trimmed:
     """The closed mesh without the surface around vertices that are not `seen` (V,).
 
     Raises:
-        StageError: nothing of it is seen.
+        StageError: no vertex is seen.
     """
     s = _tidied(mesh, _evened(mesh, seen))
     if (s >= 0.5).all():
@@ -51,7 +51,7 @@ def trimmed(field: Field, grid: Lattice, mesh: Mesh, seen: Mask) -> Trimmed:
             where="surface.unseen",
             value="trimmed: nothing would be left",
             limit="a surface that photos see",
-            remedy="check cameras and masks (the report shows both), or set surface.unseen=closed",
+            remedy="check the cameras and masks (the report shows both), or set surface.unseen=closed",
         )
     x = mesh.vertices.astype(np.float64)
     ends, share, faces = cut(mesh.faces, s)
@@ -63,8 +63,7 @@ def trimmed(field: Field, grid: Lattice, mesh: Mesh, seen: Mask) -> Trimmed:
 
 
 def _evened(mesh: Mesh, seen: Mask) -> F64:
-    """(V,) s, by a random walk of n steps over neighbours that stays where it is half of the time: it goes sqrt(n / 2)
-    edges far."""
+    """(V,) s, by a lazy random walk of n steps (it stays half of the time), which reaches sqrt(n / 2) edges far."""
     a, b = meshes.edges(mesh.faces).T
     n = len(seen)
     degree = np.maximum(np.bincount(a, minlength=n), 1)
@@ -78,9 +77,9 @@ def _evened(mesh: Mesh, seen: Mask) -> F64:
 
 
 def _tidied(mesh: Mesh, s: F64) -> F64:
-    """s with small holes, then small pieces, on the other side of 1/2."""
+    """s (V,) with small holes, then small components, moved to the other side of 1/2."""
     area = np.bincount(mesh.faces.ravel(), np.repeat(meshes.areas(mesh.vertices, mesh.faces) / 3, 3), len(s))
-    for side in (False, True):  # holes first: they must not part pieces
+    for side in (False, True):  # holes first: they must not split components
         piece = _pieces(mesh.faces, s >= 0.5)
         small = np.bincount(piece, area) < SMALL * area.sum()
         s = np.where(((s >= 0.5) == side) & small[piece], 1 - s - 1e-9 * side, s)
@@ -88,7 +87,7 @@ def _tidied(mesh: Mesh, s: F64) -> F64:
 
 
 def _pieces(faces: Faces, inside: Mask) -> Indices:
-    """(V,) pieces of vertices on one side, joined by edges."""
+    """(V,) component of each vertex, among vertices on the same side joined by edges."""
     a, b = meshes.edges(faces).T
     same = inside[a] == inside[b]
     n = len(inside)
@@ -99,8 +98,8 @@ def _pieces(faces: Faces, inside: Mask) -> Indices:
 def cut(faces: Faces, s: F64) -> tuple[Indices, F64, Faces]:
     """The part of a closed mesh where s (V,) is at least 1/2.
 
-    Ends (B, 2) of the edges that the border crosses, from inside to outside, where it does (B,) between them, and
-    faces: their indices from V on are points of the border. Vertices outside are in no face.
+    Returns the ends (B, 2) of the edges that the border crosses, from inside to outside; the position (B,) of the
+    crossing between them; and faces, whose indices from V on are points of the border. No face uses vertices outside.
     """
     e = meshes.edges(faces)
     out = e[(s[e[:, 0]] >= 0.5) & (s[e[:, 1]] < 0.5)]

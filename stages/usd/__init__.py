@@ -1,1 +1,1 @@
-"""Writes the USD component, its look-dev rig and a preview package, checks them, and renders the exported files."""
+"""Writes the USD component, its look-dev scene and a preview package, checks them, and renders the exported files."""

@@ -9,9 +9,9 @@ from pipeline.units import Pixels
 
 
 class Config(StageConfig):
-    """Settings of the export."""
+    """Settings of the usd stage."""
 
-    name: str = Field("head", description="name of the asset: prim, file and prefix of the textures")
+    name: str = Field("head", description="name of the asset: of its prim and file, and prefix of its textures")
     asset_version: str = Field("1.0.0", description="assetInfo:version of the component")
     author: str = Field("", max_length=1000, description="who made the capture; recorded in the asset")
     license: str = Field("", max_length=1000, description="licence of the capture; recorded in the asset")
@@ -20,7 +20,7 @@ class Config(StageConfig):
     glb: bool = Field(True, description="also write NAME.glb")
     obj: bool = Field(True, description="also write NAME.obj and NAME.mtl")
     divide_shadows: bool = Field(
-        True, description="take the captured light's shadows and interreflections out of the albedo"
+        True, description="divide the shadows and interreflections of the captured light out of the albedo"
     )
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
@@ -28,6 +28,6 @@ class Config(StageConfig):
     environment_width: Pixels = Field(512, ge=64, le=8192, multiple_of=2, description="width of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
     samples: int = Field(
-        0, ge=0, le=8, description="rays along each side of a pixel of these renders; 0: one, and 64 on silhouettes"
+        0, ge=0, le=8, description="rays along each side of a pixel in these renders; 0: one ray, 64 on silhouettes"
     )
     preview_size: Pixels = Field(512, ge=64, le=4096, description="side of the preview pictures")

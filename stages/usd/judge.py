@@ -1,8 +1,9 @@
-"""How good the exported asset is: faults that checks of the files found, and what was lost on the way from the model.
+"""The checks of the exported asset: faults in the files, and quality that was lost from the fitted model to the asset.
 
-Where the limits are from: renders of the asset and of the fitted model differ by 39 to 43 dB for clean heads, 30 to 33
-for people shot by hand, 22 for a torso in shreds. The lobes of clean heads differ by .65 and .94 of the fitted ones;
-where F0 is out of its physical range (stages.bake.judge tells) a lobe can look like GGX all the same: .12 to .78.
+Source of the limits: PSNR between renders of the asset and of the fitted model is 39 to 43 dB for clean heads, 30 to 33
+for people photographed by hand, 22 for a badly broken torso. The lobes of clean heads differ by .65 and .94 of the
+fitted ones. Where F0 is out of its physical range (see stages.bake.judge), a lobe can still be close to GGX: .12 to
+.78.
 """
 
 from __future__ import annotations
@@ -23,46 +24,46 @@ LOBE = Limits(1.2, 3.0, lower=False)  # |fitted - GGX| over |fitted|, summed ove
 FAULTS = Limits(0, 0, lower=False)
 WARNINGS = Limits(0, np.inf, lower=False)
 SHOWN = 3  # faults that are quoted
-EQUAL = 1e-10  # mean squared difference of pictures that are the same: 100 dB
+EQUAL = 1e-10  # lower limit of the mean squared difference: 100 dB
 
 
 def validity(found: Sequence[tuple[str, checks.Finding]]) -> tuple[Finding, ...]:
-    """Of the checks of all files: (name of the file, what was found)."""
+    """Findings on the checks of all files: (name of the file, result of a check)."""
     bad, doubtful = (_texts(f for f in found if f[1].level == level) for level in ("error", "warning"))
     return (
         judged(
             "usd_faults",
             len(bad),
             FAULTS,
-            f"the checks of the USD files found {len(bad)} faults{_quoted(bad)}",
-            "open the asset with care; report this with the run's log",
+            f"the checks of the USD files found {len(bad)} errors{_quoted(bad)}",
+            "programs may fail to open the asset; report this with the run's log",
         ),
         judged(
             "usd_warnings",
             len(doubtful),
             WARNINGS,
             f"the checks of the USD files gave {len(doubtful)} warnings{_quoted(doubtful)}",
-            "look whether the programs that will open the asset mind",
+            "test the asset in the programs that you use",
         ),
     )
 
 
 def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
-    """The asset's renders against the model's of the same views: (photo's name, model's, asset's) with pictures
-    (H, W, 4) linear, premultiplied."""
+    """Compare renders of the asset with those of the model: (photo's name, model's, asset's) with pictures (H, W, 4)
+    linear, premultiplied."""
     seen = [(name, *_compared(model, asset)) for name, model, asset in views]
     if not seen:
         return ()
     db = -10 * np.log10(max(float(np.mean([10 ** (-p / 10) for _, p, _ in seen])), EQUAL))
     share = float(np.mean([s for _, _, s in seen]))
     worst = [name for name, _, _ in sorted(seen, key=lambda s: s[1])]
-    remedy = "decimation and texels lose detail: raise bake.size and uv.target_faces, and look at the surface"
+    remedy = "decimation or texel size loses detail: raise bake.size and uv.target_faces, and check the surface"
     return (
         judged(
             "asset_against_model",
             db,
             AGAINST_MODEL,
-            f"renders of the asset agree with the fitted model's to {db:.1f} dB",
+            f"PSNR of the asset's renders against the fitted model's: {db:.1f} dB",
             remedy,
             unit="dB",
             views=worst,
@@ -71,15 +72,15 @@ def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
             "asset_silhouette",
             share,
             OVERLAP,
-            f"silhouettes of the asset agree with the fitted model's to {share:.1%}",
-            "a piece of the model is missing in the mesh: look at the surface stage's findings",
+            f"IoU of the asset's silhouettes and the fitted model's: {share:.1%}",
+            "a part of the model is missing in the mesh: see the findings of the surface stage",
             views=[name for name, _, _ in sorted(seen, key=lambda s: s[2])],
         ),
     )
 
 
 def lobe(figures: dict[str, float]) -> tuple[Finding, ...]:
-    """Whether a GGX lobe stands for the fitted one."""
+    """The finding on the error of replacing the fitted lobe by a GGX lobe. figures: of the export."""
     if "ggx_residual" not in figures:
         return ()
     off = figures["ggx_residual"]
@@ -88,15 +89,15 @@ def lobe(figures: dict[str, float]) -> tuple[Finding, ...]:
             "ggx_residual",
             off,
             LOBE,
-            f"the highlights that the shaders show differ by {off:.0%} from the fitted ones",
-            "photograph with light that moves or has an edge, so that highlights can be told from colour; use the "
-            "albedo alone",
+            f"the highlights of the exported shaders differ by {off:.0%} from the fitted ones",
+            "take photos under light that moves or has sharp edges, so that highlights can be separated from colour; "
+            "or use only the albedo",
         ),
     )
 
 
 def _compared(model: F32, asset: F32) -> tuple[float, float]:
-    """PSNR (dB) where the model's picture is covered, and the overlap of the silhouettes."""
+    """PSNR (dB) over the pixels that the model covers, and IoU of the silhouettes. Pictures (H, W, 4)."""
     a, b = model[..., 3] > 0.5, asset[..., 3] > 0.5
     both = float((a & b).sum() / max(int((a | b).sum()), 1))
     if not a.any():
@@ -110,7 +111,7 @@ def _encoded(linear: F32) -> npt.NDArray[np.float64]:
 
 
 def _texts(found: Iterable[tuple[str, checks.Finding]]) -> list[str]:
-    """Each fault once: a component and the scene that refers to it show the same."""
+    """Each fault once: a component and the scene that refers to it have the same faults."""
     messages: dict[tuple[str, str, str], str] = {}
     for file, f in found:
         messages.setdefault((f.check, f.message, f.where), f"{file}: {f.check}: {f.message} {f.where}".strip())

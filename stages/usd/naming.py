@@ -1,4 +1,4 @@
-"""The asset's name: it becomes a prim, a file and a prefix of textures, so it has to be valid as all three."""
+"""The asset's name. It names a prim and a file and is a prefix of textures, so it must be valid as all three."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RESERVED = ("payload", "lookdev", "environment", "light", "high")  # names of fi
 
 
 def check_name(name: str) -> str:
-    """The name itself, or UsageError where it can't be one."""
+    """Return the name, or raise UsageError if it is not valid."""
     limit = (
         f"a letter or _, then letters, digits or _; at most {LONGEST} characters; not starting with "
         + " or ".join(RESERVED[:2])
@@ -22,7 +22,7 @@ def check_name(name: str) -> str:
     if IDENTIFIER.fullmatch(name) and len(name) <= LONGEST and not taken:
         return name
     raise UsageError(
-        "the asset's name can't be used in USD",
+        "the asset's name is not valid in USD",
         where="usd.name (--name)",
         value=repr(name),
         limit=limit,
@@ -31,7 +31,7 @@ def check_name(name: str) -> str:
 
 
 def name_from(text: str) -> str:
-    """A valid name that reads like `text` (a folder's name, say)."""
+    """A valid name similar to `text`, for example a folder's name."""
     out = re.sub(r"[^A-Za-z0-9_]+", "_", text).strip("_")[:LONGEST]
     out = out if re.match(r"[A-Za-z_]", out) else f"head_{out}".strip("_")
     return f"head_{out}"[:LONGEST] if out.lower().startswith(RESERVED[:2]) or out.lower() in RESERVED else out

@@ -1,4 +1,4 @@
-"""Stage usd: mesh, maps, light and cameras become an asset that other programs open."""
+"""Usd stage: exports mesh, maps, light and cameras as an asset for other programs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from stages.usd.config import Config as Config
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """What is exported."""
+    """The artifacts that are exported."""
 
     surface: Located[Surface]
     uv: Located[UvMesh]
@@ -36,11 +36,11 @@ class Inputs:
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     capture: Located[Capture]
-    masks: Located[MaskSet]  # for its findings: the asset is marked with the verdict
+    masks: Located[MaskSet]  # for its findings: the verdict is written into the asset
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
-    """Write asset/, check it, then render from what was written."""
+    """Write asset/, check it, and render the written files."""
     from pipeline.verdict import verdict_of_inputs
     from stages.usd import judge
     from stages.usd.check.validate import checks_run, found_in
@@ -106,7 +106,7 @@ def _roots(name: str) -> tuple[str, ...]:
 def _pictures(
     inputs: Inputs, views: tuple[HeldOutView, ...], context: Context
 ) -> Iterator[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
-    """The photo's name, the fit's render and the asset's of each view that was held out, where the photo is asked."""
+    """Photo's name, render of the model and render of the asset of each view, inside the photo's region that counts."""
     import cv2
 
     from pipeline.images import read_alpha, read_exr
@@ -119,7 +119,7 @@ def _pictures(
         if view.index in predicted:
             model, _ = read_exr(fitted.path(predicted[view.index].exr))
             asset, _ = read_exr(context.workdir / view.exr.path)
-            if view.index in asked:  # the fit goes a little beyond the extent, where the mesh ends
+            if view.index in asked:  # the fitted model reaches a little beyond the extent, the mesh does not
                 part = cv2.resize(read_alpha(asked[view.index]), model.shape[1::-1], interpolation=cv2.INTER_AREA)
                 model, asset = (x * (np.asarray(part) > 0.99)[..., None] for x in (model, asset))
             if model.shape == asset.shape:

@@ -1,4 +1,4 @@
-"""The whole way from the dense mesh to a textured one and its proxy."""
+"""From the dense mesh to a mesh with texture coordinates, and its proxy."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, most_tiles, unwrap
 
 MAX_OVERLAP, MAX_FLIPPED, MAX_EMPTY, MAX_AGAINST = 1e-3, 1e-3, 5e-3, 1e-3
-MANY_CRUMBS = 50
+MANY_FRAGMENTS = 50
 
 Step = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """The textured mesh, its charts, the proxy, the charts' figures, and how far mesh and proxy are from the dense mesh
-    (m)."""
+    """The decimated mesh, its charts, the proxy, the charts' figures, and the distances of mesh and proxy from the
+    dense mesh (m)."""
 
     mesh: Mesh
     charts: Charts
@@ -50,10 +50,10 @@ def build(
     texel: float | None = None,
     landmarks: F64 | None = None,
 ) -> Built:
-    """Decimate, unwrap and measure. texel: see `unwrap`. landmarks: (468, 3) of the face, which then has more texels.
+    """Decimate, unwrap and measure. texel: see `unwrap`. landmarks: (468, 3) of the face, which then gets more texels.
 
     Raises:
-        StageError: a mesh that is no manifold, or one that can't be decimated or unwrapped.
+        StageError: the mesh is not a manifold, or can't be decimated or unwrapped.
     """
     found = meshes.topology(dense.faces, len(dense.vertices))
     if not found.sound:
@@ -61,13 +61,13 @@ def build(
             "the mesh is not a manifold",
             where="surface",
             value=found,
-            limit="every edge with two faces, or with one on a border; one fan of faces around every vertex",
+            limit="two faces at every edge (one at a border), one fan of faces around every vertex",
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")
     mesh = (remeshed if config.remesh == "uniform" else decimate.decimated)(dense, config.target_faces)
     proxy = decimate.decimated(mesh, config.proxy_faces)
-    with ThreadPoolExecutor(1) as beside:  # how far the meshes lie from the dense one does not depend on charts
+    with ThreadPoolExecutor(1) as beside:  # the distances between the meshes do not depend on the charts
         away = beside.submit(_away, dense, mesh, proxy)
         step(1, 4, "unwrapping")
         front = front_of(mesh, landmarks)
@@ -87,20 +87,20 @@ def build(
 
 
 def _opened(dense: meshes.Topology, mesh: Mesh) -> float:
-    """Share of the edges that are open in the decimated mesh of a closed one."""
+    """Share of the edges that are open in the decimated mesh; 0 if the dense mesh is open too."""
     if not dense.watertight:
         return 0.0
     return meshes.topology(mesh.faces, len(mesh.vertices)).boundary_edges / max(1.5 * len(mesh.faces), 1.0)
 
 
 def _crumpled(mesh: Mesh) -> float:
-    """Share of the faces that look against the normals at their own corners."""
+    """Share of the faces that point against the normals at their own corners."""
     mean = mesh.normals[mesh.faces].astype(np.float64).sum(1)
     return float(((meshes.area_vectors(mesh.vertices, mesh.faces) * mean).sum(1) < 0).mean())
 
 
 def _away(dense: Mesh, mesh: Mesh, proxy: Mesh) -> tuple[Deviation, Deviation, float]:
-    """Distances of mesh and proxy, and the share of the mesh that looks against the dense one."""
+    """Distances of mesh and proxy from the dense mesh, and the share of the mesh that faces against it."""
     against = decimate.flipped_share(dense, mesh)
     return decimate.deviation(dense, mesh), decimate.deviation(dense, proxy), against
 
@@ -110,22 +110,22 @@ def _warnings(quality: Quality, against: float) -> tuple[str, ...]:
         (quality.overlap, MAX_OVERLAP, "of the covered texels lie under two faces"),
         (quality.flipped, MAX_FLIPPED, "of the surface is mirrored in its chart"),
         (quality.empty, MAX_EMPTY, "of the surface has no area in texture space"),
-        (against, MAX_AGAINST, "of the decimated surface looks against the dense mesh"),
+        (against, MAX_AGAINST, "of the decimated surface faces against the dense mesh"),
     )
     out = [f"{value:.2%} {what}" for value, limit, what in checks if value > limit]
-    if quality.fragments > MANY_CRUMBS:
+    if quality.fragments > MANY_FRAGMENTS:
         out.append(f"{quality.fragments} of {quality.charts} charts are fragments: the surface is rough")
     return tuple(out)
 
 
 def _too_few(config: Config, wished: float | None, tiles: int, texel: float) -> tuple[str, ...]:
-    """Where the texture became coarser than was asked, or fewer tiles than asked were of use."""
+    """Warnings if the texels are coarser than the photos' pixels, or if fewer tiles than requested could be used."""
     if wished is not None and texel > 1.001 * COARSER * wished:
         return (
-            f"{tiles} tile(s) of {config.tile_size} texels leave texels of {1e3 * texel:.3g} mm, the photos' "
-            f"pixels are {1e3 * wished:.3g} mm: a larger bake.size carries more",
+            f"{tiles} tile(s) of {config.tile_size} texels give texels of {1e3 * texel:.3g} mm; the photos' "
+            f"pixels are {1e3 * wished:.3g} mm: raise bake.size to keep their detail",
         )
     most = most_tiles(config, wished)
     if wished is None and tiles < most:
-        return (f"the charts fill {tiles} of {most} tiles",)
+        return (f"the charts fill only {tiles} of {most} tiles",)
     return ()

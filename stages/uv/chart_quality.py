@@ -1,9 +1,9 @@
-"""How good the charts are.
+"""Figures of the quality of charts.
 
 Symbols
     J       2 x 3 -> the map from texture to surface of one triangle; columns S_u, S_v
     L2      sqrt((S_u . S_u + S_v . S_v) / 2), root mean square stretch of a triangle [Sander 2001, section 3]
-    Linf    larger singular value of J, the most that any direction is stretched
+    Linf    larger singular value of J: the largest stretch in any direction
     front   where the normal is within 60 degrees of FRONT
 """
 
@@ -16,22 +16,23 @@ import numpy as np
 from pipeline import meshes, raster, tiles
 from pipeline.meshes import F64, Charts, Mesh
 from stages.uv.density import face_share
+from stages.uv.parameterise import signed_areas
 from stages.uv.rough import FRAGMENT
 from stages.uv.segment import FRONT
-from stages.uv.unwrap import chart_of_face, evened, signed_areas
+from stages.uv.unwrap import chart_of_face, evened
 
-RASTER = 1024  # texels: fine enough for charts of a head, quick enough to run always
+RASTER = 1024  # texels: fine enough for charts of a head, and fast
 FACING = 0.5
-STRETCHED = 4.0  # times that some direction of a face is longer on the surface than in the texture, against the mean
+STRETCHED = 4.0  # Linf of a face, relative to the mean scale, from which it counts as stretched
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """charts; fragments: fragments, charts with less than FRAGMENT of the area; utilisation: share of texels under a
-    chart; overlap: share of those under two; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped, empty:
-    share of the area whose charts are mirrored or flat; seam_front: length (m) of the seams in front;
-    tile_utilisation: of each tile; stretched: share of the area whose faces have a Linf above STRETCHED; face_share: of
-    the area under charts."""
+    """charts: their number; fragments: charts with less than FRAGMENT of the area; utilisation: share of texels under a
+    chart; overlap: share of those under two faces; stretch: L2, stretch_max: the largest Linf, 1 is the best; flipped,
+    empty: share of the area that is mirrored or without area in the texture; seam_front: length (m) of the seams in
+    front; tile_utilisation: of each tile; stretched: share of the area with a Linf above STRETCHED; face_share: the
+    face's share of the area under charts."""
 
     charts: int
     fragments: int
@@ -48,8 +49,8 @@ class Quality:
 
 
 def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Quality:
-    """Every figure of a finished unwrap. face: (F,) faces of the face; charts may then have different scales, which do
-    not count as stretch."""
+    """Every figure of a finished unwrap. face: (F,) mask of the triangles of the face; charts then have different
+    scales, which do not count as stretch."""
     uv_area = signed_areas(charts.uvs.astype(np.float64), charts.faces)
     area = meshes.areas(mesh.vertices, mesh.faces)
     share = area / area.sum()
@@ -80,7 +81,7 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Qual
 
 
 def seam_length(mesh: Mesh, charts: Charts) -> float:
-    """Length of the edges in front whose two faces do not share them in the texture."""
+    """Length of the edges in front that are seams: their two faces do not share them in the texture. Mesh units."""
     f, t = mesh.faces, charts.faces
     low, high = (pick(f, np.roll(f, -1, 1)).T.ravel() for pick in (np.minimum, np.maximum))
     order = np.lexsort((high, low))
@@ -97,7 +98,8 @@ def seam_length(mesh: Mesh, charts: Charts) -> float:
 
 
 def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple[float, float]:
-    """Area-weighted L2 and largest Linf, with the texture scaled so that both areas agree; 1 for an isometry.
+    """Area-weighted L2 and largest Linf, with the texture scaled so that both areas are equal; 1 for an isometry. use:
+    (F,) faces that count.
 
     L2(M)^2 = sum_T L2(T)^2 A(T) / sum_T A(T) * (sum A' / sum A)
     """
@@ -107,7 +109,7 @@ def stretch(mesh: Mesh, charts: Charts, use: meshes.Mask | None = None) -> tuple
 
 
 def _stretches(mesh: Mesh, charts: Charts, keep: meshes.Mask) -> tuple[F64, F64, F64]:
-    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas agree, and their areas."""
+    """(N,) L2 and Linf of some faces, with the texture scaled so that both areas are equal, and their areas."""
     x = mesh.vertices.astype(np.float64)[mesh.faces[keep]]
     t = charts.uvs.astype(np.float64)[charts.faces[keep]]
     e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]

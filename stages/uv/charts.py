@@ -1,7 +1,7 @@
-"""From a mesh to charts: pieces, laid flat, parted where that helps, packed.
+"""From a mesh to charts: segments it, parameterises each piece, splits pieces where that helps, packs the charts.
 
-Pieces are found and first laid flat on the mesh with its bumps smoothed away, because noise would break them into
-fragments; the last rigid steps are on the true surface, so that the stretch that counts is the true one.
+Segmentation and the first parameterisation use the smoothed mesh, because noise would break the pieces into fragments.
+The last ARAP steps use the true surface, so that they reduce the true stretch.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from pipeline import meshes, raster
 from pipeline.meshes import F32, F64, Charts, Faces, Indices, Mesh
 from stages.uv.density import Front, dense_charts, enlarged, face_parted, scale_for
 from stages.uv.pack import LOOSEST, boxed, pack
-from stages.uv.parameterise import Flat, parameterised, rigid, signed, unfolded
+from stages.uv.parameterise import Flat, parameterised, rigid, signed_areas, unfolded
 from stages.uv.segment import Dual, connected, dual, halved, seam_weights, segment, without_fragments
 from stages.uv.tile_count import Tiling, packed
 
-TRUE_STEPS = 6  # rigid steps on the true surface
-LARGE = 0.2  # of the area: such charts are parted when they fill too little of their rectangle
+TRUE_STEPS = 6  # ARAP steps on the true surface
+LARGE = 0.2  # of the area: larger charts are split if they fill too little of their rectangle
 FULL = 0.7  # of its rectangle that a large chart should fill
 TRIES = 5  # packings
-ENOUGH = 0.66  # share of the square under charts from which on no chart is parted to pack better
-WORTH = 0.005  # of the square: a packing that gains less is not looked for
+GOOD_UTILISATION = 0.66  # share of the square under charts from which no chart is split to pack better
+MIN_GAIN = 0.005  # of the square: a packing must gain at least this
 MAX_CHARTS = 40
 ONE = Tiling()
-CHECK = 768  # texels along a chart's longest side: where two layers of it would show
+CHECK = 768  # texels along a chart's longest side, to test it for overlap
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """The mesh to cut: smoothed and true vertices (V, 3), faces, areas and pairs of the smoothed one, and what a seam
-    costs at each vertex (V,)."""
+    """The mesh to cut: smoothed and true vertices (V, 3); faces, face areas and face pairs of the smoothed mesh; cost
+    of a seam at each vertex (V,)."""
 
     smooth: F64
     true: F64
@@ -44,7 +44,7 @@ class Surface:
 
 
 def surface_of(mesh: Mesh, smooth: F64, front: Front | None = None) -> Surface:
-    """A mesh with its vertices smoothed (V, 3), ready to be cut. front: the face, whose charts are larger."""
+    """Prepare a mesh with smoothed vertices (V, 3) for cutting. front: the face, whose charts are larger."""
     weight = seam_weights(smooth, mesh.faces)
     pairs = dual(smooth, mesh.faces, weight)
     area = meshes.areas(smooth, mesh.faces)
@@ -54,10 +54,10 @@ def surface_of(mesh: Mesh, smooth: F64, front: Front | None = None) -> Surface:
 def unwrapped(
     mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE, front: Front | None = None
 ) -> Charts | None:
-    """Charts, or None where the mesh does not come apart into discs that lie flat (then another way is needed).
+    """Charts, or None if the mesh can't be cut into a few discs that can be parameterised.
 
-    smooth: (V, 3) vertices without bumps. padding: between charts, in uv. They are made for one square; where that is
-    not enough, only charts that are too large for a tile are cut further. front: the face, whose charts are larger.
+    smooth: (V, 3) smoothed vertices. padding: between charts, in uv. Charts are made for one tile; for several tiles,
+    only charts that are too large for a tile are cut further. front: the face, whose charts are larger.
     """
     surface = surface_of(mesh, smooth, front)
     label = segment(smooth, mesh.faces, surface.pairs)
@@ -71,10 +71,10 @@ def unwrapped(
         part = _must_part(surface, flats)
         if part is None:
             tries += 1
-            charts = _packed(surface, flats, padding, LOOSEST if best is None else best[0] + WORTH)
+            charts = _packed(surface, flats, padding, LOOSEST if best is None else best[0] + MIN_GAIN)
             if charts is not None:
                 best = _share(charts), charts, label
-            if best is not None and best[0] >= ENOUGH:
+            if best is not None and best[0] >= GOOD_UTILISATION:
                 break
             part = _worth_parting(surface, flats)
         pieces = int(label.max())
@@ -91,7 +91,7 @@ def unwrapped(
 
 
 def _tiled(surface: Surface, label: Indices, known: dict[bytes, Flat], padding: float, tiling: Tiling) -> Charts | None:
-    """The pieces in several tiles; those are cut further whose chart would fill a tile before others are large."""
+    """The pieces packed into several tiles; pieces whose charts are too large for a tile are cut further."""
     total = _charted(surface, label)
     limit = tiling.largest_chart(total)
     while True:
@@ -111,7 +111,7 @@ def _tiled(surface: Surface, label: Indices, known: dict[bytes, Flat], padding: 
 
 
 def _longest(surface: Surface, flat: Flat) -> float:
-    """Longer side of the smallest rectangle around a chart, at the scale of the true surface."""
+    """Longer side of a chart's smallest bounding rectangle, at the scale of the true surface."""
     return float(np.ptp(boxed(_at_scale(surface, flat)), axis=0).max())
 
 
@@ -125,7 +125,7 @@ def _charted(surface: Surface, label: Indices) -> float:
 
 
 def flats_of(surface: Surface, label: Indices, known: dict[bytes, Flat]) -> list[Flat]:
-    """Every piece laid flat; pieces seen before are taken from `known`."""
+    """Parameterise every piece; results are cached in `known`."""
     count = int(label.max()) + 1
     order = np.argsort(label, kind="stable")
     keys = [m.tobytes() for m in np.split(order, np.searchsorted(label[order], np.arange(1, count)))]
@@ -136,7 +136,7 @@ def flats_of(surface: Surface, label: Indices, known: dict[bytes, Flat]) -> list
 
 
 def laid_flat(surface: Surface, member: Indices) -> Flat:
-    """One piece, given by its faces (m,)."""
+    """Parameterise one piece, given by its faces (m,)."""
     label = np.zeros(len(surface.area), np.int64)
     label[member] = 1
     wanted = np.array([False, True])
@@ -144,26 +144,26 @@ def laid_flat(surface: Surface, member: Indices) -> Flat:
 
 
 def _on_true_surface(surface: Surface, flat: Flat) -> Flat:
-    """The last steps on the true surface, unless the chart's jagged border came to lie over itself by them."""
+    """The last ARAP steps, on the true surface; dropped if they make the chart overlap itself."""
     if not len(flat.uv):
         return flat
     faces = flat.faces.astype(np.int64)
     uv = unfolded(faces, rigid(surface.true[flat.vertex], faces, flat.uv, TRUE_STEPS))
     for choice in (uv, flat.uv):
-        if bool((signed(choice, faces) > 0).all()) and not lies_over_itself(choice, flat.faces):
+        if bool((signed_areas(choice, faces) > 0).all()) and not lies_over_itself(choice, flat.faces):
             return replace(flat, uv=choice, good=True)
     return replace(flat, good=False)
 
 
 def lies_over_itself(uv: F64, faces: Faces) -> bool:
-    """Whether any of CHECK x CHECK texels across a chart is under two of its faces."""
+    """Whether a chart overlaps itself: any of CHECK x CHECK texels is under two faces. uv (n, 2), faces (m, 3)."""
     low = uv.min(0)
     square = ((uv - low) / max(float((uv.max(0) - low).max()), 1e-30)).astype(np.float32)
     return bool((raster.layers(raster.texel_corners(Charts(square, faces), CHECK), CHECK) > 1).any())
 
 
 def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
-    """A piece that is no disc or folds over, else a large one that fills too little of its rectangle."""
+    """A piece that is not a disc or has mirrored faces, else a large one that fills too little of its rectangle."""
     for i, flat in enumerate(flats):
         if not flat.good:
             return i
@@ -175,26 +175,26 @@ def _must_part(surface: Surface, flats: list[Flat]) -> int | None:
 
 
 def _fill(flat: Flat) -> float:
-    """Share of the smallest rectangle around a chart that it covers."""
+    """Share of its smallest bounding rectangle that a chart covers."""
     width, height = np.ptp(boxed(flat.uv), axis=0)
-    return float(0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum() / max(width * height, 1e-30))
+    return float(signed_areas(flat.uv, flat.faces.astype(np.int64)).sum() / max(width * height, 1e-30))
 
 
 def _front(surface: Surface, flat: Flat) -> float:
-    """Mean over a chart of how costly its seams would be, 0 at the back, 1 in front."""
+    """Mean seam cost over a chart, from 0 at the back to 1 in front."""
     w = surface.weight[surface.faces[flat.member]].mean(1)
     a = surface.area[flat.member]
     return float((a * (w - 1)).sum() / (a.sum() * max(float(surface.weight.max()) - 1, 1e-30)))
 
 
 def _worth_parting(surface: Surface, flats: list[Flat]) -> int:
-    """The chart that leaves most of its rectangle empty, those in front last."""
+    """The chart that leaves most of its rectangle empty; charts in front come last."""
     loss = [(1 - _fill(f)) * surface.area[f.member].sum() * (1 - _front(surface, f)) if f.good else 0.0 for f in flats]
     return int(np.argmax(loss))
 
 
 def _parted(surface: Surface, label: Indices, flat: Flat) -> Indices:
-    """One piece in two, across its longest direction (in the chart where there is one, else in space)."""
+    """Split one piece in two, across its longest direction (in the chart if there is one, else in space)."""
     corners = flat.uv[flat.faces] if flat.good else surface.smooth[surface.faces[flat.member]]
     centre = corners.mean(1) - corners.mean((0, 1))
     along = centre @ np.linalg.svd(centre, full_matrices=False)[2][0]
@@ -205,15 +205,15 @@ def _parted(surface: Surface, label: Indices, flat: Flat) -> Indices:
 
 
 def _packed(surface: Surface, flats: list[Flat], padding: float, least: float) -> Charts | None:
-    """All charts in one square at one scale against the true surface, if `least` of it comes under charts."""
+    """Pack all charts into one square at one scale; None if less than `least` of it would be under charts."""
     uvs, faces, label = together(surface, flats)
     placed: F32 | None = pack(uvs, faces, label, padding, least)
     return None if placed is None else Charts(placed, faces)
 
 
 def together(surface: Surface, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
-    """All charts as one array of texture vertices, each at the scale of the true surface, the face's enlarged; faces,
-    and their charts."""
+    """All charts in one array: texture vertices (U, 2) at the scale of the true surface, the face's enlarged; faces
+    (F, 3); the chart (F,) of each face."""
     faces = np.zeros((len(surface.faces), 3), np.int32)
     label = np.zeros(len(surface.faces), np.int64)
     parts, first = [], 0
@@ -229,11 +229,11 @@ def together(surface: Surface, flats: list[Flat]) -> tuple[F64, Faces, Indices]:
 
 def _at_scale(surface: Surface, flat: Flat) -> F64:
     """A chart's texture vertices, scaled so that its area is that of the true surface."""
-    own = 0.5 * signed(flat.uv, flat.faces.astype(np.int64)).sum()
+    own = signed_areas(flat.uv, flat.faces.astype(np.int64)).sum()
     area = meshes.areas(surface.true, surface.faces[flat.member]).sum()
     return np.asarray(flat.uv * np.sqrt(area / max(own, 1e-30)), np.float64)
 
 
 def _share(charts: Charts) -> float:
     """Share of the square under charts."""
-    return float(0.5 * signed(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)).sum())
+    return float(signed_areas(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)).sum())

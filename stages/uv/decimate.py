@@ -1,7 +1,7 @@
-"""Fewer triangles: quadric decimation (fast-simplification, MIT), with the faults that it leaves mended.
+"""Quadric decimation (fast-simplification, MIT), and repair of the faults that it leaves.
 
-Symbols: a crowded edge has more than two faces. Collapsing can pinch off a bubble, a closed scrap that hangs on a
-ring of crowded edges; cutting the mesh along those edges and keeping the largest part takes it away.
+Symbols: a crowded edge has more than two faces. An edge collapse can pinch off a bubble, a small closed part that is
+joined at a ring of crowded edges. It is removed by cutting the mesh along those edges and keeping the largest part.
 """
 
 from __future__ import annotations
@@ -15,23 +15,22 @@ from pipeline import meshes
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Indices, Mesh, split_apart
 
-AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a manifold of the wanted size
+AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a manifold of the target size
 LOOP = 8  # edges of the largest hole that is closed
-ROUNDS = 4  # of taking bubbles away
+ROUNDS = 4  # of removing bubbles
 UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
 SAMPLE_SEED = 0
-NEAR = (
-    12  # nearest points on the goal, and nearest centres of its triangles, whose triangles a sample is measured against
-)
-SPREAD = 10  # points on the goal for each sample
+NEAR = 12  # nearest points, and nearest centroids, of the other mesh: the distance to their triangles is computed
+SPREAD = 10  # points on the other mesh for each sample
 NEARLY = 1.05  # of the target: near enough to stop trying
 
 
 def decimated(dense: Mesh, target: int) -> Mesh:
-    """A manifold with about `target` triangles and smooth normals, closed if the dense mesh is and any setting gives
-    such a one. A mesh that is small enough is kept.
+    """A manifold with about `target` triangles and smooth normals. It is closed if the dense mesh is closed and any
+    setting gives a closed one. A mesh that is small enough is returned as it is.
 
-    Normals are those of the nearest dense vertex: they come from the field's gradient and know more than the faces.
+    Normals are copied from the nearest dense vertex: they come from the field's gradient, which is more accurate than
+    the faces.
 
     Raises:
         StageError: no setting gives a manifold.
@@ -46,7 +45,7 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     for aggressiveness in AGGRESSIVENESS:
         vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
         vertices, faces = split_apart(*without_bubbles(vertices, faces))
-        if closed:  # sheets that were apart only now leave holes that can be walked around
+        if closed:  # after the removal of bubbles, holes with a simple border are left
             faces = filled(faces)
         found = meshes.topology(faces, len(vertices))
         if not (found.manifold if closed else found.sound):
@@ -64,9 +63,9 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     raise StageError(
         "the mesh can't be decimated",
         where="uv.target_faces",
-        value=f"{len(dense.faces)} to {target} faces breaks the surface",
-        limit="every edge with two faces at most, one fan of faces around every vertex",
-        remedy="choose more target_faces, or another surface.resolution",
+        value=f"from {len(dense.faces)} to {target} faces the surface breaks",
+        limit="at most two faces at every edge, one fan of faces around every vertex",
+        remedy="raise uv.target_faces, or change surface.resolution",
     )
 
 
@@ -83,7 +82,7 @@ def _simplified(points: F64, faces: Faces, target: int, aggressiveness: float) -
 
 
 def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
-    """Cut along crowded edges and keep the part with the most faces, until no edge is crowded."""
+    """Cut along crowded edges and keep the part with most faces, until none is crowded. Inputs (V, 3), (F, 3)."""
     for _ in range(ROUNDS):
         label = _parts(faces, len(vertices))
         if label is None:
@@ -94,11 +93,11 @@ def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
 
 
 def filled(faces: Faces) -> Faces:
-    """Close holes of up to LOOP edges with fans of faces: the ring that held a bubble may be a face itself."""
+    """Faces (F', 3) with holes of up to LOOP edges closed by fans: the ring around a bubble may be a hole."""
     e = meshes.edges(faces)
     count = int(faces.max()) + 1
     open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
-    after = {int(b): int(a) for a, b in open_edges}  # a hole runs against its neighbours' edges
+    after = {int(b): int(a) for a, b in open_edges}  # a hole's border is opposite to its neighbours' edges
     added = []
     while after:
         start, at = next(iter(after.items()))
@@ -113,7 +112,7 @@ def filled(faces: Faces) -> Faces:
 
 
 def _parts(faces: Faces, count: int) -> Indices | None:
-    """(F,) which part each face is in when the mesh is cut along crowded edges; None if there are none."""
+    """(F,) part of each face after a cut along crowded edges; None if there are none."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -125,7 +124,7 @@ def _parts(faces: Faces, count: int) -> Indices | None:
 
 
 def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -> npt.NDArray[np.float32]:
-    """(V, 3) unit normals of the nearest dense vertex; the faces' own where the two disagree by over 60 degrees."""
+    """(V, 3) unit normals of the nearest dense vertex; the faces' own where both differ by over 60 degrees."""
     from scipy.spatial import cKDTree
 
     _, nearest = cKDTree(dense.vertices).query(vertices, workers=1)
@@ -137,15 +136,15 @@ def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Distances between two surfaces, sampled by area both ways, in the meshes' unit."""
+    """Distances between two surfaces, sampled by area in both directions, in the meshes' unit."""
 
     mean: float
     rms: float
 
 
 def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> Deviation:
-    """The distance is exact to the triangles that are tried, so it can only be too large: large triangles are found by
-    points spread over them, small ones by their centres."""
+    """Distance between two meshes. It is exact for the candidate triangles, so it can only be too large: large
+    triangles are found by points spread over them, small ones by their centroids."""
     d = np.concatenate([_one_way(a, b, samples), _one_way(b, a, samples)])
     return Deviation(float(d.mean()), float(np.sqrt((d * d).mean())))
 
@@ -166,7 +165,7 @@ def _one_way(start: Mesh, goal: Mesh, samples: int) -> F64:
 
 
 def distance_to_triangles(p: F64, corners: F64) -> F64:
-    """(N,) distance from each point (N, 3) to its own triangle (N, 3, 3): to its plane if above it, else its sides."""
+    """(N,) distance from each point (N, 3) to its own triangle (N, 3, 3)."""
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     square = np.maximum((normal * normal).sum(1), 1e-300)
@@ -182,7 +181,7 @@ def distance_to_triangles(p: F64, corners: F64) -> F64:
 
 
 def sampled(mesh: Mesh, count: int) -> tuple[F64, Indices]:
-    """(count, 3) points on the mesh, uniform by area, the same each time, and the face (count,) of each."""
+    """(count, 3) points on the mesh, uniform by area and deterministic, and the face (count,) of each."""
     rng = np.random.default_rng(SAMPLE_SEED)
     area = meshes.areas(mesh.vertices, mesh.faces)
     face = np.searchsorted(np.cumsum(area) / area.sum(), rng.random(count)).clip(0, len(area) - 1)
@@ -193,7 +192,7 @@ def sampled(mesh: Mesh, count: int) -> tuple[F64, Indices]:
 
 
 def flipped_share(dense: Mesh, mesh: Mesh) -> float:
-    """Share of the area whose faces look against the nearest dense normal."""
+    """Share of the area whose faces point against the nearest dense normal."""
     from scipy.spatial import cKDTree
 
     centre = mesh.vertices[mesh.faces].mean(1)

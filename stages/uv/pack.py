@@ -1,14 +1,14 @@
-"""Placing charts in the square, or in several: greedy, largest first, by exact collision tests of their pixels.
+"""Packs charts into one or several squares: greedy, largest first, with exact collision tests of their pixels.
 
 Symbols
     G       cells along a square's side during packing
-    reach   cells around a chart that count as its own, so that two charts keep their padding
-    scale   side of a square over the unit of the charts: searched, the largest at which all charts fit; one for all
+    reach   cells around a chart that belong to it, so that two charts keep their padding
+    scale   side of a square over the unit of the charts: the largest at which all charts fit, the same for all
 
-All free places of a chart are found at one time, as the zeros of the correlation of its pixels with the occupied ones
-(by FFT); the one where the rim around it touches most is taken (the one nearest to a corner left 9 % more empty on a
-head; turns by 30 and 45 degrees gained nothing). xatlas's packer mirrors charts when it turns them and left half of
-the square empty on heads.
+All free positions of a chart are found at once: they are the zeros of the correlation (by FFT) of its pixels with the
+occupied ones. The position where most of its rim touches other charts is taken. (The one nearest to a corner left 9 %
+more empty on a head; rotations by 30 and 45 degrees gained nothing.) xatlas's packer mirrors charts when it rotates
+them, and it left half of the square empty on heads.
 """
 
 from __future__ import annotations
@@ -24,19 +24,18 @@ from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
 Spectrum = npt.NDArray[np.complexfloating]
 G = 256
-OVERLOOKED = 0.25  # of a cell: a corner that is drawn in the next fine cell may be this much outside
-RIM = 3  # cells around a chart whose neighbours count as touching
+OVERLOOKED = 0.25  # of a cell: largest error of a chart's drawn border
+RIM = 3  # cells around a chart that are its rim
 FINER = 4  # fine cells along a cell's side when a chart is drawn
 SEARCH = 5  # halvings of the interval of scales
-DENSEST, LOOSEST = 0.76, 0.36  # share of the square that charts may take, where the search starts and ends
+DENSEST, LOOSEST = 0.76, 0.36  # share of the square under charts, where the search starts and ends
 SMALL = 0.01  # of all charts' area: smaller charts are tried in one orientation only
-LOWER, LOWEST = 0.93, 12  # several squares: how much smaller a scale is tried where charts do not fit, and how often
+LOWER, LOWEST = 0.93, 12  # several squares: factor of the next scale to try, and number of tries
 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """One chart: its texture vertices (n,), the loops of its outline as rows of those, and its area (in the given unit
-    squared)."""
+    """One chart: its texture vertices (n,), the loops of its outline as indices into those, and its area."""
 
     vertices: Indices
     outline: list[Indices]
@@ -44,9 +43,9 @@ class Chart:
 
 
 def pack(uvs: F64, faces: Faces, chart_of_face: Indices, padding: float, least: float = LOOSEST) -> F32 | None:
-    """(U, 2) uvs in [0, 1], charts turned and moved but not mirrored, at least `padding` (in uv) apart.
+    """(U, 2) uvs in [0, 1]: charts rotated and moved but not mirrored, at least `padding` (in uv) apart.
 
-    uvs: (U, 2) in any one scale, positive areas. None if they do not fit with `least` of the square under them.
+    uvs: (U, 2) at any common scale, with positive areas. None if charts that cover `least` of the square do not fit.
     """
     upright, charts, total = _ready(uvs, faces, chart_of_face)
     low, high = np.sqrt(least / total), np.sqrt(max(DENSEST, 1.05 * least) / total)
@@ -58,8 +57,8 @@ def pack_tiles(
 ) -> F32 | None:
     """As `pack`, into `tiles` squares side by side: u in [0, tiles], no chart across a border, all at one scale.
 
-    scale: the least that will do; by default the first at which they fit, from LOOSEST of the squares under charts on
-    down. Each chart goes into the first square that has room, so that only the last ones may stay empty.
+    scale: the smallest that is accepted; by default the first at which the charts fit, from LOOSEST of the squares
+    under charts downwards. Each chart goes into the first square with room, so only the last squares may stay empty.
     """
     upright, charts, total = _ready(uvs, faces, chart_of_face)
     low = np.sqrt(tiles * LOOSEST / total) if scale is None else scale
@@ -74,7 +73,7 @@ def pack_tiles(
 
 
 def _ready(uvs: F64, faces: Faces, chart_of_face: Indices) -> tuple[F64, list[Chart], float]:
-    """The charts upright, the largest first, and their area."""
+    """The texture vertices with upright charts, the charts from the largest on, and their total area."""
     upright = np.array(uvs, np.float64)
     charts = _charts(upright, faces, chart_of_face)
     for chart in charts:
@@ -85,7 +84,7 @@ def _ready(uvs: F64, faces: Faces, chart_of_face: Indices) -> tuple[F64, list[Ch
 def _largest(
     upright: F64, charts: list[Chart], best: F32 | None, low: float, high: float, padding: float, tiles: int = 1
 ) -> F32 | None:
-    """The charts at the largest scale up to `high` at which they fit; `best`: how they lie at `low`, if they do."""
+    """The charts at the largest scale up to `high` at which they fit. `best`: the packing at `low`, if there is one."""
     for _ in range(SEARCH if best is not None else 0):
         middle = 0.5 * (low + high)
         found = _placed(upright, charts, middle, padding, tiles)
@@ -97,12 +96,12 @@ def _largest(
 
 
 def boxed(points: F64) -> F64:
-    """(n, 2) points turned so that the smallest rectangle around them is upright, its corner at 0, wider than tall."""
+    """(n, 2) points rotated so that their smallest bounding rectangle is upright, wider than tall, one corner at 0."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
         hull = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # a chart that is a line
+    except (QhullError, ValueError):  # the points lie on a line
         return np.asarray(points - points.min(0), np.float64)
     side = np.roll(hull, -1, 0) - hull
     best, smallest = points, np.inf
@@ -131,7 +130,7 @@ def _charts(uvs: F64, faces: Faces, label: Indices) -> list[Chart]:
 
 
 def outline(faces: Indices) -> list[Indices]:
-    """The loops of vertices around a chart, outer and inner ones."""
+    """The border loops (vertices in order) of a chart with faces (m, 3), outer and inner ones."""
     e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     n = int(faces.max()) + 1
     border = e[~np.isin(e[:, 0] * n + e[:, 1], e[:, 1] * n + e[:, 0])]
@@ -162,7 +161,7 @@ def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float, tiles: 
         if upright is None:
             return None
         shapes = [_Shape(np.rot90(upright, turns)) for turns in range(4 if chart.area > SMALL * total else 1)]
-        found = ((t, _snuggest(square, shapes)) for t, square in enumerate(squares))
+        found = ((t, _best_position(square, shapes)) for t, square in enumerate(squares))
         tile, place = next((f for f in found if f[1] is not None), (0, None))
         if place is None:
             return None
@@ -173,18 +172,18 @@ def _placed(uvs: F64, charts: list[Chart], scale: float, padding: float, tiles: 
     return np.asarray(out, np.float32)
 
 
-def _snuggest(square: _Room, shapes: list[_Shape]) -> tuple[int, tuple[int, int]] | None:
-    """Quarter turns and the place (row, column) where a chart sits tightest in a square; None without room."""
+def _best_position(square: _Room, shapes: list[_Shape]) -> tuple[int, tuple[int, int]] | None:
+    """Best rotation (quarter turns) and position (row, column) of a chart in a square; None without room."""
     best: tuple[float, int, tuple[int, int]] | None = None
     for turns, shape in enumerate(shapes):
-        place = square.snuggest(shape)
+        place = square.best_position(shape)
         if place is not None and (best is None or place[0] > best[0]):
             best = place[0], turns, place[1]
     return None if best is None else best[1:]
 
 
 def _turned(points: F64, shape: tuple[int, ...], turns: int) -> F64:
-    """(n, 2) x along columns, y along rows of an array of `shape`, where np.rot90 takes them."""
+    """(n, 2) points (x along columns, y along rows of an array of `shape`) after np.rot90 of the array."""
     (x, y), (height, width) = points.T, shape
     return np.stack([(x, y), (y, width - x), (width - x, height - y), (height - y, x)][turns], 1)
 
@@ -192,7 +191,7 @@ def _turned(points: F64, shape: tuple[int, ...], turns: int) -> F64:
 def _pixels(points: F64, loops: list[Indices], reach: float, border: int) -> Mask | None:
     """The chart's cells with `reach` around them; None if it is larger than the square.
 
-    Drawn FINER times finer, spread by a disc; a cell counts when any of its fine ones does.
+    It is drawn FINER times finer and dilated by a disc; a cell counts if any of its fine cells does.
     """
     import cv2
 
@@ -208,19 +207,19 @@ def _pixels(points: F64, loops: list[Indices], reach: float, border: int) -> Mas
 
 
 class _Shape:
-    """A chart's mask and the rim around it, as correlations take them: found once for all squares."""
+    """A chart's mask, the rim around it and their spectra, computed once for all squares."""
 
     def __init__(self, mask: Mask) -> None:
         self.mask = mask
 
     @cached_property
     def spectrum(self) -> Spectrum:
-        """Of the mask."""
+        """Spectrum of the mask."""
         return _spectrum(self.mask)
 
     @cached_property
     def rim(self) -> tuple[Spectrum, float]:
-        """Of the cells around it, and how many they are."""
+        """Spectrum of the rim, and its number of cells."""
         import cv2
 
         wide = np.pad(self.mask, RIM).astype(np.uint8)
@@ -229,20 +228,20 @@ class _Shape:
 
 
 class _Room:
-    """A square with the charts that are in it, ready to be asked where a further one fits best."""
+    """A square with the charts in it; finds the best position of a further one."""
 
     def __init__(self) -> None:
         self._occupied = np.zeros((G, G), np.float32)
         self._spectra: tuple[Spectrum, Spectrum] | None = None
 
     def fill(self, shape: _Shape, row: int, column: int) -> None:
-        """A chart takes its place."""
+        """Place a chart."""
         height, width = shape.mask.shape
         self._occupied[row : row + height, column : column + width] += shape.mask
         self._spectra = None
 
-    def snuggest(self, shape: _Shape) -> tuple[float, tuple[int, int]] | None:
-        """The free place (row, column) where most of the rim around the mask touches charts or walls, and the share."""
+    def best_position(self, shape: _Shape) -> tuple[float, tuple[int, int]] | None:
+        """The free position (row, column) where most of the rim touches charts or walls, and that share."""
         h, w = shape.mask.shape
         if self._occupied.sum() + shape.mask.sum() > G * G:
             return None
@@ -264,13 +263,13 @@ class _Room:
 
 
 def _correlation(room: Spectrum, shape: Spectrum) -> F32:
-    """Of two pictures by their spectra. The product is made in place: numpy rounds it otherwise into a new array, and
-    ties between places are settled by that."""
+    """Correlation of two pictures from their spectra. The product is computed in place: in a new array numpy rounds
+    differently, which would decide ties between positions differently."""
     product = shape.copy()
     product *= room
     return np.asarray(fft.irfft2(product, (2 * G, 2 * G)))
 
 
 def _spectrum(mask: npt.NDArray[np.generic]) -> Spectrum:
-    """Of the mask turned by half, so that a product of spectra is a correlation."""
+    """Spectrum of the mask rotated by 180 degrees, so that a product of spectra is a correlation."""
     return np.asarray(fft.rfft2(mask[::-1, ::-1].astype(np.float32), (2 * G, 2 * G)))

@@ -1,9 +1,9 @@
-"""Charts from pieces: cut until each is a disc, then laid flat with little stretch.
+"""Charts from pieces: cuts each piece to a disc, then parameterises it with little stretch.
 
 Symbols
     corner   one corner of a face, 3 f + i; corners that may share a texture vertex are joined across uncut edges
     LSCM     least squares conformal map [Levy 2002, eq. 3]: the start, one sparse solve
-    ARAP     as rigid as possible [Liu 2008, section 4]: turns (local) and places (global) in alternation
+    ARAP     as rigid as possible [Liu 2008, section 4]: rotations (local) and positions (global) in alternation
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import SuperLU, splu
@@ -19,14 +20,14 @@ from pipeline.meshes import F64, Faces, Indices, Mask
 from stages.uv.segment import Dual
 
 RIGID_STEPS = 12
-MIN_COTANGENT = 0.02  # of a side's weight: obtuse triangles must not push their neighbours over
+MIN_COTANGENT = 0.02  # least weight of a side: obtuse triangles must not mirror their neighbours
 UNFOLD_STEPS = 60
-PATHS = 24  # cuts that one piece may need until it is a disc
+PATHS = 24  # largest number of cuts until a piece is a disc
 
 
 @dataclass(frozen=True, slots=True)
 class Flat:
-    """One chart laid flat: its faces (m,) in the mesh, faces (m, 3) into its own vertices, uv (n, 2) and the mesh's
+    """One parameterised chart: its faces (m,) in the mesh, faces (m, 3) into its own vertices, uv (n, 2) and the mesh
     vertex (n,) of each. `good`: a disc without mirrored triangles."""
 
     member: Indices
@@ -37,7 +38,7 @@ class Flat:
 
 
 def parameterised(vertices: F64, faces: Faces, pairs: Dual, label: Indices, wanted: Mask) -> list[Flat]:
-    """The pieces of `label` (F,) that are `wanted` (pieces,) laid flat, in the order of their numbers."""
+    """Parameterise the pieces of `label` (F,) that are `wanted` (pieces,), in the order of their numbers."""
     cut = np.asarray(label[pairs.a] != label[pairs.b])
     order = np.argsort(label, kind="stable")
     starts = np.searchsorted(label[order], np.arange(int(label.max()) + 2))
@@ -51,7 +52,7 @@ def parameterised(vertices: F64, faces: Faces, pairs: Dual, label: Indices, want
 
 
 def _within(pairs: Dual, which: Indices, member: Indices, count: int) -> Dual:
-    """The pairs inside one piece, with the piece's own face numbers."""
+    """The face pairs inside one piece, with the piece's own face indices."""
     row = np.full(count, -1)
     row[member] = np.arange(len(member))
     return Dual(row[pairs.a[which]], row[pairs.b[which]], pairs.edge[which], pairs.length[which], pairs.cost[which])
@@ -68,12 +69,12 @@ def _one(vertices: F64, faces: Faces, member: Indices, pairs: Dual) -> Flat:
     except RuntimeError:  # a singular matrix: triangles without area
         return Flat(member, own.astype(np.int32), np.zeros((0, 2)), np.zeros(0, np.int64), False)
     uv = unfolded(local, uv)
-    return Flat(member, local.astype(np.int32), uv, vertex, bool((signed(uv, local) > 0).all()))
+    return Flat(member, local.astype(np.int32), uv, vertex, bool((signed_areas(uv, local) > 0).all()))
 
 
 # ------------------------------------------------------------------ topology
 def joined_corners(faces: Indices, pairs: Dual, cut: Mask) -> tuple[Indices, Indices]:
-    """Faces (m, 3) into texture vertices, and the mesh vertex (n,) of each: corners are one across uncut edges."""
+    """Faces (m, 3) into texture vertices, and the mesh vertex (n,) of each. Corners are joined across uncut edges."""
     keep = ~cut
     rows: list[Indices] = []
     columns: list[Indices] = []
@@ -90,9 +91,9 @@ def joined_corners(faces: Indices, pairs: Dual, cut: Mask) -> tuple[Indices, Ind
 
 
 def disc_cuts(faces: Indices, pairs: Dual) -> Mask | None:
-    """(E,) edges inside a piece to cut so that it becomes a disc; None if PATHS cheapest paths don't do it.
+    """(E,) edges to cut so that a piece becomes a disc; None if PATHS cheapest paths are not enough.
 
-    A path joins two border loops of the piece (its own cuts included) and takes one of them away.
+    A path joins two border loops of the piece (including its own cuts), which makes them one.
     """
     cut = np.zeros(len(pairs.a), np.bool_)
     for _ in range(PATHS):
@@ -112,7 +113,7 @@ def disc_cuts(faces: Indices, pairs: Dual) -> Mask | None:
 
 
 def border_loops(faces: Indices) -> Indices:
-    """(n,) which border loop each texture vertex lies on, -1 inside."""
+    """(n,) border loop of each texture vertex of faces (m, 3), -1 inside."""
     e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     n = int(faces.max()) + 1
     there, back = e[:, 0] * n + e[:, 1], e[:, 1] * n + e[:, 0]
@@ -126,7 +127,7 @@ def border_loops(faces: Indices) -> Indices:
 
 
 def _path(vertex: Indices, loop: Indices, pairs: Dual, cut: Mask) -> Mask | None:
-    """(E,) the cheapest edges from the shortest loop to any other one."""
+    """(E,) edges of the cheapest path from the shortest loop to any other one."""
     ids, inverse = np.unique(vertex, return_inverse=True)
     on = np.full(len(ids), -1)
     on[inverse[loop >= 0]] = loop[loop >= 0]
@@ -151,9 +152,9 @@ def _path(vertex: Indices, loop: Indices, pairs: Dual, cut: Mask) -> Mask | None
     return out
 
 
-# ------------------------------------------------------------------ laying flat
+# ------------------------------------------------------------------ parameterisation
 def local_frames(points: F64, faces: Indices) -> F64:
-    """(m, 3, 2) each triangle in its own plane: first corner at 0, second on +x."""
+    """(m, 3, 2) each triangle in its own plane: first corner at 0, second on +x. points (n, 3), faces (m, 3)."""
     p = points[faces]
     x, side = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     length = np.maximum(np.linalg.norm(x, axis=1), 1e-30)
@@ -163,14 +164,15 @@ def local_frames(points: F64, faces: Indices) -> F64:
     return np.stack([np.stack([zero, zero], 1), np.stack([length, zero], 1), np.stack([along, across], 1)], 1)
 
 
-def signed(uv: F64, faces: Indices) -> F64:
-    """(m,) twice the signed areas."""
-    a, b, c = uv[faces].transpose(1, 0, 2)
-    return np.asarray((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]), np.float64)
+def signed_areas(uvs: F64, faces: npt.NDArray[np.integer]) -> F64:
+    """(F,) signed areas of texture triangles: uvs (U, 2), faces (F, 3). Positive: counter-clockwise (u right, v up)."""
+    a, b, c = uvs[faces].transpose(1, 0, 2)
+    out: F64 = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    return out
 
 
 def conformal(points: F64, faces: Indices) -> F64:
-    """(n, 2) LSCM with the two vertices furthest apart pinned, at the surface's own area.
+    """(n, 2) LSCM of points (n, 3) and faces (m, 3), scaled to the surface's area; two distant vertices are pinned.
 
     sum over triangles of |sum_i W_i U_i|^2 / (2 A),   W_i the opposite side as a complex number, U = u + i v
     """
@@ -191,12 +193,12 @@ def conformal(points: F64, faces: Indices) -> F64:
     u[[first, second]] = fixed
     u[free] = factorised(normal).solve(np.asarray(a.conj().T @ b, np.complex128))
     uv = np.stack([u.real, u.imag], 1)
-    scale = np.sqrt(area2.sum() / max(float(np.abs(signed(uv, faces)).sum()), 1e-30))
+    scale = np.sqrt(area2.sum() / max(float(2 * np.abs(signed_areas(uv, faces)).sum()), 1e-30))
     return np.asarray(uv * scale, np.float64)
 
 
 def rigid(points: F64, faces: Indices, start: F64, steps: int = RIGID_STEPS) -> F64:
-    """(n, 2) ARAP from a start: turns that fit each triangle best, then places that fit the turns best."""
+    """(n, 2) ARAP from a start (n, 2): best rotation of each triangle, then best positions for the rotations."""
     frame = local_frames(points, faces)
     weight = _cotangents(frame)
     n = len(points)
@@ -206,7 +208,7 @@ def rigid(points: F64, faces: Indices, start: F64, steps: int = RIGID_STEPS) -> 
     both = np.concatenate([weight.ravel()] * 2)
     laplace = csc_array(coo_array((-both, (rows, columns)), shape=(n, n)))
     diagonal = np.bincount(rows, both, n)
-    diagonal[0] += diagonal.mean()  # holds the chart in place
+    diagonal[0] += diagonal.mean()  # fixes the translation
     solver = factorised(csc_array(laplace + coo_array((diagonal, (np.arange(n), np.arange(n))), shape=(n, n))))
     uv = start - start[0]
     for _ in range(steps):
@@ -230,13 +232,14 @@ def rigid(points: F64, faces: Indices, start: F64, steps: int = RIGID_STEPS) -> 
 
 
 def factorised(matrix: csc_array) -> SuperLU:
-    """A symmetric or Hermitian positive matrix, in an order made for such: ten times less fill than the default's."""
+    """LU factors of a positive definite matrix, symmetric or Hermitian. The ordering gives ten times less fill-in than
+    the default."""
     options = {"SymmetricMode": True}
     return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def _cotangents(frame: F64) -> F64:
-    """(m, 3) cotangent of the angle opposite side i, i + 1, kept above MIN_COTANGENT of the triangle's mean."""
+    """(m, 3) cotangent of the angle opposite to side i, i + 1, at least MIN_COTANGENT of the triangle's mean."""
     out = []
     for k in range(3):
         a, b = frame[:, k] - frame[:, (k + 2) % 3], frame[:, (k + 1) % 3] - frame[:, (k + 2) % 3]
@@ -247,13 +250,13 @@ def _cotangents(frame: F64) -> F64:
 
 
 def unfolded(faces: Indices, uv: F64) -> F64:
-    """The chart with the inner corners of mirrored triangles moved to the middle of their neighbours, while any is."""
+    """uv (n, 2) with the inner corners of mirrored triangles moved to the mean of their neighbours, repeatedly."""
     e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     n = len(uv)
     border = border_loops(faces) >= 0
     degree = np.maximum(np.bincount(e[:, 0], minlength=n), 1)[:, None]
     for _ in range(UNFOLD_STEPS):
-        wrong = signed(uv, faces) <= 0
+        wrong = signed_areas(uv, faces) <= 0
         if not wrong.any():
             break
         move = np.zeros(n, np.bool_)

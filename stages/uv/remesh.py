@@ -1,8 +1,8 @@
-"""Triangles of one size and shape: isotropic remeshing (by pymeshlab; Botsch and Kobbelt 2004).
+"""Isotropic remeshing: triangles of one size and shape (by pymeshlab; Botsch and Kobbelt 2004).
 
-For sculpting, subdivision and pairing to quads: every edge is about as long as the others and most vertices have six
-neighbours, which decimation does not give. It spends as many triangles on a flat forehead as on an eyelid, and so lies
-further from the dense mesh at the same number; decimation is the default for that.
+For sculpting, subdivision and conversion to quads: all edges have about the same length and most vertices have six
+neighbours. It uses as many triangles on a flat forehead as on an eyelid, so that at the same number of triangles it is
+further from the dense mesh than decimation, which is the default.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from pipeline.meshlab import filtered
 from stages.uv.decimate import normals_from
 
 ITERATIONS = 10  # of splits, collapses, flips, smoothing and projection
-PASSES = 3  # with the edge's length mended after each
-NEARLY = 0.03  # of the wished number of triangles
-CREASE = 60.0  # degrees between two faces from which their edge is kept: the cut of the neck, no wrinkle
+PASSES = 3  # the edge length is corrected after each
+NEARLY = 0.03  # accepted deviation from the target number of triangles
+CREASE = 60.0  # degrees between two faces from which their edge is kept: the cut of the neck, not wrinkles
 
 
 def remeshed(dense: Mesh, target: int) -> Mesh:
-    """A manifold of about `target` even triangles on the dense mesh, with its normals; closed if the dense mesh is.
+    """A manifold of about `target` equal triangles on the dense mesh, with its normals; closed if the dense mesh is.
 
     Raises:
-        StageError: pymeshlab is missing, or what it makes is no manifold.
+        StageError: pymeshlab is missing, or its result is not a manifold.
     """
     if len(dense.faces) <= target:
         return dense
@@ -65,9 +65,9 @@ def _even(points: F64, faces: Faces, edge: float) -> tuple[F64, Faces]:
 
 def _refused(reason: str) -> StageError:
     return StageError(
-        "the mesh can't be remeshed evenly",
+        "isotropic remeshing failed",
         where="uv.remesh",
         value=reason,
-        limit="a manifold, closed if the dense mesh is, and pymeshlab",
-        remedy="choose more target_faces, or uv.remesh=adaptive",
+        limit="a manifold, closed if the dense mesh is; pymeshlab installed",
+        remedy="raise uv.target_faces, or set uv.remesh=adaptive",
     )

@@ -1,12 +1,12 @@
-"""Charts for surfaces that are rough: as many pieces as it takes until each lies flat, none left without area.
+"""Charts for rough surfaces: as many pieces as needed, so that every face has texture area and none is mirrored.
 
-A shredded surface does not come apart into a few discs. Its pieces are parted until each of them lies flat, all those
-that do not in one round; what is left after ROUNDS, a few faces in a tangle, is laid flat face by face. Fragments are
-then given to a neighbour where the two together still lie flat.
+A rough surface can't be cut into a few discs. In each round all pieces that can't be parameterised without mirrored
+triangles are split. What is left after ROUNDS, a few faces, is parameterised face by face. Fragments are then merged
+with a neighbour if both together can be parameterised.
 
 Symbols
-    fragment  a chart with less than FRAGMENT of the area: nobody paints on it, and its seams show
-    short     a face whose area in the texture is less than SHORT of its share of the surface: it has no texels
+    fragment  a chart with less than FRAGMENT of the area: it is useless for painting, and its seams are visible
+    short     a face whose share of the texture is less than SHORT of its share of the surface: it has no texels
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ import numpy as np
 from pipeline import meshes
 from pipeline.meshes import F64, Charts, Faces, Indices, Mask, Mesh
 from stages.uv.charts import Surface, flats_of, laid_flat, surface_of, together
-from stages.uv.parameterise import Flat, local_frames, signed
+from stages.uv.parameterise import Flat, local_frames, signed_areas
 from stages.uv.segment import connected, halved, segment
 
 log = logging.getLogger("neuface.uv")
-ROUNDS = 24  # of parting what does not lie flat; of a shredded torso with 50,000 faces 12 leave 0.1 % of the area
-MAX_PIECES = 1500  # from here on xatlas is quicker
-FRAGMENT = 5e-4  # of the area. Of a head's 0.15 m^2 75 mm^2, a square of 9 mm
-MERGES = 300  # of fragments that are tried, the smallest first: a fifth of a second each with large neighbours
+ROUNDS = 24  # of splitting; on a broken torso with 50,000 faces 12 rounds leave 0.1 % of the area
+MAX_PIECES = 1500  # from this number on xatlas is faster
+FRAGMENT = 5e-4  # of the area. For a head of 0.15 m^2: 75 mm^2, a square of 9 mm
+MERGES = 300  # fragments that are tried, the smallest first: each takes 0.2 s with large neighbours
 SHORT = 1e-3
-MIN_HEIGHT = 1e-2  # of a face's length: faces without area are drawn as high, so that they have texels
+MIN_HEIGHT = 1e-2  # of a face's length: height of faces without area, so that they have texels
 
 
 def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
-    """Texture vertices (U, 2) in one common scale, faces (F, 3) into them and the chart (F,) of each: not packed yet.
-    None where that would take more than MAX_PIECES charts.
+    """Texture vertices (U, 2) at one common scale, faces (F, 3) into them and the chart (F,) of each; not packed. None
+    if more than MAX_PIECES charts would be needed.
 
-    smooth: (V, 3) vertices without bumps.
+    smooth: (V, 3) smoothed vertices.
     """
     surface = surface_of(mesh, smooth)
     label = segment(smooth, mesh.faces, surface.pairs)
@@ -48,7 +48,7 @@ def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
         label = _all_parted(surface, label, bad)
     flats = flats_of(surface, label, known)
     flats = _merged(surface, flats)
-    log.info("uv: %d pieces, %d of them laid face by face", len(flats), sum(not f.good for f in flats))
+    log.info("uv: %d pieces, %d of them parameterised face by face", len(flats), sum(not f.good for f in flats))
     flats = [one for f in flats for one in ([f] if f.good else _face_by_face(surface, f))]
     if len(flats) > MAX_PIECES:
         return None
@@ -56,14 +56,14 @@ def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
 
 
 def short(mesh: Mesh, charts: Charts) -> Mask:
-    """(F,) faces with next to no area in the texture for the area that they have on the surface."""
-    t = np.abs(signed(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)))
+    """(F,) faces whose area in the texture is far too small for their area on the surface."""
+    t = np.abs(signed_areas(charts.uvs.astype(np.float64), charts.faces.astype(np.int64)))
     area = meshes.areas(mesh.vertices, mesh.faces)
     return np.asarray(t / max(float(t.sum()), 1e-30) < SHORT * area / max(float(area.sum()), 1e-30))
 
 
 def _all_parted(surface: Surface, label: Indices, bad: list[Flat]) -> Indices:
-    """Every one of the pieces in two, across its longest direction in space."""
+    """Labels (F,) with each of the bad pieces split in two, across its longest direction in space."""
     for flat in bad:
         centre = surface.smooth[surface.faces[flat.member]].mean(1)
         centre = centre - centre.mean(0)
@@ -74,7 +74,7 @@ def _all_parted(surface: Surface, label: Indices, bad: list[Flat]) -> Indices:
 
 
 def _merged(surface: Surface, flats: list[Flat]) -> list[Flat]:
-    """Fragments laid flat with the neighbour that they share the longest border with, where that lies flat."""
+    """Merge fragments with the neighbour of the longest common border, if both together can be parameterised."""
     chart = np.zeros(len(surface.area), np.int64)
     for i, flat in enumerate(flats):
         chart[flat.member] = i
@@ -85,7 +85,7 @@ def _merged(surface: Surface, flats: list[Flat]) -> list[Flat]:
         a, b = chart[pairs.a], chart[pairs.b]
         border = (a == which) != (b == which)
         if not border.any():
-            continue  # a piece of its own, or merged before
+            continue  # no neighbour, or already merged
         beside = np.where(a == which, b, a)[border]
         length = np.bincount(beside, pairs.length[border])
         for into in np.argsort(-length, kind="stable")[:3].tolist():
@@ -100,7 +100,7 @@ def _merged(surface: Surface, flats: list[Flat]) -> list[Flat]:
 
 
 def _face_by_face(surface: Surface, flat: Flat) -> list[Flat]:
-    """Each face of a piece as a chart of its own, without stretch; one without area is drawn MIN_HEIGHT high."""
+    """Each face of a piece as a chart of its own, without stretch; a face without area gets the height MIN_HEIGHT."""
     faces = surface.faces[flat.member].astype(np.int64)
     frame = local_frames(surface.true, faces)
     span = float(np.ptp(surface.true, axis=0).max())

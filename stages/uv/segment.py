@@ -1,14 +1,14 @@
-"""Where a mesh is cut into charts: pieces that bend little, with borders that keep off the front of the face.
+"""Segments a mesh into charts: pieces with little curvature, whose borders avoid the front of the face.
 
 Symbols, for a set X of faces with areas a and unit normals n
     N_X     sum of a n
     D_X     sum of a less |N_X|: 0 for a flat set, half its area for a hemisphere, all of it for a closed one
     bend    D_X over its area
-    w       what a metre of border costs, per edge (seam_weights)
+    w       cost of a metre of border, per edge (seam_weights)
 
-Pieces grow from single faces: in each round two neighbours that are each other's best merge, best being the smallest
-growth of D for the border that goes away (hierarchical clustering as Garland 2001 has it, with the border's cost in
-the place of his shape term). Borders are then straightened by moving single faces.
+Pieces grow from single faces. In each round two neighbours merge if each is the other's best: the smallest growth of D
+for the border that is removed (hierarchical face clustering of Garland 2001, with the border's cost in place of his
+shape term). Borders are then straightened by moving single faces.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from pipeline.least_cut import ENDLESS, least_cut
 from pipeline.meshes import F64, Faces, Indices, Mask
 
 FRONT = np.array([0.0, 0.0, 1.0])  # asset coordinates: the subject looks along +Z
-FRONT_COST = 12.0  # times what a seam elsewhere costs
+FRONT_COST = 12.0  # additional cost of a seam in front; elsewhere it costs 1
 FRONT_FROM, FRONT_TO = 0.1, 0.5  # cosines to FRONT between which the cost grows
-BEND = 0.4  # most bend of a chart: a little more than half a cylinder (0.36), less than half a sphere (0.5)
-FRONT_BEND = 0.6  # where the border that would go away lies in front: a face reaches from ear to ear
-LARGER_BEND = 0.5  # allowed when a fragment is taken up
-CRUMB = 0.012  # of the area: smaller pieces are given to a neighbour
+BEND = 0.4  # largest bend of a chart: a little more than half a cylinder (0.36), less than half a sphere (0.5)
+FRONT_BEND = 0.6  # the same if the removed border lies in front: a face reaches from ear to ear
+LARGER_BEND = 0.5  # the same if a small piece is merged
+MIN_PIECE = 0.012  # of the area: smaller pieces are merged with a neighbour
 ROUNDS = 400
-ENDS = 0.3  # of a piece: where its ends are when it is parted
-FLOW = 20_000  # largest capacity of an edge, in whole numbers
+ENDS = 0.3  # of a piece's area at each of its ends, when it is split
+FLOW = 20_000  # largest capacity of an edge (integer)
 SWEEPS, STRAIGHTEN = 24, 0.06  # of the span: how much border length weighs against bending
 
 
 @dataclass(frozen=True, slots=True)
 class Dual:
-    """Neighbouring faces: a, b (E,), their edge's vertices (E, 2), its length (E,), and the length times w (E,)."""
+    """Pairs of neighbouring faces: a, b (E,), vertices of their edge (E, 2), its length (E,), and length times w."""
 
     a: Indices
     b: Indices
@@ -46,14 +46,15 @@ class Dual:
 
 
 def seam_weights(vertices: F64, faces: Faces) -> F64:
-    """(V,) what a seam costs at each vertex: 1, up to 1 + FRONT_COST where the surface looks to the front."""
+    """(V,) cost of a seam at each vertex: 1, up to 1 + FRONT_COST where the surface faces the front. vertices (V, 3),
+    faces (F, 3)."""
     normals = meshes.vertex_normals(vertices, faces).astype(np.float64)
     t = ((normals @ FRONT - FRONT_FROM) / (FRONT_TO - FRONT_FROM)).clip(0, 1)
     return np.asarray(1 + FRONT_COST * t * t * (3 - 2 * t), np.float64)
 
 
 def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
-    """Pairs of faces across each inner edge of a manifold, in a fixed order."""
+    """Pairs of faces across the inner edges of a manifold, sorted. vertices (V, 3), faces (F, 3), weights (V,)."""
     first, second, _ = meshes.paired_edges(faces, len(vertices))
     edge = np.sort(meshes.edges(faces)[first], axis=1)
     length = np.linalg.norm(vertices[edge[:, 0]] - vertices[edge[:, 1]], axis=1)
@@ -61,7 +62,7 @@ def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
 
 
 def segment(vertices: F64, faces: Faces, pairs: Dual) -> Indices:
-    """(F,) piece of each face, numbered from 0; every piece hangs together."""
+    """(F,) piece of each face, numbered from 0; every piece is connected."""
     vectors = meshes.area_vectors(vertices, faces)
     area = np.linalg.norm(vectors, axis=1)
     label = _grown(vectors, area, pairs)
@@ -71,7 +72,7 @@ def segment(vertices: F64, faces: Faces, pairs: Dual) -> Indices:
 
 
 def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
-    """(F,) labels split where a piece does not hang together (`cut` (E,): edges that part faces as well)."""
+    """(F,) labels, split where a piece is not connected. `cut` (E,): edges that also separate faces."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -83,7 +84,7 @@ def connected(label: Indices, pairs: Dual, cut: Mask | None = None) -> Indices:
 
 
 def without_fragments(vertices: F64, faces: Faces, label: Indices, pairs: Dual) -> Indices:
-    """Pieces (F,) that were parted otherwise, small ones given to their neighbours."""
+    """Pieces (F,) of any origin, with small ones merged into their neighbours."""
     vectors = meshes.area_vectors(vertices, faces)
     return _without_fragments(label, vectors, np.linalg.norm(vectors, axis=1), pairs)
 
@@ -99,7 +100,7 @@ def _sums(label: Indices, vectors: F64, area: F64) -> tuple[F64, F64]:
 
 
 def _borders(label: Indices, pairs: Dual) -> tuple[Indices, Indices, F64, F64]:
-    """Neighbouring pieces a < b, the cost of the border between them, and how far in front it lies, in [0, 1]."""
+    """Neighbouring pieces a < b, the cost of their border, and how much of it lies in front, in [0, 1]."""
     count = int(label.max()) + 1
     a, b = label[pairs.a], label[pairs.b]
     across = a != b
@@ -112,7 +113,7 @@ def _borders(label: Indices, pairs: Dual) -> tuple[Indices, Indices, F64, F64]:
 
 
 def _grown(vectors: F64, area: F64, pairs: Dual) -> Indices:
-    """Merge mutual best neighbours until no two may merge."""
+    """(F,) pieces after merging mutual best neighbours until none may merge."""
     label = np.arange(len(area))
     for _ in range(ROUNDS):
         normal, size = _sums(label, vectors, area)
@@ -131,7 +132,7 @@ def _grown(vectors: F64, area: F64, pairs: Dual) -> Indices:
 
 
 def _mutual(a: Indices, b: Indices, score: F64, count: int) -> Mask:
-    """Pairs that are the best of both their pieces (ties: the first pair)."""
+    """Pairs that are the best of both pieces (ties: the first pair)."""
     order = np.lexsort((np.arange(len(score)), score))
     order = order[np.isfinite(score[order])]
     best = np.full(count, -1)
@@ -146,13 +147,13 @@ def _mutual(a: Indices, b: Indices, score: F64, count: int) -> Mask:
 
 
 def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: float) -> Indices:
-    """Faces move to a neighbour's piece where that costs less: bending + STRAIGHTEN span * border.
+    """Move faces to a neighbour's piece if that costs less: bending + STRAIGHTEN span * border.
 
-    Half of the faces may move in one sweep, so that two neighbours do not swap for ever.
+    Half of the faces may move in one sweep, so that two neighbours do not swap endlessly.
     """
     n = len(area)
     unit = vectors / np.maximum(area, 1e-30)[:, None]
-    near = np.repeat(np.arange(n)[:, None], 3, 1)  # beyond a border there is nobody but the face itself
+    near = np.repeat(np.arange(n)[:, None], 3, 1)  # across a border a face is its own neighbour
     cost = np.zeros((n, 3))
     faces, others = np.concatenate([pairs.a, pairs.b]), np.concatenate([pairs.b, pairs.a])
     order = np.argsort(faces, kind="stable")
@@ -175,14 +176,14 @@ def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: fl
 
 
 def _without_fragments(label: Indices, vectors: F64, area: F64, pairs: Dual) -> Indices:
-    """Pieces below CRUMB of the area go to the neighbour with the costliest border that bears it."""
+    """Pieces below MIN_PIECE of the area go to the neighbour with the costliest border that may take them."""
     total = area.sum()
     for _ in range(ROUNDS):
         normal, size = _sums(label, vectors, area)
         a, b, cost, _ = _borders(label, pairs)
         joint = _bent(normal[a] + normal[b], size[a] + size[b])
         least = np.minimum(size[a], size[b])
-        allowed = (least < CRUMB * total) & (joint <= LARGER_BEND * (size[a] + size[b]))
+        allowed = (least < MIN_PIECE * total) & (joint <= LARGER_BEND * (size[a] + size[b]))
         if not allowed.any():
             break
         pick = np.flatnonzero(allowed)
@@ -193,10 +194,10 @@ def _without_fragments(label: Indices, vectors: F64, area: F64, pairs: Dual) -> 
 
 
 def halved(place: F64, label: Indices, which: int, area: F64, pairs: Dual) -> Indices:
-    """Piece `which` of `label` parted where the border is cheapest between its two ends: the least cut in the graph
-    of its faces.
+    """Labels (F,) with piece `which` split in two where the border is cheapest between its two ends, by a minimum cut
+    in the graph of its faces.
 
-    place: (F,) how far along the piece each of its faces lies; the ends are the first and last ENDS of its area.
+    place: (F,) coordinate of the faces along the piece; the ends are the first and last ENDS of its area.
     """
     own = np.flatnonzero(label == which)
     row = np.full(len(label), -1)

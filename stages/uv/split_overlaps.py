@@ -1,7 +1,7 @@
-"""Charts that fold over themselves, taken apart until none does.
+"""Splits charts that overlap themselves, until none does.
 
-A chart of a crumpled surface may lie twice on the same texels. One layer of it stays; the faces of the others are
-given charts of their own, in pieces that hang together, and where these fold again, face by face.
+A chart of a crumpled surface may cover the same texels twice. One layer is kept. The faces of the others become charts
+of their own, in connected pieces, and if these overlap again, face by face.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import numpy as np
 from pipeline import meshes, raster
 from pipeline.meshes import F64, Charts, Faces, Indices, Mask
 
-# barycentric places that are looked at in each face: its middle, near its corners, and along its sides
+# barycentric positions that are tested in each face: centroid, near the corners, along the sides
 PLACES = np.array([[1, 1, 1], [8, 1, 1], [1, 8, 1], [1, 1, 8], [4, 4, 1], [4, 1, 4], [1, 4, 4]], np.float64)
 PLACES /= PLACES.sum(1, keepdims=True)
 
 
 def folded(charts: Charts, size: int) -> Mask:
-    """(F,) faces that are mirrored, or that lie on texels where another face is the owner. One tile; size: texels."""
+    """(F,) faces that are mirrored, or lie on texels that belong to another face. For one tile of `size` texels."""
     corners = raster.texel_corners(charts, size)
     mirrored = raster.doubled_areas(corners) > 0  # y points down in texels
     if mirrored.mean() > 0.5:
@@ -36,13 +36,14 @@ def folded(charts: Charts, size: int) -> Mask:
 
 
 def taken_apart(uvs: F64, faces: Faces, out: Mask) -> tuple[F64, Faces]:
-    """Texture coordinates in which the faces of `out` share no vertex with the others, only among themselves."""
+    """Uvs (U', 2) and faces (F, 3) in which the faces of `out` (F,) share vertices only among themselves."""
     fresh, inverse = np.unique(faces[out], return_inverse=True)
     return _with(uvs, faces, out, uvs[fresh], inverse.reshape(-1, 3))
 
 
 def one_by_one(uvs: F64, faces: Faces, out: Mask, corners: F64) -> tuple[F64, Faces]:
-    """Texture coordinates in which each face of `out` lies by itself, without stretch; corners (F, 3, 3)."""
+    """Uvs (U', 2) and faces (F, 3) in which each face of `out` (F,) is a chart of its own, without stretch; corners
+    (F, 3, 3) in space."""
     a, b, c = corners[out].transpose(1, 0, 2)
     along = b - a
     length = np.linalg.norm(along, axis=1)

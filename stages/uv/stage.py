@@ -13,8 +13,7 @@ MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The dense mesh; and for how fine the photos are on it, which of them were fitted and their cameras;
-    and the face's landmarks."""
+    """The dense mesh; the fitted photos and their cameras, for the pixel size on the mesh; the face's landmarks."""
 
     surface: Located[Surface]
     inverse_rendering: Located[FittedFace]
@@ -23,7 +22,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
-    """Decimate, cut, flatten, pack, measure. Raises StageError when the mesh can't be unwrapped."""
+    """Decimate, cut, parameterise, pack, measure. Raises StageError if the mesh can't be unwrapped."""
     from pipeline import footprint, meshes
     from pipeline.faces.landmarks3d import load_landmarks
     from stages.uv.build import build

@@ -1,8 +1,8 @@
-"""A few charts of our own (stages.uv.charts), more of them where the surface is rough (stages.uv.rough), and xatlas's
-(MIT) where even these do not lie flat.
+"""Unwraps a mesh: a few charts of our own (stages.uv.charts); more charts if the surface is rough (stages.uv.rough);
+xatlas (MIT) if that fails too.
 
-xatlas too cuts and flattens the mesh with its bumps smoothed away, in the same connectivity: noise in the surface
-would otherwise break its charts into hundreds of fragments. Its mirrored charts are turned over.
+xatlas also gets the smoothed mesh, with the same connectivity: noise in the surface would break its charts into
+hundreds of fragments. Its mirrored charts are flipped.
 """
 
 from __future__ import annotations
@@ -18,31 +18,32 @@ from stages.uv.charts import unwrapped
 from stages.uv.config import Config
 from stages.uv.density import Front, enlarged
 from stages.uv.pack import pack
+from stages.uv.parameterise import signed_areas
 from stages.uv.rough import in_pieces, short
 from stages.uv.split_overlaps import folded, one_by_one, taken_apart
 from stages.uv.tile_count import Tiling, packed
 
 log = logging.getLogger("neuface.uv")
 UNIT = 1000.0  # longest side during the cut: xatlas has absolute thresholds of about 1e-7 for areas
-SMOOTH_SHARE = 0.02  # of the box's longest side: how far the smoothing reaches
-PACK_MARGIN = 2.0  # xatlas overshoots the asked resolution by up to this; the padding is asked larger by it
-COARSER = 1.05  # of the texel that is wished for: a few per cent are not worth a further tile
-UNFOLDINGS = 6  # rounds in which what folds is taken apart; in the latter half face by face, which ends it
-FOLD_RASTER = 2048  # texels along a side on which folds are looked for
-WORTH_TEXELS = 1e-3  # of the surface without texels: with less, the charts stay as they are
+SMOOTH_SHARE = 0.02  # of the box's longest side: reach of the smoothing
+PACK_MARGIN = 2.0  # xatlas exceeds the requested resolution by up to this factor, so the padding is multiplied by it
+COARSER = 1.05  # of the requested texel: a few per cent do not justify a further tile
+UNFOLDINGS = 6  # rounds of splitting overlaps; the second half goes face by face, which always ends
+FOLD_RASTER = 2048  # texels along a side of the raster that is tested for overlaps
+MIN_WITHOUT_TEXELS = 1e-3  # of the surface without texels: below it the charts stay as they are
 ITERATIONS = 1  # rounds in which xatlas grows charts from better seeds: more are slow
-MANY_CHARTS = 150  # from here on xatlas packs: our own packer takes time for each chart
+MANY_CHARTS = 150  # from this number on xatlas packs: our own packer is slow for many charts
 
 
 def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float | None = None) -> Charts:
-    """Charts over the mesh, none mirrored, packed into [0, 1]^2 with padding, or into tiles (pipeline.tiles).
+    """Charts over the mesh, none mirrored, packed with padding into [0, 1]^2 or into tiles (pipeline.tiles).
 
-    A mesh that takes MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger. texel: mean edge
-    on the surface, in the mesh's unit, that texels should not exceed but for COARSER, config.tile_size of them along a
-    tile's side; no more tiles are filled than that takes. None: config.tiles are filled.
+    A mesh that needs MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger. texel: largest
+    mean edge of a texel on the surface (up to the factor COARSER), in the mesh's unit, with config.tile_size texels
+    along a tile's side; only as many tiles are filled as this needs. None: config.tiles are filled.
 
     Raises:
-        StageError: xatlas gives up, or leaves faces without a chart.
+        StageError: xatlas fails, or leaves faces without a chart.
     """
     span = float(np.ptp(mesh.vertices, axis=0).max())
     points = smoothed(mesh.vertices.astype(np.float64) * (UNIT / span), mesh.faces, SMOOTH_SHARE * UNIT)
@@ -52,27 +53,27 @@ def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float 
     own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
     if own is not None:
         return _with_texels(own, mesh, config, tiling, front)
-    log.info("uv: a few discs do not lie flat; cutting further")
+    log.info("uv: the mesh can't be cut into a few discs; cutting further")
     found = in_pieces(scaled, points)
     if found is not None:
         uvs, faces, _ = found
         even = evened(uvs, faces, meshes.areas(mesh.vertices, mesh.faces))
     else:
-        log.info("uv: too many pieces do not lie flat; xatlas takes over")
+        log.info("uv: too many pieces are needed; using xatlas")
         even, faces = _flat(*_cut(points, mesh.faces, config), mesh, config)
     return _with_texels(_placed(even, faces, mesh, config, tiling, front), mesh, config, tiling, front)
 
 
 def most_tiles(config: Config, texel: float | None) -> int:
-    """How many tiles may be filled. texel: the largest that is wished for; auto without one knows no need of more."""
+    """Largest number of tiles. texel: see `unwrap`; without it, `auto` means one tile."""
     if config.tiles == "auto":
         return 1 if texel is None else tiles.MAX_TILES
     return config.tiles
 
 
 def _placed(even: F64, faces: Faces, mesh: Mesh, config: Config, tiling: Tiling, front: Front | None = None) -> Charts:
-    """Charts of one scale, but for the face's, in one square, or in tiles where that is asked for and they are not too
-    many."""
+    """Pack charts at one scale (the face's are larger) into one square, or into tiles if requested and the charts are
+    not too many."""
     padding, label = config.padding / config.texture_size, chart_of_face(faces, len(even))
     if front is not None:
         even = enlarged(even, faces, label, front, meshes.areas(mesh.vertices, mesh.faces))
@@ -88,26 +89,26 @@ def _placed(even: F64, faces: Faces, mesh: Mesh, config: Config, tiling: Tiling,
 
 
 def _with_texels(charts: Charts, mesh: Mesh, config: Config, tiling: Tiling, front: Front | None = None) -> Charts:
-    """The charts, those faces laid flat by themselves that have next to no texels, if they are worth it."""
+    """The charts, with faces that have almost no texels as charts of their own, if they have enough area together."""
     areas = meshes.areas(mesh.vertices, mesh.faces)
     out = short(mesh, charts)
-    if areas[out].sum() <= WORTH_TEXELS * areas.sum():
+    if areas[out].sum() <= MIN_WITHOUT_TEXELS * areas.sum():
         return charts
-    log.info("uv: %d faces have no texels and are laid flat by themselves", int(out.sum()))
+    log.info("uv: %d faces have no texels and become charts of their own", int(out.sum()))
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     uvs, faces = one_by_one(charts.uvs.astype(np.float64), charts.faces, out, corners)
     return _placed(evened(uvs, faces, areas), faces, mesh, config, tiling, front)
 
 
 def _flat(uvs: F64, faces: Faces, mesh: Mesh, config: Config) -> tuple[F64, Faces]:
-    """Charts of one scale, turned the right way, none of which folds over itself (stages.uv.split_overlaps)."""
+    """Charts at one scale, not mirrored, none of which overlaps itself (stages.uv.split_overlaps)."""
     areas, corners = meshes.areas(mesh.vertices, mesh.faces), mesh.vertices.astype(np.float64)[mesh.faces]
     uvs = evened(turned_over(uvs, faces), faces, areas)
     for turn in range(UNFOLDINGS):
         out = folded(_packed(spread(uvs, faces), faces, config), FOLD_RASTER)
         if not out.any():
             break
-        log.info("uv: %d faces lie on others", int(out.sum()))
+        log.info("uv: %d faces overlap others", int(out.sum()))
         in_pieces = turn < UNFOLDINGS // 2
         uvs, faces = taken_apart(uvs, faces, out) if in_pieces else one_by_one(uvs, faces, out, corners)
         uvs = evened(turned_over(uvs, faces), faces, areas)
@@ -115,7 +116,7 @@ def _flat(uvs: F64, faces: Faces, mesh: Mesh, config: Config) -> tuple[F64, Face
 
 
 def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
-    """Uniform Laplacian smoothing that diffuses over about `length` (same unit as the vertices)."""
+    """(V, 3) vertices after uniform Laplacian smoothing that reaches about `length` (unit of the vertices)."""
     from scipy.sparse import coo_array, diags_array
 
     e = meshes.edges(faces)
@@ -129,13 +130,13 @@ def smoothed(vertices: F64, faces: Faces, length: float) -> F64:
 
 
 def _cut(points: F64, triangles: Faces, config: Config) -> tuple[F64, Faces]:
-    """uvs (U, 2) in a common scale, one vertex for each place in each chart, and faces (F, 3)."""
+    """The charts of xatlas: uvs (U, 2) at a common scale and faces (F, 3)."""
     import xatlas
 
     atlas = xatlas.Atlas()
     charts, quick = xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost, charts.max_iterations = config.max_cost, ITERATIONS
-    quick.resolution, quick.padding, quick.bilinear = 256, 0, False  # thrown away: the charts are packed again
+    quick.resolution, quick.padding, quick.bilinear = 256, 0, False  # not used: the charts are packed again
     normals = meshes.vertex_normals(points, triangles)
     try:
         atlas.add_mesh(points.astype(np.float32), triangles.astype(np.uint32), normals)
@@ -150,7 +151,7 @@ def _cut(points: F64, triangles: Faces, config: Config) -> tuple[F64, Faces]:
 def _whole(faces: object, expected: int) -> Faces:
     out = np.asarray(faces, np.int64).reshape(-1, 3).astype(np.int32)
     if len(out) != expected:
-        raise _failed(f"{len(out)} of {expected} faces came back")
+        raise _failed(f"xatlas returned {len(out)} of {expected} faces")
     return out
 
 
@@ -165,20 +166,13 @@ def _failed(reason: str) -> StageError:
 
 
 def chart_of_face(faces: Faces, count: int) -> Indices:
-    """(F,) chart of each face, numbered from 0; charts are what hangs together in texture space."""
+    """(F,) chart of each face (F, 3), numbered from 0: the connected components in texture space. count: vertices."""
     label = meshes.component_of_face(faces, count)
     return np.asarray(np.unique(label, return_inverse=True)[1].reshape(-1), np.int64)
 
 
-def signed_areas(uvs: F64, faces: Faces) -> F64:
-    """(F,) signed areas, positive counter-clockwise (u right, v up)."""
-    a, b, c = uvs[faces].transpose(1, 0, 2)
-    out: F64 = 0.5 * ((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
-    return out
-
-
 def turned_over(uvs: F64, faces: Faces) -> F64:
-    """Charts with negative area mirrored in u. Charts may overlap afterwards."""
+    """uvs (U, 2) with the charts of negative area mirrored in u. Charts may overlap afterwards."""
     chart = chart_of_face(faces, len(uvs))
     mirrored = np.bincount(chart, signed_areas(uvs, faces)) < 0
     flip = np.zeros(len(uvs), np.bool_)
@@ -187,7 +181,7 @@ def turned_over(uvs: F64, faces: Faces) -> F64:
 
 
 def evened(uvs: F64, faces: Faces, areas: F64) -> F64:
-    """Every chart at the same scale against the true surface (smoothing had shrunk the bumpy ones)."""
+    """uvs (U, 2) with every chart scaled to its true area (smoothing had shrunk the rough ones). areas (F,)."""
     chart = chart_of_face(faces, len(uvs))
     flat, true = np.bincount(chart, np.abs(signed_areas(uvs, faces))), np.bincount(chart, areas)
     scale = np.sqrt(true / np.maximum(flat, 1e-9 * flat.sum()))
@@ -197,7 +191,7 @@ def evened(uvs: F64, faces: Faces, areas: F64) -> F64:
 
 
 def spread(uvs: F64, faces: Faces) -> F64:
-    """Charts side by side, so that none touches another before they are packed."""
+    """uvs (U, 2) with the charts side by side, so that none touches another before packing."""
     chart = chart_of_face(faces, len(uvs))
     of_vertex = np.zeros(len(uvs), np.int64)
     of_vertex[faces.ravel()] = np.repeat(chart, 3)
@@ -212,10 +206,10 @@ def spread(uvs: F64, faces: Faces) -> F64:
 
 
 def _packed(uvs: F64, faces: Faces, config: Config) -> Charts:
-    """The charts in one square as xatlas places them: quick for hundreds of fragments, but not tight.
+    """Pack the charts into one square with xatlas: fast for hundreds of charts, but not dense.
 
-    xatlas leaves faces out that are smaller than 1e-7 in the given unit, and puts them anywhere: on a surface in metres
-    a tenth of a square millimetre. So the charts are given to it larger.
+    xatlas ignores faces smaller than 1e-7 in the input unit and places them anywhere; on a surface in metres that is a
+    tenth of a square millimetre. So the charts are enlarged first.
     """
     import xatlas
 
@@ -226,7 +220,7 @@ def _packed(uvs: F64, faces: Faces, config: Config) -> Charts:
     settings.resolution = config.texture_size
     settings.padding = int(np.ceil(config.padding * PACK_MARGIN))
     settings.bilinear, settings.bruteForce = True, False
-    settings.rotate_charts = False  # xatlas turns a chart by swapping its axes, which mirrors it
+    settings.rotate_charts = False  # xatlas rotates a chart by swapping its axes, which mirrors it
     try:
         atlas.add_uv_mesh(uvs.astype(np.float32), faces.astype(np.uint32))
         atlas.generate(xatlas.ChartOptions(), settings)

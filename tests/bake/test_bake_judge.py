@@ -75,7 +75,11 @@ def test_nothing_shines() -> None:
     """A loss on people, none on a stone; and where there is no lobe, its roughness says nothing."""
     matt = head(f0=lambda t: 0 * t.f0)
     found = by_name(matt)
-    assert found["f0_none"].level == "usable" and "nothing shines" in found["f0_none"].said and "roughness" not in found
+    assert (
+        found["f0_none"].level == "usable"
+        and "it has no highlights" in found["f0_none"].said
+        and "roughness" not in found
+    )
     assert "f0_none" not in by_name(matt, person=False)
 
 

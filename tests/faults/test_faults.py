@@ -196,7 +196,7 @@ def test_a_limit_on_file_sizes_is_told_in_plain_words(tree: Path, environment: d
     limited += f"sys.argv = sys.argv[1:]; runpy.run_path({str(TOY_BATCH)!r}, run_name='__main__')"
     code, said = finish(start(environment, "-c", limited, *batch(tree)))
     assert code == 1
-    assert "larger than may be written here" in said, said
+    assert "larger than the limit for files" in said, said
 
 
 def test_a_read_only_store_is_told_before_any_work(tree: Path, environment: dict[str, str], small_disk: Path) -> None:

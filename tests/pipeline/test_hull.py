@@ -255,5 +255,5 @@ def test_bad_input(cameras: int, lo: list[float], hi: list[float], cell: float, 
 
 def test_bounds_of_nothing() -> None:
     cameras = around(5)
-    with pytest.raises(StageError, match="inside all silhouettes"):
+    with pytest.raises(StageError, match="the visual hull is empty"):
         hull_bounds(cameras, [np.zeros((16, 16), np.float32)] * 5, 0.1)

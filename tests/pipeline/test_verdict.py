@@ -23,7 +23,7 @@ def test_an_upper_limit(value: float, level: str) -> None:
 
 @pytest.mark.parametrize(("good", "usable", "lower"), [(0.5, 0.9, True), (3, 1, False)])
 def test_limits_in_the_wrong_order_are_refused(good: float, usable: float, lower: bool) -> None:
-    with pytest.raises(ValueError, match="no stricter"):
+    with pytest.raises(ValueError, match="not be stricter"):
         Limits(good, usable, lower)
 
 

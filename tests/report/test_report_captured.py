@@ -47,8 +47,8 @@ def test_drawing_table_and_outlines(results: SyntheticResults, tmp_path: Path) -
     worst = sorted(0.9 + 0.01 * c.index for c in cameras)[:5]
     assert [p.caption.split(",")[1] for p in found.outlines] == [f" {w:.3f}" for w in worst]
     assert "not fitted" in found.outlines[0].caption and found.more == len(cameras) - 5
-    assert "lost<1>.jpg: no place found for it" in found.lost
-    assert "soft.jpg: no place found for it; blurred: hardly any detail" in found.lost
+    assert "lost<1>.jpg: no camera pose was found" in found.lost
+    assert "soft.jpg: no camera pose was found; blurred: hardly any detail" in found.lost
 
 
 def test_given_cameras_without_points_and_no_masks_shown(results: SyntheticResults) -> None:

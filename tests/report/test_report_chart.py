@@ -64,7 +64,7 @@ def run(results: SyntheticResults, folder: Path) -> tuple[dict, str]:
 def test_the_page_has_a_table_of_it(tmp_path: Path) -> None:
     results = write_results(tmp_path / "r")
     metrics, page = run(results, tmp_path / "none")
-    assert metrics["colour_chart"] == {"found": 0} and "Colour chart" not in page
+    assert metrics["colour_chart"] == {"found": 0} and "Colour checker" not in page
     fit = ChartFound(camera_group="A 1", photo="3.jpg", index=results.poses.artifact.cameras[0].index,
                      corners=((40, 30), (70, 31), (71, 50), (39, 49)), matrix=((1, 0, 0), (0, 2, 0), (0, 0, 4)),
                      way="gains", error=0.02, patches=23, white=(1.0, 0.5, 0.25))  # fmt: skip
@@ -83,4 +83,4 @@ def test_the_page_has_a_table_of_it(tmp_path: Path) -> None:
     assert found["found"] == 2 and found["A 1: error of its patches"] == 0.02
     assert found["A 1: fitted light on it, of what fell on it"] == pytest.approx(1.6)
     assert not any(k.startswith("B: fitted") for k in found)  # its photo has no place
-    assert "Colour chart" in page and "1.000, 0.500, 0.250" in page and "not the albedo" in page
+    assert "Colour checker" in page and "1.000, 0.500, 0.250" in page and "not the scale of the albedo" in page

@@ -158,7 +158,7 @@ def test_no_held_out_view_is_said_clearly(tmp_path: Path) -> None:
     assert metrics["holdout"]["views"] == 2
     assert metrics["holdout"]["psnr"] is None
     assert metrics["holdout"]["asset_psnr"] > 30
-    assert "No photo was held back." in page
+    assert "No photo was held out." in page
     assert "FITTED photos" in page
     assert "Held-out views" not in page
 

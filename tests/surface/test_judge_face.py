@@ -86,7 +86,7 @@ def test_a_face_behind_its_place_is_of_the_wrong_shape_but_not_buried() -> None:
 def test_a_mesh_without_the_head() -> None:
     found = by_name(ellipsoid(0.5, (0, -0.4, 0)))
     assert found["face_shape_mm"].level == "unusable" and found["face_shape_mm"].value is None
-    assert "nothing of the mesh" in found["face_shape_mm"].said
+    assert "not on the mesh" in found["face_shape_mm"].said
     assert found["face_reprojection_mm"].level == "unusable" and found["nose_buried_mm"].level == "good"
 
 

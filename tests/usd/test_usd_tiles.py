@@ -157,7 +157,7 @@ FAULTS: list[tuple[Callable[[Path], None], str, str]] = [
     (lambda a: (a / "textures/head_albedo.1002.png").unlink(), "missing_texture", "head_albedo.1002.png"),
     (lambda a: (a / "textures/head_f0.1001.exr").unlink(), "missing_texture", "head_f0.1001.exr"),
     (lambda a: (a / "textures/head_normal.1001.png").write_bytes(b"no"), "unreadable_texture", "normal.1001.png"),
-    (across, "st", "lie on two UDIM tiles"),
+    (across, "st", "are in two UDIM tiles"),
     (beyond, "missing_texture", "head_albedo.1003.png"),
     (smaller, "tile_size", "64x64 and 128x128"),
 ]

@@ -101,7 +101,7 @@ def test_a_cylinder_unrolls_to_its_rectangle() -> None:
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     flat, true = (np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1) for p in (uv, points))
     np.testing.assert_allclose(flat, true, rtol=2e-3)
-    assert (parameterise.signed(uv, faces) > 0).all()
+    assert (parameterise.signed_areas(uv, faces) > 0).all()
     diagonal = np.linalg.norm(uv[0] - uv[-1])
     assert diagonal == pytest.approx(np.hypot(1.5, 2.0), rel=2e-3)
 
@@ -150,8 +150,8 @@ def test_unfolding_mends_a_mirrored_triangle() -> None:
     uv = parameterise.rigid(points, faces, parameterise.conformal(points, faces))
     broken = uv.copy()
     broken[27] += 3 * (uv[28] - uv[27])  # an inner vertex beyond its neighbour
-    assert (parameterise.signed(broken, faces) <= 0).any()
-    assert (parameterise.signed(parameterise.unfolded(faces, broken), faces) > 0).all()
+    assert (parameterise.signed_areas(broken, faces) <= 0).any()
+    assert (parameterise.signed_areas(parameterise.unfolded(faces, broken), faces) > 0).all()
 
 
 def test_pixel_filters_have_their_moments() -> None:

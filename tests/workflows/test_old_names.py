@@ -27,7 +27,7 @@ def test_a_removed_one_is_ignored_with_a_hint(path: str, caplog: Messages) -> No
     configs = configs_for("draft", parse_sets([f"{path}=1"]))
     assert configs == configs_for("draft", {})
     assert len(caplog.messages) == 1
-    assert f"--set {path} is no longer a setting; ignored" in caplog.text
+    assert f"--set {path} is no longer a setting and was ignored" in caplog.text
 
 
 def test_the_hint_comes_once_and_from_a_file_too(caplog: Messages) -> None:
@@ -40,7 +40,7 @@ def test_the_hint_comes_once_and_from_a_file_too(caplog: Messages) -> None:
 def test_a_renamed_one_sets_the_new_one_which_wins(caplog: Messages, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(old_names.RENAMED, "first.add", "plus")
     assert configs_for("draft", parse_sets(["first.add=7"]), registry=TOYS)["first"].model_dump()["plus"] == 7
-    assert "first.add is called first.plus now" in caplog.text
+    assert "first.add is now named first.plus" in caplog.text
     both = parse_sets(["first.add=7", "first.plus=8"])
     assert configs_for("draft", both, registry=TOYS)["first"].model_dump()["plus"] == 8
 
@@ -54,7 +54,7 @@ def test_each_renamed_setting_still_sets_what_it_set(path: str, value: object, c
     stage, _, name = path.partition(".")
     configs = configs_for("draft", parse_sets([f"{path}={value}"]))
     assert configs[stage].model_dump()[old_names.RENAMED[path]] == value
-    assert f"--set {path} is called {stage}.{old_names.RENAMED[path]} now" in caplog.text
+    assert f"--set {path} is now named {stage}.{old_names.RENAMED[path]}" in caplog.text
 
 
 def test_the_renamed_settings_are_the_ones_tested_above() -> None:
@@ -68,7 +68,7 @@ def test_the_renamed_settings_are_the_ones_tested_above() -> None:
 def test_a_renamed_value_is_the_new_one(path: str, old: str, new: str, caplog: Messages) -> None:
     stage, _, name = path.partition(".")
     assert configs_for("draft", parse_sets([f"{path}={old}"]))[stage].model_dump()[name] == new
-    assert f"{path}={new} now" in caplog.text
+    assert f"is now named {path}={new};" in caplog.text
 
 
 def test_a_name_that_never_was_stays_an_error(caplog: Messages) -> None:

@@ -1,1 +1,1 @@
-"""The parts of the systems that the paper compares, to compare with. pipeline.fields.build is the one door."""
+"""Parts of the systems that the paper compares, for comparisons. Only pipeline.fields.build uses them."""

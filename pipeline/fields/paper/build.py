@@ -1,6 +1,6 @@
-"""Which part stands where in the systems that the paper compares; pipeline.fields.build has the names of a spec.
+"""Constructors of the parts of the systems that the paper compares. For the names see pipeline.fields.build.
 
-prior        hull | sphere | imface          for geometry displaced; a grid starts from a hull or a sphere
+prior        hull | sphere | imface          for the geometry `displaced`; a grid starts from a hull or a sphere
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipeline.fields.spec import FaceSpec
 
 
 def compared(spec: FaceSpec) -> System:
-    """A system that differs from ours in one part or more."""
+    """A system that differs from ours in at least one part."""
     return System(
         GEOMETRIES[spec.geometry], SPATIALS[spec.appearance], INTEGRALS[spec.integral], LIGHTS[spec.light],
         shading_of(spec),
@@ -37,7 +37,7 @@ def middle(spec: FaceSpec) -> tuple[Tensor, float]:
 
 
 def columns(spec: FaceSpec) -> tuple[int, bool]:
-    """How many numbers the Spatial MLP hands to the material integral, and whether they are kept >= 0."""
+    """Number of outputs of the Spatial MLP for the material integral, and whether they are kept >= 0."""
     return {"low_rank": spec.rank, "direct": 1, "feature": FEATURES}[spec.integral], spec.integral == "low_rank"
 
 
@@ -47,45 +47,45 @@ def hashed(spec: FaceSpec) -> Spatial:
 
 
 def sinusoidal(spec: FaceSpec) -> Spatial:
-    """The paper's."""
+    """The paper's Spatial MLP."""
     return SinusoidalField(*middle(spec), *columns(spec), spec.albedo_start, spec.width, spec.depth)
 
 
 def direct(spec: FaceSpec) -> Integral:
-    """One network of everything."""
+    """Material integral by one network of position and directions."""
     return DirectIntegral(*middle(spec), 2 * spec.basis_width, spec.basis_depth + 1)
 
 
 def feature(spec: FaceSpec) -> Integral:
-    """One network of a feature and the directions."""
+    """Material integral by one network of a feature and the directions."""
     return FeatureIntegral(2 * spec.basis_width, spec.basis_depth + 1)
 
 
 def cubemap(spec: FaceSpec) -> Light:
-    """A map, blurred with the lobe of the specular term."""
+    """A cube map, blurred with the lobe of the specular term."""
     return CubemapLight(spec.cubemap_size, spec.light_start, "ggx" if spec.shading == "disney" else "vmf")
 
 
 def shading_of(spec: FaceSpec) -> Callable[[FaceSpec, Integral, Light], Shading]:
-    """Neural bases where there are any, else one of the others."""
+    """The specular term: neural bases if the system has them, else one of the others."""
     if spec.shading == "neural":
         return makers.shading if spec.integral == "low_rank" else IntegralShading
     return {"phong": PhongShading, "disney": DisneyShading}[spec.shading]
 
 
 def sphere_prior(spec: FaceSpec) -> SpherePrior:
-    """A sphere in the middle of the box, of its smallest half edge."""
+    """A sphere at the centre of the box, with its smallest half edge as radius."""
     centre, _ = middle(spec)
     return SpherePrior(centre, 0.5 * min(b - a for a, b in zip(spec.lo, spec.hi, strict=True)) * 1.2)
 
 
 def displaced(spec: FaceSpec, prior: nn.Module) -> DisplacedSdf:
-    """[NeuFace eq. 17] over a prior."""
+    """Displaced geometry over a prior. [NeuFace eq. 17]"""
     return DisplacedSdf(prior, spec.displacement_width)
 
 
 def stored_displaced(spec: FaceSpec, arrays: Mapping[str, Tensor], cell: float) -> DisplacedSdf:
-    """The same over the prior whose arrays are given; its own cell is what counts."""
+    """The same over a prior given by its arrays; the cell is that of the prior."""
     named = under(arrays, "geometry.prior")
     if spec.prior == "imface":
         return displaced(spec, ImFacePrior(named, torch.tensor(spec.prior_centre), spec.prior_scale))

@@ -1,7 +1,7 @@
-"""A learnable cube map as the captured light, blurred to every width of lobe at once. [NeuFace section 5.2]
+"""A learnable cube map as the captured light, blurred with lobes of several widths. [NeuFace section 5.2]
 
-Symbols: T texels; level 0 is the map itself, level i has been averaged with a lobe of width WIDTHS[i]; the levels
-between are interpolated in the logarithm of the width.
+Symbols: T texels; level 0 is the map itself, level i is averaged with a lobe of width WIDTHS[i]; between levels, values
+are interpolated in the logarithm of the width.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ class CubemapLight(nn.Module):
         self.raw = nn.Parameter(torch.full((len(d), 3), math.log(math.expm1(max(start, 1e-4)))))
 
     def texels(self) -> Tensor:
-        """(T, 3)."""
+        """The map (T, 3)."""
         return functional.softplus(self.raw)
 
     def forward(self) -> Tensor:
-        """SH coefficients of order 10 of the map, (121, 3): what other stages take for the light."""
+        """SH coefficients of order 10 of the map, (121, 3), for the other stages."""
         out: Tensor = self.harmonics @ self.texels()
         return out
 
     def uniform_gradient(self, order: int) -> None:
-        """While nothing but the light moves: the same for all colours. A map has no order to keep to."""
+        """Make the gradient equal for all colours, while only the light is optimised. A map has no order."""
         if self.raw.grad is not None:
             self.raw.grad.copy_(self.raw.grad.mean(-1, keepdim=True).expand_as(self.raw.grad))
 
@@ -64,7 +64,7 @@ class CubemapLight(nn.Module):
         return cubemap.lookup(levels, w_r, self.level(width))
 
     def level(self, width: Tensor) -> Tensor:
-        """Fractional level (N,) of a width: 0 to 1 linearly up to the first, then by logarithm, the last beyond."""
+        """Fractional level (N,) of a width: linear up to the first width (level 1), then logarithmic, then constant."""
         steps = torch.tensor(self.widths, device=width.device, dtype=width.dtype)
         log = torch.log(width.clamp(min=self.widths[0]))
         edges = torch.log(steps)

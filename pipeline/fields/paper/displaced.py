@@ -1,6 +1,6 @@
 """SDF(x) = I(x) + D(x): a prior and a learnt displacement. [NeuFace eq. 17]
 
-Values and normals come from one pass and automatic differentiation.
+Values and normals are computed in one pass, with automatic differentiation.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pipeline.maths.tracing import aggressive_trace
 
 OCTAVES = 6  # L of [NeuFace section B]
 THRESHOLD, TRUNCATION, FACTOR = 5e-5, 0.05, 1.2  # metres, metres: [NeuFace section 4.4, B]
-CELLS = 160  # nominal cells across Omega, for those who ask how fine the surface is
+CELLS = 160  # nominal number of cells across Omega
 
 
 class Displacement(nn.Module):
     """D(u): positional encoding of 6 octaves, ReLU layers, one output. [NeuFace eq. 17]
 
-    The last layer starts at zero, so that the prior is what is traced at the first step.
+    The last layer is initialised to zero, so that the first step traces the prior itself.
     """
 
     def __init__(self, width: int = 256, depth: int = 3) -> None:
@@ -42,7 +42,7 @@ class Displacement(nn.Module):
 class DisplacedSdf(nn.Module):
     """A prior, its displacement, and the learnt width beta of the Laplace density.
 
-    Lengths are kept in units of Omega's radius, so that a learning rate means the same for a face and a statue.
+    Lengths are in units of Omega's radius, so that learning rates do not depend on the size of the subject.
     """
 
     BETA_START, BETA_MIN = 0.01, 1e-4
@@ -55,7 +55,7 @@ class DisplacedSdf(nn.Module):
 
     @property
     def known(self) -> Prior:
-        """The prior with its questions typed."""
+        """The prior, with its type."""
         return self.prior  # type: ignore[return-value]
 
     @property
@@ -68,7 +68,7 @@ class DisplacedSdf(nn.Module):
         return (self.beta_raw.abs() + self.BETA_MIN) * self.known.sphere()[1]
 
     def box(self) -> tuple[Tensor, Tensor]:
-        """The cube around Omega."""
+        """(3,) corners of the cube around Omega."""
         centre, radius = self.known.sphere()
         return centre - radius, centre + radius
 
@@ -78,12 +78,12 @@ class DisplacedSdf(nn.Module):
         return self.known.sdf(x), self.displacement((x - centre) / radius) * radius
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """SDF (N,) and gradient (N, 3); both carry gradients to the parameters where gradients are on."""
+        """SDF (N,) and gradient (N, 3) at x (N, 3); differentiable in the parameters if gradients are enabled."""
         s, g, _ = self.with_displacement(x)
         return s, g
 
     def with_displacement(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """SDF (N,), its gradient (N, 3) and the displacement's share D(x) (N,)."""
+        """SDF (N,), its gradient (N, 3) and the displacement D(x) (N,)."""
         wanted = torch.is_grad_enabled()
         with torch.enable_grad():
             at = x.detach().requires_grad_()

@@ -1,12 +1,12 @@
-"""ImFace checkpoints as published, read into our names; or exactly what is wrong with one.
+"""Reads published ImFace checkpoints and renames their keys to ours, with exact error messages.
 
-Two layouts are in use, told apart by their keys:
+There are two layouts, which are distinguished by their keys:
     of 2022    envs_last.pth -> 'decoder': id_embedding.weight, landmarks.0.weight, template_landmarks,
                {deform,reference,template}_net.mini_nets.mini_net.net.net.I.0.*, ...mini_hypernet.nets.J.net.I.0.*,
                ...fusion.weights.I.*
     of 2023    envs_last.pth -> 'model': embeddings.id_embeddings.weight, landmark_nets.id_landmark_net.0.weight,
                {exp,id,template}_field.mini_nets.mini_net.net.I.0.*, ...
-A file may also hold the bare state. Only tensors are read, never code.
+A file may also contain only the state. Only tensors are read, never code.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ REMEDY = "pass the envs_last.pth of a published ImFace model (docs/imface.md)"
 
 
 def digest(path: str) -> str:
-    """sha256 of a file, or "" where there is none (the loader then says so)."""
+    """sha256 of a file, or "" if it is missing (the loader reports that)."""
     file = Path(path)
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
 def load_imface_state(path: Path) -> dict[str, Tensor]:
-    """A published checkpoint in our names, checked.
+    """Read and check a published checkpoint, with keys renamed to ours.
 
     Raises:
-        StageError: the file can't be read, a key is missing, or a shape is wrong; says which.
+        StageError: the file can't be read, a key is missing, or a shape is wrong. The message names it.
     """
     import torch
 
@@ -73,24 +73,27 @@ def load_imface_state(path: Path) -> dict[str, Tensor]:
         ) from e
     except Exception as e:
         raise StageError(
-            "the file is no checkpoint that can be read safely",
+            "the file is not a checkpoint that can be read safely",
             where=path,
             value=str(e).splitlines()[0][:200],
-            limit="a file of torch.save that holds tensors alone",
+            limit="a file of torch.save with only tensors",
             remedy=REMEDY,
         ) from e
     state = next((loaded[k] for k in ("decoder", "model") if isinstance(loaded, dict) and k in loaded), loaded)
     if not isinstance(state, dict) or not all(isinstance(k, str) for k in state):
         raise StageError(
-            "the file holds no state of a network", where=path, value=type(state).__name__, limit="a dictionary of "
-            "tensors, or one under 'decoder' or 'model'", remedy=REMEDY,
-        )  # fmt: skip
+            "the file does not contain the state of a network",
+            where=path,
+            value=type(state).__name__,
+            limit="a dictionary of tensors, or one under 'decoder' or 'model'",
+            remedy=REMEDY,
+        )
     tensors = {re.sub(r"^module\.", "", k): v for k, v in state.items() if isinstance(v, torch.Tensor)}
     return our_names(tensors, str(path))
 
 
 def our_names(state: dict[str, Tensor], where: str) -> dict[str, Tensor]:
-    """The state in our names, every shape checked against the others. Raises StageError."""
+    """The state with our names, after checking that all shapes match. Raises StageError."""
     layout = "2023" if any(k.startswith(("exp_field.", "landmark_nets.")) for k in state) else "2022"
     renamed: dict[str, Tensor] = {}
     origin: dict[str, str] = {}
@@ -112,13 +115,13 @@ def our_names(state: dict[str, Tensor], where: str) -> dict[str, Tensor]:
 
 
 def _mean_code(codes: Tensor) -> Tensor:
-    """The mean of the codes that were trained: those of more than no length."""
+    """The mean of the trained codes, which are those with a length above 0."""
     used = codes[codes.norm(dim=1) > 0]
     return used.mean(0) if len(used) else codes.new_zeros(codes.shape[1])
 
 
 def _published(name: str, layout: str) -> str:
-    """The published key of one of our names, for messages."""
+    """The published key for one of our names, for messages."""
     if layout == "2022":
         fixed = {"codes_id": "id_embedding.weight", "codes_exp": "exp_embedding.weight"}
         name = re.sub(r"^(\w+)\.net\.(\d+)\.", r"\1_net.mini_nets.mini_net.net.net.\2.0.", name)
@@ -142,13 +145,13 @@ def _published(name: str, layout: str) -> str:
 
 
 class _Checker:
-    """Asks a renamed state for tensors of known shapes, and says in the published words what it lacks."""
+    """Checks the tensors of a renamed state; messages use the published keys."""
 
     def __init__(self, state: dict[str, Tensor], origin: dict[str, str], layout: str, where: str) -> None:
         self.state, self.origin, self.layout, self.where = state, origin, layout, where
 
     def get(self, name: str, *shape: int | None) -> Tensor:
-        """The tensor `name`; None in `shape` stands for any size."""
+        """The tensor `name`; None in `shape` means any size."""
         if name not in self.state:
             raise StageError(
                 "a key is missing from the ImFace checkpoint",
@@ -164,7 +167,7 @@ class _Checker:
         return t
 
     def wrong(self, name: str, found: str, wanted: str) -> None:
-        """Raise: this key has a wrong shape."""
+        """Raise StageError: this key has a wrong shape."""
         raise StageError(
             "a key of the ImFace checkpoint has the wrong shape",
             where=f"{self.where}: {self.origin.get(name, name)}",
@@ -174,19 +177,19 @@ class _Checker:
         )
 
     def linear(self, name: str, width_in: int | None, width_out: int | None) -> int:
-        """A layer; returns its output width."""
+        """Check a layer; returns its output width."""
         weight = self.get(f"{name}.weight", width_out, width_in)
         self.get(f"{name}.bias", weight.shape[0])
         return int(weight.shape[0])
 
     def children(self, prefix: str) -> int:
-        """Numbered children below a prefix, at least 1."""
+        """Number of numbered children below a prefix, at least 1."""
         found = {k[len(prefix) + 1 :].split(".")[0] for k in self.state if k.startswith(prefix + ".")}
         return max(len(found), 1)
 
 
 def _check(state: dict[str, Tensor], origin: dict[str, str], layout: str, where: str) -> None:
-    """Every tensor that the prior reads is there and fits."""
+    """Check that every tensor that the prior reads exists and has a matching shape."""
     c = _Checker(state, origin, layout, where)
     n_id, n_exp = c.get("codes_id", None, None).shape[1], c.get("codes_exp", None, None).shape[1]
     landmarks = c.get("template_landmarks", None, 3)

@@ -1,6 +1,6 @@
 """The material integral without the low-rank prior, for the paper's comparisons. [NeuFace eq. 6]
 
-Both stand where `pipeline.fields.appearance.IntegratedBasis` stands and answer `integral`.
+Both classes replace `pipeline.fields.appearance.IntegratedBasis` and implement `integral`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ OCTAVES, FEATURES = 6, 256
 
 
 def start_at_one(net: nn.Sequential) -> None:
-    """Set the last bias so that softplus of the output starts near 1, as c . B does."""
+    """Initialise the last bias so that softplus of the output starts near 1, like c . B."""
     last = net[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
@@ -43,7 +43,7 @@ class DirectIntegral(nn.Module):
         start_at_one(self.net)
 
     def integral(self, x: Tensor, c: Tensor, wo: Tensor, n: Tensor) -> Tensor:
-        """F >= 0, (N,). c is not read."""
+        """F >= 0, (N,). c is not used."""
         u = (x - self.centre) / self.radius
         inputs = torch.cat([u, positional_encoding(u, OCTAVES), angles(wo, n)], -1)
         return functional.softplus(self.net(inputs)).squeeze(-1)

@@ -4,9 +4,9 @@ Symbols: p position in the prior's own unit sphere; z_e, z_i codes of expression
 
     q = warp(p, E(p; z_e)),   r, e = R(q; z_i),   I(p) = T(warp(q, r)) + e
 
-E, R and T are blends of K small sinusoidal networks, each fed with p - l_k of all landmarks and weighted by a softmax
-over the position; the weights of E and R come from hyper-networks of the codes. A warp is a translation or a screw
-motion, told by the width of E's output. Shapes are whatever the state holds: `imface_layout` reads a checkpoint.
+E, R and T are blends of K small sinusoidal networks. The input of each is p - l_k for all landmarks, and its weight is
+a softmax over the position; the weights of E and R come from hyper-networks of the codes. A warp is a translation or a
+screw motion, which the width of E's output determines. Shapes come from the state, which `imface_layout` reads.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def linear(state: State, name: str) -> nn.Linear:
 
 
 def count(state: State, prefix: str) -> int:
-    """How many numbered children `prefix`.0, `prefix`.1, ... a state has."""
+    """Number of numbered children `prefix`.0, `prefix`.1, ... in a state."""
     numbers = {k[len(prefix) + 1 :].split(".")[0] for k in state if k.startswith(prefix + ".")}
     return len(numbers)
 
@@ -114,7 +114,7 @@ def warp(x: Tensor, motion: Tensor) -> Tensor:
 
         R = I + a W + b W^2,  t = (I + b W + c W^2) v,   a = sin T / T,  b = (1 - cos T) / T^2,  c = (T - sin T) / T^3
 
-    a, b, c are their series below T = 0.1, where the quotients lose their digits and their derivatives are 0 / 0.
+    a, b, c are series below T = 0.1, where the quotients lose precision and their derivatives are 0 / 0.
     """
     if motion.shape[1] == 3:
         return x + motion
@@ -153,7 +153,8 @@ class ImFacePrior(nn.Module):
     """`pipeline.fields.paper.priors.Prior` over ImFace, built from a state in our names (`imface_layout.our_names`).
 
     scale: asset units per unit of the prior; centre: its origin in asset coordinates. Its axes are the asset's.
-    The codes start at the mean of the state's, and are learnt at the full rate; the networks at a hundredth of it.
+    The codes are initialised to the mean of those in the state, and are learnt at the full rate; the networks at 1 % of
+    it.
     """
 
     share = 0.01
@@ -176,7 +177,7 @@ class ImFacePrior(nn.Module):
         self.template = BlendField(under(state, "template"), hyper=False)
 
     def sdf(self, x: Tensor) -> Tensor:
-        """I(x), asset units."""
+        """I(x) (N,) at x (N, 3), asset units."""
         p = (x - self.centre) / self.scale
         l_exp = self._five(self.landmarks(torch.cat([self.z_exp, self.z_id])))
         q = warp(p, self.deform(p, l_exp, self.z_exp))
@@ -186,7 +187,7 @@ class ImFacePrior(nn.Module):
         return value * self.scale
 
     def _five(self, landmarks: Tensor) -> Tensor:
-        """The landmarks that the networks blend by: all that there are, or the sparse ones of a full set."""
+        """The landmarks by which the networks are blended: all of them, or the sparse ones of a full set."""
         return landmarks if len(landmarks) == len(self.sparse) else landmarks[self.sparse]
 
     def sphere(self) -> tuple[Tensor, float]:
@@ -199,5 +200,5 @@ class ImFacePrior(nn.Module):
 
 
 def under(state: State, prefix: str) -> dict[str, Tensor]:
-    """The part of a state below `prefix`, without it."""
+    """The part of a state below `prefix`, with the prefix removed."""
     return {k[len(prefix) + 1 :]: v for k, v in state.items() if k.startswith(prefix + ".")}

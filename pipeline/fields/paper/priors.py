@@ -1,13 +1,13 @@
-"""Geometry priors: where the surface is looked for and what it starts as. [NeuFace section 4.3]
+"""Geometry priors: the initial surface and the region in which the surface is searched. [NeuFace section 4.3]
 
-A prior is a network module that answers three questions, all in asset units and coordinates:
+A prior is a network module with three functions, all in asset units and coordinates:
 
     sdf(x)        (N, 3) -> (N,), differentiable in x and in its parameters
     sphere()      centre and radius of Omega, the sphere inside which it is defined [NeuFace section 4.4]
     embeddings()  what [NeuFace eq. 24] regularises, or None
 
-`share` is its part of the learning rate: 0.01 for ImFace as in the paper (section B), 1 for a network that starts as a
-sphere, 0 for the hull, which stays as it is.
+`share` is the factor of its learning rate: 0.01 for ImFace as in the paper (section B), 1 for a network that starts as
+a sphere, 0 for the hull, which is frozen.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pipeline.maths.sdf import spline_sdf
 
 
 class Prior(Protocol):
-    """What a prior answers; see above."""
+    """Interface of a prior; see above."""
 
     share: float
 
@@ -41,9 +41,9 @@ class Prior(Protocol):
 
 
 class HullPrior(nn.Module):
-    """The visual hull's distance on a spline grid. Nothing in it is learnt; the displacement network does the rest.
+    """The visual hull's distance on a spline grid. It is frozen; only the displacement network is learnt.
 
-    Differs: the paper starts from ImFace. Its weights are licensed; the hull needs none and knows the subject's size.
+    Differs: the paper starts from ImFace, whose weights need a licence. The hull needs none and has the subject's size.
     """
 
     share = 0.0
@@ -63,14 +63,14 @@ class HullPrior(nn.Module):
         return float(self.edge)
 
     def sdf(self, x: Tensor) -> Tensor:
-        """Spline value; beyond the grid that of its border plus the way there."""
+        """Spline value; outside the grid, that of its border plus the distance to it."""
         hi = self.lo + (torch.tensor(self.values.shape, device=x.device) - 1) * self.cell
         inside = torch.minimum(torch.maximum(x, self.lo), hi)
         beyond = torch.sqrt(((x - inside) ** 2).sum(-1) + 1e-16) - 1e-8
         return spline_sdf(self.values, inside, self.lo, self.cell)[0] + beyond
 
     def sphere(self) -> tuple[Tensor, float]:
-        """Around the hull's own solid, a tenth larger than half its diagonal."""
+        """Sphere around the hull's solid, with 1.1 times half its diagonal as radius."""
         near = torch.nonzero(self.values < self.cell)
         if not len(near):
             near = torch.tensor([[0, 0, 0], list(self.values.shape)], device=self.values.device)
@@ -83,10 +83,10 @@ class HullPrior(nn.Module):
 
 
 class SpherePrior(nn.Module):
-    """A network that starts as a sphere: general objects, of which nothing is known. [NeuFace section 5.3]
+    """A network that is initialised to a sphere, for general objects. [NeuFace section 5.3]
 
-    The geometric start of IDR: softplus(100 .) layers drawn so that the output is |u| - r at first; positional encoding
-    enters with zero weights.
+    Geometric initialisation of IDR: softplus(100 .) layers, initialised so that the output is |u| - r; the weights of
+    the positional encoding start at zero.
     """
 
     share = 1.0
@@ -109,10 +109,10 @@ class SpherePrior(nn.Module):
             self.last.weight.normal_(math.sqrt(math.pi / width), 1e-4)
             self.last.bias.fill_(-self.START)
 
-    START = 0.6  # radius of the first sphere, of Omega's
+    START = 0.6  # radius of the initial sphere over that of Omega
 
     def sdf(self, x: Tensor) -> Tensor:
-        """Network value, in asset units."""
+        """Network value (N,), asset units."""
         from pipeline.fields.paper.sinusoidal import positional_encoding
 
         u = (x - self.centre) / self.radius

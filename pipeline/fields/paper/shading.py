@@ -1,4 +1,4 @@
-"""The specular terms that the paper compares its own with. [NeuFace section 5.2]"""
+"""The specular terms with which the paper compares its own. [NeuFace section 5.2]"""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pipeline.fields.protocol import F32
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf, split_sum
 
-DIELECTRIC = 0.04  # F0 of what is no metal
+DIELECTRIC = 0.04  # F0 of non-metals
 
 
 class IntegralShading:
-    """L_s = rho F int D L with a material integral F that is not of low rank: nothing that a texture could hold."""
+    """L_s = rho F int D L with a material integral F that is not of low rank, so that textures can't represent it."""
 
     def __init__(self, spec: FaceSpec, integral: Integral, light: Light) -> None:
         self.spec, self.integral, self.light = spec, integral, light
 
     @property
     def rank(self) -> int:
-        """k of the spec, which nothing reads."""
+        """k of the spec; it is not used."""
         return self.spec.rank
 
     def diffuse_albedo(self, skin: Skin) -> Tensor:
@@ -40,7 +40,7 @@ class IntegralShading:
         return c
 
     def bases(self, wo: Tensor, n: Tensor) -> Tensor:
-        """None: raises StageError."""
+        """Raises StageError: there are no bases."""
         raise StageError(
             "this model has no specular bases to bake",
             where="inverse_rendering.shading, inverse_rendering.integral",
@@ -51,7 +51,7 @@ class IntegralShading:
 
 
 class PhongShading(IntegralShading):
-    """L_s = rho int D L: one lobe, which is a basis that is 1 everywhere."""
+    """L_s = rho int D L: one lobe, like a basis that is 1 everywhere."""
 
     @property
     def rank(self) -> int:
@@ -73,10 +73,10 @@ class PhongShading(IntegralShading):
 
 
 class DisneyShading(IntegralShading):
-    """Split-sum GGX with a metallic parameter, which rho's output stands for."""
+    """Split-sum GGX with a metallic parameter, for which the output rho is used."""
 
     def diffuse_albedo(self, skin: Skin) -> Tensor:
-        """(N, 3): that of the part that is no metal."""
+        """(N, 3): albedo of the non-metallic part."""
         return skin.albedo * (1 - skin.rho[:, None])
 
     def specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor) -> Tensor:

@@ -17,10 +17,10 @@ SKIP = 4
 
 
 class SineLayer(nn.Module):
-    """sin(30 (W x + b)), initialised so that activations keep their spread from layer to layer.
+    """sin(30 (W x + b)), initialised so that the variance of activations is the same in all layers.
 
-    Differs: biases are drawn and not 0: with zero biases the whole network is an odd function at the start, so that
-    the two halves of a face begin as each other's negative.
+    Differs: biases are random instead of 0. With zero biases the initial network is an odd function, so that the two
+    halves of a face would start as negatives of each other.
     """
 
     def __init__(self, width_in: int, width: int, first: bool = False) -> None:
@@ -63,7 +63,7 @@ class SinusoidalField(nn.Module):
         start_heads(self.last, albedo)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Material at x."""
+        """Material at x (N, 3)."""
         u = (x - self.centre) / self.radius
         h = u
         for i, layer in enumerate(self.layers):

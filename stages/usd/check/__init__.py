@@ -1,1 +1,1 @@
-"""`neuface validate`: is an exported asset what it says?"""
+"""`neuface validate`: checks of an exported asset."""

@@ -1,5 +1,5 @@
-"""Checks of texture coordinates that the USD library does not know: texels that belong to two places of the surface,
-and surface that has no texels or mirrored ones."""
+"""Checks of texture coordinates that the USD library does not make: texels that belong to two places on the surface,
+and surface with no texels or with a mirrored texture."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from stages.usd.check.findings import Finding
 
 F64 = npt.NDArray[np.float64]
 RASTER = 1024  # texels along a side of a tile
-MAX_OVERLAP, SOME_OVERLAP = 0.01, 0.002  # of the covered texels: an error, worth a warning
+MAX_OVERLAP, SOME_OVERLAP = 0.01, 0.002  # of the covered texels: more is an error, a warning
 MAX_EMPTY = 0.005  # of the surface
 MAX_MIRRORED = 0.02
 FLAT = 1e-10  # of a tile, twice the area
 
 
 def chart_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
-    """st (N, 2): of the corners of all faces, in the order of the mesh's indices. Faces are taken as fans."""
+    """Findings on texture coordinates st (N, 2) of all faces' corners, in the order of the mesh's indices. Faces are
+    triangulated as fans."""
     where, counts = str(mesh.GetPath()), np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64)
     corner = _fans(counts)
     points = np.asarray(mesh.GetPointsAttr().Get(), np.float64)
@@ -37,13 +38,13 @@ def chart_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
     twice = overlap(t)
     if twice > SOME_OVERLAP:
         level = "error" if twice > MAX_OVERLAP else "warning"
-        text = f"{twice:.2%} of the covered texels belong to two places of the surface, at most {MAX_OVERLAP:.0%} may"
+        text = f"{twice:.2%} of the covered texels belong to two places on the surface, limit {MAX_OVERLAP:.0%}"
         out.append(Finding(level, "st_overlap", text, where))  # type: ignore[arg-type]
     return out
 
 
 def overlap(triangles: F64) -> float:
-    """Share of the covered texels that lie under two triangles (F, 3, 2) or more; each tile is looked at by itself."""
+    """Share of the covered texels that lie under two or more triangles (F, 3, 2); each tile is tested by itself."""
     tile = np.floor(triangles.mean(1)).astype(np.int64)
     covered = twice = 0
     for one in np.unique(tile, axis=0):
@@ -54,7 +55,7 @@ def overlap(triangles: F64) -> float:
 
 
 def _fans(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(F, 3) corners of the triangles of faces with so many corners each."""
+    """(F, 3) corner indices of the triangles of faces with `counts` corners."""
     start = np.cumsum(counts) - counts
     triangles = counts - 2
     first = np.repeat(start, triangles)

@@ -1,4 +1,4 @@
-"""What a check found."""
+"""The result of a check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Level = Literal["error", "warning", "info"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """`check`: the rule's short name. `where`: prim, attribute or file."""
+    """One result. `check`: short name of the rule. `where`: prim, attribute or file."""
 
     level: Level
     check: str
@@ -18,7 +18,7 @@ class Finding:
     where: str = ""
 
     def json(self) -> dict[str, str]:
-        """As plain values for JSON."""
+        """The finding as plain values for JSON."""
         return asdict(self)
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""Checks of one UsdGeomMesh that the USD library leaves to its clients."""
+"""Checks of one UsdGeomMesh that the USD library does not make."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from stages.usd.check.tile_checks import coordinate_findings, tiled
 
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
-UNIT_TOLERANCE = 0.01  # float16 normals are 0.001 off
+UNIT_TOLERANCE = 0.01  # float16 normals have an error of 0.001
 EXTENT_TOLERANCE = 1e-5  # of the longest side
 
 
 def mesh_findings(mesh: UsdGeom.Mesh) -> list[Finding]:
-    """Topology first: where it is broken the rest can't be looked at."""
+    """All findings on a mesh. If its topology is broken, only that is reported."""
     where = str(mesh.GetPath())
     points = np.array(mesh.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [], np.int64)
@@ -35,7 +35,7 @@ def mesh_findings(mesh: UsdGeom.Mesh) -> list[Finding]:
     out = [*_extent(mesh, points), *_subdivision(mesh), *_primvars(mesh, sizes)]
     normals, interpolation = _normals(mesh)
     if normals is None:
-        return [*out, Finding("warning", "normals", "none: shading is up to the client", where)]
+        return [*out, Finding("warning", "normals", "no normals: programs will shade the mesh differently", where)]
     if len(normals) != sizes.get(interpolation):
         found = f"{len(normals)} {interpolation} normals, {sizes.get(interpolation)} expected"
         return [*out, Finding("error", "normals", found, where)]
@@ -86,7 +86,7 @@ def _normals(mesh: UsdGeom.Mesh) -> tuple[F64 | None, str]:
 def _against_winding(
     mesh: UsdGeom.Mesh, points: F64, counts: I64, index: I64, normals: F64, interpolation: str
 ) -> list[Finding]:
-    """Unit length, and on the side that the faces' winding calls the front."""
+    """Findings on normals: unit length, and direction towards the front side of the faces (by their winding)."""
     where, out = str(mesh.GetPath()), []
     length = np.linalg.norm(normals, axis=1)
     off = ~(np.abs(length - 1) <= UNIT_TOLERANCE)
@@ -101,15 +101,13 @@ def _against_winding(
         mean = normals[index[corner] if interpolation != "faceVarying" else corner].sum(1)
         against = float(((mean * front).sum(1) < 0).mean())
         if against > 0.02:
-            out.append(
-                Finding("error", "winding", f"{against:.1%} of the faces turn their back to their normals", where)
-            )
+            out.append(Finding("error", "winding", f"{against:.1%} of the faces point against their normals", where))
     return out
 
 
 def _primvars(mesh: UsdGeom.Mesh, sizes: dict[str, int]) -> list[Finding]:
-    """Counts and indices of every primvar, and texture coordinates that are there, typed, finite and in the square, or
-    each face in one of a row of tiles."""
+    """Findings on counts and indices of every primvar, and on texture coordinates: present, of the right type, finite,
+    inside the unit square or with every face inside one UDIM tile."""
     out = []
     for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvarsWithAuthoredValues():
         where = str(primvar.GetAttr().GetPath())

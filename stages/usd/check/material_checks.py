@@ -1,4 +1,4 @@
-"""Checks of materials that the USD library leaves to its clients: connections, colour spaces, MaterialX."""
+"""Checks of materials that the USD library does not make: connections, colour spaces, MaterialX."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VALUE_TYPES = {
 
 
 def material_findings(stage: Usd.Stage) -> list[Finding]:
-    """Every mesh bound to a material with a surface; every connection ends at an attribute that exists."""
+    """Every mesh must be bound to a material with a surface; every connection must end at an existing attribute."""
     out = []
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.Mesh):
@@ -39,7 +39,7 @@ def material_findings(stage: Usd.Stage) -> list[Finding]:
                 out.append(Finding("error", "material", "it has no surface shader", str(material.GetPath())))
         for attribute in prim.GetAttributes():
             out += [
-                Finding("error", "connection", f"leads to {target}, which does not exist", str(attribute.GetPath()))
+                Finding("error", "connection", f"connected to {target}, which is missing", str(attribute.GetPath()))
                 for target in attribute.GetConnections()
                 if not stage.GetAttributeAtPath(target)
             ]
@@ -48,7 +48,7 @@ def material_findings(stage: Usd.Stage) -> list[Finding]:
 
 # ------------------------------------------------------------------ colour spaces
 def colour_findings(stage: Usd.Stage) -> list[Finding]:
-    """Colours are read from 8-bit files as sRGB; data, and everything from float files, as stored."""
+    """Colours in 8-bit files must be read as sRGB; data, and everything in float files, as raw values."""
     out: list[Finding] = []
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         shader = UsdShade.Shader(prim)
@@ -92,11 +92,9 @@ def _swapped(path: str, found: str, colour: bool, where: str) -> Finding:
 
 # ------------------------------------------------------------------ MaterialX
 def materialx_findings(stage: Usd.Stage, known: frozenset[Sdf.Path] = frozenset()) -> list[Finding]:
-    """Each material's `mtlx` surface as a MaterialX document: definitions, types, validity, and generated shaders.
+    """Check each material's `mtlx` surface as a MaterialX document: definitions, types, validity, generated shaders.
 
-    Surfaces among the `known` ones are passed over.
-
-    Without the MaterialX package the networks are left unchecked, which is said.
+    Surfaces in `known` are skipped. Without the MaterialX package a finding states that nothing was checked.
     """
     out = []
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
@@ -116,7 +114,7 @@ def materialx_findings(stage: Usd.Stage, known: frozenset[Sdf.Path] = frozenset(
 
 
 def materialx_surfaces(stage: Usd.Stage) -> frozenset[Sdf.Path]:
-    """The shaders that are some material's `mtlx` surface."""
+    """The shaders that are the `mtlx` surface of a material."""
     outputs = [UsdShade.Material(p).GetSurfaceOutput("mtlx") for p in stage.Traverse() if p.IsA(UsdShade.Material)]
     sources = [s for o in outputs if o for s in o.GetConnectedSources()[0]]
     return frozenset(s.source.GetPrim().GetPath() for s in sources)
@@ -147,7 +145,7 @@ def _document_findings(root: Usd.Prim, where: str) -> list[Finding]:
         return faults
     surface = document.getNode(names[root.GetPath()])
     if surface is None or surface.getType() != "surfaceshader":
-        return [Finding("error", "materialx", "the surface is no surface shader", where)]
+        return [Finding("error", "materialx", "the surface is not a surface shader", where)]
     material = document.addNode("surfacematerial", "captured_material", "material")
     material.addInput("surfaceshader", "surfaceshader").setNodeName(surface.getName())
     valid, message = document.validate()
@@ -159,14 +157,14 @@ def _document_findings(root: Usd.Prim, where: str) -> list[Finding]:
 def _input_findings(
     given: UsdShade.Input, node: Any, definition: Any, names: dict[Sdf.Path, str], graph: Any, *, outside: bool
 ) -> list[Finding]:
-    """Copy one input into the document; what does not fit its definition."""
+    """Copy one input into the document, and return what does not match its definition."""
     where, name = str(given.GetAttr().GetPath()), given.GetBaseName()
     wanted = definition.getActiveInput(name)
     if wanted is None:
         return [Finding("error", "materialx_input", f"{definition.getName()} has no input '{name}'", where)]
     kind = VALUE_TYPES.get(str(given.GetTypeName()), str(given.GetTypeName()))
     if kind != wanted.getType():
-        return [Finding("error", "materialx_type", f"{kind}, the definition says {wanted.getType()}", where)]
+        return [Finding("error", "materialx_type", f"{kind}, the definition has {wanted.getType()}", where)]
     made = node.addInput(name, wanted.getType())
     sources = given.GetConnectedSources()[0]
     if not sources:
@@ -191,7 +189,7 @@ def _input_findings(
 
 
 def _generated(document: Any, material: Any, where: str) -> list[Finding]:
-    """Shader code in the three languages that renderers take."""
+    """Findings of generating shader code in the three languages that renderers use."""
     import MaterialX as mx
     from MaterialX import PyMaterialXGenGlsl, PyMaterialXGenMdl, PyMaterialXGenOsl
     from MaterialX import PyMaterialXGenShader as gen
@@ -238,7 +236,7 @@ def _library() -> Any:
 
 
 def _closure(root: Usd.Prim) -> dict[Sdf.Path, Usd.Prim]:
-    """The shaders that feed `root`, itself first."""
+    """The shaders that `root` depends on, `root` first."""
     found, waiting = {root.GetPath(): root}, [root]
     while waiting:
         for given in UsdShade.Shader(waiting.pop()).GetInputs():

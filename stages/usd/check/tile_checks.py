@@ -1,7 +1,6 @@
-"""Checks of textures in UDIM tiles: whether every tile that a mesh needs is there, and alike in size.
+"""Checks of textures in UDIM tiles: every tile that a mesh needs must exist, and all must have the same size.
 
-The USD library resolves no path with <UDIM> by itself and finds nothing wrong where a tile is missing; renderers show
-its place black.
+The USD library does not report a missing tile; renderers show it black.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ SLACK = 1e-5  # of a tile: rounding of coordinates on a border
 
 
 def is_tiled(path: str) -> bool:
-    """Whether a path stands for a row of tiles."""
+    """Whether a path contains <UDIM>."""
     return bool(UsdShade.UdimUtils.IsUdimIdentifier(path))
 
 
@@ -38,7 +37,7 @@ def _asset_paths(material: Usd.Prim) -> list[str]:
 
 
 def coordinate_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
-    """Texture coordinates (N, 2) of all faces' corners in a row of tiles: inside of it, no face on two of them."""
+    """Texture coordinates (N, 2) of all faces' corners must be inside the row of tiles, and no face in two of them."""
     where = str(mesh.GetPath())
     if (
         st[:, 0].min() < -SLACK
@@ -51,11 +50,11 @@ def coordinate_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
     start = np.cumsum(counts) - counts
     low, high = np.minimum.reduceat(st[:, 0], start), np.maximum.reduceat(st[:, 0], start)
     across = int((np.floor(low + SLACK) < np.ceil(high - SLACK) - 1).sum())
-    return [Finding("error", "st", f"{across} faces lie on two UDIM tiles", where)] if across else []
+    return [Finding("error", "st", f"{across} faces are in two UDIM tiles", where)] if across else []
 
 
 def needed(stage: Usd.Stage) -> set[str]:
-    """The numbers of the tiles that faces of the meshes with such textures lie in."""
+    """Numbers of the tiles that contain faces of meshes with textures in tiles."""
     out: set[str] = set()
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         mesh = UsdGeom.Mesh(prim)
@@ -68,7 +67,7 @@ def needed(stage: Usd.Stage) -> set[str]:
 
 
 def tile_files(path: str, stage: Usd.Stage, attribute: Usd.Attribute) -> dict[str, str]:
-    """The resolved files of a path with <UDIM> by the number of their tile, those that are there."""
+    """The existing files of a path with <UDIM>, by tile number."""
     layers = [spec.layer for spec in attribute.GetPropertyStack()] or [stage.GetRootLayer()]
     return {number: file for file, number in UsdShade.UdimUtils.ResolveUdimTilePaths(path, layers[0])}
 
@@ -81,12 +80,12 @@ def named(path: str, number: str) -> str:
 def tile_findings(
     path: str, files: dict[str, str], wanted: set[str], sizes: set[tuple[int, ...]], where: str
 ) -> list[Finding]:
-    """Tiles that are missing among the wanted ones, and tiles of unequal size."""
+    """Findings on missing tiles and on tiles of different sizes."""
     out = [
         Finding("error", "missing_texture", f"{named(path, number)} is missing", where)
         for number in sorted(wanted - files.keys())
     ]
     if len(sizes) > 1:
         text = " and ".join("x".join(map(str, s)) for s in sorted(sizes))
-        out.append(Finding("error", "tile_size", f"the tiles of {path} are not of one size: {text}", where))
+        out.append(Finding("error", "tile_size", f"the tiles of {path} have different sizes: {text}", where))
     return out

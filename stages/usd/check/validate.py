@@ -1,8 +1,8 @@
-"""Checks an asset as a client would: every validator of the USD library, and what those leave unseen.
+"""Checks an asset with every validator of the USD library, and with checks of our own.
 
-The library misses extents, face indices, primvar counts, dangling shader connections, absolute paths, kind, whether an
-image can be decoded, colour spaces, MaterialX networks, and all variants but the selected; these are checked here.
-Works on .usd, .usda, .usdc and .usdz alone, without the pipeline's manifests.
+The library does not check extents, face indices, primvar counts, dangling shader connections, absolute paths, kind,
+decoding of images, colour spaces, MaterialX networks, and variants that are not selected; these are checked here. Works
+on .usd, .usda, .usdc and .usdz files alone, without the pipeline's manifests.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UNRESOLVED = "NormalMapTextureValidator.InvalidFile"
 
 
 def validate(path: Path) -> list[Finding]:
-    """Every finding, errors first. StageError if the file is not there or is no USD file."""
+    """Every finding, errors first. StageError if the file is missing or is not a USD file."""
     stage = _open(path)
     out: list[Finding] = []
     for check in CHECKS:
@@ -41,12 +41,12 @@ def validate(path: Path) -> list[Finding]:
 
 
 def checks_run() -> int:
-    """How many checks `validate` makes: the library's validators and our own."""
+    """Number of checks that `validate` makes: the library's validators and our own."""
     return len(_validators()) + len(CHECKS) - 1
 
 
 def found_in(path: Path) -> list[Finding]:
-    """As `validate`; a file that can't be opened is an error among the others."""
+    """As `validate`, but a file that can't be opened is reported as a finding."""
     try:
         return validate(path)
     except StageError as e:
@@ -78,8 +78,8 @@ def _validators() -> list[object]:
 
 
 def library(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """UsdValidation. Shader ids of MaterialX are unknown to builds without its node definitions: info, not error. So is
-    a normal map in tiles, which has no single file: `textures` looks for the tiles."""
+    """Findings of UsdValidation. Two are lowered to info: MaterialX shader ids, which builds without its node
+    definitions do not know; and a normal map in tiles, which has no single file (`textures` checks the tiles)."""
     out = []
     for e in UsdValidation.ValidationContext(_validators()).Validate(stage):
         kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
@@ -93,7 +93,7 @@ def library(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 # ------------------------------------------------------------------ layers
 def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Default prim, kind, asset info; units and axis on every layer, so that each can be opened by itself."""
+    """Default prim, kind and asset info; units and axis on every layer, because each may be opened by itself."""
     out = []
     prim = stage.GetDefaultPrim()
     if not prim:
@@ -106,7 +106,9 @@ def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
             out.append(Finding("warning", "assetInfo", "no name", where))
         stray = [str(p.GetPath()) for p in stage.GetPseudoRoot().GetChildren() if p != prim and not p.IsAbstract()]
         if stray:
-            out.append(Finding("warning", "defaultPrim", f"root prims that a reference would lose: {stray}", where))
+            out.append(
+                Finding("warning", "defaultPrim", f"root prims that a reference does not include: {stray}", where)
+            )
     for layer in stage.GetUsedLayers():
         if layer.anonymous:
             continue
@@ -122,7 +124,7 @@ def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Every path relative and inside the asset's folder; every file that is named there."""
+    """Every path must be relative and inside the asset's folder, and every file must exist."""
     layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(path), _but_tiles)
     out = [Finding("error", "missing_file", "does not resolve", _shown(str(u), path)) for u in unresolved]
     for layer in layers:
@@ -134,17 +136,17 @@ def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
             if ABSOLUTE.match(p):
                 out.append(Finding("error", "absolute_path", p, name))
             elif os.path.normpath(p).startswith(".."):
-                out.append(Finding("error", "path_outside", f"{p} leaves the asset's folder", name))
+                out.append(Finding("error", "path_outside", f"{p} is outside the asset's folder", name))
     return out
 
 
 def _but_tiles(layer: Sdf.Layer, found: UsdUtils.DependencyInfo) -> UsdUtils.DependencyInfo:
-    """Rows of tiles are looked at by `textures`; the library would complain of each aloud, though it finds them."""
+    """Skip paths with <UDIM>: `textures` checks them, and the library would print an error for each."""
     return UsdUtils.DependencyInfo() if tile_checks.is_tiled(found.assetPath) else found
 
 
 def _shown(text: str, path: Path) -> str:
-    """A path as the user knows it: from the asset's folder on."""
+    """A path relative to the asset's folder."""
     return text.removeprefix(f"{path.resolve().parent}/").removeprefix(f"{path.parent}/")
 
 
@@ -164,7 +166,7 @@ def materials(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """The same in every other variant of the default prim, as far as it differs. The stage is left as it was."""
+    """The same checks in every other variant of the default prim; only new findings. The stage is not changed."""
     prim, out = stage.GetDefaultPrim(), []
     known = materialx_surfaces(stage)
     for name in prim.GetVariantSets().GetNames() if prim else ():
@@ -177,7 +179,7 @@ def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
                 selected.SetVariantSelection(variant)
             found = [*material_findings(stage), *colour_findings(stage), *materialx_findings(stage, known)]
             if not any(p.IsA(UsdGeom.Mesh) for p in stage.Traverse()):
-                found.append(Finding("error", "mesh", "no mesh is left", path.name))
+                found.append(Finding("error", "mesh", "the variant has no mesh", path.name))
             known |= materialx_surfaces(stage)
             out += [replace(f, message=f"{f.message} [{name}={variant}]") for f in found if f.level != "info"]
             with Usd.EditContext(stage, stage.GetSessionLayer()):
@@ -186,7 +188,7 @@ def variants(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Every image resolves, decodes and holds no NaN; of one in tiles, every tile that the meshes need."""
+    """Every image must resolve, decode and contain no NaN; of an image in tiles, every tile that the meshes need."""
     out: list[Finding] = []
     done: set[str] = set()
     wanted = tile_checks.needed(stage)
@@ -211,7 +213,7 @@ def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 def _tiles(path: str, files: dict[str, str], wanted: set[str], where: str) -> list[Finding]:
-    """A texture in tiles: each decodes, none is missing, all are of one size."""
+    """Findings on a texture in tiles: each must decode, none may be missing, all must have the same size."""
     out, sizes = [], set()
     for number, file in sorted(files.items()):
         seen: list[tuple[int, ...]] = []
@@ -224,7 +226,7 @@ def _tiles(path: str, files: dict[str, str], wanted: set[str], where: str) -> li
 
 
 def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> str:
-    """What is wrong with an image, or "". Its size is added to `sizes`."""
+    """The fault of an image, or "". Its size is added to `sizes`."""
     import numpy as np
 
     from pipeline.images import MAX_BYTES, read_encoded, read_exr
@@ -233,7 +235,7 @@ def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> s
     try:
         if member:
             with zipfile.ZipFile(member[1]) as z, tempfile.TemporaryDirectory() as scratch:
-                if z.getinfo(member[2]).file_size > MAX_BYTES:  # a package from outside may hold a bomb
+                if z.getinfo(member[2]).file_size > MAX_BYTES:  # a foreign package may contain a decompression bomb
                     return f"is larger than {MAX_BYTES / 1e9:.0f} GB"
                 copy = Path(scratch) / Path(member[2]).name
                 copy.write_bytes(z.read(member[2]))
@@ -246,19 +248,19 @@ def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> s
         return f"can't be decoded: {e}"
     if sizes is not None:
         sizes.append(image.shape[1::-1])
-    return "" if np.isfinite(image).all() else "holds values that are not finite"
+    return "" if np.isfinite(image).all() else "contains values that are not finite"
 
 
 # ------------------------------------------------------------------ package
 def package(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """A .usdz: layer first, nothing compressed, data at multiples of 64 bytes, no light (AR viewers refuse it)."""
+    """A .usdz: layer first, no compression, data at multiples of 64 bytes, no light (AR viewers reject lights)."""
     if path.suffix.lower() != ".usdz":
         return []
     out = []
     with zipfile.ZipFile(path) as z, path.open("rb") as f:
         members = z.infolist()
         if not members[0].filename.lower().endswith((".usd", ".usda", ".usdc")):
-            out.append(Finding("error", "usdz", "the first file is no USD layer", members[0].filename))
+            out.append(Finding("error", "usdz", "the first file is not a USD layer", members[0].filename))
         for m in members:
             f.seek(m.header_offset + 26)
             name, extra = struct.unpack("<HH", f.read(4))

@@ -12,7 +12,7 @@ F64 = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A camera as the renderer needs it; K in pixels with the first pixel's centre at (0.5, 0.5)."""
+    """A camera of the renderer; K in pixels with the first pixel's centre at (0.5, 0.5)."""
 
     K: F64
     world_from_cam: F64
@@ -28,7 +28,8 @@ class View:
 
 
 def orbit_view(radius: float, azimuth: float, size: int, centre: F64 | None = None, elevation: float = 0.0) -> View:
-    """A camera that looks at `centre` (default the origin) and frames a sphere of `radius`; azimuth 0 is +Z."""
+    """A camera that looks at `centre` (3,) (default: the origin) and frames a sphere of `radius`. azimuth, elevation:
+    radians; azimuth 0 is +Z. size: pixels along each side."""
     back = np.array([np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)])
     right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])
     distance = 6 * radius

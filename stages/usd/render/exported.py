@@ -1,6 +1,6 @@
-"""Reads an exported asset back: mesh from the USD file, maps and light from the files beside it.
+"""Reads an exported asset: the mesh from the USD file, maps and light from the files beside it.
 
-The renderer works on this, so that what it shows is what was handed out, not what an earlier stage held in memory.
+The renderer uses these, so that it shows the written files and not data of an earlier stage.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ F32 = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class ExportedAsset:
-    """Everything that the model's equations need. Maps of several tiles lie side by side: W = tiles H.
+    """The data of the model's equations. Maps of several tiles are side by side: W = tiles H.
 
-    albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) the share of the captured light that arrives, so that
-    albedo * occlusion is the fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
+    albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) share of the captured light that arrives, with
+    albedo * occlusion = fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
     normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
     light ((L + 1)^2, 3).
     """
@@ -45,7 +45,7 @@ class ExportedAsset:
 
 
 def load_exported(root: Path) -> ExportedAsset:
-    """From NAME.usd (with payload.usdc, textures/ and light.json beside it). StageError names what is missing."""
+    """Read NAME.usd, with payload.usdc, textures/ and light.json beside it. StageError if a file is missing."""
     import json
 
     folder, name = root.parent, root.stem
@@ -59,7 +59,7 @@ def load_exported(root: Path) -> ExportedAsset:
     basis = numbered(_files(folder, name, "basis_lut")[0]).mean(0)
     if coefficients.shape[2] != basis.shape[1]:
         raise StageError(
-            "the specular maps do not fit each other",
+            "the specular maps do not match",
             where=f"{name}_specular_coefficients.exr",
             value=f"{coefficients.shape[2]} coefficients",
             limit=f"{basis.shape[1]} bases in basis_lut.exr",
@@ -85,7 +85,7 @@ def _map(folder: Path, name: str, which: str, count: int) -> F32:
 
 
 def _files(folder: Path, name: str, which: str, count: int = 1) -> list[Path]:
-    """A map's file for each tile, all of them there."""
+    """A map's file for each tile; StageError if one is missing."""
     paths = _paths(folder, name, which, "exr", count)
     for path in paths:
         if not path.is_file():
@@ -104,7 +104,7 @@ def _paths(folder: Path, name: str, which: str, kind: str, count: int) -> list[P
 
 
 def numbered(path: Path) -> F32:
-    """A map whose channels are numbered, in the order of the numbers ("c10" after "c9")."""
+    """(H, W, C) map with numbered channels, in the order of the numbers ("c10" after "c9")."""
     values, names = read_exr(path)
     if all(re.search(r"\d+$", n) for n in names):
         values = values[..., np.argsort([int(re.findall(r"\d+", n)[-1]) for n in names])]
@@ -112,7 +112,7 @@ def numbered(path: Path) -> F32:
 
 
 def _occlusion(folder: Path, name: str, count: int) -> F32 | None:
-    """What the export divided out of the albedo, or the same as the fit modelled it (pipeline.fields.shadowing)."""
+    """Occlusion (H, W, 3): divided out of the albedo by the export, or modelled in the fit (fields.shadowing)."""
     for which in ("occlusion", "irradiance_ratio"):
         if _paths(folder, name, which, "exr", count)[0].is_file():
             return _map(folder, name, which, count)[..., :3]
@@ -120,7 +120,7 @@ def _occlusion(folder: Path, name: str, count: int) -> F32 | None:
 
 
 def _normal(folder: Path, name: str, count: int) -> F32 | None:
-    """From the PNG that the shader network reads: stored as (n + 1) / 2."""
+    """Normals (H, W, 3) from the PNG of the shader network, which stores (n + 1) / 2."""
     paths = _paths(folder, name, "normal", "png", count)
     if not paths[0].is_file():
         return None
@@ -154,7 +154,7 @@ def read_usd_mesh(path: Path) -> UvSurface:
 
 
 def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
-    """The captured cameras of lookdev.usda by their photos' index, and whether the photo was held out.
+    """The captured cameras of lookdev.usda by photo index, and whether the photo was held out.
 
     The inverse of stages.usd.write.lookdev: K from apertures and offsets, the lens distortion from the metadata.
     """

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the renderer: maps under many points, and many lamps at each."""
+"""Compiled inner loops of the renderer: map lookup at many points, and shading under many lamps."""
 
 # mypy: disable-error-code=no-untyped-def
 from __future__ import annotations
@@ -12,7 +12,7 @@ STEP = np.float32(1 / 256)
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def hit_weights(corners, face, origin, directions, out):
-    """Barycentric weights (M, 3) of rays on their triangles, in float64 (embree's own are good to 1e-5 only)."""
+    """Write barycentric weights (M, 3) of rays on their triangles, in float64 (Embree's have errors of 1e-5)."""
     for i in prange(len(face)):
         a, b, c = corners[face[i], 0], corners[face[i], 1], corners[face[i], 2]
         d = directions[i]
@@ -33,8 +33,8 @@ def hit_weights(corners, face, origin, directions, out):
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def bilinear(image, tiles, uv, out):
-    """(N, C) of (H, W, C), `tiles` squares side by side, at uv (N, 2): texel centres at +0.5, v up, clamped at the
-    border of each tile."""
+    """(N, C) values of (H, W, C), `tiles` squares side by side, at uv (N, 2): texel centres at +0.5, v up, clamped at
+    the border of each tile."""
     h, w, channels = image.shape[0], image.shape[1] // tiles, image.shape[2]
     for i in prange(len(uv)):
         tile = min(max(int(uv[i, 0]), 0), tiles - 1)
@@ -52,12 +52,12 @@ def bilinear(image, tiles, uv, out):
 
 @njit(parallel=True, error_model="numpy", cache=True)
 def under_lamps(normal, mirror, inv_kappa, corner, weights, seen, lamp, diffuse, specular):
-    """Irradiance, and radiance through a lobe of 1/kappa about the mirror direction, at M points under N lamps.
+    """Irradiance, and radiance filtered by a lobe of 1/kappa around the mirror direction, at M points under N lamps.
 
     normal, mirror (M, 3); corner (M, 3) vertices of each point's triangle and their weights; seen (V, N) 0 or 1;
-    lamp (7, N): direction, flux, spread, which adds to 1/kappa as variances do (a lamp stands for a piece of sky).
+    lamp (7, N): direction, flux, spread, which is added to 1/kappa like a variance (a lamp is an area of the sky).
     The first loop has no sums, so that it vectorises under strict arithmetic.
-    Writes diffuse, specular (M, 3). exp(t) is (1 + t / 256)^256, 0.2 % off at t = -1, without a call.
+    Writes diffuse, specular (M, 3). exp(t) is computed as (1 + t / 256)^256; the error is 0.2 % at t = -1.
     """
     one, zero, count = np.float32(1), np.float32(0), lamp.shape[1]
     for i in prange(len(normal)):

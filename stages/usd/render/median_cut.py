@@ -1,8 +1,8 @@
-"""A lat-long picture as a few distant lamps that carry the same light.
+"""Converts a lat-long picture into a few distant lamps with the same energy.
 
-The picture is cut in two again and again, always the piece that holds most (half by its energy, half by its solid
-angle: a sun is cut out and dim sky is not forgotten), where its halves hold equally much. Each piece becomes a lamp at
-its centre of energy. [Debevec 2005, median cut; the weight of the solid angle is ours]
+The area with the largest weight (half energy, half solid angle, so that a sun is isolated and dim sky is kept) is split
+repeatedly into two halves of equal weight. Each area becomes a lamp at its centre of energy. [Debevec 2005, median cut;
+the weight of the solid angle is ours]
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ F64 = npt.NDArray[np.float64]
 Piece = tuple[int, int, int, int]  # rows y0..y1 and columns x0..x1
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-LARGEST = 1024  # columns: a finer picture is shrunk first, which keeps its energy
-HALF_MAX = 65504.0  # what a 16-bit float holds; suns are often stored as more than that, or as infinite
+LARGEST = 1024  # columns: a finer picture is first reduced, with the same energy
+HALF_MAX = 65504.0  # largest 16-bit float; suns are often stored with more, or as infinite
 
 
 def checked_environment(image: F32, name: str) -> F32:
-    """(H, 2 H, 3) finite, not negative, not black. Raises StageError."""
+    """(H, 2 H, 3) picture, clipped to finite values. Raises StageError if it has a wrong shape, negative values or NaN,
+    or is black."""
     bad = ""
     if image.ndim != 3 or image.shape[2] < 3 or abs(image.shape[1] - 2 * image.shape[0]) > 2:
         bad = f"{image.shape[1]} x {image.shape[0]}, {image.shape[2]} channels"
@@ -36,19 +37,19 @@ def checked_environment(image: F32, name: str) -> F32:
         bad = "black"
     if bad:
         raise StageError(
-            "this light can't be used",
+            "this environment map can't be used",
             where=name,
             value=bad,
-            limit="a lat-long picture twice as wide as high, linear, not negative",
-            remedy="give an equirectangular .hdr or .exr",
+            limit="a lat-long picture, twice as wide as high, linear, not negative, not black",
+            remedy="use an equirectangular .hdr or .exr file",
         )
     return np.asarray(np.minimum(image[..., :3], HALF_MAX), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class Lamps:
-    """directions (N, 3) towards them, unit; flux (N, 3) irradiance on a facing surface; spread (N,) about the variance
-    (rad^2) along one axis of the piece that each stands for: what 1 / kappa is for a vMF lobe."""
+    """directions (N, 3) towards the lamps, unit; flux (N, 3) irradiance on a facing surface; spread (N,) approximate
+    variance (rad^2) along one axis of each lamp's area, comparable to 1 / kappa of a vMF lobe."""
 
     directions: F32
     flux: F32
@@ -56,7 +57,7 @@ class Lamps:
 
 
 def lamps(image: F32, count: int) -> Lamps:
-    """At most `count` of them. The sum of their irradiances is the picture's integral over the sphere."""
+    """At most `count` lamps of a picture (H, 2 H, 3). The sum of their irradiances is its integral over the sphere."""
     image = _shrunk(image)
     height, width = image.shape[:2]
     weights = np.broadcast_to(latlong_weights(width, height), (height, width))
@@ -79,7 +80,7 @@ def lamps(image: F32, count: int) -> Lamps:
 
 
 def _shrunk(image: F32) -> F32:
-    """At most LARGEST columns, by means over blocks."""
+    """Reduce to at most LARGEST columns, by means over blocks."""
     factor = -(-image.shape[1] // LARGEST)
     if factor == 1:
         return image
@@ -106,7 +107,7 @@ def _share(piece: Piece, sums: F64) -> float:
 
 
 def _halves(piece: Piece, sums: F64) -> list[Piece]:
-    """Cut across the longer side (as an arc on the sphere); nothing for a single pixel."""
+    """Split across the longer side (as an arc on the sphere); empty for a single pixel."""
     y0, y1, x0, x1 = piece
     rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     if (y1 - y0) * (x1 - x0) == 1:

@@ -1,4 +1,4 @@
-"""Pictures of the exported asset: the held-out views, and its shape and look from three sides."""
+"""Pictures of the exported asset: the held-out views, and previews of its shape and appearance from three sides."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from stages.usd.render.exported import load_exported
 from stages.usd.render.render import Renderer
 
 F32 = npt.NDArray[np.float32]
-FITTED_SHOWN, FITTED_SIDE = 3, 640  # views rendered where none is held out, and their largest side
+FITTED_SHOWN, FITTED_SIDE = 3, 640  # fitted views rendered if none is held out, and their largest side
 SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
 THUMBNAIL_SIDE, THUMBNAIL_TURN = 256, 25.0  # pixels, degrees
 GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
-"""A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape alone."""
+"""A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape."""
 
 
 def view_of(camera: Camera) -> View:
-    """A manifest's camera for the renderer."""
+    """Convert a manifest's camera for the renderer."""
     return View(
         matrix(camera.K),
         matrix(camera.world_from_cam),
@@ -39,9 +39,9 @@ def view_of(camera: Camera) -> View:
 def render_held_out(
     root: Path, cameras: CameraSet, face: FittedFace, samples: int, context: Context
 ) -> tuple[HeldOutView, ...]:
-    """asset_views/I.exr and .png for each view that the fit predicted: at its scale, in the colours of its camera.
+    """Write asset_views/I.exr and .png for each view that the fit predicted, at its scale, in its camera's colours.
 
-    With no held-out view, of a few fitted ones instead, so that there is something to look at.
+    Without held-out views, a few fitted ones are rendered instead.
     """
     by_index = {c.index: c for c in cameras.cameras}
     wanted = [(v.index, v.scale) for v in face.held_out if v.index in by_index]
@@ -64,13 +64,13 @@ def render_held_out(
 
 
 def spread(items: tuple[int, ...], count: int) -> list[int]:
-    """At most `count` of the items, evenly spread."""
+    """At most `count` of the items, evenly spaced."""
     picks = np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)
     return [items[i] for i in picks]
 
 
 def factor_for(camera: Camera) -> int:
-    """The smallest block of photo pixels that divides the photo and brings its longest side to FITTED_SIDE."""
+    """Side of the smallest block of photo pixels that divides the photo and reduces its longest side to FITTED_SIDE."""
     longest = max(camera.width, camera.height)
     fits = [
         f
@@ -81,7 +81,7 @@ def factor_for(camera: Camera) -> int:
 
 
 def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
-    """SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
+    """Write SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
     renderer = Renderer(load_exported(root))
     written = []
     for side, degrees in SIDES.items():
@@ -94,7 +94,7 @@ def render_previews(root: Path, size: int, folder: Path, check: Callable[[], Non
 
 
 def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
-    """The head from slightly beside the front, under the captured light."""
+    """Write a picture of the head, slightly from one side, under the captured light."""
     check()
     renderer = Renderer(load_exported(root))
     view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
@@ -110,7 +110,7 @@ def framing(renderer: Renderer, azimuth: float, size: int) -> View:
 
 
 def write_rgba_png(path: Path, rgba: F32) -> None:
-    """8-bit sRGB with straight alpha, as PNG defines it, from linear premultiplied RGBA."""
+    """Write linear premultiplied RGBA (H, W, 4) as 8-bit sRGB with straight alpha, as PNG defines it."""
     alpha = rgba[..., 3:].clip(0, 1)
     straight = np.where(alpha > 0, rgba[..., :3] / np.maximum(alpha, 1e-6), 0).clip(0, 1)
     write_png(path, np.concatenate([srgb_from_linear(straight), alpha], -1))

@@ -1,8 +1,8 @@
-"""The exported asset under any light: lamps in place of the picture, shadows, and light thrown back by the head.
+"""Renders the exported asset under any environment map: as lamps, with shadows and interreflections.
 
     L(wo) = a / pi (D + I) + (sum_j rho c_j B_j(n.wo)) sum_k V_k E_k vMF(w_k; w_r, kappa)
 
-The lobe is the model's own; the light is the whole picture instead of its spherical harmonics. Symbols:
+The lobe is the model's own; the light is the picture itself, not its spherical harmonics. Symbols:
 write/transport.py.
 """
 
@@ -26,7 +26,7 @@ COUNT = 256
 
 
 class Environment:
-    """A lat-long picture as the light of one asset. Shadows are traced here, once for all views."""
+    """A lat-long picture as the light of one asset. Shadows are traced once for all views."""
 
     def __init__(
         self, renderer: Renderer, image: F32, name: str, count: int = COUNT, check: Callable[[], None] = lambda: None
@@ -40,7 +40,7 @@ class Environment:
         self._indirect = transport.indirect(direct, vertex_values(renderer.asset.albedo, renderer)).astype(np.float32)
 
     def shade(self, renderer: Renderer, points: Points) -> F64:
-        """(M, 3) radiance towards wo. kappa is kept within what the exported roughness can say."""
+        """(M, 3) radiance towards wo. kappa is limited to the range of the exported roughness."""
         n = points.normal.astype(np.float32)
         facing = (points.normal * points.wo).sum(1, keepdims=True)
         mirror = (2 * facing * points.normal - points.wo).astype(np.float32)
@@ -53,12 +53,12 @@ class Environment:
 
 
 def table_of(lit: Lamps) -> F32:
-    """(7, N) direction, flux and spread, as the kernel takes them."""
+    """(7, N) direction, flux and spread of the lamps, as input of the kernel."""
     return np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
 
 
 def vertex_values(image: F32, renderer: Renderer) -> F64:
-    """(V, C) of a map at the vertices; at a seam, of one of its sides."""
+    """(V, C) values of a map (H, W, C) at the vertices; at a seam, from one of its sides."""
     mesh = renderer.asset.mesh
     uv = np.zeros((len(mesh.vertices), 2), np.float32)
     uv[mesh.faces] = mesh.uvs[mesh.uv_faces]

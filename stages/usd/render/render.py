@@ -1,10 +1,10 @@
-"""Renders the exported asset on the CPU with the model's own equations, straight from its maps.
+"""Renders the exported asset on the CPU from its maps, with the equations of the model.
 
     L(wo) = a / pi max(E(n), 0) + (sum_j rho c_j B_j(n.wo)) max(sum_l A_l(1/kappa) L_l(w_r), 0)     [NeuFace eq. 12, 16]
 
-Primary rays go through the exact cameras (distortion included). Under spherical harmonics, the captured light above
-all, there are no shadows and no bounces, as in the model that was fitted, and a is the albedo times the occlusion.
-Under any other light (stages.usd.render.relight) both are traced.
+Primary rays use the exact cameras, including distortion. Under spherical harmonics, such as the captured light, there
+are no shadows and no interreflections, as in the fitted model, and a is the albedo times the occlusion. Under any other
+light (stages.usd.render.relight) both are traced.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.maths import brdf
+from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
 from stages.usd.render.camera import View
@@ -27,14 +28,13 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
 CHUNK = 1 << 18  # rays at once
-EDGE_SAMPLES = 8  # along each side of what a pixel on the silhouette sees
-EDGE_REACH = 2.0  # pixels: the triangle filter of a pixel there; a photo's lens and sensor mix neighbours as much
-EMBREE_SIZE = 100.0  # embree works in float32 with absolute tolerances: the mesh is scaled to about this size
+EDGE_SAMPLES = 8  # rays along each side of the filter of a pixel on the silhouette
+EDGE_REACH = 2.0  # pixels: width of its triangle filter, similar to the blur of a photo's lens and sensor
 
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Where rays met the mesh. ray, face (M,); weights (M, 3) barycentric."""
+    """Hits of rays with the mesh. ray, face (M,): indices; weights (M, 3) barycentric."""
 
     ray: npt.NDArray[np.int64]
     face: npt.NDArray[np.int64]
@@ -58,27 +58,27 @@ class Points:
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Where a pixel looks: offsets (S, 2) from its corner in pixels, and weights (S,) that sum to 1."""
+    """Samples of a pixel: offsets (S, 2) from its corner in pixels, and weights (S,) that sum to 1."""
 
     offsets: F64
     weights: F32
 
 
 class Light(Protocol):
-    """Turns points of one asset into radiance (M, 3) towards wo."""
+    """Computes the radiance (M, 3) towards wo at points of one asset."""
 
     def shade(self, renderer: Renderer, points: Points) -> F64: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Harmonics:
-    """The model's closed form. coefficients ((L + 1)^2, 3); `plain`: a grey diffuse surface, to see the shape alone."""
+    """The model's closed form. coefficients ((L + 1)^2, 3); `plain`: grey diffuse surface, to show only the shape."""
 
     coefficients: F32
     plain: bool = False
 
     def shade(self, renderer: Renderer, points: Points) -> F64:
-        """[NeuFace eq. 12] + [NeuFace eq. 16]"""
+        """(M, 3) radiance. [NeuFace eq. 12] + [NeuFace eq. 16]"""
         asset, light = renderer.asset, torch.from_numpy(np.asarray(self.coefficients, np.float32))
         n = torch.from_numpy(points.normal.astype(np.float32))
         albedo = np.full((len(n), 3), 0.5, np.float32) if self.plain else renderer.at(renderer.fitted_albedo, points.uv)
@@ -92,18 +92,13 @@ class Harmonics:
 
 
 class Renderer:
-    """Holds the ray tracing structure of one asset; `render` may be called for any number of views and lights."""
+    """Renders one asset; `render` may be called for any number of views and lights."""
 
     def __init__(self, asset: ExportedAsset) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
         self.asset = asset
         mesh = asset.mesh
         self._corners = mesh.vertices[mesh.faces].astype(np.float64)
-        self._scale = EMBREE_SIZE / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-9)
-        self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, (mesh.vertices * self._scale).astype(np.float32), mesh.faces)
+        self._caster = RayCaster(mesh.vertices, mesh.faces)
         self._tangents = tangents(asset).astype(np.float32)
         self._normals = mesh.normals[mesh.faces].astype(np.float32)
         self._uvs = mesh.uvs[mesh.uv_faces].astype(np.float32)
@@ -120,10 +115,9 @@ class Renderer:
     ) -> F32:
         """(height / factor, width / factor, 4) linear Rec.709 RGBA, premultiplied.
 
-        `factor`: one pixel for factor x factor photo pixels. `samples`: rays along each side of a pixel; 0: one, and
-        where the silhouette passes the mean over a triangle filter, as soft as a photo's. `light`: other SH
-        coefficients than the captured ones, or any Light.
-        `plain`: grey diffuse surface, to see the shape alone.
+        `factor`: one pixel for factor x factor photo pixels. `samples`: rays along each side of a pixel; 0: one ray,
+        and on the silhouette the mean over a triangle filter, as soft as in a photo. `light`: SH coefficients in place
+        of the captured ones, or any Light. `plain`: grey diffuse surface, to show only the shape.
         """
         if light is None or isinstance(light, np.ndarray):
             light = Harmonics(self.asset.light if light is None else light, plain)
@@ -137,7 +131,7 @@ class Renderer:
         return out.reshape(h, w, 4)
 
     def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
-        """Pixels in the rectangle around the mesh's picture; all where part of it lies beside or behind the camera."""
+        """Pixels in the mesh's bounding rectangle; all pixels if part of the mesh is beside or behind the camera."""
         points = self.asset.mesh.vertices.astype(np.float64)
         distances = points @ view.world_from_cam[:3, 2] - view.world_from_cam[:3, 2] @ view.world_from_cam[:3, 3]
         if distances.min() <= 0 or np.any(view.distortion):
@@ -151,7 +145,7 @@ class Renderer:
     def _pixels(
         self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, filtered: Filter, light: Light
     ) -> F32:
-        """(N, 4) RGBA of some pixels, given by row * width + column."""
+        """(N, 4) RGBA of pixels (N,), given by row * width + column."""
         out = np.zeros((len(pixel), 4), np.float32)
         count = len(filtered.weights)
         step = max(1, CHUNK // count)
@@ -168,17 +162,15 @@ class Renderer:
         return out
 
     def trace(self, origin: F64, directions: F64) -> Hits:
-        """First hits."""
-        starts = np.broadcast_to((origin * self._scale).astype(np.float32), directions.shape)
-        found = self._scene.run(np.ascontiguousarray(starts), np.ascontiguousarray(directions, np.float32))
-        face = np.asarray(found, np.int64)
+        """First hits of rays from origin (3,) along directions (N, 3)."""
+        face = self._caster.first_faces(np.broadcast_to(origin, directions.shape), directions)
         ray = np.flatnonzero(face >= 0)
         weights = np.empty((len(ray), 3))
         kernels.hit_weights(self._corners, face[ray], origin, directions[ray], weights)
         return Hits(ray, face[ray], weights)
 
     def points(self, origin: F64, directions: F64) -> Points:
-        """What the rays meet, with the normal that the normal map gives it."""
+        """The surface points that the rays hit, with the normals of the normal map."""
         hits, mesh = self.trace(origin, directions), self.asset.mesh
         w = hits.weights.astype(np.float32)
         uv, smooth = (np.einsum("nic,ni->nc", a[hits.face], w) for a in (self._uvs, self._normals))
@@ -188,17 +180,17 @@ class Renderer:
         return Points(hits.ray, -directions[hits.ray], normal, uv, mesh.faces[hits.face], w)
 
     def at(self, image: F32, uv: npt.NDArray[np.floating]) -> F32:
-        """(N, C) values of one of the asset's maps at uv (N, 2)."""
+        """(N, C) values of a map (H, W, C) of the asset at uv (N, 2)."""
         return bilinear(image, uv, self.asset.tiles)
 
     def strength(self, points: Points) -> F32:
-        """(M,) rho c . B(n.wo): the lobe's share of the light in it."""
+        """(M,) rho c . B(n.wo): the factor of the light in the lobe."""
         cosine = (points.normal * points.wo).sum(1).clip(0, 1)
         table = lookup(self.asset.basis, cosine)
         return np.asarray((self.at(self.asset.coefficients, points.uv) * table).sum(1).clip(min=0), np.float32)
 
     def _bent(self, face: npt.NDArray[np.int64], weights: F32, normal: F64, local: F32) -> F64:
-        """The normal map's normal (tangent space) in asset coordinates."""
+        """(M, 3) normals of the normal map, in asset coordinates."""
         tangent = np.einsum("nic,ni->nc", self._tangents[face], weights)
         sign = np.where(tangent[:, 3:] < 0, -1.0, 1.0)
         t = _unit(tangent[:, :3] - normal * (normal * tangent[:, :3]).sum(1, keepdims=True))
@@ -207,7 +199,7 @@ class Renderer:
 
 
 def _borders(alpha: F32) -> npt.NDArray[np.bool_]:
-    """(H, W) pixels with a neighbour (of eight) on the other side of the silhouette."""
+    """(H, W) pixels with one of eight neighbours on the other side of the silhouette."""
     import cv2
 
     solid, ring = (alpha > 0).astype(np.uint8), np.ones((3, 3), np.uint8)
@@ -215,7 +207,7 @@ def _borders(alpha: F32) -> npt.NDArray[np.bool_]:
 
 
 def tangents(asset: ExportedAsset) -> F64:
-    """(F, 3, 4) direction of growing u at each triangle corner, averaged in its chart, and the chart's handedness."""
+    """(F, 3, 4) direction of growing u at each triangle corner, averaged in its chart; the chart's handedness."""
     mesh = asset.mesh
     x, t = mesh.vertices[mesh.faces].astype(np.float64), mesh.uvs[mesh.uv_faces].astype(np.float64)
     e1, e2, d1, d2 = x[:, 1] - x[:, 0], x[:, 2] - x[:, 0], t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -231,14 +223,15 @@ def tangents(asset: ExportedAsset) -> F64:
 
 def bilinear(image: F32, uv: npt.NDArray[np.floating], tiles: int = 1) -> F32:
     """(N, C) values of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border. `tiles`: the image
-    is that many squares side by side, tile t for t <= u < t + 1, each clamped at its own border."""
+    consists of that many squares side by side, tile t for t <= u < t + 1, each clamped at its own border."""
     out = np.empty((len(uv), image.shape[2]), np.float32)
     kernels.bilinear(np.ascontiguousarray(image, np.float32), tiles, uv, out)
     return out
 
 
 def lookup(table: F32, cosine: F64) -> F32:
-    """(N, k) rows of the (W, k) table at n.v = (i + 0.5) / W, linear between, constant beyond the ends."""
+    """(N, k) rows of the (W, k) table for cosines (N,). Row i is n.v = (i + 0.5) / W; linear between rows, constant
+    beyond the ends."""
     width = len(table)
     x = (cosine * width - 0.5).clip(0, width - 1)
     low = np.floor(x).astype(np.int64)
@@ -247,13 +240,13 @@ def lookup(table: F32, cosine: F64) -> F32:
 
 
 def _square(samples: int) -> Filter:
-    """A pixel's own square, samples x samples positions of equal weight."""
+    """Box filter of one pixel: samples x samples positions of equal weight."""
     inside = (np.arange(samples) + 0.5) / samples
     return _separable(inside, np.ones(samples))
 
 
 def _triangle(samples: int, reach: float) -> Filter:
-    """samples x samples positions over `reach` pixels around the middle, weights falling to 0 at its ends."""
+    """Triangle filter: samples x samples positions over `reach` pixels around the centre, 0 at its ends."""
     away = ((np.arange(samples) + 0.5) / samples - 0.5) * reach
     return _separable(0.5 + away, 1 - np.abs(away) / (0.5 * reach))
 

@@ -1,9 +1,9 @@
-"""The component's layers: root, payload, and the single layer of the preview package.
+"""The component's layers: root, payload, dense mesh, and the single layer of the preview package.
 
 Structure (ASWF asset-structure guidelines): root = Xform of kind component with assetInfo and a class to inherit;
-payload = geo/render, geo/proxy and mtl; high.usdc = the dense mesh, loaded where asked for. One material has three
-ways to the same look (write/shading.py, write/materialx.py); the variant sets `look` and `lod` on the root choose
-among them, and among the meshes.
+payload = geo/render, geo/proxy and mtl; high.usdc = the dense mesh, loaded on request. One material has several
+networks for the same look (write/shading.py, write/materialx.py). The variant sets `look` and `lod` on the root choose
+among them and among the meshes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ HIGH_FILE = "high.usdc"
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Who and what the asset is. Only `name` and `version` are ours; the rest is what the user said, or nothing."""
+    """Metadata of the asset. Only `name` and `version` are always set; the rest comes from the user, or is empty."""
 
     name: str
     version: str
@@ -34,13 +34,13 @@ class Identity:
     subject_consent: str = ""
 
     def stated(self) -> dict[str, str]:
-        """What the user said, by the names under which it is recorded."""
+        """The metadata from the user, by the names under which it is recorded."""
         metadata = {"author": self.author, "license": self.license, "subjectConsent": self.subject_consent}
         return {k: v for k, v in metadata.items() if v}
 
 
 def new_stage(comment: str, default: str) -> Usd.Stage:
-    """A stage in memory with units, axis and default prim authored on its root layer. Nothing is loaded into it."""
+    """An empty stage in memory, with units, axis and default prim authored on its root layer."""
     stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -50,14 +50,14 @@ def new_stage(comment: str, default: str) -> Usd.Stage:
 
 
 def detached(stage: Usd.Stage) -> Sdf.Layer:
-    """The root layer's content as a layer that outlives the stage and composes nothing."""
+    """A copy of the root layer that is independent of the stage."""
     layer = Sdf.Layer.CreateAnonymous(".usda")
     layer.TransferContent(stage.GetRootLayer())
     return layer
 
 
 def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
-    """Kind, asset info and the class that lets a scene restyle every instance at once."""
+    """Set kind, asset info and a class, with which a scene can change every instance at once."""
     prim = stage.GetDefaultPrim()
     stage.CreateClassPrim(f"/_class_{who.name}")
     prim.GetInherits().AddInherit(f"/_class_{who.name}")
@@ -75,7 +75,7 @@ def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
 def root_layer(
     who: Identity, extents: list[Gf.Vec3f], look: Look, *, high: bool, proxy: bool, thumbnail: str | None
 ) -> Sdf.Layer:
-    """NAME.usd: the file that others reference. `extents`: the box of each purpose present, for display unloaded."""
+    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
@@ -92,8 +92,8 @@ def root_layer(
 
 
 def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
-    """`look`: which network of the material is its surface. Each variant holds only what differs, so that the payload
-    alone is what the first one shows."""
+    """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
+    payload alone equals the first variant."""
     material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
     outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
     if not look.specular:
@@ -113,7 +113,7 @@ def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
 
 
 def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> None:
-    """`lod`: the mesh that is textured (with its proxy), the dense mesh alone, or the proxy alone."""
+    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
     path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
     for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
@@ -140,14 +140,14 @@ def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> Non
 
 
 def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
-    """payload.usdc: what is heavy. With a proxy the full mesh has purpose render, else it is shown always."""
+    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look)
     return detached(stage)
 
 
 def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
-    """high.usdc: the dense mesh as /high. It is bound to the material where it is loaded."""
+    """high.usdc: the dense mesh as /high. The material is bound where it is loaded."""
     stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -159,8 +159,8 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
 
 
 def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
-    """The one layer of NAME.usdz. No proxy: viewers on phones show every purpose at once. Of several tiles each is a
-    mesh with a material of its own, its st in the unit square: those viewers know no <UDIM>."""
+    """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
+    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
@@ -194,7 +194,7 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None,
 
 
 def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:
-    """A triangle mesh. Vertices without a face are left out; normals are made unit length."""
+    """Author a triangle mesh. Vertices without a face are left out; normals are normalised."""
     used, faces = np.unique(mesh.faces, return_inverse=True)
     uv_used, uv_faces = np.unique(mesh.uv_faces, return_inverse=True)
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices[used], np.float32))
@@ -211,7 +211,7 @@ def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Mater
     out.CreateDoubleSidedAttr(False)
     out.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(points))
     st = UsdGeom.PrimvarsAPI(out).CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
-    # xatlas may put a border vertex a rounding error outside of the square
+    # xatlas may put a border vertex outside the square by a rounding error
     kept = mesh.uvs[uv_used].clip(0, [tile_count(mesh), 1])
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(kept, np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))

@@ -25,13 +25,13 @@ from stages.usd.write.obj import write_obj
 from stages.usd.write.package import bounded_png, write_package
 from stages.usd.write.shading import Look
 
-NEAR_HIGH = 4  # triangles looked at for each of the dense mesh, which is finer than what it lies on
-THUMBNAIL = "./thumbnails/default.png"  # made by the stage once there is something to render
+NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
+THUMBNAIL = "./thumbnails/default.png"  # rendered by the stage after the export
 
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The files written, notes on what was left out, and for the report: figures, and what the user stated."""
+    """The written files, notes on parts that were left out, and for the report: figures, and metadata from the user."""
 
     written: list[Path]
     notes: list[str]
@@ -50,7 +50,7 @@ def export(
     folder: Path,
     check: Callable[[], None],
 ) -> Export:
-    """Write all but the thumbnail, which has to be rendered from what is written here."""
+    """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
     proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
@@ -84,7 +84,7 @@ def export(
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
     if config.usdz:
-        # viewers on phones read no MaterialX, and some take any preview surface that they find
+        # viewers on phones do not read MaterialX, and some use any preview surface that they find
         plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
         single = component.package_layer(who, mesh, plain)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
@@ -98,10 +98,10 @@ def export(
 
 
 def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
-    """A layer as a file; form: "usda" or "usdc", for the extension .usd, which may hold either.
+    """Write a layer to a file; form: "usda" or "usdc", because .usd may be either.
 
     Raises:
-        StageError: it can't be written.
+        StageError: the file can't be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     args = {"format": form} if path.suffix == ".usd" else {}
@@ -109,7 +109,7 @@ def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
         raise StageError(
             "a USD layer can't be written",
             where=path.name,
-            value="the USD library refused",
+            value="the USD library reported a failure",
             limit="a writable folder",
             remedy="check the disk's space and permissions",
         )
@@ -121,13 +121,13 @@ def _corners(mesh: UvSurface) -> npt.NDArray[np.float64]:
 
 
 def _hints(boxes: list[npt.NDArray[np.float64]]) -> list[npt.NDArray[np.float64]]:
-    """extentsHint holds a box for each purpose in the order default, render, proxy; an unused one is empty."""
+    """Boxes for extentsHint: one per purpose, in the order default, render, proxy; an unused one is empty."""
     empty = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
     return [row for box in (empty, *boxes) for row in box]
 
 
 def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
-    """The coarse mesh with the full mesh's texture coordinates, unless they would be misleading."""
+    """The proxy with texture coordinates from the full mesh, or a note why it is left out."""
     if uv.artifact.proxy is None:
         return None, []
     proxy = without_overlap(with_uvs_from(read_mesh(uv.path(uv.artifact.proxy), with_uvs=False), mesh))
@@ -136,7 +136,7 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
 
 
 def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
-    """The dense mesh with the textured mesh's coordinates. On seams its corners reach into the gutter."""
+    """The dense mesh with texture coordinates from the textured mesh. At seams its corners reach into the padding."""
     dense = read_mesh(surface.path(surface.artifact.mesh), with_uvs=False)
     high = with_uvs_from(dense, mesh, NEAR_HIGH, half_gap(mesh))
     fault = uv_fault(high, mesh)
@@ -144,14 +144,14 @@ def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None,
 
 
 def attenuation_of(face: FittedFace) -> str:
-    """How the fit attenuated the light's bands; the paper's exponential where its model does not say."""
+    """Name of the light's attenuation in the fit; the paper's exponential if the model does not have the entry."""
     found = [v["attenuation"] for v in face.model.values() if "attenuation" in v]
     return str(found[0]) if found else "exponential"
 
 
 # ------------------------------------------------------------------ package
 def _package(content: Sdf.Layer, folder: Path, name: str, look: Look, count: int) -> Path:
-    """NAME.usdz: one binary layer and the PNG textures that it reads, of `count` tiles."""
+    """Write NAME.usdz: one binary layer and the PNG textures that it reads, of `count` tiles."""
     with tempfile.TemporaryDirectory() as scratch:
         layer = Path(scratch) / f"{name}.usdc"
         write_layer(content, layer, "usdc")

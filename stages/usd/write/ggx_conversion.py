@@ -1,13 +1,13 @@
-"""NeuFace's specular lobe in the words of standard shaders: a table for the basis, and what is lost in translation.
+"""Converts NeuFace's specular lobe to GGX: a lookup table for the basis, and the error of the conversion.
 
 Symbols
     c           n.v
     s           1 / kappa
-    F(c)        sum_j rho c_j B_j(c): what the fitted lobe reflects of a constant light
-    R(c)        what a GGX lobe of F0 and alpha(kappa) reflects of it: F0 a(c, alpha) + b(c, alpha)
+    F(c)        sum_j rho c_j B_j(c): reflectance of the fitted lobe under constant light
+    R(c)        reflectance of a GGX lobe of F0 and alpha(kappa) under it: F0 a(c, alpha) + b(c, alpha)
 
-A dielectric layer in a shader reflects `tint` R(c) with the R of its own index of refraction. So the tint that gives
-F exactly is sum_j rho c_j B_j(c) / R(c, alpha(s)): linear in the coefficients, and a table over (c, s).
+A dielectric layer in a shader reflects `tint` R(c), with the R of its own index of refraction. So the tint that gives
+exactly F is sum_j rho c_j B_j(c) / R(c, alpha(s)): linear in the coefficients, with a table over (c, s).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ REFERENCE_IOR = 1.5
 REFERENCE_F0 = ((REFERENCE_IOR - 1) / (REFERENCE_IOR + 1)) ** 2
 INV_KAPPA_SCALE = 2.0  # the table's v is this times 1/kappa: 1/kappa up to 0.5, beyond which alpha is clamped
 ROWS = 64
-COSINES = (np.arange(16) + 0.5) / 16  # where F and R are compared
-NO_LOBE = 1e-6  # of a constant light: what reflects less was fitted without a lobe
+COSINES = (np.arange(16) + 0.5) / 16  # at which F and R are compared
+NO_LOBE = 1e-6  # reflectance under constant light: below it there is no lobe
 GROUP = 3  # coefficients in one picture: red, green, blue
-RESOLVED_KAPPA = 50.0  # above it a light of order 10 looks the same through the lobe
+RESOLVED_KAPPA = 50.0  # light of order 10 does not resolve sharper lobes
 
 
 @dataclass(frozen=True, slots=True)
 class LobeFit:
     """residual (H, W): |F - R| over |F|, root mean square over c weighted by c; 0 where there is no lobe.
-    unresolved (H, W): kappa is a guess.
+    unresolved (H, W): the light does not determine kappa.
     covered (H, W): texels under charts.
     error, power: |F - R|^2 and |F|^2, sums over the covered texels."""
 
@@ -53,10 +53,10 @@ class LobeFit:
 
 
 def fit_figures(fits: Sequence[LobeFit]) -> dict[str, float]:
-    """Over the covered texels of all tiles, for the report.
+    """Figures over the covered texels of all tiles, for the report.
 
-    ggx_residual: |F - R| over |F|, both summed first, so that a lobe counts by what it reflects. The mean of the
-    texels' own ratios is ruled by those with next to no lobe."""
+    ggx_residual: |F - R| over |F|, both summed first, so that a texel counts by its reflectance. (The mean of the
+    texels' ratios would depend mainly on texels with almost no lobe.)"""
     if not fits:
         return {}
     shown, unresolved = (np.concatenate(p) for p in zip(*(f.shown(len(fits)) for f in fits), strict=True))
@@ -71,7 +71,7 @@ def fit_figures(fits: Sequence[LobeFit]) -> dict[str, float]:
 
 
 def basis_table(basis: F32) -> F32:
-    """(ROWS, W, k) B_j(c) / R(c, alpha(s)) of a dielectric of REFERENCE_IOR; row 0 is s = 0.5 (v = 1), as pictures go.
+    """(ROWS, W, k) B_j(c) / R(c, alpha(s)) of a dielectric of REFERENCE_IOR; row 0 is s = 0.5 (v = 1), as in pictures.
 
     basis (W, k): B_j at c = (i + 0.5) / W.
     """
@@ -85,7 +85,7 @@ def basis_table(basis: F32) -> F32:
 
 
 def in_groups(image: F32) -> list[F32]:
-    """(H, W, k) as pictures of three channels, padded with 0: what a colour texture can hold."""
+    """Split (H, W, k) into pictures (H, W, 3) for colour textures, padded with 0."""
     count = -(-image.shape[2] // GROUP)
     padded = np.zeros((*image.shape[:2], count * GROUP), np.float32)
     padded[..., : image.shape[2]] = image
@@ -93,7 +93,7 @@ def in_groups(image: F32) -> list[F32]:
 
 
 def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Mask) -> LobeFit:
-    """How well a GGX lobe stands for the fitted one at each texel: (H, W, k), (H, W), (H, W), (W, k), (H, W)."""
+    """Error of GGX against the fitted lobe. coefficients (H, W, k); inv_kappa, f0, covered (H, W); basis (W, k)."""
     residual = np.zeros(covered.shape, np.float32)
     errors = powers = 0.0
     weights = COSINES / COSINES.sum()
@@ -118,7 +118,7 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
 def _rows_at(
     table: npt.NDArray[np.float64], places: npt.NDArray[np.float64], x: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Rows of `table` at even `places`, linear between: (N, columns)."""
+    """(N, columns) rows of `table` at evenly spaced `places`, interpolated linearly."""
     t = ((x - places[0]) / (places[1] - places[0])).clip(0, len(places) - 1)
     low = np.minimum(t.astype(np.int64), len(places) - 2)
     f = (t - low)[:, None]

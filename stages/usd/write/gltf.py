@@ -1,12 +1,12 @@
-"""NAME.glb: the same look for the web and for engines, in one binary file.
+"""Writes NAME.glb: the same asset for the web and for game engines, in one binary file.
 
 Core metallic-roughness material with metallic 0, and KHR_materials_specular: reflectance at normal incidence is
 
     F0 = 0.04 * specularColorFactor * specularColorTexture
 
-whose texture is sRGB-encoded F0 over its largest value, so that eight bits serve. Texture coordinates have their origin
-top left there, so v becomes 1 - v. glTF knows no UDIM tiles: each becomes a primitive and a material of its own, its
-coordinates in the unit square. The same content gives the same bytes.
+whose texture is sRGB-encoded F0 over its largest value, so that eight bits are enough. The origin of texture
+coordinates is top left in glTF, so v becomes 1 - v. glTF has no UDIM tiles: each tile becomes a primitive with its own
+material and coordinates in the unit square. The same content gives the same bytes.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from stages.usd.write.shading import Look
 FLOAT, UINT, ARRAY_BUFFER, ELEMENT_BUFFER = 5126, 5125, 34962, 34963
 LINEAR, LINEAR_MIPMAPS, CLAMP = 9729, 9987, 33071
 DIELECTRIC_F0 = 0.04
-MIN_TOP, LARGEST_TOP = 0.02, 0.16  # of F0's largest value: outliers of a fit must not take all eight bits
+MIN_TOP, LARGEST_TOP = 0.02, 0.16  # range of F0's largest value: outliers of a fit must not use up the eight bits
 
 
 class _Binary:
-    """The binary chunk and what points into it."""
+    """The binary chunk, its buffer views and accessors."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -62,14 +62,14 @@ class _Binary:
 
 
 def corners(mesh: UvSurface) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
-    """Vertices split at seams: (N,) rows of the vertices and of the uvs, and faces (F, 3) into them."""
+    """Vertices split at seams: (N,) indices into the vertices and into the uvs, and faces (F, 3) into these."""
     pairs = np.stack([mesh.faces.ravel(), mesh.uv_faces.ravel()], -1).astype(np.int64)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     return unique[:, 0], unique[:, 1], inverse.reshape(-1, 3).astype(np.uint32)
 
 
 def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, metadata: dict[str, str]) -> None:
-    """`folder`: what the look's paths are relative to. `said`: what the user stated about the capture."""
+    """Write the file. `folder`: base of the look's paths. `metadata`: from the user."""
     binary, count = _Binary(), tile_count(mesh)
     looks = [look.on_tile(t) for t in range(count)]
     primitives = [_primitive(on_tile(mesh, t, count), t, binary) for t in range(count)]
@@ -124,14 +124,14 @@ def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any
 
 
 def _top(f0: Path) -> float:
-    """What stands for the largest F0 of a map, outliers left out."""
+    """The largest F0 of a map, without outliers."""
     return float(np.clip(np.percentile(read_exr(f0)[0][..., 0], 99.9), MIN_TOP, LARGEST_TOP))
 
 
 def _material(
     name: str, look: Look, folder: Path, binary: _Binary, images: list[dict[str, Any]], top: float
 ) -> dict[str, Any]:
-    """`top`: the F0 that the texture's largest value stands for."""
+    """The material. `top`: the F0 of the texture's largest value."""
 
     def add(kind: str, content: bytes) -> dict[str, int]:
         images.append({"name": f"{name}_{kind}", "mimeType": "image/png", "bufferView": binary.view(content)})

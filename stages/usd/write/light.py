@@ -1,4 +1,4 @@
-"""The captured light: spherical harmonics to and from a lat-long picture, and as a file.
+"""The captured light: conversion between spherical harmonics and a lat-long picture, and its file.
 
 Lat-long (USD's dome): rows from +Y (top) to -Y; the image's centre looks along +Z, its left edge is longitude +pi,
 and columns grow towards -X. Longitude 0 is +Z and grows towards +X.
@@ -20,7 +20,7 @@ from pipeline.maths import sh
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 
-KEPT_ORDER, SOLVE_WIDTH, SOLVE_STEPS = 4, 128, 200  # of the positive picture's correction
+KEPT_ORDER, SOLVE_WIDTH, SOLVE_STEPS = 4, 128, 200  # of the correction of the positive picture
 
 CONVENTION = (
     "Radiance L(d) = sum over l = 0..order, m = -l..l of coefficients[l * (l + 1) + m] * Y_lm(d), linear Rec.709, one "
@@ -47,21 +47,21 @@ def latlong_directions(width: int, height: int) -> F64:
 
 
 def latlong_weights(width: int, height: int) -> F64:
-    """(height, 1) solid angle of one pixel in each row; over all pixels they sum to 4 pi."""
+    """(height, 1) solid angle of one pixel in each row; the sum over all pixels is 4 pi."""
     edge = np.sin(np.pi * (0.5 - np.arange(height + 1) / height))
     weights: F64 = ((edge[:-1] - edge[1:]) * 2 * np.pi / width)[:, None]
     return weights
 
 
 def environment(light: F32, width: int) -> F32:
-    """(width / 2, width, 3) picture of the light that any renderer can take: nowhere negative.
+    """(width / 2, width, 3) picture of the light without negative values, for any renderer.
 
         max(L(d) + sum_{l <= 4} q_lm Y_lm(d), 0)
 
-    A sum of harmonics rings below 0 beside bright lamps. Cutting that off alone would add light; q takes it back out,
-    so that the picture's own harmonics up to order KEPT_ORDER are the light's: its energy, and through the clamped
-    cosine nearly all that a surface's irradiance depends on. Where no positive picture can have them (a light that
-    was fitted to be dark somewhere), the nearest that the steps find; the energy is then kept by a factor per colour.
+    A sum of harmonics rings below 0 beside bright lamps. Clamping alone would add light; q removes it again, so that
+    the picture's harmonics up to order KEPT_ORDER equal those of the light. They determine its energy and, through the
+    clamped cosine, nearly all of the irradiance of a surface. If no positive picture has these harmonics (a light that
+    was fitted very dark somewhere), the nearest one found is used, and a factor per colour keeps the energy.
     """
     height = width // 2
     small = _picture(light, SOLVE_WIDTH)
@@ -79,7 +79,7 @@ def environment(light: F32, width: int) -> F32:
 
 
 def _picture(light: F32, width: int) -> F64:
-    """(width / 2, width, 3) L(d), ringing and all."""
+    """(width / 2, width, 3) L(d), including its negative values."""
     directions = torch.from_numpy(latlong_directions(width, width // 2).reshape(-1, 3))
     found: F64 = sh.radiance(torch.from_numpy(np.asarray(light, np.float64)), directions).numpy()
     return found.reshape(width // 2, width, 3)
@@ -93,7 +93,7 @@ def _kept_basis(width: int) -> F64:
 
 
 def environment_figures(light: F32, image: F32) -> dict[str, float]:
-    """For the report: how far the raw light is negative, and how well the picture stands for it.
+    """For the report: how negative the raw light is, and how well the picture (width / 2, width, 3) represents it.
 
     light_negative_share: of the raw light's energy; light_peak_ratio: picture's over raw maximum;
     light_irradiance_error: largest difference of E(n) over all n, relative to the mean of E.
@@ -113,7 +113,7 @@ def environment_figures(light: F32, image: F32) -> dict[str, float]:
 
 
 def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:
-    """((order + 1)^2, 3) coefficients of a lat-long picture (H, W, 3), by summing over its pixels."""
+    """((order + 1)^2, 3) coefficients of a lat-long picture (H, W, 3), by a sum over its pixels."""
     height, width = image.shape[:2]
     directions = latlong_directions(width, height)
     weights = latlong_weights(width, height)
@@ -125,7 +125,7 @@ def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:
 
 
 def light_json(light: F32, attenuation: str) -> str:
-    """The raw coefficients with what they mean."""
+    """JSON of the raw coefficients, with their definition."""
     rows = [[float(f"{x:.9g}") for x in row] for row in np.asarray(light, np.float64)]
     content = {
         "order": int(np.sqrt(len(light))) - 1,
@@ -138,7 +138,7 @@ def light_json(light: F32, attenuation: str) -> str:
 
 
 def read_light(path: Path) -> F32:
-    """((L + 1)^2, 3) from light.json, or from the fit's .npz or .npy file."""
+    """((L + 1)^2, 3) coefficients from light.json, or from the fit's .npz or .npy file."""
     try:
         found: Any
         if path.suffix == ".json":

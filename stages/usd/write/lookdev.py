@@ -1,7 +1,7 @@
-"""lookdev.usda: the component under its captured light, seen by its captured cameras.
+"""Writes lookdev.usda: the component with its captured light and cameras.
 
-The rig is added to the component's own prim in a stronger layer (the component is sublayered, not referenced), so
-that the file has one root prim and references cleanly, while NAME.usd itself stays free of lights and cameras.
+Light and cameras are added to the component's own prim in a stronger layer (the component is a sublayer, not a
+reference). So the file has one root prim and can be referenced, and NAME.usd has no lights and cameras.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from stages.usd.write.component import detached
 
 MAIN_CAMERA = "main_cam"
 SENSOR_WIDTH = (
-    0.36  # USD measures apertures in tenths of the scene's unit: 36 mm; only its ratio to focal length counts
+    0.36  # tenths of the scene's unit, as USD defines apertures: 36 mm; only the ratio to the focal length matters
 )
 
 
 def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int], radius: float) -> Sdf.Layer:
-    """`radius`: of the region of interest around the origin, for clipping ranges."""
+    """The layer. `radius`: of the region of interest around the origin, for the clipping ranges."""
     stage = Usd.Stage.CreateInMemory()
     layer = stage.GetRootLayer()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -41,15 +41,15 @@ def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int
         _camera(stage, f"/{name}/lookdev/cameras/view_{camera.index}", camera, camera.index in holdout, radius)
     _shown_first(stage, name, cameras, holdout)
     out = detached(stage)
-    out.subLayerPaths.append(f"./{name}.usd")  # only now: on a stage it would be looked for in the working folder
+    out.subLayerPaths.append(f"./{name}.usd")  # not before: a stage would search it in the working folder
     return out
 
 
 def _shown_first(stage: Usd.Stage, name: str, cameras: tuple[Camera, ...], holdout: frozenset[int]) -> None:
-    """What opens first: the held-out photo taken most from the front (with none held out, any photo).
+    """Set the first camera: the most frontal held-out photo (if none is held out, the most frontal photo).
 
-    Viewers disagree on how a file says so: usdview takes a camera called main_cam, others the layer's cameraSettings,
-    renderers the stage's render settings.
+    There are several conventions: usdview uses a camera called main_cam, others the layer's cameraSettings, renderers
+    the stage's render settings.
     """
     if not cameras:
         return
@@ -65,7 +65,7 @@ def _shown_first(stage: Usd.Stage, name: str, cameras: tuple[Camera, ...], holdo
 
 
 def _camera(stage: Usd.Stage, path: str, camera: Camera, held_out: bool, radius: float) -> None:
-    """A UsdGeomCamera whose frustum is that of K: fx, fy and principal point; the distortion goes along as metadata.
+    """A UsdGeomCamera with the frustum of K: fx, fy and principal point. The distortion is stored as metadata.
 
         horizontalAperture / focalLength = width / fx,   horizontalApertureOffset / focalLength = (width / 2 - cx) / fx
         verticalAperture / focalLength = height / fy,    verticalApertureOffset / focalLength = (cy - height / 2) / fy

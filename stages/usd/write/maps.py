@@ -1,4 +1,4 @@
-"""The asset's textures: the baked maps, and what standard shaders need beside them."""
+"""The asset's textures: the baked maps, and further maps for standard shaders."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
-SKIN_F0 = 0.028  # where no F0 was baked
-RAYS = 4_000_000  # about how many are spent on the lamps' visibility
+SKIN_F0 = 0.028  # used if no F0 was baked
+RAYS = 4_000_000  # about the number of rays for the lamps' visibility
 LAMPS = (96, 384)
 LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
-OCCLUSION_SIZE = 1024  # texels: it varies from vertex to vertex only
+OCCLUSION_SIZE = 1024  # texels: it is computed at the vertices
 
 
 @dataclass(frozen=True, slots=True)
 class Maps:
-    """Files written, what the material reads of them, and figures for the report."""
+    """The written files, those that the material reads, and figures for the report."""
 
     written: list[Path]
     look: Look
@@ -60,8 +60,8 @@ def write_maps(
     divide: bool,
     acescg: bool = False,
 ) -> Maps:
-    """Everything in textures/. `divide`: take shadows and bounced light out of the albedo. `acescg`: that albedo in
-    ACEScg too."""
+    """Write textures/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also write that
+    albedo in ACEScg."""
     folder = asset / "textures"
     written = copy_maps(bake, name, folder)
     figures: dict[str, float] = {}
@@ -86,7 +86,7 @@ def write_maps(
 def _derived(
     bake: Located[TextureSet], tile: int, name: str, folder: Path, basis: F32, *, acescg: bool
 ) -> tuple[list[Path], LobeFit | None]:
-    """One tile's maps that are made from others, and how well a GGX lobe serves there."""
+    """One tile's maps that are computed from others, and the error of GGX there."""
     exr, png = (tiles.form(k, tile, bake.artifact.tiles) for k in ("exr", "png"))
     written = []
     if acescg:
@@ -104,19 +104,19 @@ def _derived(
     write_png_from_linear(written[-1], np.repeat(f0[..., None].clip(0, 1), 3, -1))
     fit = lobe_fit(coefficients, _map(bake, "inv_kappa", tile)[..., 0], f0, basis, covered_texels(bake, tile))
     written.append(folder / f"{name}_lobe_fit.{png}")
-    # red: the residual of the GGX lobe, 1 = 100 %; green: 1 where kappa can't be told; blue: nothing
+    # red: residual of the GGX lobe, 1 = 100 %; green: 1 where the light does not determine kappa; blue: 0
     write_png(written[-1], np.stack([fit.residual, fit.unresolved, np.zeros_like(fit.residual)], -1))
     return written, fit
 
 
 def shadows_fitted(bake: Located[TextureSet]) -> bool:
-    """Whether the fit modelled shadows and bounces itself, so that its albedo is free of them."""
+    """Whether the fit modelled shadows and interreflections, so that its albedo does not contain them."""
     ratio = bake.artifact.maps.get("irradiance_ratio")
     return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
 def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
-    """Every file of every map as NAME_map.format."""
+    """Copy every file of every map as NAME_map.format."""
     count = bake.artifact.tiles
     wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
     wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
@@ -125,7 +125,7 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
             "maps are missing",
             where="bake",
             value=", ".join(sorted(bake.artifact.maps)) or "no maps",
-            limit=f"{', '.join(NEEDED)} as exr, albedo as png too",
+            limit=f"{', '.join(NEEDED)} as exr, albedo also as png",
             remedy="run the bake stage again",
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -141,10 +141,10 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
 def divided_albedo(
     bake: Located[TextureSet], mesh: UvSurface, light: F32, name: str, folder: Path, check: Callable[[], None]
 ) -> tuple[list[Path], dict[str, float]]:
-    """albedo without the light's shadows and bounces, over the baked one, and `occlusion`: albedo * occlusion = baked.
+    """Divide shadows and interreflections out of the albedo files, and write `occlusion`: albedo * occlusion = baked.
 
-    The closed form of the fit has neither, so that the photos' were fitted into the albedo. A path tracer has both:
-    with the albedo as fitted it would show them twice.
+    The closed form of the fit has neither, so that those of the photos were fitted into the albedo. A path tracer
+    computes both: with the albedo as fitted they would appear twice.
     """
     count = bake.artifact.tiles
     share = vertex_occlusion(mesh, light, vertex_albedo(bake, mesh), check)
@@ -164,7 +164,7 @@ def divided_albedo(
         write_png_from_linear(folder / f"{name}_albedo.{png}", albedo)
         written.append(folder / f"{name}_occlusion.{exr}")
         write_exr(written[-1], image)
-        shown.append(image[covered_texels(bake, tile)][::count])  # as many in all as one tile would have
+        shown.append(image[covered_texels(bake, tile)][::count])  # in total as many as in one tile
     found = np.concatenate(shown)
     figures = {
         "occlusion_mean": round(float(found.mean(dtype=np.float64)), 5),
@@ -174,7 +174,7 @@ def divided_albedo(
 
 
 def vertex_albedo(bake: Located[TextureSet], mesh: UvSurface) -> F64:
-    """(V, 3) the baked albedo at the vertices; at a seam, of one of its sides."""
+    """(V, 3) the baked albedo at the vertices; at a seam, from one of its sides."""
     uv, count = np.zeros((len(mesh.vertices), 2), np.float32), bake.artifact.tiles
     uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
     out = np.zeros((len(uv), 3))
@@ -195,7 +195,7 @@ def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F64, check: Callable[[
 
 
 def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
-    """(size, size, C) values (V, C) of the vertices on the texture, every texel filled from the nearest chart."""
+    """(size, size, C) texture of vertex values (V, C); texels between charts are filled from the nearest one."""
     charts = Charts(mesh.uvs, mesh.uv_faces)
     hits = raster.rasterise(raster.texel_corners(charts, size), size, 0, size)
     image = np.zeros((size * size, values.shape[1]), np.float32)
@@ -208,7 +208,7 @@ def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
 
 # ------------------------------------------------------------------ what the material reads
 def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
-    """The networks' files, and the index of refraction of the mean F0 over covered texels."""
+    """The files for the material's networks, and the index of refraction of the mean F0 over covered texels."""
 
     count = bake.artifact.tiles
 
@@ -245,7 +245,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
 
 
 def covered_texels(bake: Located[TextureSet], tile: int = 0) -> Mask:
-    """(H, W) texels that a chart touches, seen by a photo (1) or not (0.5); all where that was not baked."""
+    """(H, W) mask of the texels that a chart touches; all texels if `coverage` was not baked."""
     size, count = bake.artifact.size, bake.artifact.tiles
     files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
     exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))

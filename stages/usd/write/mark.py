@@ -1,11 +1,11 @@
-"""Writes into the asset how good it is. That is known last: when it was written, checked and rendered.
+"""Writes the verdict into the asset's metadata, after the asset was written, checked and rendered.
 
-`assetInfo` of the component's prim, and the same as `customLayerData` of its layer:
+In `assetInfo` of the component's prim, and in `customLayerData` of its layer:
 
     neuface:verdict         "good", "usable" or "unusable"
     neuface:verdictReasons  a sentence for each check that is not good, the worst first
 
-The report's own checks, which compare the finished asset with the photos, come later: they are not in it.
+The checks of the report stage, which compare the finished asset with the photos, come later and are not included.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ NAMESPACE, LEVEL, REASONS = "neuface", "verdict", "verdictReasons"
 
 
 def mark(root: Path, verdict: Verdict) -> None:
-    """Mark NAME.usd, and NAME.usdz if it lies beside it.
+    """Write the verdict into NAME.usd, and into NAME.usdz beside it if there is one.
 
     Raises:
         StageError: a layer can't be written.
@@ -44,7 +44,7 @@ def _note(layer: Sdf.Layer, verdict: Verdict) -> None:
 
 
 def _mark_package(path: Path, verdict: Verdict) -> None:
-    """A package is opened by its first member: that layer is marked, the pictures are kept as they are."""
+    """Write the verdict into the first member of a package, which is its layer; the pictures do not change."""
     (name, content), *pictures = read_package(path)
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / name

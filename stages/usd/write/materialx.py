@@ -1,4 +1,4 @@
-"""The material's two networks of stock MaterialX nodes, inline, because importers fail on definitions of our own.
+"""The material's two MaterialX networks, of standard nodes only, because importers fail on custom node definitions.
 
 `openpbr`        OpenPBR with albedo, roughness, normal, and F0 as `specular_weight`
 `neuface_basis`  OpenPBR whose specular tint is the learned lobe itself:
@@ -7,7 +7,7 @@
 
     viewdirection, normal -> facingratio -> combine2(n.v, 2/kappa) -> image T -> dotproduct(image c) -> specular_color
 
-View direction and normal are connected, not left to defaults: renderers differ in those.
+View direction and normal are connected explicitly, because renderers have different defaults.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from stages.usd.write.shading import Look, T, connect, shader
 SURFACE = "ND_open_pbr_surface_surfaceshader"
 CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
 SRGB, DATA = "srgb_texture", "raw"
-LARGEST_F0 = 0.16  # of `specular_weight` = 4: a fit gone wrong must not become a mirror
+LARGEST_F0 = 0.16  # `specular_weight` = 4: limits the reflectance of a failed fit
 
 
 class _Nodes:
-    """Authors nodes below one folder of the material, and shares the readers."""
+    """Authors nodes below one prim of the material, and reuses texture readers."""
 
     def __init__(self, stage: Usd.Stage, path: str) -> None:
         self.stage, self.path = stage, path
@@ -35,7 +35,7 @@ class _Nodes:
         self.st = node.CreateOutput("out", T.Float2)
 
     def node(self, name: str, identifier: str, out: Sdf.ValueTypeName, **inputs: object) -> UsdShade.Output:
-        """A node; inputs are outputs of other nodes, or (type, value)."""
+        """Author a node; inputs are outputs of other nodes, or (type, value)."""
         made = shader(self.stage, f"{self.path}/{name}", identifier)
         for key, value in inputs.items():
             key = key.rstrip("_")
@@ -46,25 +46,25 @@ class _Nodes:
         return made.CreateOutput("out", out)
 
     def image(self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str) -> UsdShade.Output:
-        """A picture at st."""
+        """Author a texture lookup at st."""
         return self.image_at(name, kind, out, file, space, self.st)
 
     def image_at(
         self, name: str, kind: str, out: Sdf.ValueTypeName, file: str, space: str, at: UsdShade.Output
     ) -> UsdShade.Output:
-        """A picture at `at`, clamped if it is one and not a row of tiles."""
+        """Author a texture lookup at `at`; clamped, unless it has tiles."""
         made = shader(self.stage, f"{self.path}/{name}", f"ND_image_{kind}")
         picture = made.CreateInput("file", T.Asset)
         picture.Set(Sdf.AssetPath(file))
         picture.GetAttr().SetColorSpace(space)
         connect(made.CreateInput("texcoord", T.Float2), at)
-        for axis in "uv" if tiles.TOKEN not in file else "":  # with tiles, clamped would be the whole row
+        for axis in "uv" if tiles.TOKEN not in file else "":  # clamping would apply to the whole row of tiles
             made.CreateInput(f"{axis}addressmode", T.String).Set("clamp")
         return made.CreateOutput("out", out)
 
 
 def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) -> list[str]:
-    """Author what the look's maps allow; the first becomes outputs:mtlx:surface. Hands back the networks' names."""
+    """Author the networks for which the look has maps. The first becomes outputs:mtlx:surface. Returns their names."""
     path, made = str(material.GetPath()), []
     if look.roughness and look.f0:
         made.append("openpbr")
@@ -74,7 +74,7 @@ def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look
         _surface(stage, f"{path}/neuface_basis", look, basis=True)
     if made:
         prim = material.GetPrim()
-        prim.AddAppliedSchema(CONFIG_SCHEMA)  # no plugin of this schema in all builds: ApplyAPI would refuse
+        prim.AddAppliedSchema(CONFIG_SCHEMA)  # not ApplyAPI: some builds have no plugin of this schema
         prim.CreateAttribute("config:mtlx:version", T.String, False, Sdf.VariabilityUniform).Set(VERSION)
         output = UsdShade.Shader.Get(stage, f"{path}/{made[0]}/surface").ConnectableAPI()
         material.CreateSurfaceOutput("mtlx").ConnectToSource(output, "out")

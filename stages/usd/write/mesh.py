@@ -1,4 +1,4 @@
-"""The asset's mesh in memory, and texture coordinates for its proxy."""
+"""The asset's mesh in memory, and texture coordinates for proxy and dense mesh."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
 SHRINK, SHRINK_ROUNDS = 0.85, 6
-AREAS = (0.25, 4.0)  # of a triangle's own: with less or more in the texture it is laid flat anew
-INSIDE = 1e-5  # of a tile: how far from its border corners are kept, so that rounding leaves no doubt whose they are
-CANDIDATES = 12  # nearest triangles among which the exact nearest point is looked for
+AREAS = (0.25, 4.0)  # accepted ratio of texture area to the triangle's own; others are parameterised again
+INSIDE = 1e-5  # of a tile: least distance of corners from its border, against rounding errors
+CANDIDATES = 12  # nearest triangles that are searched for the exact nearest point
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class UvSurface:
 
 
 def read_mesh(path: Path, *, with_uvs: bool = True) -> UvSurface:
-    """A mesh npz. Without uvs (a proxy) these arrays are empty. StageError where arrays do not fit each other."""
+    """Read a mesh npz. Without uvs (a proxy) those arrays are empty. StageError if the arrays do not match."""
     with np.load(path, allow_pickle=False) as f:
         stored = {k: f[k] for k in f.files}
     if not with_uvs:
@@ -82,7 +82,7 @@ def _bad_mesh(path: Path, value: str) -> StageError:
 
 
 def tile_count(mesh: UvSurface) -> int:
-    """How many UDIM tiles (pipeline.tiles) a mesh's triangles lie in."""
+    """Number of UDIM tiles (pipeline.tiles) of a mesh."""
     return tiles.count(Charts(mesh.uvs, mesh.uv_faces))
 
 
@@ -96,7 +96,7 @@ def on_tile(mesh: UvSurface, tile: int, count: int) -> UvSurface:
 
 
 def charts_of(uv_faces: I32, count: int) -> I32:
-    """(F,) chart number of each triangle: triangles that share a texture vertex are in one chart."""
+    """(F,) chart of each triangle (F, 3): triangles that share a texture vertex are in one chart. count: vertices."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -107,16 +107,17 @@ def charts_of(uv_faces: I32, count: int) -> I32:
 
 
 def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATES, beyond: float = 0.0) -> UvSurface:
-    """The proxy with texture coordinates of the full mesh, so that one material serves both.
+    """The proxy with texture coordinates of the full mesh, so that both use one material.
 
-    Each proxy triangle takes the chart that lies nearest to its centroid, and each of its corners the texture
-    coordinate of that chart's nearest point. At a chart's edge corners are therefore drawn onto the edge: never into
-    a neighbour's texels. Nearest is measured in space and in the texture together (against where the centroid's
-    triangle, continued as a plane, would put the corner), because a chart may wind around and meet itself at a seam.
+    Each proxy triangle is assigned to the chart nearest to its centroid, and each of its corners takes the texture
+    coordinate of that chart's nearest point. So at a chart's edge corners move onto the edge, and never into another
+    chart's texels. The distance combines space and texture (measured from the position that the plane of the centroid's
+    triangle predicts for the corner), because a chart may meet itself at a seam.
 
-    `beyond` (uv): how far corners may lie past their chart's edge instead, where its triangle continued as a plane
-    puts them. A fine mesh needs that: of its triangles on a seam nothing would be left. Those that stand on end
-    against what they take their coordinates from (a rim that the full mesh cuts off) are laid flat around their middle.
+    `beyond` (uv): corners may instead lie this far outside their chart's edge, at the position predicted by the plane
+    of its triangle. A fine mesh needs this, because its triangles on a seam would lose their area. Triangles
+    perpendicular to the surface they are assigned to (a rim that the full mesh does not have) are rotated into its
+    plane.
     """
     from scipy.spatial import cKDTree
 
@@ -125,7 +126,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     ends = proxy.vertices[proxy.faces].astype(np.float64)
     near = cKDTree(corners.mean(1)).query(ends.mean(1), candidates)[1]
     hit, weights_at_centre = _nearest(ends.mean(1), corners, near)
-    scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres a unit of texture
+    scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres per unit of texture
     expected = _continued(ends, corners[hit], t[hit], weights_at_centre)
     places = np.concatenate([corners.mean(1), scale * t.mean(1)], 1)
     wanted = np.concatenate([ends, scale * expected], -1)
@@ -145,16 +146,16 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     if beyond > 0:
         _lay_flat(uvs, ends, corners[hit], t[hit], weights_at_centre, beyond)
     home = tiles.of_face(Charts(full.uvs, full.uv_faces))[hit].astype(np.float64)
-    if home.any():  # of several tiles: what reaches past a border of its own would show another's texels
+    if home.any():  # several tiles: a corner outside its own tile would show texels of another one
         uvs[..., 0] = uvs[..., 0].clip(home[:, None] + INSIDE, home[:, None] + 1 - INSIDE)
     values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
 
 
 def _lay_flat(uvs: F64, ends: F64, corners: F64, t: F64, weights: F64, most: float) -> None:
-    """Triangles (N, 3, 3) that lost most of their area in uvs (N, 3, 2), turned over or were torn apart are turned in
-    space until they lie in their triangle of the full mesh (`corners`, `t` (N, 3, .), `weights` (N, 3) under their
-    middle), and take its coordinates. Corners stay within `most` (uv) of the middle. Changes uvs."""
+    """Parameterise again triangles (N, 3, 3) whose uvs (N, 3, 2) are almost empty, mirrored or far too large. They are
+    rotated into the plane of their triangle of the full mesh (`corners`, `t` (N, 3, .), `weights` (N, 3) at their
+    centroid) and take its coordinates. Corners stay within `most` (uv) of the centroid. Changes uvs."""
     own, base = (np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]) for x in (ends, corners))
     a, b = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
     c, d = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
@@ -173,9 +174,9 @@ def _lay_flat(uvs: F64, ends: F64, corners: F64, t: F64, weights: F64, most: flo
 
 
 def _turned(points: F64, start: F64, goal: F64) -> F64:
-    """(N, K, 3) points turned by the smallest turn that takes direction start (N, 3) to goal (N, 3)."""
+    """(N, K, 3) points after the smallest rotation that takes direction start (N, 3) to goal (N, 3)."""
     a, b = (v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30) for v in (start, goal))
-    half = a + b  # two mirrorings, at the plane across a and at that across the way between a and b
+    half = a + b  # two reflections, at the planes perpendicular to a and to the bisector of a and b
     opposite = np.linalg.norm(half, axis=1) < 1e-6
     half[opposite] = np.cross(a[opposite], np.eye(3)[np.abs(a[opposite]).argmin(1)])
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -185,8 +186,8 @@ def _turned(points: F64, start: F64, goal: F64) -> F64:
 
 
 def half_gap(mesh: UvSurface, size: int = 1024) -> float:
-    """Half of the least distance (uv) between two charts, found on a raster of `size` and a texel too small rather
-    than too large; infinite for one chart. The gutter's texels up to there are filled from the nearer chart."""
+    """Half of the least distance (uv) between two charts, measured on a raster of `size`, at most a texel too small;
+    infinite for one chart. Texels within this distance of a chart are filled from it."""
     count = tile_count(mesh)
     return min(_half_gap(on_tile(mesh, t, count), size) for t in range(count))
 
@@ -212,10 +213,10 @@ def _half_gap(mesh: UvSurface, size: int) -> float:
 
 
 def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
-    """The proxy with texture triangles drawn towards their centres where two lie on the same texels.
+    """The proxy with texture triangles shrunk towards their centroids where two cover the same texels.
 
-    At a chart's edge corners are drawn onto the edge, so that neighbours may fold over each other. Baking onto the
-    proxy would then write texels twice. A stand-in can bear a little stretch instead.
+    Moving corners onto a chart's edge may make neighbours overlap. Baking onto the proxy would then write texels twice.
+    On a proxy a little stretch does no harm.
     """
     from pipeline import raster
 
@@ -241,7 +242,7 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
 
 
 def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
-    """(N, K, 2): where each triangle's affine map from space to texture puts its points (N, K, 3)."""
+    """(N, K, 2) texture coordinates of points (N, K, 3) by each triangle's affine map from space to texture."""
     edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
     on = (corners * weights[..., None]).sum(1)
     start = (t * weights[..., None]).sum(1)
@@ -255,7 +256,7 @@ def _areas(triangles: F64) -> F64:
 
 
 def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.int64], F64]:
-    """Of the candidate triangles (N, K) the nearest (N,), and the barycentric weights (N, 3) of its nearest point."""
+    """The nearest (N,) of the candidate triangles (N, K), and barycentric weights (N, 3) of its nearest point."""
     import trimesh
 
     best = np.full(len(points), np.inf)
@@ -270,9 +271,9 @@ def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> 
 
 
 def uv_fault(proxy: UvSurface, full: UvSurface, limit: float = 0.005) -> str:
-    """Why texture coordinates taken from the full mesh would mislead a client, or "".
+    """The fault of texture coordinates taken from the full mesh, or "".
 
-    Triangles without area, or more mirrored ones than the full mesh has (an atlas may mirror whole charts).
+    Faults: triangles without area, or more mirrored ones than in the full mesh (which may mirror whole charts).
     """
     empty, mirrored = _shares(proxy)
     if empty > limit:
@@ -282,7 +283,7 @@ def uv_fault(proxy: UvSurface, full: UvSurface, limit: float = 0.005) -> str:
 
 
 def _shares(mesh: UvSurface) -> tuple[float, float]:
-    """Shares of a mesh's area whose triangles are empty, and are mirrored, in the texture."""
+    """Shares of a mesh's area whose triangles have no area, and are mirrored, in the texture."""
     t = mesh.uvs[mesh.uv_faces].astype(np.float64)
     a, b = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     signed = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -1,6 +1,6 @@
-"""NAME.obj and NAME.mtl: for tools without USD. The maps are those in textures/.
+"""Writes NAME.obj and NAME.mtl, for tools without USD. The maps are those in textures/.
 
-The format knows no UDIM tiles: each becomes a material of its own, its texture coordinates in the unit square.
+The format has no UDIM tiles: each becomes a material of its own, with texture coordinates in the unit square.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from stages.usd.write.shading import MATERIAL, Look
 
 
 def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path]:
-    """Metres, +Y up, as the asset. Indices count from 1; v, vt and vn have their own."""
+    """Write the files: metres, +Y up, as the asset. Indices start at 1; v, vt and vn are indexed separately."""
     normals = mesh.normals.astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     vertex, uv, count = mesh.faces + 1, mesh.uv_faces + 1, tile_count(mesh)

@@ -1,7 +1,6 @@
 """Writes .usdz: an uncompressed zip whose members start at multiples of 64 bytes.
 
-Own writer instead of the library's, because the same content has to give the same bytes: that one stores the files'
-modification times.
+The USD library's own writer stores modification times; here the same content must give the same bytes.
 """
 
 from __future__ import annotations
@@ -15,15 +14,15 @@ import numpy.typing as npt
 
 from pipeline.images import read_encoded
 
-AR_SIDE = 2048  # texels: phones hold no more
+AR_SIDE = 2048  # texels: the limit of phones
 ALIGNMENT = 64
 LOCAL_HEADER = 30
 PADDING_ID = 0x1986  # the extra-field id that USD's own writer uses for its padding
-STAMP = (1980, 1, 1, 0, 0, 0)  # the earliest a zip can hold
+STAMP = (1980, 1, 1, 0, 0, 0)  # the earliest date in a zip
 
 
 def write_package(path: Path, members: list[tuple[str, bytes]]) -> None:
-    """Members in order, the root layer first (a viewer opens the first file)."""
+    """Write the members in order, the root layer first (a viewer opens the first file)."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=False) as z:
         for name, content in members:
             info = zipfile.ZipInfo(name, STAMP)
@@ -34,7 +33,7 @@ def write_package(path: Path, members: list[tuple[str, bytes]]) -> None:
 
 
 def read_package(path: Path) -> list[tuple[str, bytes]]:
-    """The members of a package in their order."""
+    """The members of a package, in order."""
     with zipfile.ZipFile(path) as z:
         return [(name, z.read(name)) for name in z.namelist()]
 
@@ -50,10 +49,11 @@ def _padding(offset: int) -> bytes:
 
 
 def bounded_png(source: Path | npt.NDArray[np.integer]) -> bytes:
-    """A PNG of at most AR_SIDE texels a side: the file as it is if it is that small, else shrunk by means over blocks.
+    """A PNG of at most AR_SIDE texels per side: the file itself if it is small enough, else reduced by means over
+    blocks.
 
-    `source`: a file, or (H, W, C) as stored. The means are of stored values, which is right for data and close for
-    colours. Every 8-bit picture keeps its channels.
+    `source`: a file, or (H, W, C) as stored. The means are of stored values, which is exact for data and approximate
+    for colours. Every 8-bit picture keeps its channels.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""What the asset's material reads, and helpers to author shader prims."""
+"""The files that the asset's material reads, and helpers to author shader prims."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MATERIAL = "captured"
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What the material's networks show. Paths are relative to the layer, of several tiles with <UDIM> in place of the
-    tile's number; None leaves a map out.
+    """Inputs of the material's networks. Paths are relative to the layer, with <UDIM> in place of the tile's number if
+    there are several tiles; None leaves a map out.
 
-    coefficients, basis: pictures of three coefficients c_j(x), and three tables B_j / R, each; () where there are none.
+    coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     """
 
     albedo: str
@@ -34,7 +34,7 @@ class Look:
     basis: tuple[str, ...] = ()
 
     def on_tile(self, tile: int) -> Look:
-        """The same with the files of one tile."""
+        """The same look with the files of one tile."""
         number = str(tiles.FIRST + tile)
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         named: dict[str, Any] = {k: p.replace(tiles.TOKEN, number) for k, p in values.items() if isinstance(p, str)}
@@ -64,8 +64,8 @@ def connect(target: UsdShade.Input, source: UsdShade.Output) -> None:
 
 # ------------------------------------------------------------------ UsdPreviewSurface
 def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) -> None:
-    """`preview` in the metallic workflow, which every importer reads the same way, as the material's surface, and
-    `preview_specular` beside it, which is F0 as a map: a variant, because many importers take it for something else.
+    """Author `preview` as the material's surface, in the metallic workflow, which all importers read in the same way.
+    Author `preview_specular` with a map of F0; it is a variant, because many importers misread it.
     """
     path = str(material.GetPath())
     name = material.CreateInput("st_name", T.String)
@@ -101,8 +101,8 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
 def _texture(
     stage: Usd.Stage, st: UsdShade.Output, path: str, file: str, space: str, channel: str = "rgb"
 ) -> UsdShade.Output:
-    """A texture reader. Clamped: charts never wrap, and wrapping would mix opposite borders. (Readers of tiles pay no
-    heed to it, each tile being looked up by its own part of st.)"""
+    """Author a texture reader. It is clamped: charts never wrap, and wrapping would mix opposite borders. (Readers of
+    tiles ignore this.)"""
     out = shader(stage, path, "UsdUVTexture")
     out.CreateInput("file", T.Asset).Set(Sdf.AssetPath(file))
     out.CreateInput("sourceColorSpace", T.Token).Set(space)
@@ -113,7 +113,7 @@ def _texture(
 
 
 def _normal_texture(stage: Usd.Stage, st: UsdShade.Output, path: str, file: str) -> UsdShade.Output:
-    """Eight bits hold (n + 1) / 2."""
+    """Author a reader of a normal map, which stores (n + 1) / 2 in eight bits."""
     output = _texture(stage, st, path, file, "raw")
     out = UsdShade.Shader(output.GetPrim())
     out.CreateInput("scale", T.Float4).Set(Gf.Vec4f(2, 2, 2, 1))
