@@ -322,6 +322,11 @@ class FittedFace(Artifact):
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 
+    @property
+    def attenuation(self) -> str:
+        """Name of the light's attenuation in the fit; the paper's exponential if the model does not have the entry."""
+        return next((str(v["attenuation"]) for v in self.model.values() if "attenuation" in v), "exponential")
+
 
 # ------------------------------------------------------------------ mesh
 class Surface(Artifact):

@@ -20,7 +20,7 @@ MIN_ALPHA = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class FittedPhoto:
     """A fitted photo and its camera; its mask, clipped pixels and labels, if they exist."""
 
     camera: Camera
@@ -32,15 +32,15 @@ class View:
 
 def seen_by(
     fitted: FittedFace, poses: CameraSet, masks: Located[MaskSet], capture: Located[Capture]
-) -> tuple[View, ...]:
+) -> tuple[FittedPhoto, ...]:
     """The views that the field was fitted to, in the order of its colour responses, without held-out views."""
     used = set(fitted.fitted_views) - {v.index for v in capture.artifact.views if v.holdout}
     cut = {m.index: m for m in masks.artifact.masks}
     shot = {v.index: v for v in capture.artifact.views}
 
-    def view(camera: Camera) -> View:
+    def view(camera: Camera) -> FittedPhoto:
         mask, photo = cut.get(camera.index), shot.get(camera.index)
-        return View(
+        return FittedPhoto(
             camera,
             None if mask is None else masks.path(mask.mask),
             None if photo is None else capture.path(photo.image),
@@ -67,7 +67,7 @@ class Occluder(RayCaster):
         return out
 
 
-def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occluder) -> F64:
+def seen_weight(points: F64, normals: F64, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
     """(N,) sum of the cosines towards all views that see each point. points, normals (N, 3)."""
     total = np.zeros(len(points))
     for view in views:
@@ -75,7 +75,7 @@ def seen_weight(points: F64, normals: F64, views: Sequence[View], occluder: Occl
     return total
 
 
-def view_cosines(view: View, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
+def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
     """(N,) cosine towards the camera if the view sees the point, else 0; (N, 2) position in the photo, pixels. points,
     normals (N, 3)."""
     camera = view.camera

@@ -146,6 +146,11 @@ class FittedField:
         """((L + 1)^2, 3) coefficients."""
         return np.asarray(self.model.light().detach().cpu().numpy(), np.float32)
 
+    @property
+    def colour_responses(self) -> F32 | None:
+        """(views, 3, 3) A_n of the fitted photos. [NeuFace eq. 19]"""
+        return np.asarray(self.model.calibration().detach().cpu().numpy(), np.float32)
+
     def _map(self, function: Any, *arrays: F32) -> tuple[F32, ...]:
         out = []
         with torch.no_grad():

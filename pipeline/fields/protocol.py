@@ -52,6 +52,11 @@ class Field(Protocol):
         """(121, 3) real orthonormal SH coefficients of the captured light, index l(l+1)+m."""
         ...
 
+    @property
+    def colour_responses(self) -> F32 | None:
+        """(views, 3, 3) A_n of the fitted photos [NeuFace eq. 19]; None if the field has none."""
+        ...
+
     def sdf(self, points: F32) -> F32:
         """(N,) signed distance, negative inside."""
         ...

@@ -14,7 +14,7 @@ from pipeline import footprint, meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
-from pipeline.visibility import Occluder, View, seen_weight
+from pipeline.visibility import FittedPhoto, Occluder, seen_weight
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.confidence import SIZE as SIGHT
@@ -80,7 +80,7 @@ class Baker:
         field: Field,
         mesh: Mesh,
         charts: Charts,
-        views: Sequence[View],
+        views: Sequence[FittedPhoto],
         size: int,
         step: Step,
         photos: Photos | None = None,
@@ -143,7 +143,7 @@ def _per_tile(side: int, count: int) -> int:
 
 
 def _known(
-    field: Field, mesh: Mesh, views: Sequence[View], occluder: Occluder, step: Callable[[int, int], None]
+    field: Field, mesh: Mesh, views: Sequence[FittedPhoto], occluder: Occluder, step: Callable[[int, int], None]
 ) -> Known:
     normals = meshes.unit(mesh.normals)
     seen = seen_weight(mesh.vertices.astype(np.float64), normals, views, occluder) > 0
@@ -152,7 +152,7 @@ def _known(
 
 
 def _detail(
-    field: Field, mesh: Mesh, charts: Charts, views: Sequence[View], size: int, photos: Photos, step: Step
+    field: Field, mesh: Mesh, charts: Charts, views: Sequence[FittedPhoto], size: int, photos: Photos, step: Step
 ) -> detail.Detail:
     count = tiles.count(charts)
     sparse = min(size, _per_tile(SPARSE, count))

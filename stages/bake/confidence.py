@@ -19,7 +19,7 @@ import numpy as np
 from pipeline import raster
 from pipeline.meshes import F32, F64, Charts, Mesh
 from pipeline.nearest import filled
-from pipeline.visibility import Occluder, View, picked, view_cosines
+from pipeline.visibility import FittedPhoto, Occluder, picked, view_cosines
 from stages.bake.regions import Poll, Votes
 
 SIZE = 512  # texels: visibility has little fine detail, and rays are expensive
@@ -37,7 +37,7 @@ class Sighted:
 def sighted(
     mesh: Mesh,
     charts: Charts,
-    views: Sequence[View],
+    views: Sequence[FittedPhoto],
     size: int,
     step: Callable[[int, int], None],
     occluder: Occluder | None = None,
@@ -67,7 +67,7 @@ def sighted(
     return Sighted(spread(1 - 2.0**-total), poll.result(spread))
 
 
-def unclipped(view: View, cosine: F64, uv: F64) -> F64:
+def unclipped(view: FittedPhoto, cosine: F64, uv: F64) -> F64:
     """(N,) cosines (N,) of the points that a view sees, set to 0 where its photo is clipped at uv (N, 2) pixels."""
     if view.clipped is None:
         return cosine

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pipeline.images import read_alpha, read_linear, shrink_whole
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.transforms import inverse_rigid, matrix, rays
-from pipeline.visibility import Occluder, View
+from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake import detail_kernels as kernels
 
 DEPTH_SIDE = 768  # largest side of a depth picture in pixels: rays are expensive
@@ -39,7 +39,7 @@ class Photos:
 
 
 def read_photos(
-    views: Sequence[View], responses: F64, mesh: Mesh, texel: float, step: Callable[[int, int], None]
+    views: Sequence[FittedPhoto], responses: F64, mesh: Mesh, texel: float, step: Callable[[int, int], None]
 ) -> Photos:
     """Read all fitted photos, not finer than `texel` (metres on the surface), and compute the depth of the mesh in
     each.
@@ -72,14 +72,14 @@ def read_photos(
     return Photos(cameras, np.concatenate(pixels), np.concatenate(depths), ends)
 
 
-def _clipped(view: View, shape: tuple[int, ...], factor: int) -> U8:
+def _clipped(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> U8:
     """(h w,) 1 where a block of `factor` x `factor` photo pixels contains a clipped pixel."""
     if view.clipped is None:
         return np.zeros(shape[0] * shape[1], np.uint8)
     return (shrink_whole(read_alpha(view.clipped), factor) > 0).astype(np.uint8).ravel()
 
 
-def _factor(view: View, mesh: Mesh, texel: float) -> int:
+def _factor(view: FittedPhoto, mesh: Mesh, texel: float) -> int:
     """Side of the largest block of photo pixels that is not wider than a texel at the point nearest to the camera."""
     origin = matrix(view.camera.world_from_cam)[:3, 3]
     distance = float(np.linalg.norm(mesh.vertices - origin, axis=1).min())
@@ -87,7 +87,7 @@ def _factor(view: View, mesh: Mesh, texel: float) -> int:
 
 
 def _row(
-    view: View,
+    view: FittedPhoto,
     response: F64,
     factor: int,
     photo: tuple[int, ...],
@@ -109,7 +109,7 @@ def _row(
     return row
 
 
-def _depth(view: View, alpha: F32, occluder: Occluder) -> F32:
+def _depth(view: FittedPhoto, alpha: F32, occluder: Occluder) -> F32:
     """(h, w) distance to the mesh through each pixel's centre; 0 outside the mesh or the mask, and near depth edges."""
     camera = view.camera
     shrunk = max(1, -(-max(camera.width, camera.height) // DEPTH_SIDE))

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from pipeline import meshes
 from pipeline.images import read_encoded
 from pipeline.meshes import F32, F64, Charts, Indices, Mesh
-from pipeline.visibility import View, picked
+from pipeline.visibility import FittedPhoto, picked
 
 U8 = npt.NDArray[np.uint8]
 GRID = 8192  # texels along the side of the texture in which the triangles' centroids are looked up
@@ -64,7 +64,7 @@ class Poll:
         self._count = count
         self._votes: dict[int, F64] = {}
 
-    def ask(self, view: View, cosine: F64, uv: F64) -> None:
+    def ask(self, view: FittedPhoto, cosine: F64, uv: F64) -> None:
         """Add the votes of a view: cosines (N,) of the points, 0 where it does not see them, at pixels uv (N, 2)."""
         if view.labels is None:
             return

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.fields.protocol import Field as FittedField
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
@@ -55,7 +56,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     views = seen_by(fitted.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
     exposure = {v.index: v.exposure for v in inputs.capture.artifact.views}
     response = responses(field, [exposure[v.camera.index] for v in views])
-    photos = Photos(response, attenuation(fitted.artifact)) if config.detail else None
+    photos = Photos(response, fitted.artifact.attenuation) if config.detail else None
 
     def step(done: int, total: int, message: str) -> None:
         context.check()
@@ -102,19 +103,12 @@ def region_shares(areas: Mapping[int, float], names: Sequence[str]) -> dict[str,
     return {named[code]: round(areas[code] / total, 6) for code in sorted(areas)}
 
 
-def responses(field: object, exposures: Sequence[float]) -> F64:
-    """(views, 3, 3) e_n A_n of each photo: its exposure, by which the fit divided it, times the fitted A_n (the
-    identity for fields without one). [NeuFace eq. 19]"""
+def responses(field: FittedField, exposures: Sequence[float]) -> F64:
+    """(views, 3, 3) e_n A_n of each photo: its exposure, by which the fit divided it, and the fitted A_n; the identity
+    if the field has none. [NeuFace eq. 19]"""
     e = np.asarray(exposures, np.float64)[:, None, None]
-    model = getattr(field, "model", None)
-    if model is None:
-        return e * np.eye(3)
-    return np.asarray(e * model.calibration().detach().cpu().numpy(), np.float64)
-
-
-def attenuation(face: FittedFace) -> str:
-    """Name of the light's attenuation in the fit; the paper's exponential if the model does not have the entry."""
-    return next((str(v["attenuation"]) for v in face.model.values() if "attenuation" in v), "exponential")
+    fitted = field.colour_responses
+    return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
 STAGE = Stage(name="bake", version=7, inputs=Inputs, config=Config, output=TextureSet, run=run)

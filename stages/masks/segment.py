@@ -31,7 +31,7 @@ from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.refine_contour import refined_contour
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
 from stages.masks.segment_person import of_subject
-from stages.masks.sources import Plan, View, inverted, mask, plan, to_full_size
+from stages.masks.sources import PhotoToMask, Plan, inverted, mask, plan, to_full_size
 from stages.masks.support_object import SupportedObject, distinct, find_supported_object
 from stages.masks.user_model import UserModel, hair_model, user_model
 
@@ -55,7 +55,7 @@ R = TypeVar("R")
 class Masked:
     """A view's mask: reduced (h, w) in memory, full size in a file. coverage: mean alpha. iou: with the hull."""
 
-    view: View
+    view: PhotoToMask
     camera: Camera
     small: F32
     source: str
@@ -159,7 +159,7 @@ def _asked(masked: list[Masked], votes: list[Masked], extent: Extent | None, con
     return {index: path for index, path in found if path is not None}
 
 
-def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Camera]]:
+def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[PhotoToMask, Camera]]:
     by_index = {v.index: v for v in capture.artifact.views}
     out = []
     for camera in poses.cameras:
@@ -167,7 +167,7 @@ def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[View, Came
         disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
         out.append(
             (
-                View(
+                PhotoToMask(
                     v.index,
                     v.name,
                     camera,
@@ -217,7 +217,7 @@ def _each(work: Callable[[T], R], items: list[T], context: Context, message: str
     return out
 
 
-def _make(view: View, camera: Camera, how: Plan, config: Config, context: Context) -> Masked:
+def _make(view: PhotoToMask, camera: Camera, how: Plan, config: Config, context: Context) -> Masked:
     use = replace(view, given=view.given if config.method in ("auto", "given") else None,
                   plate=view.plate if config.method in ("auto", "plate") else None)  # fmt: skip
     alpha, source = mask(use, how, config.threshold, WORKING_SIZE, config.seed)
@@ -226,7 +226,7 @@ def _make(view: View, camera: Camera, how: Plan, config: Config, context: Contex
     return _keep(use, camera, alpha, source, context)
 
 
-def _keep(view: View, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:
+def _keep(view: PhotoToMask, camera: Camera, alpha: F32, source: str, context: Context) -> Masked:
     write_png(_path(view.index, context), alpha)
     w, h = working_size(alpha.shape[1], alpha.shape[0], SMALL)
     return Masked(view, camera, np.asarray(resized(alpha, w, h), np.float32), source, float(alpha.mean()))

@@ -27,7 +27,7 @@ SOFT = 2  # pixels of the working size: accuracy of a segmented contour
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PhotoToMask:
     """A photo to segment. read: its 8-bit sRGB (H, W, 3). given: reads its given mask, alpha (H, W). plate: reads its
     clean plate (H, W, 3)."""
 
@@ -58,7 +58,7 @@ class Plan:
 
 
 def plan(
-    views: Sequence[View], method: Method, threshold: float, working_size: int, seed: int,
+    views: Sequence[PhotoToMask], method: Method, threshold: float, working_size: int, seed: int,
     solid: Callable[[], SupportedObject | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
     """Choose the method from a few of the fitted views. solid: finds the object among the sparse points. model: the
@@ -118,7 +118,7 @@ def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: i
     return float(inside[centre].mean()) if centre.any() else 0.0
 
 
-def mask(view: View, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:
+def mask(view: PhotoToMask, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:
     """Alpha (H, W) at the photo's size, and the method. A given mask is returned unchanged.
 
     Raises:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline import meshes
 from pipeline.meshes import F64, Faces, Indices, Mesh
-from pipeline.visibility import Occluder, View, view_cosines
+from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 
 MIN_AREA = 0.02  # of the largest component's area: smaller ones are specks and get no votes
 MAX_VIEWS = 24  # photos that vote, evenly spaced
@@ -21,7 +21,7 @@ MAX_POINTS = 20_000  # points of the surface that are tested
 Votes = Callable[[Mesh, Indices], F64]  # mesh, component (F,) of each face -> share of each component
 
 
-def votes(mesh: Mesh, piece: Indices, views: Sequence[View], check: Callable[[], None]) -> F64:
+def votes(mesh: Mesh, piece: Indices, views: Sequence[FittedPhoto], check: Callable[[], None]) -> F64:
     """(pieces,) share of the votes of each component; all 0 if no photo sees any.
 
     A point's area in a photo is its area on the surface times the cosine over the squared distance.

@@ -16,7 +16,7 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.images import write_exr, write_png
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
-from pipeline.visibility import View
+from pipeline.visibility import FittedPhoto
 from stages.bake import detail, detail_kernels, detail_views, smooth
 from stages.bake.build import Baker, Photos
 from stages.bake.texels import ALBEDO_RANGE
@@ -95,16 +95,16 @@ class Scene:
     folder: Path
     responses: F64
 
-    def shot(self, change: Callable[[int, F32], F32] = lambda i, photo: photo) -> list[View]:
+    def shot(self, change: Callable[[int, F32], F32] = lambda i, photo: photo) -> list[FittedPhoto]:
         out = []
         for i, c in enumerate(CAMERAS):
             path = self.folder / f"{i}.exr"
             photo = photograph(c, lambda p: smooth_albedo(p) + freckles(p), self.responses[i])
             write_exr(path, change(i, photo))
-            out.append(View(c, None, path))
+            out.append(FittedPhoto(c, None, path))
         return out
 
-    def baked(self, views: list[View], photos: bool = True) -> tuple[F64, F64, F32, F32]:
+    def baked(self, views: list[FittedPhoto], photos: bool = True) -> tuple[F64, F64, F32, F32]:
         """Points, albedo, support, unseen of the covered texels."""
         given = Photos(self.responses, "exponential") if photos else None
         found = Baker(self.field, self.mesh, self.charts, views, SIZE, lambda *_: None, given).tile(0)
@@ -189,7 +189,7 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
     place = pixel_centres(PIXELS, PIXELS).reshape(PIXELS, PIXELS, 2) / PIXELS
     write_exr(tmp_path / "0.exr", np.concatenate([place, np.ones((PIXELS, PIXELS, 1))], -1).astype(np.float32))
     photos = detail_views.read_photos(
-        [View(c, None, tmp_path / "0.exr")], np.eye(3)[None], scene.mesh, 1e-4, lambda *_: None
+        [FittedPhoto(c, None, tmp_path / "0.exr")], np.eye(3)[None], scene.mesh, 1e-4, lambda *_: None
     )
     n = scene.mesh.vertices.astype(np.float64) / RADIUS
     x = (RADIUS + 1e-5 * offset) * n
@@ -253,7 +253,10 @@ def test_clipped_pixels_have_no_say(scene: Scene, tmp_path: Path) -> None:
     write_exr(tmp_path / "0.exr", np.full((PIXELS, PIXELS, 3), 0.3, np.float32))
     n = scene.mesh.vertices.astype(np.float64) / RADIUS
     x, zero = RADIUS * n, np.zeros((len(n), 3), np.int32)
-    plain, burnt = View(c, None, tmp_path / "0.exr"), View(c, None, tmp_path / "0.exr", tmp_path / "clipped.png")
+    plain, burnt = (
+        FittedPhoto(c, None, tmp_path / "0.exr"),
+        FittedPhoto(c, None, tmp_path / "0.exr", tmp_path / "clipped.png"),
+    )
     seen, texel = [], 2.5 * 0.2 / FOCAL
     for view in (plain, burnt):
         photos = detail_views.read_photos([view], np.eye(3)[None], scene.mesh, texel, lambda *_: None)

@@ -14,7 +14,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.maths import microfacet
 from pipeline.meshes import Charts, Mesh
-from pipeline.visibility import Occluder, View
+from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake.ambient import ambient
 from stages.bake.build import Baked, Baker
 from stages.bake.dilate import nearest_rows
@@ -29,7 +29,7 @@ from tests.support.analytic_fields import AnalyticField, bumpy_head, ellipsoid, 
 from tests.support.field_artifacts import camera
 
 SIZE = 256
-VIEWS = tuple(View(camera(i, np.pi / 2 * i), None) for i in range(4))
+VIEWS = tuple(FittedPhoto(camera(i, np.pi / 2 * i), None) for i in range(4))
 
 
 def quiet(done: int, total: int, message: str = "") -> None:

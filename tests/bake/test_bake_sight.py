@@ -11,7 +11,7 @@ import pytest
 from pipeline.contract import Context
 from pipeline.images import read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
-from pipeline.visibility import Occluder, View, view_cosines
+from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.regions import Poll, Votes
@@ -23,7 +23,7 @@ from stages.uv.unwrap import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.field_artifacts import camera
 
-VIEWS = tuple(View(camera(i, np.pi / 2 * i), None) for i in range(4))
+VIEWS = tuple(FittedPhoto(camera(i, np.pi / 2 * i), None) for i in range(4))
 
 
 def quiet(done: int, total: int, message: str = "") -> None:
@@ -36,7 +36,7 @@ def mesh_and_charts() -> tuple[Mesh, Charts]:
     return mesh, unwrap(mesh, Config(texture_size=256, padding=4))
 
 
-def weight_of(view: View, points: np.ndarray, normals: np.ndarray, occluder: Occluder) -> np.ndarray:
+def weight_of(view: FittedPhoto, points: np.ndarray, normals: np.ndarray, occluder: Occluder) -> np.ndarray:
     return view_cosines(view, points, normals, occluder)[0]
 
 
@@ -44,7 +44,7 @@ def test_confidence_of_a_sphere_is_its_cosines() -> None:
     mesh = surface_build(AnalyticField(sphere()), 40, quiet).mesh
     points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
     occluder = Occluder(mesh)
-    view = View(camera(0, 0.0), None)
+    view = FittedPhoto(camera(0, 0.0), None)
     away = np.array([0, 0, 0.6]) - points
     cosine = (away / np.linalg.norm(away, axis=1, keepdims=True) * normals).sum(1)
     clear = np.abs(cosine) > 0.1  # facets hide their own horizon
@@ -62,9 +62,9 @@ def test_confidence_sees_what_is_in_the_way(tmp_path: Path) -> None:
         np.concatenate([ball.faces, wall]),
     )
     points, normals = ball.vertices.astype(np.float64), ball.normals.astype(np.float64)
-    assert weight_of(View(camera(0, 0.0), None), points, normals, Occluder(both)).max() == 0
-    assert weight_of(View(camera(0, np.pi), None), points, normals, Occluder(both)).max() > 0.9
-    small = replace(View(camera(0, 0.0, focal=1000.0), None))  # only the middle fits into the photo
+    assert weight_of(FittedPhoto(camera(0, 0.0), None), points, normals, Occluder(both)).max() == 0
+    assert weight_of(FittedPhoto(camera(0, np.pi), None), points, normals, Occluder(both)).max() > 0.9
+    small = replace(FittedPhoto(camera(0, 0.0, focal=1000.0), None))  # only the middle fits into the photo
     seen = weight_of(small, points, normals, Occluder(ball)) > 0
     assert seen.any() and np.hypot(*points[seen][:, :2].T).max() < 0.6 * 32 / 1000 * 1.5
 
@@ -75,7 +75,7 @@ def test_confidence_respects_masks(tmp_path: Path) -> None:
     write_png(tmp_path / "0.png", mask)
     mesh = surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh
     points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
-    seen = weight_of(View(camera(0, 0.0), tmp_path / "0.png"), points, normals, Occluder(mesh)) > 0
+    seen = weight_of(FittedPhoto(camera(0, 0.0), tmp_path / "0.png"), points, normals, Occluder(mesh)) > 0
     assert seen.any() and points[seen][:, 0].min() > -1e-3
 
 
@@ -103,7 +103,7 @@ def test_clipped_pixels_lower_the_confidence(mesh_and_charts: tuple[Mesh, Charts
 
 
 # ------------------------------------------------------------------ regions
-def labelled(folder: Path, index: int, left: int, right: int) -> View:
+def labelled(folder: Path, index: int, left: int, right: int) -> FittedPhoto:
     """A view whose photo has one label to the left of its middle, and another to the right."""
     labels = np.full((64, 64), left)
     labels[:, 32:] = right

@@ -16,7 +16,7 @@ from pipeline.support import Support, find_support, is_level
 from pipeline.transforms import F64, matrix, pixel_centres, rays, rows
 from stages.masks import sources
 from stages.masks.region import Disc
-from stages.masks.sources import View
+from stages.masks.sources import PhotoToMask
 from stages.masks.stage import STAGE, Config, Inputs
 from stages.masks.support_object import distinct, find_supported_object, silhouette_of_points
 from tests.support.textured_ball import camera_on_orbit
@@ -145,7 +145,7 @@ def test_a_statue_is_no_person(
     monkeypatch.setattr(sources, "_person_share", lambda *_: next(said))
     noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)  # no background of one colour
     camera = cameras(1)[0]
-    views = [View(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
+    views = [PhotoToMask(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
     solid = find_supported_object(points(), cameras(), ROI, 0) if points_at_hand else None
     assert solid is not None or not points_at_hand
     assert sources.plan(views, "auto", 0.5, 64, 0, lambda: solid).method == wanted

@@ -18,7 +18,7 @@ from pipeline.store import Store
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 from stages.masks import segment
 from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, tolerated, trimap
-from stages.masks.sources import View
+from stages.masks.sources import PhotoToMask
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.masks.test_masks_user_model import write_red_detector
 
@@ -292,7 +292,7 @@ def test_a_hole_in_one_mask_is_closed(tmp_path: Path, monkeypatch: pytest.Monkey
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     spot = np.hypot(x - 4, y + 3) < 2.5
 
-    def made(view: View, *_: Any) -> tuple[F32, str]:
+    def made(view: PhotoToMask, *_: Any) -> tuple[F32, str]:
         alpha = ball_alpha(scene.cameras[view.index])
         return np.where(spot & (view.index == 5), np.float32(0), alpha), "grabcut"
 

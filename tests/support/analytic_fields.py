@@ -127,6 +127,10 @@ class AnalyticField:
         out[0] = 1.0
         return out
 
+    @property
+    def colour_responses(self) -> None:
+        """None: every photo shows the true colours."""
+
     def sdf(self, points: F32) -> F32:
         self.evaluations += len(points)
         return self.distance(points.astype(np.float64))[0].astype(np.float32)

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from support.synthetic_asset import RADIUS, ball
 
-from stages.usd.render.camera import View
+from pipeline.camera import PinholeCamera
 from stages.usd.render.exported import ExportedAsset
 from stages.usd.write.mesh import UvSurface
 
@@ -36,7 +36,7 @@ def asset(**changes: object) -> ExportedAsset:
     return ExportedAsset(**(parts | changes))  # type: ignore[arg-type]
 
 
-def sphere_points(view: View, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sphere_points(view: PinholeCamera, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Normals (size, size, 3), wo, and which pixels lie well inside, by intersecting a sphere analytically."""
     pixel = np.arange(size) + 0.5
     x, y = np.meshgrid((pixel - view.K[0, 2]) / view.K[0, 0], (pixel - view.K[1, 2]) / view.K[1, 1])

@@ -114,7 +114,7 @@ def test_masks_decide_what_the_photos_show(tmp_path: Path, monkeypatch: pytest.M
 
 def test_votes_are_shares_of_the_pictures(tmp_path: Path) -> None:
     """Two balls of radii 2 and 1 at one distance: four fifths and a fifth of each picture."""
-    from pipeline.visibility import View
+    from pipeline.visibility import FittedPhoto
 
     big, small = (build(AnalyticField(sphere(r), (0.12, 0.12, 0.12)), 48, quiet).mesh for r in (0.05, 0.025))
     shift = np.float32([0, 0.1, 0])
@@ -124,7 +124,7 @@ def test_votes_are_shares_of_the_pictures(tmp_path: Path) -> None:
         np.concatenate([big.faces, small.faces + len(big.vertices)]),
     )
     piece = np.repeat([0, 1], [len(big.faces), len(small.faces)])
-    views = [View(c, None) for c in poses(tmp_path).artifact.cameras]
+    views = [FittedPhoto(c, None) for c in poses(tmp_path).artifact.cameras]
     share = votes(mesh, piece, views, lambda: None)
     assert share.sum() == pytest.approx(1) and share[1] == pytest.approx(0.2, abs=0.02)
     assert not votes(mesh, piece, [], lambda: None).any()

@@ -9,7 +9,7 @@ from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
 from pipeline.maths.microfacet import KAPPA_RANGE
-from stages.usd.render.camera import orbit_view
+from stages.usd.render.camera import orbit_camera
 from stages.usd.render.median_cut import Lamps, checked_environment, lamps
 from stages.usd.render.relight import Environment, table_of
 from stages.usd.render.render import Renderer, kernels
@@ -134,7 +134,7 @@ def test_a_ball_in_even_light_is_its_albedo_and_its_lobe() -> None:
     made = asset(coefficients=np.full((8, 8, 1), 0.1, np.float32), inv_kappa=np.full((8, 8, 1), 0.1, np.float32))
     renderer = Renderer(made)
     light = Environment(renderer, np.ones((32, 64, 3), np.float32), "even", 512)
-    view = orbit_view(RADIUS, 0.4, 48)
+    view = orbit_camera(RADIUS, 0.4, 48)
     image = renderer.render(view, samples=1, light=light)
     facing = sphere_points(view, 48)[2]
     # lobes that reach below the horizon lose what the ball itself blocks there; the middle does not
@@ -149,7 +149,7 @@ def test_a_sun_lights_by_the_cosine_and_leaves_the_other_side_dark() -> None:
     renderer = Renderer(asset())
     light = Environment(renderer, image, "sun", 8)
     for azimuth in (0.0, np.pi):
-        view = orbit_view(RADIUS, azimuth, 48)
+        view = orbit_camera(RADIUS, azimuth, 48)
         shown = renderer.render(view, samples=1, light=light)
         n, _, inside = sphere_points(view, 48)
         wanted = 0.4 / np.pi * flux * np.maximum(n @ sun, 0)

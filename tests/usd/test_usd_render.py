@@ -7,8 +7,9 @@ import pytest
 from support.render_stand_ins import asset, sphere_points
 from support.synthetic_asset import RADIUS, smooth_light, texture_arrays, write_inputs
 
+from pipeline.camera import PinholeCamera
 from pipeline.transforms import inverse_rigid, project
-from stages.usd.render.camera import View, orbit_view
+from stages.usd.render.camera import orbit_camera
 from stages.usd.render.render import Renderer, bilinear, lookup, tangents
 from stages.usd.write.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
 
@@ -17,7 +18,7 @@ SIZE = 64
 
 def test_constant_light_gives_the_albedo() -> None:
     """a / pi * pi L = a L."""
-    view = orbit_view(RADIUS, 0.3, SIZE)
+    view = orbit_camera(RADIUS, 0.3, SIZE)
     image = Renderer(asset()).render(view, samples=1)
     inside = sphere_points(view, SIZE)[2]
     np.testing.assert_allclose(image[inside][:, :3], 0.4, atol=1e-4)
@@ -26,7 +27,7 @@ def test_constant_light_gives_the_albedo() -> None:
 
 
 def test_alpha_is_the_disc() -> None:
-    image = Renderer(asset()).render(orbit_view(RADIUS, 0.0, 128), samples=4)
+    image = Renderer(asset()).render(orbit_camera(RADIUS, 0.0, 128), samples=4)
     radius = np.sqrt(image[..., 3].sum() / np.pi)
     assert radius == pytest.approx(64 / 1.02, rel=2e-3)
     np.testing.assert_allclose(image[..., 0], 0.4 * image[..., 3], atol=1e-4)  # premultiplied
@@ -34,7 +35,7 @@ def test_alpha_is_the_disc() -> None:
 
 def test_soft_silhouettes_keep_the_disc_and_its_inside() -> None:
     """samples = 0: a triangle filter on the edge moves no area and leaves the inside alone."""
-    view = orbit_view(RADIUS, 0.0, 128)
+    view = orbit_camera(RADIUS, 0.0, 128)
     sharp, soft = (Renderer(asset()).render(view, samples=n) for n in (8, 0))
     assert soft[..., 3].sum() == pytest.approx(sharp[..., 3].sum(), rel=5e-4)
     within = (sharp[..., 3] > 0.02) & (sharp[..., 3] < 0.98)
@@ -50,7 +51,7 @@ def test_first_order_light() -> None:
     slope = np.array([0.3, 0.5, -0.2])
     light[0] = np.sqrt(4 * np.pi)
     light[[3, 1, 2]] = slope[:, None] / np.sqrt(3 / (4 * np.pi))
-    view = orbit_view(RADIUS, 0.7, SIZE, elevation=0.2)
+    view = orbit_camera(RADIUS, 0.7, SIZE, elevation=0.2)
     image = Renderer(asset()).render(view, samples=1, light=light)
     n, _, inside = sphere_points(view, SIZE)
     wanted = 0.4 / np.pi * (np.pi + 2 * np.pi / 3 * (n @ slope))
@@ -65,7 +66,7 @@ def test_mirror_shows_the_light_of_the_mirror_direction() -> None:
     slope = np.array([0.1, 0.6, 0.3])
     light[0] = np.sqrt(4 * np.pi)
     light[[3, 1, 2]] = slope[:, None] / np.sqrt(3 / (4 * np.pi))
-    view = orbit_view(RADIUS, -0.4, SIZE)
+    view = orbit_camera(RADIUS, -0.4, SIZE)
     image = Renderer(made).render(view, samples=1, light=light)
     n, wo, inside = sphere_points(view, SIZE)
     cosine = (n * wo).sum(-1)
@@ -85,7 +86,7 @@ def test_rough_lobes_soften_the_light(attenuation: str, factor: float) -> None:
     )
     light = np.zeros((121, 3), np.float32)
     light[0], light[1] = np.sqrt(4 * np.pi), 0.8 / np.sqrt(3 / (4 * np.pi))
-    view = orbit_view(RADIUS, 0.0, SIZE)
+    view = orbit_camera(RADIUS, 0.0, SIZE)
     image = Renderer(made).render(view, samples=1, light=light)
     n, wo, inside = sphere_points(view, SIZE)
     mirror = 2 * (n * wo).sum(-1)[..., None] * n - wo
@@ -94,7 +95,7 @@ def test_rough_lobes_soften_the_light(attenuation: str, factor: float) -> None:
 
 def test_flat_normal_map_changes_nothing_and_a_tilted_one_turns_the_right_way() -> None:
     light = smooth_light()
-    view = orbit_view(RADIUS, 0.5, SIZE)
+    view = orbit_camera(RADIUS, 0.5, SIZE)
     flat = np.broadcast_to(np.float32([0, 0, 1]), (8, 8, 3))
     plain, same = (Renderer(asset(light=light, normal=n)).render(view, samples=1) for n in (None, flat))
     np.testing.assert_allclose(plain, same, atol=1e-5)
@@ -102,7 +103,7 @@ def test_flat_normal_map_changes_nothing_and_a_tilted_one_turns_the_right_way() 
     light = np.zeros((121, 3), np.float32)
     light[0] = np.sqrt(4 * np.pi)
     light[3] = 0.9 / np.sqrt(3 / (4 * np.pi))  # grows along +x
-    image = Renderer(asset(light=light, normal=tilted)).render(orbit_view(RADIUS, 0.0, SIZE), samples=1)
+    image = Renderer(asset(light=light, normal=tilted)).render(orbit_camera(RADIUS, 0.0, SIZE), samples=1)
     middle = image[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1, 0].mean()
     assert middle == pytest.approx(0.4 * (1 + 2 / 3 * 0.9 * np.sin(0.3)), abs=2e-3)  # u grows towards +x there
 
@@ -113,18 +114,18 @@ def test_a_normal_map_tilted_along_v_looks_up() -> None:
     light[0], light[1] = np.sqrt(4 * np.pi), 0.9 / np.sqrt(3 / (4 * np.pi))  # grows along +y
     tilted = np.broadcast_to(np.float32([0, np.sin(0.3), np.cos(0.3)]), (8, 8, 3))
     for azimuth in (0.0, 2.0, 4.5):
-        image = Renderer(asset(light=light, normal=tilted)).render(orbit_view(RADIUS, azimuth, SIZE), samples=1)
+        image = Renderer(asset(light=light, normal=tilted)).render(orbit_camera(RADIUS, azimuth, SIZE), samples=1)
         middle = image[SIZE // 2 - 1 : SIZE // 2 + 1, SIZE // 2 - 1 : SIZE // 2 + 1, 0].mean()
         assert middle == pytest.approx(0.4 * (1 + 2 / 3 * 0.9 * np.sin(0.3)), abs=2e-3)
 
 
 def test_silhouette_lies_where_the_distorted_camera_projects_it() -> None:
     """An off-centre ball seen through a strong lens: its outline's mean is that of its projected contour."""
-    view = orbit_view(RADIUS, 0.0, 200, centre=np.array([0.06, 0.04, 0.0]))
+    view = orbit_camera(RADIUS, 0.0, 200, centre=np.array([0.06, 0.04, 0.0]))
     K = view.K.copy()
     K[0, 0] *= 0.6
     K[1, 1] *= 0.5
-    bent = View(K, view.world_from_cam, 200, 200, np.array([-0.4, 0.1, 0.02, -0.03, 0.0]))
+    bent = PinholeCamera(K, view.world_from_cam, 200, 200, np.array([-0.4, 0.1, 0.02, -0.03, 0.0]))
     alpha = Renderer(asset()).render(bent, samples=2)[..., 3]
     row, column = np.mgrid[:200, :200] + 0.5
     found = np.array([(alpha * column).sum(), (alpha * row).sum()]) / alpha.sum()
@@ -155,8 +156,8 @@ def test_tangent_follows_u() -> None:
 
 def test_distortion_and_factor_keep_the_picture_in_place() -> None:
     """A distorted camera's picture at factor 2 is the mean over 2 x 2 of its picture at factor 1."""
-    view = orbit_view(RADIUS, 0.0, 64)
-    bent = View(view.K, view.world_from_cam, 64, 64, np.array([-0.9, 0.0, 0.01, 0.0, 0.0]))
+    view = orbit_camera(RADIUS, 0.0, 64)
+    bent = PinholeCamera(view.K, view.world_from_cam, 64, 64, np.array([-0.9, 0.0, 0.01, 0.0, 0.0]))
     renderer = Renderer(asset(light=smooth_light()))
     fine, coarse = renderer.render(bent, samples=1), renderer.render(bent, factor=2, samples=2)
     np.testing.assert_allclose(fine.reshape(32, 2, 32, 2, 4).mean((1, 3)), coarse, atol=1e-6)
@@ -175,10 +176,10 @@ def test_lookup_is_linear_and_clamped() -> None:
 
 
 def test_nothing_in_sight_is_black() -> None:
-    view = orbit_view(RADIUS, 0.0, 16)
+    view = orbit_camera(RADIUS, 0.0, 16)
     away = view.world_from_cam.copy()
     away[:3, :3] = away[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    assert Renderer(asset()).render(View(view.K, away, 16, 16)).max() == 0
+    assert Renderer(asset()).render(PinholeCamera(view.K, away, 16, 16)).max() == 0
 
 
 def test_exported_maps_are_read_back(exported) -> None:

@@ -18,7 +18,7 @@ from pipeline.artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
 from stages.usd.check.validate import validate
-from stages.usd.render.camera import orbit_view
+from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
 from stages.usd.render.relight import vertex_values
 from stages.usd.render.render import Renderer, bilinear
@@ -82,7 +82,7 @@ def test_it_looks_as_on_one_tile(tiled: tuple[Path, UsdAsset], exported: tuple[P
     pictures = []
     for read in (two, one):
         renderer = Renderer(read)
-        pictures.append(np.stack([renderer.render(orbit_view(RADIUS * 1.25, a, 48)) for a in (0.1, 2.0, 4.0)]))
+        pictures.append(np.stack([renderer.render(orbit_camera(RADIUS * 1.25, a, 48)) for a in (0.1, 2.0, 4.0)]))
         assert vertex_values(read.albedo, renderer).shape == (len(read.mesh.vertices), 3)
     alpha = pictures[1][..., 3]
     assert np.array_equal(pictures[0][..., 3], alpha)

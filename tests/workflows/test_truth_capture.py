@@ -13,6 +13,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from pipeline import meshes
 from pipeline.artifacts import CaptureView, FileRef, GivenCamera
+from pipeline.camera import PinholeCamera
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import apply, centre_K_from_corner_K, inverse_rigid, rigid, rows, similarity
 from workflows.bench.captures_figures import Run, figures_of, texture_of
@@ -117,7 +118,7 @@ def test_what_the_truths_outline_leaves_out_does_not_count_for_accuracy(tmp_path
     with_plate, _ = stored_truth.measure(run, scan)
     assert with_plate["accuracy_mm"] > 0.1 and with_plate["completeness_mm"] < 0.05
     for i, eye in enumerate(EYES):
-        camera = geometry.Camera("", K, pose(eye), SIZE, SIZE)
+        camera = PinholeCamera(K, pose(eye), SIZE, SIZE)
         at, inside = camera.pixels(geometry.spread(sphere(), 20_000)[0])
         subject = np.zeros((SIZE, SIZE))
         subject[at[inside, 1], at[inside, 0]] = 1

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import StageError, UsageError
 
 if TYPE_CHECKING:
-    from stages.usd.render.camera import View
+    from pipeline.camera import PinholeCamera
     from stages.usd.render.render import Light, Renderer
 
 CAPTURED = "captured"
@@ -96,7 +96,7 @@ def _light(name: str, renderer: Renderer) -> Light | None:
     return Environment(renderer, read_linear(path), path.name)
 
 
-def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, View]:
+def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, PinholeCamera]:
     from stages.usd.render.exported import read_cameras
     from stages.usd.render.previews import framing
 
@@ -137,11 +137,11 @@ def _indices(text: str) -> list[int]:
     return [int(p) for p in parts]
 
 
-def _given(params: Path, folder: Path) -> dict[int, View]:
+def _given(params: Path, folder: Path) -> dict[int, PinholeCamera]:
     """Cameras of a params.json, moved from the capture's world into the asset's by the run's own matrix."""
+    from pipeline.camera import PinholeCamera
     from pipeline.transforms import inverse_rigid, matrix, rescale_camera
     from stages.capture.readers.facescape import given_view, is_valid, read_params, view_indices
-    from stages.usd.render.camera import View
 
     record = folder / "run.json"
     try:
@@ -161,5 +161,5 @@ def _given(params: Path, folder: Path) -> dict[int, View]:
             camera, (width, height) = given_view(found, index)
             capture_from_cam = inverse_rigid(matrix(camera.cam_from_world))
             pose = rescale_camera(matrix(np.linalg.inv(capture_from_asset)), capture_from_cam)
-            out[index] = View(matrix(camera.K), pose, width, height, np.array(camera.distortion, np.float64))
+            out[index] = PinholeCamera(matrix(camera.K), pose, width, height, np.array(camera.distortion, np.float64))
     return out

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.camera import PinholeCamera
 from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry
-from workflows.evaluation.geometry import F64, Camera
+from workflows.evaluation.geometry import F64
 
 Labels = dict[str, dict[str, dict[str, float]]]  # PSNR and share of the error by label, of model and asset
 
 
-def albedo_figures(run: Run, truth: Path, asset: Any, st: F64, cameras: dict[str, Camera]) -> Figures:
+def albedo_figures(run: Run, truth: Path, asset: Any, st: F64, cameras: dict[str, PinholeCamera]) -> Figures:
     """Of the pictures in truth/albedo whose camera is known; asset and cameras are in one world. cameras: by the
     pictures' stems."""
     from pipeline.images import read_alpha, read_exr

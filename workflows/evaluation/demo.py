@@ -86,7 +86,7 @@ def _picture_psnr(views: Path, capture_folder: Path, view: CaptureView) -> float
 # ------------------------------------------------------------------ surface
 def seen_by(mesh: Any, views: list[CaptureView]) -> F64:
     """Points spread over a mesh that several of the views show (truth_geometry.SEEN_BY)."""
-    return geometry.seen(mesh, ((geometry.of_view(v), None) for v in views))
+    return geometry.seen(mesh, ((geometry.camera_of(v), None) for v in views))
 
 
 # ------------------------------------------------------------------ albedo
@@ -98,7 +98,7 @@ def _albedo_psnr(out: Path, capture_folder: Path, mesh: Any, st: F64, views: lis
         path = capture_folder / f"truth/albedo/{view.index}.exr"
         if path.is_file():
             alpha = read_alpha(capture_folder / f"truth/alpha/{view.index}.png")
-            a, b = geometry.albedo_pairs(mesh, st, texture, geometry.of_view(view), read_exr(path)[0][..., :3], alpha)
+            a, b = geometry.albedo_pairs(mesh, st, texture, geometry.camera_of(view), read_exr(path)[0][..., :3], alpha)
             got.append(a)
             expected.append(b)
     if not got:

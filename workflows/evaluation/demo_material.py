@@ -127,9 +127,9 @@ def _seen_points(view: CaptureView, folder: Path) -> _Seen:
     import trimesh
 
     from pipeline.demo import head
-    from workflows.evaluation.geometry import of_view
+    from workflows.evaluation.geometry import camera_of
 
-    camera = of_view(view)
+    camera = camera_of(view)
     inner = np.flatnonzero(read_alpha(folder / f"truth/alpha/{view.index}.png").ravel() > 0.999)
     origin, directions = camera.rays(pixel_centres(view.width, view.height)[inner])
     mesh: Any = trimesh.load(folder / "truth" / "mesh_gt.ply", process=False)

@@ -6,7 +6,6 @@ Meshes are trimesh objects in one world with the cameras; lengths in that world'
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import CaptureView
+from pipeline.camera import PinholeCamera
 from pipeline.colour import srgb_from_linear
-from pipeline.transforms import apply, inverse_rigid, matrix, project, rays
+from pipeline.transforms import apply, inverse_rigid, matrix
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -26,41 +26,14 @@ OFFSET = 1e-4  # metres: rays to the camera start off the surface, well below wh
 WHOLE = 0.999  # alpha of pixels that no background is mixed into
 
 
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """A known camera. K: pixels, centre of the first one at (0.5, 0.5); world_from_cam: OpenCV axes."""
-
-    name: str
-    K: F64
-    world_from_cam: F64
-    width: int
-    height: int
-    distortion: F64 = field(default_factory=lambda: np.zeros(5))
-
-    @property
-    def eye(self) -> F64:
-        """(3,) its centre."""
-        return np.asarray(self.world_from_cam[:3, 3], np.float64)
-
-    def pixels(self, points: F64) -> tuple[npt.NDArray[np.int64], Mask]:
-        """(N, 2) column and row of the pixel that each point falls into, and whether that is in the picture."""
-        uv, depth = project(self.K, inverse_rigid(self.world_from_cam), self.distortion, points)
-        inside = (depth > 0) & (uv >= 0).all(1) & (uv < (self.width, self.height)).all(1)
-        return np.where(inside[:, None], uv, 0).astype(np.int64), inside
-
-    def rays(self, uv: F64) -> tuple[F64, F64]:
-        """Origin (3,) and unit directions (N, 3) through positions in the picture."""
-        return rays(self.K, self.world_from_cam, self.distortion, uv)
-
-
-def of_view(view: CaptureView) -> Camera:
+def camera_of(view: CaptureView) -> PinholeCamera:
     """The camera that came with a photo. ValueError if none did."""
     if view.camera is None:
         raise ValueError(f"view {view.index} has no camera")
     cam_from_world = np.eye(4)
     cam_from_world[:3] = matrix(view.camera.cam_from_world)[:3]
     distortion = np.pad(np.array(view.camera.distortion, np.float64), (0, 5))[:5]
-    return Camera(view.name, matrix(view.camera.K), inverse_rigid(cam_from_world), view.width, view.height, distortion)
+    return PinholeCamera(matrix(view.camera.K), inverse_rigid(cam_from_world), view.width, view.height, distortion)
 
 
 # ------------------------------------------------------------------ a run's surface
@@ -95,7 +68,7 @@ def spread(mesh: Any, count: int = SURFACE_SAMPLES) -> tuple[F64, F64]:
 
 # ------------------------------------------------------------------ sight and distance
 def visible(
-    mesh: Any, points: F64, normals: F64, camera: Camera, least: float = 0.0, inside: F32 | None = None
+    mesh: Any, points: F64, normals: F64, camera: PinholeCamera, least: float = 0.0, inside: F32 | None = None
 ) -> Mask:
     """(N,) whether the camera sees the points: in its picture, not hidden by the mesh, turned to it with a cosine above
     `least` and, with a picture `inside` (H, W), on a pixel above one half."""
@@ -109,7 +82,7 @@ def visible(
     return found
 
 
-def seen(mesh: Any, cameras: Iterable[tuple[Camera, F32 | None]]) -> F64:
+def seen(mesh: Any, cameras: Iterable[tuple[PinholeCamera, F32 | None]]) -> F64:
     """Points spread over a mesh that at least SEEN_BY of the cameras see; of a camera with a picture of the subject
     only points on it count."""
     points, normals = spread(mesh)
@@ -152,7 +125,7 @@ def albedo_map(textures: Path) -> F32:
     return np.concatenate([read_exr(f)[0][..., :3] for f in files], 1)
 
 
-def mapped(mesh: Any, st: F64, texture: F32, camera: Camera, pixel: npt.NDArray[np.int64], factor: int) -> F64:
+def mapped(mesh: Any, st: F64, texture: F32, camera: PinholeCamera, pixel: npt.NDArray[np.int64], factor: int) -> F64:
     """(N, 3) a texture as the camera sees it in some pixels of a picture `factor` times smaller than its own, given by
     row * columns + column; the mean over factor x factor rays. NaN where a ray meets nothing."""
     import trimesh
@@ -171,7 +144,7 @@ def mapped(mesh: Any, st: F64, texture: F32, camera: Camera, pixel: npt.NDArray[
     return np.asarray(found.reshape(len(pixel), -1, 3).mean(1), np.float64)
 
 
-def albedo_pairs(mesh: Any, st: F64, texture: F32, camera: Camera, truth: F32, alpha: F32) -> tuple[F64, F64]:
+def albedo_pairs(mesh: Any, st: F64, texture: F32, camera: PinholeCamera, truth: F32, alpha: F32) -> tuple[F64, F64]:
     """(N, 3) the asset's and the true albedo of the pixels that lie wholly on the subject and on the asset.
 
     truth: (H / f, W / f, 3) for a camera of W x H pixels; alpha: of that size, or W x H.

@@ -26,11 +26,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.camera import PinholeCamera
 from pipeline.transforms import apply, corner_K_from_centre_K, inverse_rigid, matrix, rigid, umeyama
 from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry
 from workflows.evaluation.albedo import Labels, albedo_figures
-from workflows.evaluation.geometry import F64, SEEN_BY, Camera, Mask
+from workflows.evaluation.geometry import F64, SEEN_BY, Mask
 
 SKIN = 1
 NAMES = {"skin": SKIN, "hair": 2, "eyes": 3, "cloth": 4}
@@ -73,14 +74,13 @@ def measure(run: Run, truth: Path) -> tuple[Figures, Labels]:
 
 
 # ------------------------------------------------------------------ where things are
-def true_cameras(truth: Path) -> dict[str, Camera]:
+def true_cameras(truth: Path) -> dict[str, PinholeCamera]:
     """By the photo's stem, in the head's frame."""
     out = {}
     for photo in json.loads((truth / "cameras.json").read_text())["photos"]:
         motion = matrix(photo.get("head_motion", np.eye(4)))
         stem = PurePath(photo["name"]).stem
-        out[stem] = Camera(
-            stem,
+        out[stem] = PinholeCamera(
             corner_K_from_centre_K(matrix(photo["K"])),
             inverse_rigid(matrix(photo["world_to_camera"]) @ motion),
             int(photo["width"]),
@@ -90,7 +90,7 @@ def true_cameras(truth: Path) -> dict[str, Camera]:
     return out
 
 
-def head_from_asset(run: Run, cameras: dict[str, Camera]) -> F64 | None:
+def head_from_asset(run: Run, cameras: dict[str, PinholeCamera]) -> F64 | None:
     """4x4 similarity by the centres of the run's cameras; None with fewer than three in common."""
     own = {PurePath(c["name"]).stem: matrix(c["world_from_cam"])[:3, 3] for c in run.manifest("poses")["cameras"]}
     both = [stem for stem in own if stem in cameras]
@@ -99,7 +99,7 @@ def head_from_asset(run: Run, cameras: dict[str, Camera]) -> F64 | None:
     return umeyama(np.array([own[s] for s in both]), np.array([cameras[s].eye for s in both]))
 
 
-def sight_of(skin: Any, points: F64, normals: F64, cameras: dict[str, Camera], truth: Path) -> Mask:
+def sight_of(skin: Any, points: F64, normals: F64, cameras: dict[str, PinholeCamera], truth: Path) -> Mask:
     """(N, cameras) whether a photo shows each point, and as skin."""
     out = np.zeros((len(points), len(cameras)), np.bool_)
     for column, (stem, camera) in enumerate(cameras.items()):

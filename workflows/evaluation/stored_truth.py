@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.artifacts import CaptureView
+from pipeline.camera import PinholeCamera
 from pipeline.transforms import matrix
 from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry
 from workflows.evaluation.albedo import Labels, albedo_figures
-from workflows.evaluation.geometry import F32, F64, Camera
+from workflows.evaluation.geometry import F32, F64
 
 
 def measure(run: Run, folder: Path) -> tuple[Figures, Labels]:
@@ -45,9 +46,9 @@ def _scanned(run: Run, truth: Path) -> Figures:
     views = [CaptureView.model_validate(v) for v in run.manifest("capture")["views"]]
     with_camera = [v for v in views if v.camera is not None]
     asset, st = geometry.asset_mesh(run.out / run.record["asset"], matrix(run.record["capture_from_asset"]))
-    fitted = [(geometry.of_view(v), alpha_of(truth, v.index)) for v in with_camera if not v.holdout]
+    fitted = [(geometry.camera_of(v), alpha_of(truth, v.index)) for v in with_camera if not v.holdout]
     found = surface_figures(asset, trimesh.load(truth / "mesh_gt.ply", process=False), fitted)
-    from_file = {str(v.index): geometry.of_view(v) for v in with_camera}
+    from_file = {str(v.index): geometry.camera_of(v) for v in with_camera}
     return found | albedo_figures(run, truth, asset, st, from_file)
 
 
@@ -59,7 +60,7 @@ def alpha_of(truth: Path, index: int) -> F32 | None:
     return next((read_alpha(p) for p in paths if p.is_file()), None)
 
 
-def surface_figures(asset: Any, truth: Any, fitted: list[tuple[Camera, F32 | None]]) -> Figures:
+def surface_figures(asset: Any, truth: Any, fitted: list[tuple[PinholeCamera, F32 | None]]) -> Figures:
     """Distances in mm of two meshes in metres; what no three views see counts for neither."""
     mine = geometry.seen(asset, fitted)
     true = geometry.seen(truth, [(camera, None) for camera, _ in fitted])

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import tiles
+from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
-from stages.usd.render.camera import View
 from stages.usd.write.light import read_light
 from stages.usd.write.mesh import UvSurface, tile_count
 
@@ -153,7 +153,7 @@ def read_usd_mesh(path: Path) -> UvSurface:
     )
 
 
-def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
+def read_cameras(lookdev: Path) -> dict[int, tuple[PinholeCamera, bool]]:
     """The captured cameras of lookdev.usda by photo index, and whether the photo was held out.
 
     The inverse of stages.usd.write.lookdev: K from apertures and offsets, the lens distortion from the metadata.
@@ -192,6 +192,6 @@ def read_cameras(lookdev: Path) -> dict[int, tuple[View, bool]]:
         K = np.array([[fx, 0, width / 2 - shift_x * fx / focal], [0, fy, height / 2 + shift_y * fy / focal], [0, 0, 1]])
         pose = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default())).T
         distortion = np.array([float(x) for x in metadata["distortion_k1_k2_p1_p2_k3"].split()])
-        view = View(K, pose @ USD_CAM_FROM_OPENCV_CAM, width, height, distortion)
+        view = PinholeCamera(K, pose @ USD_CAM_FROM_OPENCV_CAM, width, height, distortion)
         out[int(prim.GetName().removeprefix("view_"))] = (view, bool(metadata["heldOut"]))
     return out

@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import UNCHANGED, Camera, CameraSet, FittedFace, HeldOutView
+from pipeline.camera import PinholeCamera
 from pipeline.colour import as_photographed, srgb_from_linear
 from pipeline.contract import Context
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import matrix
-from stages.usd.render.camera import View, orbit_view
+from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
 from stages.usd.render.render import Renderer
 
@@ -25,9 +26,9 @@ GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
 """A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape."""
 
 
-def view_of(camera: Camera) -> View:
+def view_of(camera: Camera) -> PinholeCamera:
     """Convert a manifest's camera for the renderer."""
-    return View(
+    return PinholeCamera(
         matrix(camera.K),
         matrix(camera.world_from_cam),
         camera.width,
@@ -102,11 +103,11 @@ def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
     return path.resolve()
 
 
-def framing(renderer: Renderer, azimuth: float, size: int) -> View:
+def framing(renderer: Renderer, azimuth: float, size: int) -> PinholeCamera:
     """A square view of the whole asset from `azimuth` (radians from +Z towards +X)."""
     vertices = renderer.asset.mesh.vertices
     centre = (vertices.min(0) + vertices.max(0)).astype(np.float64) / 2
-    return orbit_view(float(np.linalg.norm(vertices - centre, axis=1).max()), azimuth, size, centre)
+    return orbit_camera(float(np.linalg.norm(vertices - centre, axis=1).max()), azimuth, size, centre)
 
 
 def write_rgba_png(path: Path, rgba: F32) -> None:

@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from pipeline.camera import PinholeCamera
 from pipeline.maths import brdf
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
-from stages.usd.render.camera import View
 from stages.usd.render.exported import ExportedAsset
 
 F32 = npt.NDArray[np.float32]
@@ -106,7 +106,7 @@ class Renderer:
 
     def render(
         self,
-        view: View,
+        view: PinholeCamera,
         *,
         factor: int = 1,
         samples: int = 2,
@@ -130,7 +130,7 @@ class Renderer:
             out[edge] = self._pixels(view, edge, w, factor, _triangle(EDGE_SAMPLES, EDGE_REACH), light)
         return out.reshape(h, w, 4)
 
-    def _reached(self, view: View, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
+    def _reached(self, view: PinholeCamera, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
         """Pixels in the mesh's bounding rectangle; all pixels if part of the mesh is beside or behind the camera."""
         points = self.asset.mesh.vertices.astype(np.float64)
         distances = points @ view.world_from_cam[:3, 2] - view.world_from_cam[:3, 2] @ view.world_from_cam[:3, 3]
@@ -143,7 +143,7 @@ class Renderer:
         return np.asarray((rows[:, None] * width + columns).ravel(), np.int64)
 
     def _pixels(
-        self, view: View, pixel: npt.NDArray[np.int64], width: int, factor: int, filtered: Filter, light: Light
+        self, view: PinholeCamera, pixel: npt.NDArray[np.int64], width: int, factor: int, filtered: Filter, light: Light
     ) -> F32:
         """(N, 4) RGBA of pixels (N,), given by row * width + column."""
         out = np.zeros((len(pixel), 4), np.float32)

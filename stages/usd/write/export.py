@@ -80,7 +80,7 @@ def export(
     dome = environment(light, config.environment_width)
     write_exr(folder / "environment.exr", dome)
     figures = maps.figures | environment_figures(light, dome)
-    (folder / "light.json").write_text(light_json(light, attenuation_of(face.artifact)))
+    (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
     if config.usdz:
@@ -141,12 +141,6 @@ def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None,
     high = with_uvs_from(dense, mesh, NEAR_HIGH, half_gap(mesh))
     fault = uv_fault(high, mesh)
     return (None, [f"the dense mesh was left out: {fault}"]) if fault else (high, [])
-
-
-def attenuation_of(face: FittedFace) -> str:
-    """Name of the light's attenuation in the fit; the paper's exponential if the model does not have the entry."""
-    found = [v["attenuation"] for v in face.model.values() if "attenuation" in v]
-    return str(found[0]) if found else "exponential"
 
 
 # ------------------------------------------------------------------ package
