@@ -127,7 +127,7 @@ def _warnings(kept: Kept, repairs: Topology | None, handles: int) -> tuple[str, 
     out = []
     if kept.second > LARGE_SECOND:
         out.append(
-            f"{kept.removed} disconnected components were removed; the largest has {kept.second:.0%} of the head's "
+            f"disconnected components that were removed: {kept.removed}; the largest has {kept.second:.0%} of the head's "
             "area: check the masks"
         )
     if repairs is not None:

@@ -174,7 +174,7 @@ def test_finished_capture_is_left_alone(tmp_path: Path, monkeypatch: pytest.Monk
     write_demo_capture(tmp_path / "a", **TINY)
     monkeypatch.setattr(capture, "_write", lambda *_: pytest.fail("written twice"))
     write_demo_capture(tmp_path / "a", **TINY)
-    with pytest.raises(FileExistsError, match="something else"):
+    with pytest.raises(FileExistsError, match="does not contain this demo capture"):
         write_demo_capture(tmp_path / "a", **TINY, seed=5)
 
 

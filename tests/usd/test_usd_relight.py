@@ -52,7 +52,7 @@ def test_a_sun_becomes_a_lamp_of_its_own() -> None:
     "image", [np.zeros((8, 16, 3)), np.full((8, 16, 3), -1.0), np.full((8, 16, 3), np.nan), np.ones((8, 8, 3))]
 )
 def test_unusable_lights_are_refused(image: np.ndarray) -> None:
-    with pytest.raises(StageError, match="light can't be used"):
+    with pytest.raises(StageError, match="environment map can't be used"):
         checked_environment(image.astype(np.float32), "x.exr")
 
 

@@ -126,7 +126,7 @@ def test_files_that_are_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(StageError, match="read safely"):
         load_imface_state(tmp_path / "torn.pth")
     torch.save({"model": [1, 2]}, tmp_path / "list.pth")
-    with pytest.raises(StageError, match="no state"):
+    with pytest.raises(StageError, match="does not contain the state"):
         load_imface_state(tmp_path / "list.pth")
     assert digest(str(tmp_path / "none.pth")) == "" and len(digest(str(tmp_path / "torn.pth"))) == 64
 
