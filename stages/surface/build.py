@@ -127,8 +127,8 @@ def _warnings(kept: Kept, repairs: Topology | None, handles: int) -> tuple[str, 
     out = []
     if kept.second > LARGE_SECOND:
         out.append(
-            f"disconnected components that were removed: {kept.removed}; the largest has {kept.second:.0%} of the head's "
-            "area: check the masks"
+            f"disconnected components that were removed: {kept.removed}; the largest has {kept.second:.0%} of the "
+            "head's area: check the masks"
         )
     if repairs is not None:
         out.append(
