@@ -77,7 +77,7 @@ def test_a_plan_is_kept_for_its_purpose(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_budget_and_preset_exclude_each_other(photos: Path, toys: None) -> None:
     request = RunRequest(capture=str(photos), out=str(photos.parent / "out"), budget=60.0, preset="studio")
-    with pytest.raises(UsageError, match="both say how large"):
+    with pytest.raises(UsageError, match="both set the size of the fit"):
         make_plan(request)
 
 

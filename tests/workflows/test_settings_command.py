@@ -28,7 +28,7 @@ def test_the_list_has_every_setting_with_its_default_its_limits_and_what_presets
     batch = lines.index("  batch = 4096 rays   (whole number, 16 to 1048576; film 8192; paper 2048)")
     assert lines[batch + 1].strip() == "rays in one optimisation step"
     assert "  rank = auto   (whole number, 1 to 8, or auto; paper 3)" in lines
-    assert '  author = ""   (text of up to 1000 letters)' in lines
+    assert '  author = ""   (text of up to 1000 characters)' in lines
     assert not any("sha256" in line or "digest" in line for line in lines)  # filled in by the stages
     assert len(lines) == 2 * len(all_settings()) + sum(bool(s.config.setting_names()) for s in REGISTRY)
 
