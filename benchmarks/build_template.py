@@ -78,7 +78,9 @@ def main() -> None:
     }
     print(json.dumps(worth, indent=1))
     centre = middle_of_head(found.mean, cut, label)
-    write_template(options.out, options.source, cut, label, found, centre, uv, expressions(source, ARKIT), points, worth)
+    write_template(
+        options.out, options.source, cut, label, found, centre, uv, expressions(source, ARKIT), points, worth
+    )
     if options.pictures:
         look.write_pictures(options.pictures, found, cut, label, uv, points)
 

@@ -11,7 +11,10 @@ from scipy.sparse.csgraph import connected_components
 from benchmarks.hm08.source import Source
 from pipeline.meshes import F64, Indices
 
-NECK, SLOPE = 6.1, -0.4  # quads of the body with y > NECK + SLOPE z (decimetres) are the head's: ends at a loop of edges
+NECK, SLOPE = (
+    6.1,
+    -0.4,
+)  # quads of the body with y > NECK + SLOPE z (decimetres) are the head's: ends at a loop of edges
 WIDE = 1.1  # from the middle: the arms rise above the neck
 PARTS = {  # name: groups of the base mesh, the skin aside
     "eye_left": ("helper-l-eye",),

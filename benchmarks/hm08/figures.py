@@ -50,7 +50,10 @@ def layout_figures(mean: F64, cut: Cut, label: Indices, uv: F64) -> dict[str, An
     region = np.array(NAMES)[label]
     area = texture_areas(uv)
     amount, _ = stretch(mean[cut.quads], cut.quads, uv)
-    out: dict[str, Any] = {"face_share": round(float(area[np.isin(region, FACE)].sum()), 4), "smallest_area": float(area.min())}
+    out: dict[str, Any] = {
+        "face_share": round(float(area[np.isin(region, FACE)].sum()), 4),
+        "smallest_area": float(area.min()),
+    }
     for name in NAMES:
         own = region == name
         out[name] = {

@@ -21,7 +21,7 @@ from benchmarks.hm08.source import MACRO, Source
 from pipeline.meshes import F64, Indices
 
 SAMPLES, SEED = 20_000, 8
-KEPT, MOST = 0.995, 100 # share of the variance that is wanted, and the most components for it
+KEPT, MOST = 0.995, 100  # share of the variance that is wanted, and the most components for it
 SPREAD, OWN = 0.28, 0.07  # standard deviations of weights, and of what left and right differ by
 ASYMMETRY = 0.15
 CHILDREN = 0.1  # share of the sampled persons

@@ -21,5 +21,4 @@ PAIRS = {  # name: right, left
     "lip_lower_side": (91, 321), "lip_lower_near": (84, 314), "chin_side": (148, 377), "cheekbone": (117, 346),
     "cheek": (50, 280), "nasolabial": (205, 425), "jaw": (149, 378),
 }  # fmt: skip
-ABOVE = ("lid_upper", "lip_upper", "lip_peak")  # names that begin so lie above the opening next to them
-BELOW = ("lid_lower", "lip_lower")
+ABOVE = ("lid_upper", "lip_upper", "lip_peak")  # of those at an opening, the names of what lies above it

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.hm08 import pictures
 from benchmarks.hm08.cut import Cut
-from benchmarks.hm08.landmark_names import ABOVE, BELOW, MIDDLE, PAIRS
+from benchmarks.hm08.landmark_names import ABOVE, MIDDLE, PAIRS
 from benchmarks.hm08.regions import NAMES, brow_share, eye_centres
 from pipeline.artifacts import Camera
 from pipeline.faces.find import find_face
@@ -32,14 +32,18 @@ SKIN, BROW, WHITE, IRIS, PUPIL = (
     np.array(c) for c in ((0.6, 0.4, 0.31), (0.06, 0.04, 0.03), (0.75, 0.72, 0.7), (0.12, 0.07, 0.04), (0.005,) * 3)
 )
 IRIS_COSINE, PUPIL_COSINE = 0.913, 0.985  # of the angle to the front, seen from the eye's centre
-SIDES_AGREE, HEADS_AGREE, ON_SKIN = 0.035, 0.04, 0.06  # decimetres: largest half difference, spread, distance to the skin
+SIDES_AGREE, HEADS_AGREE, ON_SKIN = (
+    0.035,
+    0.04,
+    0.06,
+)  # decimetres: largest half difference, spread, distance to the skin
 VIEWS_AGREE = 0.02  # of the face's size in a picture
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """names, network (L,) number in the face network's 468, corners (L, 3) vertices and weights (L, 3); left_out: names with
-    the reason."""
+    """names, network (L,) number in the face network's 468, corners (L, 3) vertices and weights (L, 3); left_out: names
+    with the reason."""
 
     names: list[str]
     network: Indices

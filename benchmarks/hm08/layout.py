@@ -1,9 +1,9 @@
 """The texture layout: skin upright and symmetric on tile 1001, everything else on tile 1002.
 
-The skin's left half is laid into the left half of the tile: its middle line on u = 1/2, a seam down the back of the head
-along the tile's top and outer side, the neck's border along the bottom. All of the tile is used, and since no quad
-flips and the outline is the tile's own, nothing overlaps. The mouth's and the sockets' insides are laid flat with it, very
-small, to hold their openings open, and then get charts of their own.
+The left half of the skin is laid into the right half of the tile, as seen from the front: its middle line on u = 1/2, a
+seam down the back of the head along the tile's top and outer side, the neck's border along the bottom. All of the tile
+is used, and since no quad flips and the outline is the tile's own, nothing overlaps. The insides of the mouth and of
+the sockets are laid flat with it, very small, to hold their openings open, and then get charts of their own.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ OF_PART = {
 }  # fmt: skip
 HAIRLINE = np.array([[6.60, 0.45], [7.00, 0.62], [7.35, 0.78], [7.70, 1.00], [7.92, 1.14], [8.08, 1.30], [8.10, 2.0]])
 JAWLINE = np.array([[-0.50, 6.72], [0.20, 6.62], [0.50, 6.50], [0.90, 6.27], [1.30, 6.13], [2.0, 6.10]])
-BROW = np.array([[-0.17, 0.195], [-0.02, 0.250], [0.13, 0.270], [0.25, 0.205]])  # from the left eye's centre
+BROW = np.array([[-0.17, 0.135], [-0.02, 0.168], [0.13, 0.178], [0.25, 0.125]])  # from the left eye's centre
 BROW_HALF = 0.042  # of its height
 LID_RINGS, LIP_RINGS = 10, 7  # of quads round the eyes' sockets and round the inside of the mouth
 EAR, NOSE_MOVED = 0.05, 0.35  # of a target's largest offset, from which a vertex belongs to what the target changes

@@ -23,8 +23,8 @@ NO_SHAPE = re.compile(r"head-trans-|asymm-")  # moves the whole head, or the che
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """vertices (N, 3) decimetres; quads (F, 4); uvs (M, 2) base.obj's texture vertices; uv_quads (F, 4) into them; group (F,) name of
-    each quad's group; mirror (N,) the vertex on the other side, itself in the middle."""
+    """vertices (N, 3) decimetres; quads (F, 4); uvs (M, 2) base.obj's texture vertices; uv_quads (F, 4) into them;
+    group (F,) name of each quad's group; mirror (N,) the vertex on the other side, itself in the middle."""
 
     folder: Path
     vertices: F64

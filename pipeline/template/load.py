@@ -94,7 +94,8 @@ def _landmarks(manifest: Manifest, skin: Indices, count: int) -> Points:
     """The landmarks, all on the skin."""
     corners = np.array([x.corners for x in manifest.landmarks], np.int64)
     checks.in_range(manifest.path, "landmarks", corners, count)
-    lost = [x.name for x, on in zip(manifest.landmarks, np.isin(corners, skin).all(1), strict=True) if not on]
+    off = np.flatnonzero(~np.isin(corners, skin).all(axis=1))
+    lost = [manifest.landmarks[i].name for i in off]
     if lost:
         refuse("a landmark of a template is not on its skin", f"{manifest.path}: landmarks", lost[0],
                "three vertices of the skin", REMEDY)  # fmt: skip
@@ -129,7 +130,9 @@ def _identity(manifest: Manifest, path: Path, arrays: checks.Arrays, mirror: Ind
         checks.in_range(path, "identity_vertices", rows, len(mirror))
     missing = len(mirror) - len(np.union1d(rows, mirror[rows]))
     if len(rows) != n or missing:
-        checks.bad_array(path, "identity_basis", f"{n} vertices, {missing} on neither side", f"{len(mirror)}, or a side")
+        checks.bad_array(
+            path, "identity_basis", f"{n} vertices, {missing} on neither side", f"{len(mirror)}, or a side"
+        )
     basis = checks.completed(stored, rows, mirror, symmetric)
     deviation = checks.array(path, arrays, "identity_deviation", (k,), "float") * manifest.metres
     checks.check_basis(path, basis, deviation)

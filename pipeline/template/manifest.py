@@ -132,7 +132,7 @@ def _landmarks(found: _Keys) -> tuple[Landmark, ...]:
             f"{MIN_LANDMARKS} to {MAX_LANDMARKS}", REMEDY,
         )  # fmt: skip
     out = tuple(_Keys(found.path, {f"landmarks[{i}]": v}).get(f"landmarks[{i}]", _landmark) for i, v in enumerate(many))
-    for what, values in (("name", [x.name for x in out]), ("network number", [x.network for x in out])):
+    for what, values in (("name", [x.name for x in out]), ("network number", [str(x.network) for x in out])):
         if len(set(values)) != len(values):
             twice = next(v for v in values if values.count(v) > 1)
             refuse(f"two landmarks have the same {what}", f"{found.path}: landmarks", twice, "each only once", REMEDY)

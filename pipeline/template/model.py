@@ -57,8 +57,8 @@ class Expressions:
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """parts and regions: name -> quads; each quad is in one of either. uvs (U, 2), uv_quads (Q, 4) into them, UDIM tiles
-    in one row. mirror (V,) the vertex on the other side, itself in the middle. joints: name -> (3,)."""
+    """parts and regions: name -> quads; each quad is in one of either. uvs (U, 2), uv_quads (Q, 4) into them, UDIM
+    tiles in one row. mirror (V,) the vertex on the other side, itself in the middle. joints: name -> (3,)."""
 
     name: str
     licence: str
