@@ -4,7 +4,7 @@
 
 CAPTURE has photos, truth/skin.obj, truth/cameras.json and truth/landmarks.json (person_c, person_e). The template is
 laid on the true skin by identity alone (nearest points, no landmarks after the start). Then in mm: the named true
-points against the template's, and what the face network sees in the photos, triangulated, against the template's landmarks.
+points against the template's, and what the face network sees in the photos, triangulated, against the template's.
 """
 
 from __future__ import annotations
