@@ -14,6 +14,7 @@ from pipeline.template.files import refuse
 from pipeline.template.manifest import REMEDY
 
 MAX_VERTICES, MAX_TILES = 1_000_000, 10
+FARTHEST = 1e9  # units of length from the origin
 UV_SLACK = 1e-6  # of a tile, for rounded coordinates
 SYMMETRIC = 1e-3  # of the mesh's size: how far from its mirror image a vertex may be where no mirror is given
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -63,8 +64,8 @@ def check_mesh(path: Path, vertices: F64, quads: Indices) -> None:
     """At least one quad, of four different vertices each, and no vertex that no quad uses."""
     if not 0 < len(vertices) <= MAX_VERTICES or len(quads) == 0:
         bad_array(path, "vertices", f"{len(vertices)} vertices, {len(quads)} quads", f"1 to {MAX_VERTICES} vertices")
-    if not np.isfinite(vertices).all():
-        bad_array(path, "vertices", "NaN or infinite", "finite numbers")
+    if not (np.abs(vertices) <= FARTHEST).all():
+        bad_array(path, "vertices", "NaN, infinite or huge", f"finite numbers up to {FARTHEST:g}")
     in_range(path, "quads", quads, len(vertices))
     ordered = np.sort(quads, 1)
     if (ordered[:, 1:] == ordered[:, :-1]).any():

@@ -226,6 +226,7 @@ def test_an_unknown_expression_is_named(head: Template) -> None:
 
 
 # ------------------------------------------------------------------ against the source
+@pytest.mark.slow
 def test_identity_reaches_raw_persons_within_the_stated_error(head: Template, repo: Path) -> None:
     """Persons mixed from the raw shape targets with other seeds than those of the basis."""
     folder = repo.parent / "shared/template"

@@ -184,6 +184,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "quad with a point": (poke("quads", (0, 0), 1), "array of a template is wrong"),
     "loose vertex": (swap("vertices", lambda v: np.vstack([v, v[:1]])), "array of a template is wrong"),
     "NaN": (poke("vertices", (2, 1), np.nan), "array of a template is wrong"),
+    "huge": (poke("vertices", (2, 1), 1e300), "array of a template is wrong"),
     "floats as quads": (swap("quads", lambda q: q * 1.0), "array of a template is wrong"),
     "no uvs": (lambda m, a: a.pop("uvs"), "array of a template is wrong"),
     "uvs infinite": (poke("uvs", (0, 0), np.inf), "array of a template is wrong"),
