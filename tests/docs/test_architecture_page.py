@@ -16,6 +16,7 @@ FOLDERS = {
     "pipeline/maths": "### pipeline/maths/",
     "pipeline/fields": "### pipeline/fields/",
     "pipeline/faces": "### pipeline/faces/",
+    "pipeline/template": "### pipeline/template/",
     "pipeline/demo": "### pipeline/demo/",
     "stages": "## stages/",
     "workflows": "## workflows/",

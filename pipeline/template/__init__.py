@@ -1,0 +1,1 @@
+"""A head with a topology that is the same for every person (docs/template.md)."""
