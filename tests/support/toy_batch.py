@@ -24,6 +24,7 @@ from stages.capture.stage import STAGE as CAPTURE
 from tests.support.points import instrument, reach
 from tests.support.toy_stages import finding
 from workflows.batch import local
+from workflows.run.published import write_whole
 from workflows.server import adapter
 
 
@@ -63,7 +64,7 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         context.check()
         context.progress(step, config.steps, "working")
         reach("work.step")
-        checkpoint.write_text(str(step + 1))
+        write_whole(checkpoint, str(step + 1))  # as the fit's: SIGKILL leaves the old one or the new one
         reach("work.checkpoint", context.cancelled)
     if config.fault == "hangs":
         reach("work.hangs")
