@@ -72,5 +72,5 @@ def _face(words: list[str], vertices: int, uvs: int, where: str) -> list[int]:
             "convert the mesh to quads before it becomes a template",
         )  # fmt: skip
     both = [word.split("/") for word in words]
-    v, t = ([int(word[k]) for word in both] for k in (0, 1))
+    v, t = ([int(np.int64(int(word[k]))) for word in both] for k in (0, 1))  # OverflowError: no index is so large
     return [i - 1 if i > 0 else vertices + i for i in v] + [i - 1 if i > 0 else uvs + i for i in t]

@@ -45,6 +45,7 @@ def test_importing_is_light(module: str, repo: Path) -> None:
 
 
 @pytest.mark.parametrize("module", ["workflows.cli.main", "stages.__main__", "workflows.flows"])
+@pytest.mark.slow
 def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path) -> None:
     code = (
         "import os, sys\n"

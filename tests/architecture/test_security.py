@@ -38,6 +38,7 @@ def keyword(call: ast.Call, name: str) -> object:
     return next((ast.literal_eval(k.value) for k in call.keywords if k.arg == name), None)
 
 
+@pytest.mark.slow
 def test_no_pickle_is_ever_loaded(repo: Path) -> None:
     loads = [(at, name, c) for at, name, c in calls(repo) if name in ("torch.load", "np.load", "numpy.load")]
     assert len(loads) >= 5

@@ -142,6 +142,7 @@ def test_detail_is_found_through_gloss_calibration_and_distortion(scene: Scene) 
     assert np.allclose(without[1][without[3] == 0], smooth_albedo(x)[without[3] == 0], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_low_band_stays_the_fields_and_no_seam_shows(scene: Scene) -> None:
     """Photos of wrong exposure, each another: what they add has no mean, and does not step where photos change."""
     gains = 1 + 0.2 * np.linspace(-1, 1, len(CAMERAS))

@@ -170,6 +170,7 @@ def test_points_of_several_tiles_are_put_together() -> None:
     assert detail.joined(parts[:1]) is parts[0]
 
 
+@pytest.mark.slow
 def test_the_stage_bakes_every_tile_with_the_photos_detail(
     inputs: Inputs,  # noqa: F811
     tmp_path: Path,

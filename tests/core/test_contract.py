@@ -237,6 +237,7 @@ def start(photos: Path, store: Store, environment: dict[str, str], *options: str
 
 
 @pytest.mark.parametrize("step", [1, 2, 5, 10])
+@pytest.mark.slow
 def test_killed_in_mid_stage_then_resumed(
     photos: Path, store: Store, child_environment: dict[str, str], step: int, tmp_path: Path
 ) -> None:

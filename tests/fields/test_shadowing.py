@@ -40,6 +40,7 @@ def on_sphere(radius: float, highest: float, n: int = 200) -> torch.Tensor:
     return radius * d[d[:, 2] < highest]
 
 
+@pytest.mark.slow
 def test_a_convex_body_hides_nothing() -> None:
     s = solved(geometry(None), 0.8)
     assert bool(s.solved)

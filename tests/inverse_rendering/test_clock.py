@@ -60,6 +60,7 @@ def test_an_interrupted_fit_has_the_rest_of_its_time(ticking: None, tmp_path: Pa
         assert (a == b).all(), name
 
 
+@pytest.mark.slow
 def test_the_pace_so_far_tells_the_total(ticking: None) -> None:
     t = by_clock()
     for _ in range(20):

@@ -190,6 +190,7 @@ def test_three_interruptions_change_nothing(fitted: Trainer, tmp_path: Path) -> 
         assert torch.equal(a, b), name
 
 
+@pytest.mark.slow
 def test_a_torn_or_foreign_checkpoint_is_not_used(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.pt"
     path.write_bytes(b"torn")

@@ -190,6 +190,7 @@ def loss_at(k: float) -> float:
 
 
 @pytest.mark.parametrize("scale", [pytest.param(1e-3, marks=pytest.mark.slow), 1e5])
+@pytest.mark.slow
 def test_scenes_of_any_size(scale: float) -> None:
     """The ball of 0.1 units at 1e-4 and 1e4 units: the same fit, in other units."""
     assert loss_at(scale) == pytest.approx(loss_at(1.0), rel=0.05)

@@ -191,6 +191,7 @@ def test_a_fit_takes_the_light_over() -> None:
         {"specular": "off"},
     ],
 )
+@pytest.mark.slow
 def test_where_the_lobe_is_not_asked(changes: dict[str, Any]) -> None:
     from tests.inverse_rendering.test_evidence import trainer
     from tests.support.balls import Ball, gloss

@@ -87,6 +87,7 @@ def test_a_mask_that_lacks_a_part_cuts_nothing_off(lost: str) -> None:
         assert (np.linalg.norm(points - np.array(middle), axis=1) < 0.5 * radius).any()
 
 
+@pytest.mark.slow
 def test_an_empty_mask_among_many() -> None:
     alphas = [*ALPHAS[:5], np.zeros_like(ALPHAS[5]), *ALPHAS[6:]]
     assert volume(alphas) == pytest.approx(volume(ALPHAS), rel=0.02)
@@ -107,6 +108,7 @@ def test_a_narrow_strip_is_left_to_the_mask() -> None:
     assert agreed(CAMERAS, alphas, RADIUS).alphas[4] is alphas[4]
 
 
+@pytest.mark.slow
 def test_the_start_ends_a_little_beyond_the_extent() -> None:
     """The torso is cut off below the neck; the head stays as it is."""
     cut = Cut(normal=(0.0, -1.0, 0.0), offset=0.08)

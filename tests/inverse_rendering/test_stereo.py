@@ -75,6 +75,7 @@ def misses(start: Start) -> np.ndarray:
 
 
 @pytest.mark.parametrize("lens", [(0.0,) * 5, pytest.param(LENS, marks=pytest.mark.slow)], ids=["straight", "lens"])
+@pytest.mark.slow
 def test_a_fill_is_carved_away(lens: tuple[float, ...]) -> None:
     start = too_large(0.007)
     found = stereo.start_from_photos(start, [photo(i, lens=lens) for i in range(24)], "cpu")
@@ -93,6 +94,7 @@ def test_a_deep_fill_is_carved_away_from_clean_photos(monkeypatch: pytest.Monkey
     assert misses(stereo.start_from_photos(start, photos, "cpu")).max() > 6e-3
 
 
+@pytest.mark.slow
 def test_blank_skin_stays_where_it_is() -> None:
     start = too_large(0.004)
     found = stereo.start_from_photos(start, [photo(i, blank=True) for i in range(24)], "cpu")
@@ -146,6 +148,7 @@ def test_twice_the_same(all_cores: None) -> None:
     assert np.array_equal(a.values, b.values)
 
 
+@pytest.mark.slow
 def test_views_behind_do_not_see() -> None:
     """Every view that is kept faces the point; the order is by how squarely."""
     start = too_large(0.0)

@@ -194,6 +194,7 @@ def test_held_out_view_never_votes(scene: Scene, tmp_path: Path) -> None:
     assert after.dropped == () and "view 2 (2.png) is held out and its mask may be wrong" in after.warnings[0]
 
 
+@pytest.mark.slow
 def test_computed_outlier_is_mended(scene: Scene, tmp_path: Path) -> None:
     """Half of the ball in one photo is in black shadow: keying loses it, the other views know better."""
     c = scene.cameras[6]

@@ -36,6 +36,7 @@ def copied(ball: Path, folder: Path, *, cameras: bool) -> Path:
 
 
 # ------------------------------------------------------------------ cameras that don't match the photos
+@pytest.mark.slow
 def test_one_camera_that_is_not_its_photos_is_left_out(ball: Path, tmp_path: Path, capture_of, place) -> None:
     folder = copied(ball, tmp_path / "c", cameras=True)
     params = json.loads((folder / "params.json").read_text())

@@ -111,6 +111,7 @@ def pretzel(count: int) -> Distance:
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.slow
 def test_loops_part_nothing_and_run_along_edges(count: int) -> None:
     mesh = marched(pretzel(count), 0, 96).mesh
     vertices = mesh.vertices.astype(np.float64)

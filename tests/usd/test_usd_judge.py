@@ -28,6 +28,7 @@ def collapsed() -> dict[str, np.ndarray]:
     return mesh | {"uvs": np.concatenate([uvs, line]), "uv_faces": faces}
 
 
+@pytest.mark.slow
 def test_an_asset_with_faults_is_written_and_marked(tmp_path: Path) -> None:
     asset = run_stage(write_inputs(tmp_path / "in", mesh=collapsed()), tmp_path / "work")
     (faults,) = (f for f in asset.findings if f.check == "usd_faults")

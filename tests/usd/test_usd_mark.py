@@ -76,6 +76,7 @@ def test_a_mark_replaces_another_and_gives_the_same_bytes(asset: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["capture", *(pytest.param(s, marks=pytest.mark.slow) for s in ("masks", "inverse_rendering", "bake"))]
 )
+@pytest.mark.slow
 def test_findings_of_every_stage_before_count(inputs: SyntheticInputs, tmp_path: Path, name: str) -> None:
     located = getattr(inputs, name)
     found = Located(located.artifact.model_copy(update={"findings": (FAIR,)}), located.folder)

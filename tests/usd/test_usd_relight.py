@@ -90,6 +90,7 @@ def bowl(columns: int = 96, rings: int = 48) -> tuple[np.ndarray, np.ndarray, np
     return out.astype(np.float32), (-out).astype(np.float32), np.array(faces, np.int32)
 
 
+@pytest.mark.slow
 def test_a_bowl_sees_half_the_sky_and_throws_light_back() -> None:
     """Within a sphere every place sees every other alike, so that each place of a half sphere sees the opening with
     half its cosine-weighted directions: D = E / 2, and k bounces give D (a / 2)^k."""

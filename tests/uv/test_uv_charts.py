@@ -192,6 +192,7 @@ def test_least_cut_parts_a_dumbbell_at_its_waist() -> None:
     assert (np.abs(vertices[e[a[across], 0], 2] - 3) <= 1.2).all()
 
 
+@pytest.mark.slow
 def test_charts_hold_their_faces() -> None:
     mesh = mesh_of(trimesh.creation.icosphere(2, 0.1))
     charts: Charts = unwrap.unwrap(mesh, Config(texture_size=512, padding=3))

@@ -44,6 +44,7 @@ def test_edges_are_alike_and_vertices_have_six_neighbours(dense: Mesh) -> None:
     assert regular(even) > 0.6 > regular(few)
 
 
+@pytest.mark.slow
 def test_it_lies_on_the_surface_and_keeps_the_cut_of_the_neck(dense: Mesh) -> None:
     even = remeshed(dense, 5000)
     edge = meshes.edge_lengths(even.vertices, even.faces).mean()

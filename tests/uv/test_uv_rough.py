@@ -61,6 +61,7 @@ def test_thousands_of_loose_faces_stay_whole_and_are_judged() -> None:
     assert charts.level != "good" and charts.value == q.charts
 
 
+@pytest.mark.slow
 def test_faces_without_area_do_not_break_the_charts() -> None:
     """Slivers, faces whose corners are at one place, and whole flakes of no thickness."""
     mesh = with_worthless_faces(shredded(3, 0.2))

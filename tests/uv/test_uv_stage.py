@@ -63,6 +63,7 @@ def test_settings_have_limits(bad: dict[str, float]) -> None:
         Config(**bad)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_failing_unwrap_is_a_stage_error(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Broken:
         def add_mesh(self, *_: object) -> None:

@@ -146,6 +146,7 @@ def camera(z: float, at: tuple[float, float] = (0.0, 0.0)) -> Camera:
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Path) -> None:
     meshes.save(tmp_path / "surface.npz", ball)
     surface = Surface(

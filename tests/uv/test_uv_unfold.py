@@ -109,6 +109,7 @@ def mirrored_and_wound() -> np.ndarray:
 @pytest.mark.parametrize(
     "uvs", [turned(*wound()), *(pytest.param(x, marks=pytest.mark.slow) for x in (mirrored_and_wound(), thrown(1)))]
 )
+@pytest.mark.slow
 def test_charts_that_fold_are_mended_before_they_are_packed(uvs: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = band()
     before = measure(mesh, Charts(uvs.astype(np.float32), mesh.faces))

@@ -173,6 +173,7 @@ def test_a_run_may_keep_its_checkpoint_before_it_ends(tmp_path: Path) -> None:
     assert (tmp_path / "kept").read_text() == "kept" and process.returncode == 0
 
 
+@pytest.mark.slow
 def test_what_does_not_let_go_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(child, "GRACE", 0.2)
     deaf = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); print('up', flush=True); time.sleep(600)"

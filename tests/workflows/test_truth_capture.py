@@ -110,6 +110,7 @@ def test_a_larger_sphere_in_another_world_is_measured_in_millimetres(tmp_path: P
     assert labels == {}
 
 
+@pytest.mark.slow
 def test_what_the_truths_outline_leaves_out_does_not_count_for_accuracy(tmp_path: Path, scan: Path) -> None:
     """A plate beside the sphere: in the cameras' sight, but on no photo's subject. completeness never sees it."""
     plate = trimesh.creation.box((0.02, 0.02, 0.02), transform=rigid(np.eye(3), np.array([0, 0.115, 0.02])))
@@ -194,6 +195,7 @@ def solved(asset_from_head: np.ndarray) -> dict[str, Any]:
 ASSET_FROM_HEAD = similarity(3.0, pose(EYES[2])[:3, :3], np.array([1.0, 2.0, 3.0]))
 
 
+@pytest.mark.slow
 def test_a_person_in_a_world_of_its_own(tmp_path: Path, person: Path) -> None:
     asset = sphere()
     asset.apply_transform(ASSET_FROM_HEAD)
