@@ -149,7 +149,7 @@ def _landmark(value: Any) -> Landmark:
     network, corners, weights = value["network"], value["corners"], value["weights"]
     if not _whole(network) or not 0 <= network < MAX_LANDMARKS:
         raise ValueError(f"network: a number from 0 to {MAX_LANDMARKS - 1}")
-    if not isinstance(corners, list) or len(corners) != 3 or not all(_whole(c) for c in corners):
+    if not isinstance(corners, list) or len(corners) != 3 or not all(_whole(c) and abs(c) < 2**31 for c in corners):
         raise ValueError("corners: three vertices")
     good = isinstance(weights, list) and len(weights) == 3
     if not good or not all(isinstance(w, int | float) and not isinstance(w, bool) for w in weights):
