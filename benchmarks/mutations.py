@@ -77,7 +77,7 @@ MUTATIONS = (
     Mutation("stages/poses/scale.py", "<= MET * max(", "<= 100 * MET * max(", "tests/poses/test_poses_scale.py"),
     # ---------------------------------------------------------------- masks and hull
     Mutation("stages/masks/refine_contour.py", "UNIT * (behind - own)", "UNIT * (own - behind)",
-             "tests/masks/test_masks_redraw.py::test_a_contour_that_is_nearly_right_becomes_right"),
+             "tests/masks/test_masks_refine_contour.py::test_a_contour_that_is_nearly_right_becomes_right"),
     Mutation("stages/masks/face_labels.py", "(out > 0) & (out != EYES)", "(out > 0)",
              "tests/masks/test_masks_faces.py"),
     Mutation("pipeline/hull.py", "1.2 * np.sqrt(3) / 2 * cell * factor", "0.2 * cell * factor",
@@ -95,7 +95,7 @@ MUTATIONS = (
     Mutation("stages/usd/write/light.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
              "np.pi * (2 * (np.arange(width) + 0.5) / width - 1)", "tests/usd/test_usd_light.py"),
     Mutation("stages/usd/write/ggx_conversion.py", "REFERENCE_F0 * a + b", "REFERENCE_F0 * a",
-             "tests/usd/test_usd_lobe.py"),
+             "tests/usd/test_usd_ggx_conversion.py"),
     Mutation("stages/usd/render/median_cut.py", "np.minimum(image[..., :3], HALF_MAX)",
              "np.minimum(image[..., :3], 1e3)",
              "tests/usd/test_usd_relight.py::test_infinite_suns_are_bounded"),

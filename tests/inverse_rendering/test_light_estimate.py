@@ -158,7 +158,7 @@ def test_harmonics_agree_with_the_projects() -> None:
 def test_a_fit_takes_the_light_over() -> None:
     """A glossy ball: the light is put in, the lobe begins anew, and the fit goes on with both; a checkpoint knows."""
     from stages.inverse_rendering.model_selection import restored
-    from tests.inverse_rendering.test_evidence import trainer
+    from tests.inverse_rendering.test_cross_validation import trainer
     from tests.support.balls import Ball, gloss
 
     t = trainer(Ball(gloss(4, 0.02)))
@@ -193,7 +193,7 @@ def test_a_fit_takes_the_light_over() -> None:
 )
 @pytest.mark.slow
 def test_where_the_lobe_is_not_asked(changes: dict[str, Any]) -> None:
-    from tests.inverse_rendering.test_evidence import trainer
+    from tests.inverse_rendering.test_cross_validation import trainer
     from tests.support.balls import Ball, gloss
 
     t = trainer(Ball(gloss(4, 0.25)), **changes)
