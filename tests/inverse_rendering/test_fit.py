@@ -106,7 +106,7 @@ def test_the_ball_is_found(fitted: Trainer) -> None:
 
 
 def test_the_fit_finds_out_what_the_ball_requires(fitted: Trainer) -> None:
-    """It is Lambertian, its photos are of one camera, and it began 8 mm too large (test_cross_validation.py has more)."""
+    """It is Lambertian, its photos are of one camera, and it began 8 mm too large; test_cross_validation.py has more."""
     c = fitted.choices
     assert c is not None and not c.specular and not c.calibrated and c.refine_geometry and c.light_order == 3
     assert len(fitted.model.light()) == 16 and all(
