@@ -18,7 +18,7 @@ from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.ray_sampling import PhotoView
-from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, hooks
+from tests.support.small_ball import SMALL, ball_start, ball_view, hooks
 
 SHORT = SMALL.changed(steps=8, batch=256, levels=1, shadows=False, max_dropped=3)
 

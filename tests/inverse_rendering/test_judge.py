@@ -19,7 +19,7 @@ from stages.inverse_rendering.judge import Fitted, findings
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.residuals import LabelError, ViewError, photo_noise, view_errors
-from tests.inverse_rendering.test_fit import SMALL, ball_start, ball_view, fit_of_the_ball, hooks, trainer
+from tests.support.small_ball import SMALL, ball_start, ball_view, fit_of_the_ball, hooks, trainer
 from tests.support.spread import made_once
 
 REF = FileRef(path="a.png", sha256="0" * 64, size=1)

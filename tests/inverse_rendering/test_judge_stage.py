@@ -14,7 +14,7 @@ from pipeline.images import write_png, write_png_from_linear
 from pipeline.transforms import rows
 from stages.inverse_rendering import judge
 from stages.inverse_rendering.stage import Config, Inputs, run
-from tests.inverse_rendering.test_fit import SMALL, ball_view
+from tests.support.small_ball import SMALL, ball_view
 
 COUNT = 12
 SETTINGS = {k: v for k, v in SMALL.model_dump().items() if k in Config.model_fields and k != "stereo"}

@@ -16,7 +16,7 @@ from stages.inverse_rendering import fit, time_budget
 from stages.inverse_rendering.fit import Trainer, run_fit
 from stages.inverse_rendering.stage import Config
 from stages.inverse_rendering.time_budget import FINER, seconds_to_predict
-from tests.inverse_rendering.test_fit import SMALL, ball_view, hooks, trainer
+from tests.support.small_ball import SMALL, ball_view, hooks, trainer
 
 TICK = 0.25  # seconds between two looks at the clock
 STEPS = 60

@@ -23,8 +23,8 @@ from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.paper import trainer as paper
 from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.ray_sampling import Rays
-from tests.inverse_rendering.test_fit import RADIUS, SMALL, ball_start, ball_view, hooks
 from tests.support.imface_checkpoint import ours, published
+from tests.support.small_ball import RADIUS, SMALL, ball_start, ball_view, hooks
 
 PAPER = Config(preset="paper")
 TINY = PAPER.changed(
