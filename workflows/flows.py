@@ -24,7 +24,7 @@ from workflows.run.runner import run_stages
 from workflows.run.session import Session
 from workflows.run.verdict import last_lines, level_in, state_name
 from workflows.server.access import check_folders
-from workflows.server.adapter import publish_result, report_batch, task_executor, with_slot
+from workflows.server.adapter import execute_as_task, publish_result, report_batch, with_slot
 from workflows.server.flow_signature import takes
 
 CAPTURE_FLOW: dict[str, Any] = {
@@ -63,7 +63,7 @@ def _run_capture(asked: Mapping[str, Any], watch: Session | None) -> Any:
     with _watched(asked, watch) as watched:
         plan, note = make_plan(request), watched.observer.note
         with exclusive_run(plan.store.root, plan.out, watched.stopped, note):
-            done = run_stages(plan, watched, task_executor(), with_slot(plan, watched.stopped))
+            done = run_stages(plan, watched, execute_as_task, with_slot(plan, watched.stopped))
             record = publish(plan, done, note)
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))

@@ -22,7 +22,6 @@ from workflows.batch.failures import Failure, back_off, smaller
 from workflows.batch.page import write_page
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import ENDED, BatchState, Entry, Summary, fingerprint
-from workflows.run.output_dirs import writable
 from workflows.run.plan import check_settings
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
@@ -85,7 +84,7 @@ def run_batch(
     _not_inside(out, Path(request.root))
     for item in {str(i.own): i for i in items}.values():  # a wrong setting is reported once, not by each capture
         check_settings(request.run_request(item.capture, item.name, (), item.own))
-    with writable(out, store), exclusive_run(store, request.folder, stopped, notify):
+    with exclusive_run(store, request.folder, stopped, notify):
         works = [_prepared(i, state, request) for i in items]
         summary = Summary([w.entry for w in works])
         notify(f"{len(items)} captures, {len(items) - summary.failed} of them done before")

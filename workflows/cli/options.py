@@ -105,18 +105,18 @@ def _value(name: str, field: FieldInfo, description: str) -> dict[str, Any]:
     return {**out, "help": description + shown}
 
 
-def request_from(options: argparse.Namespace, model: type[M], **changes: Any) -> M:
-    """The request that the options make. changes: fields that no option gives.
+def request_from(options: argparse.Namespace, model: type[M]) -> M:
+    """The request that the options make.
 
     Raises:
         UsageError: a value outside its limits.
     """
     given = {n: getattr(options, n) for n in model.model_fields if hasattr(options, n)}
     file = given.get("config")
-    given |= {"sets": tuple(given.get("sets", ()))}
+    given["sets"] = tuple(given["sets"])
     given["config"] = read_config_file(Path(file)) if file else {}
     try:
-        return model(**{**given, **changes})
+        return model(**given)
     except ValidationError as e:
         first = e.errors()[0]
         name = str(first["loc"][0])

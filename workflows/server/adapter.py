@@ -28,7 +28,7 @@ from pipeline.contract import Done, Stage, StageConfig, execute, key
 from pipeline.store import MANIFEST
 from stages.registry import FIT
 from workflows.run.plan import Plan
-from workflows.run.runner import Around, ExecuteStage
+from workflows.run.runner import Around
 from workflows.run.verdict import last_lines
 from workflows.server.concurrency import slot
 
@@ -36,23 +36,19 @@ log = logging.getLogger(__name__)
 PUBLISH_EVERY = 5.0  # seconds between two updates of a progress artifact: each is a request to the server
 
 
-def task_executor() -> ExecuteStage:
-    """Executes a stage as a Prefect task, in place of pipeline.contract.execute."""
-
-    def execute_as_task(stage: Stage[Any, Any, Any], *arguments: Any, **options: Any) -> Done[Any]:
-        as_task = task(
-            name=stage.name,
-            task_run_name=stage.name,
-            description=(stage.run.__doc__ or "").strip(),
-            version=str(stage.version),
-            retries=0,
-            cache_policy=NO_CACHE,
-            persist_result=False,
-        )
-        run: Callable[[_Call], Done[Any]] = as_task(_execute)
-        return run(_Call(stage, arguments, options))
-
-    return execute_as_task
+def execute_as_task(stage: Stage[Any, Any, Any], *arguments: Any, **options: Any) -> Done[Any]:
+    """As pipeline.contract.execute, but as a Prefect task."""
+    as_task = task(
+        name=stage.name,
+        task_run_name=stage.name,
+        description=(stage.run.__doc__ or "").strip(),
+        version=str(stage.version),
+        retries=0,
+        cache_policy=NO_CACHE,
+        persist_result=False,
+    )
+    run: Callable[[_Call], Done[Any]] = as_task(_execute)
+    return run(_Call(stage, arguments, options))
 
 
 class _Call:
@@ -85,8 +81,10 @@ def with_slot(plan: Plan, stopped: Callable[[], bool]) -> Around:
 
     def around(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig) -> AbstractContextManager[None]:
         limit = plan.request.fit_slots
+        if limit is None or stage.name != FIT:
+            return nullcontext()
         stored = (plan.store.folder(stage.name, key(stage, inputs, config)) / MANIFEST).is_file()
-        return nullcontext() if limit is None or stage.name != FIT or stored else slot(limit, stopped)
+        return nullcontext() if stored else slot(limit, stopped)
 
     return around
 
