@@ -40,7 +40,7 @@ class Check:
         """A line of the table."""
         good = _joined(x.words() for x in self.limits) or DEPENDS
         usable = _joined(_usable(x) for x in self.limits) or DEPENDS
-        remedy = _joined(self.remedies).replace("|", "\\|") or "nothing: it is told, and has no other level"
+        remedy = _joined(self.remedies).replace("|", "\\|") or "nothing: it is only reported"
         return f"| {self.stage} | `{self.name}` | {good} | {usable} | {remedy} |"
 
 
