@@ -52,7 +52,8 @@ class Config(StageConfig):
         default=2, ge=1, le=4, description="number of grid resolutions, coarse to fine; each halves the cell size"
     )
     stereo: bool = Field(
-        default=True, description="refine the visual hull by plane-sweep stereo before the fit (prior hull)"
+        default=True,
+        description="refine the visual hull by plane-sweep stereo before the fit (prior auto, hull or template)",
     )
     # model
     rank: Annotated[int, Field(ge=1, le=8)] | Literal["auto"] = Field(
@@ -131,8 +132,10 @@ class Config(StageConfig):
     )
     basis_width: int = Field(default=64, ge=8, le=512, description="width of the Integrated Basis MLP")
     basis_depth: int = Field(default=2, ge=1, le=16, description="hidden layers of the Integrated Basis MLP")
-    prior: Literal["hull", "sphere", "imface"] = Field(
-        default="hull", description="initial geometry [NeuFace section 4.3]"
+    prior: Literal["auto", "hull", "template", "sphere", "imface"] = Field(
+        default=AUTO,
+        description="initial geometry [NeuFace section 4.3]; hull: of the masks; template: the hull, cut by the head "
+        "template on the face landmarks; auto: template where the hull hides the face",
     )
     prior_file: str = Field(
         default="", description="path of an ImFace checkpoint, for prior imface (docs/imface.md)", exclude=True

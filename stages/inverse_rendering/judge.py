@@ -43,19 +43,19 @@ AGREE = Limits(0.12, 0.35, lower=False)
 SPECULAR = Limits(MIN_SPECULAR, 0.0)
 ALWAYS = Limits(0.0, 0.0)
 MAX_NAMED = 12
+HULL = "visual hull"  # choose_start.py; other initial geometries need not have the silhouettes
 
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
     """errors: of the fitted photos. history: running PSNR in dB at each tenth of the fit. facts: of the model selection
-    (model_selection.py). prior: the initial geometry (config.py)."""
+    (model_selection.py) and of the initial geometry (choose_start.py)."""
 
     errors: Sequence[ViewError]
     capture: Capture
     masks: MaskSet
     history: Sequence[float]
     facts: Facts
-    prior: str = "hull"
 
 
 def findings(f: Fitted) -> tuple[Finding, ...]:
@@ -66,7 +66,7 @@ def findings(f: Fitted) -> tuple[Finding, ...]:
 def start(f: Fitted) -> list[Finding]:
     """The check whether the initial hull has the masks' silhouettes."""
     error = _number(f.facts, "relief", "silhouette_error_of_prior")
-    if error is None or f.prior != "hull":
+    if error is None or f.facts.get("geometry", {}).get("prior") != HULL:
         return []
     message = f"the initial geometry contradicts the masks of the validation views in {error:.1%} of the rays"
     remedy = (

@@ -96,17 +96,15 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
     return rgba.reshape(h, w, 4).astype(np.float32)
 
 
-def model_facts(trainer: Trainer, looked: Footprint | None) -> dict[str, dict[str, str | float | bool]]:
-    """The selected model and the figures of each decision, for the report."""
+def model_facts(
+    trainer: Trainer, looked: Footprint | None, geometry: dict[str, str | float | bool]
+) -> dict[str, dict[str, str | float | bool]]:
+    """The selected model and the figures of each decision, for the report. geometry: of the initial geometry."""
     settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
         **decided,
-        "geometry": {
-            "prior": {"hull": "visual hull", "sphere": "sphere", "imface": "ImFace"}[settings.prior],
-            "cell_mm": round(model.geometry.cell * 1e3, 4),
-            "why": "no face prior with a suitable licence" if settings.prior == "hull" else "setting",
-        },
+        "geometry": {**geometry, "cell_mm": round(model.geometry.cell * 1e3, 4)},
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
         "density": {"kind": settings.density, "why": "setting"},

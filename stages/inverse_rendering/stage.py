@@ -25,6 +25,8 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
+    from pipeline.faces.landmarks3d import load_landmarks
+    from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import exposures_differ
     from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
@@ -33,7 +35,6 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
-    from stages.inverse_rendering.stereo import start_from_photos
     from stages.inverse_rendering.systems import trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
 
@@ -65,12 +66,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         settings, cells = supported(settings, looked, start), settings.grid_cells
         if settings.grid_cells < cells and settings.prior != "sphere":
             start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
-    prior = start
-    if settings.stereo and settings.prior == "hull":
-        context.progress(0, settings.steps, "stereo")
-        start = start_from_photos(start, views, context.device, context.check)
+    context.progress(0, settings.steps, "initial geometry")
+    ref = inputs.masks.artifact.landmarks
+    landmarks = None if ref is None else load_landmarks(inputs.masks.path(ref))
+    chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
+    start = chosen.start
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
-    trainer = trainer_for(views, start, settings, own_colours, context.device, prior)
+    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -81,10 +83,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     held_out = predict_held_out(
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
-    facts = model_facts(trainer, looked)
+    facts = model_facts(trainer, looked, chosen.facts)
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
-    fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts, settings.prior)
+    fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts)
     return FittedFace(
         field=context.file("field.npz"),
         light=context.file("light.json"),
@@ -112,4 +114,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
-STAGE = Stage(name="inverse_rendering", version=9, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=10, inputs=Inputs, config=Config, output=FittedFace, run=run)

@@ -10,7 +10,7 @@ normals, positive outwards; scores (N, J) of pipeline.maths.correlation.agreemen
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -84,7 +84,11 @@ class Photos:
 
 
 def start_from_photos(
-    hull: Start, views: list[PhotoView], device: str, check: Callable[[], None] = lambda: None
+    hull: Start,
+    views: list[PhotoView],
+    device: str,
+    check: Callable[[], None] = lambda: None,
+    sweeps: Sequence[Sweep] = SWEEPS,
 ) -> Start:
     """The hull's SDF moved to where the photos agree; unchanged where they do not determine depth, as on smooth skin.
 
@@ -92,7 +96,7 @@ def start_from_photos(
     """
     photos = photos_of(views, device)
     values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
-    for sweep in SWEEPS:
+    for sweep in sweeps:
         check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)

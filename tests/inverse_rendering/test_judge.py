@@ -13,6 +13,7 @@ import torch
 from pipeline.artifacts import Capture, CaptureView, FileRef, MaskSet, ViewMask
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, worst
+from stages.inverse_rendering.choose_start import NAMES
 from stages.inverse_rendering.fit import Trainer, run_fit
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.judge import Fitted, findings
@@ -140,9 +141,12 @@ def test_histories_too_short_to_judge() -> None:
 
 @pytest.mark.parametrize(("wrong", "level"), [(0.035, "good"), (0.08, "usable"), (0.315, "unusable")])
 def test_a_start_that_the_masks_contradict(wrong: float, level: str) -> None:
-    facts = {"relief": FACTS["relief"] | {"silhouette_error_of_prior": wrong}}
+    facts = {
+        "relief": FACTS["relief"] | {"silhouette_error_of_prior": wrong},
+        "geometry": {"prior": NAMES["hull"]},
+    }
     assert only(sound(facts=facts), "start_silhouette").level == level
-    sphere = sound(facts=facts, prior="sphere")  # which is never the subject's shape
+    sphere = sound(facts=facts | {"geometry": {"prior": NAMES["sphere"]}})  # which is never the subject's shape
     assert "start_silhouette" not in [f.check for f in findings(sphere)]
 
 

@@ -161,7 +161,7 @@ def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
     """The geometry prior of the settings."""
     if settings.prior == "sphere":
         return build.sphere_prior(spec)
-    if settings.prior == "hull":
+    if settings.prior != "imface":  # the hull, whether the head template has cut it or not
         return HullPrior(torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     if not settings.prior_file:
         raise StageError(

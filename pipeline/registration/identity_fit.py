@@ -1,0 +1,170 @@
+"""Similarity and identity of the template by robust Gauss-Newton steps: the person's head from landmarks, and from
+points of a surface where there are any.
+
+Symbols: a datum is a place on the template (three corners c and weights a) and the point y (3,) of the world where it
+is; s, R, t the similarity world_from_template; w (K,) identity weights in standard deviations; v(w) = mean + B w.
+
+    r = sum_a a_i v_ci(w) - R^T (y - t) / s            the residual, in the template's metres
+    E = sum rho(|r| / sigma) + |w|^2                   landmarks: all three coordinates; surface points: n . r only
+
+rho is Cauchy's: its weight is 1 / (1 + (|r| / (SOFT sigma))^2), so that a landmark that is wrong, or that means another
+place on this person, does not pull. The prior |w|^2 is that of the persons of which the basis was made.
+
+Source: Blanz and Vetter, A morphable model for the synthesis of 3D faces (1999), for the maximum a posteriori;
+the similarity by linearised rotations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import StageError
+from pipeline.meshes import F64, Indices
+from pipeline.template.model import Template
+from pipeline.transforms import apply, similarity, umeyama
+
+ROUNDS = 12  # Gauss-Newton steps; 6 are enough on all captures
+SOFT = 2.0  # sigmas at which a datum has half of its weight
+MIN_DATA = 8  # landmarks: fewer do not determine a similarity well
+STEP = 3.0  # largest change of an identity weight in one step
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """N data: corners (N, 3) vertices, weights (N, 3), where (N, 3) in the world, sigma (N,) metres of the template.
+
+    normals (N, 3) unit, world: only the distance along them counts; None: all three coordinates.
+    """
+
+    corners: Indices
+    weights: F64
+    where: F64
+    sigma: F64
+    normals: F64 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedHead:
+    """world_from_template: 4x4 similarity. weights (K,): identity. vertices (V, 3): in the world. residual (N,): metres
+    of the template, of the first data. scale_deviation: standard deviation of log s given the data and the prior."""
+
+    world_from_template: F64
+    weights: F64
+    vertices: F64
+    residual: F64
+    scale_deviation: float
+
+    @property
+    def scale(self) -> float:
+        """World units per metre of the template."""
+        return float(np.cbrt(np.linalg.det(self.world_from_template[:3, :3])))
+
+
+def landmark_data(template: Template, landmarks: F64, sigma: float) -> Data:
+    """The template's landmarks that the network's points landmarks (468, 3) show; sigma: metres."""
+    points = template.landmarks
+    where = landmarks[points.network]
+    known = np.isfinite(where).all(1)
+    return Data(points.corners[known], points.weights[known], where[known], np.full(int(known.sum()), sigma))
+
+
+def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None = None) -> PlacedHead:
+    """The most probable similarity and identity. data: landmarks first, without a start; then surface points.
+
+    Raises:
+        StageError: too few data, or they are not finite.
+    """
+    _check(data)
+    world, weights = _start(template, data[0]) if start is None else (start.world_from_template, start.weights)
+    basis = None if template.shape is None else template.shape.basis * template.shape.deviation[:, None, None]
+    weights = np.zeros(0) if basis is None else np.resize(weights, len(basis)) if len(weights) else np.zeros(len(basis))
+    normal = np.eye(7 + len(weights))
+    for _ in range(ROUNDS):
+        normal, right = _normal_equations(template, basis, data, world, weights)
+        step = np.linalg.solve(normal, right)
+        weights = weights + np.clip(step[7:], -STEP, STEP)
+        world = _turned(world, step[:7])
+    vertices = apply(world, template.identity(weights))
+    residual = np.linalg.norm(_residual(template, data[0], world, weights)[0], axis=1)
+    # the covariance is the inverse of the normal matrix; robust weights are taken as they are
+    deviation = float(np.sqrt(np.linalg.inv(normal)[6, 6]))
+    return PlacedHead(world, weights, vertices, residual, deviation)
+
+
+def _start(template: Template, landmarks: Data) -> tuple[F64, F64]:
+    """Least squares similarity of the mean head, then again without the worst third."""
+    at = (template.vertices[landmarks.corners] * landmarks.weights[..., None]).sum(1)
+    world = umeyama(at, landmarks.where)
+    off = np.linalg.norm(apply(world, at) - landmarks.where, axis=1)
+    use = off <= np.quantile(off, 0.67)
+    return umeyama(at[use], landmarks.where[use]), np.zeros(0)
+
+
+def _residual(template: Template, data: Data, world: F64, weights: F64) -> tuple[F64, F64]:
+    """r (N, 3), and the points of the world in the template's coordinates (N, 3)."""
+    shape = template.vertices if template.shape is None else template.identity(weights)
+    there = apply(np.linalg.inv(world), data.where)
+    return np.asarray((shape[data.corners] * data.weights[..., None]).sum(1) - there, np.float64), there
+
+
+def _normal_equations(
+    template: Template, basis: F64 | None, data: tuple[Data, ...], world: F64, weights: F64
+) -> tuple[F64, F64]:
+    """Normal matrix and right side for (rotation, translation, log scale, identity), in the template's frame."""
+    size = 7 + len(weights)
+    left, right = np.zeros((size, size)), np.zeros(size)
+    left[range(7, size), range(7, size)] = 1.0
+    right[7:] = -weights
+    turn = world[:3, :3] / np.cbrt(np.linalg.det(world[:3, :3]))
+    for part in data:
+        r, there = _residual(template, part, world, weights)
+        J = np.zeros((len(r), 3, size))
+        # a small similarity of the world's points: y' = y + omega x y + tau + sigma y, and r = v - y'
+        J[:, :, 0:3] = _cross(there)
+        J[:, :, 3:6] = -np.eye(3)
+        J[:, :, 6] = -there
+        if basis is not None:
+            J[:, :, 7:] = np.einsum("knci,nc->nik", basis[:, part.corners], part.weights)
+        if part.normals is None:
+            inlier = 1 / (1 + (np.linalg.norm(r, axis=1) / (SOFT * part.sigma)) ** 2)
+            A, b = J.reshape(-1, size), r.ravel()
+            weight = np.repeat(inlier / part.sigma**2, 3)
+        else:
+            n = part.normals @ turn
+            A, b = np.einsum("ni,nik->nk", n, J), (n * r).sum(1)
+            weight = 1 / (1 + (b / (SOFT * part.sigma)) ** 2) / part.sigma**2
+        left += A.T @ (weight[:, None] * A)
+        right -= A.T @ (weight * b)
+    left[range(7), range(7)] += 1e-9 * max(float(np.abs(left).max()), 1.0)
+    return left, right
+
+
+def _cross(y: F64) -> F64:
+    """(N, 3, 3) matrices M with M omega = -(omega x y) = y x omega."""
+    zero = np.zeros(len(y))
+    return np.stack([zero, -y[:, 2], y[:, 1], y[:, 2], zero, -y[:, 0], -y[:, 1], y[:, 0], zero], 1).reshape(-1, 3, 3)
+
+
+def _turned(world: F64, step: F64) -> F64:
+    """The similarity after the small change of the world's points in the template's frame."""
+    from scipy.spatial.transform import Rotation
+
+    change = similarity(
+        float(np.exp(np.clip(step[6], -0.5, 0.5))), Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6]
+    )
+    return np.asarray(world @ np.linalg.inv(change), np.float64)
+
+
+def _check(data: tuple[Data, ...]) -> None:
+    count = len(data[0].where) if data else 0
+    finite = all(np.isfinite(d.where).all() and (d.sigma > 0).all() for d in data)
+    if count < MIN_DATA or not finite:
+        raise StageError(
+            "the template can't be placed",
+            where="registration",
+            value=f"{count} landmarks" + ("" if finite else ", some not finite"),
+            limit=f"at least {MIN_DATA}, all finite",
+            remedy="take sharper photos of the face from the front and both sides",
+        )
