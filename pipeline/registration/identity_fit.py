@@ -83,7 +83,7 @@ def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None =
     normal = np.eye(7 + len(weights))
     for _ in range(ROUNDS):
         normal, right = _normal_equations(template, basis, data, world, weights)
-        step = np.linalg.solve(normal, right)
+        step: F64 = np.asarray(np.linalg.solve(normal, right), np.float64)
         weights = weights + np.clip(step[7:], -STEP, STEP)
         world = _turned(world, step[:7])
     vertices = apply(world, template.identity(weights))
@@ -105,7 +105,7 @@ def _start(template: Template, landmarks: Data) -> tuple[F64, F64]:
 def _residual(template: Template, data: Data, world: F64, weights: F64) -> tuple[F64, F64]:
     """r (N, 3), and the points of the world in the template's coordinates (N, 3)."""
     shape = template.vertices if template.shape is None else template.identity(weights)
-    there = apply(np.linalg.inv(world), data.where)
+    there = apply(np.asarray(np.linalg.inv(world), np.float64), data.where)
     return np.asarray((shape[data.corners] * data.weights[..., None]).sum(1) - there, np.float64), there
 
 

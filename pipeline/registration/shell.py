@@ -46,7 +46,7 @@ def outer_shell(template: Template) -> Shell:
     triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     loops = border_loops(quads)
     middle = len(template.vertices) + np.arange(len(loops))
-    caps = [np.stack([np.roll(l, -1), l, np.full(len(l), m)], 1) for l, m in zip(loops, middle, strict=True)]
+    caps = [np.stack([np.roll(b, -1), b, np.full(len(b), m)], 1) for b, m in zip(loops, middle, strict=True)]
     quad = np.concatenate([np.repeat(keep, 2), np.full(sum(map(len, caps)), -1)])
     return Shell(np.concatenate([triangles, *caps]).astype(np.int32), quad.astype(np.int64), tuple(loops))
 

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.meshes import F64
+from pipeline.meshes import F64, Mask
 from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
 
-FINE_SWEEPS = 1  # last sweeps of stereo that follow the template: on smooth skin the longer ones move it at random
+FACE = 0.008  # metres from the placed template within which long sweeps do not move the start: on smooth skin they
+# find depths at random
 
 NAMES = {
     "hull": "visual hull",
@@ -47,10 +48,10 @@ def choose_start(
     Raises:
         StageError: `prior` is template, and the photos show no face that the template fits.
     """
-    from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
+    from stages.inverse_rendering.stereo import start_from_photos
 
-    def refined(start: Start, last: int = len(SWEEPS)) -> Start:
-        return start_from_photos(start, views, device, check, SWEEPS[-last:]) if settings.stereo else start
+    def refined(start: Start, known: Callable[[F64], Mask] | None = None) -> Start:
+        return start_from_photos(start, views, device, check, known) if settings.stereo else start
 
     if settings.prior not in (AUTO, "hull", "template"):
         return ChosenStart(hull, hull, {"prior": NAMES[settings.prior], "why": "setting"})
@@ -67,11 +68,12 @@ def _with_face(
     settings: Config,
     refined: Callable[..., Start],
 ) -> ChosenStart:
+    from pipeline.registration.carve import on_face, placed_on_face
     from pipeline.template.load import load_template
     from stages.inverse_rendering import template_start as template
 
     forced, model = settings.prior == "template", load_template()
-    head = template.placed_on_face(model, landmarks) if landmarks is not None else None
+    head = placed_on_face(model, landmarks) if landmarks is not None else None
     if head is None or landmarks is None:
         if forced:
             raise _no_face(landmarks is not None)
@@ -89,7 +91,7 @@ def _with_face(
             return ChosenStart(start, hull, {"prior": NAMES["hull"], "why": why, **facts})
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     cut = template.carved_by_template(hull, model, head, centres)
-    start = refined(cut, FINE_SWEEPS)
+    start = refined(cut, lambda points: on_face(model, head, points, FACE))
     facts["landmarks_off_mm"] = round(1e3 * template.landmarks_off(start, landmarks, head.scale), 3)
     why = "setting" if forced else "the hull's surface does not have the face"
     return ChosenStart(start, cut, {"prior": NAMES["template"], "why": why, **facts})

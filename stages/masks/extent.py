@@ -18,6 +18,7 @@ from pipeline.extent import ASKED, BELOW, bounds, core, signed
 from pipeline.hull import Hull, surface_points, visual_hull
 from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
 from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
+from stages.masks.judge import open_share
 from stages.masks.region import F32, Bool
 
 CELLS = 96  # along the cube in which the hull is carved: 6 mm on a head
@@ -28,6 +29,7 @@ COARSE = 48  # cells along the cube in which the volumes inside and beyond the e
 BUST = (
     1.25  # largest volume beyond over volume inside of a subject that is kept whole (head scans .9, a seated man 1.8)
 )
+MAX_OPEN = 0.2  # of the edge of the region of interest, above the neck, inside the hull: 0 to .02 all around
 NEAR = 0.15  # h: largest distance beside the hull at which its nearest point decides
 MIN_ALPHA = 0.01  # alpha of background is below
 NOTHING = 1e-3  # of the subject's pixels: if fewer are left out, all pixels count
@@ -45,11 +47,25 @@ def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent)
                        max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
 
 
+def cut_by_head(hull: Hull, cameras: Sequence[Camera], face: F64) -> Hull:
+    """A hull that the photos leave open, without what no person with this face fills. face: (468, 3) landmarks."""
+    from pipeline.registration.carve import carved_hull, placed_on_face
+    from pipeline.template.load import load_template
+
+    template = load_template()
+    head = placed_on_face(template, face)
+    centres = np.stack([matrix(c.world_from_cam)[:3, 3] for c in cameras])
+    return hull if head is None else carved_hull(hull, template, head, centres)
+
+
 def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent, roi_radius: float) -> float:
-    """Volume of the hull of the masks (h, w) beyond the extent over that inside it, within CUBE `roi_radius`."""
+    """Volume of the hull of the masks (h, w) beyond the extent over that inside it, within CUBE `roi_radius`. Infinite
+    for a hull that the photos leave open, as on an arc in front of a face: how far it goes on is unknown."""
     edge = CUBE * roi_radius
     hull = visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / COARSE, min_views=min(3, len(cameras)),
                        max_outside=tolerated(len(cameras)), outside_share=WRONG_SHARE)  # fmt: skip
+    if open_share(hull, roi_radius) > MAX_OPEN:
+        return float("inf")
     beyond = signed(extent, hull.centres(hull.occupied)) > 0
     return float(beyond.sum() / max(int((~beyond).sum()), 1))
 

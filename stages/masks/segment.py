@@ -20,13 +20,14 @@ from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
 from pipeline.faces.find import Face
 from pipeline.faces.landmarks3d import HeadFrame, head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
+from pipeline.meshes import F64
 from pipeline.support import Support
 from stages.masks.config import Config
-from stages.masks.extent import BUST, asked, outline_points, share_beyond, whole_hull
+from stages.masks.extent import BUST, MAX_OPEN, asked, cut_by_head, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import LABELS, labels_with, subjects_face
 from stages.masks.grabcut import cut
 from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, trimap
-from stages.masks.judge import Seen, extent_finding, judge
+from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.refine_contour import refined_contour
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
@@ -117,7 +118,8 @@ def segment(
     frame = head_frame(found_face.face.xyz) if found_face is not None and people else None
     votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
     extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
-    parts = _asked(masked, votes, extent, context)
+    face = None if found_face is None else found_face.face.xyz
+    parts = _asked(masked, votes, extent, face, poses.roi_radius, context)
     masks = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, faces, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in masks))  # fmt: skip
@@ -142,11 +144,23 @@ def _is_bust(votes: list[Masked], frame: HeadFrame, roi_radius: float) -> bool:
     return beyond <= BUST
 
 
-def _asked(masked: list[Masked], votes: list[Masked], extent: Extent | None, context: Context) -> dict[int, Path]:
-    """Files of the pixels that count, by view index; only for views in which not all pixels count."""
+def _asked(
+    masked: list[Masked],
+    votes: list[Masked],
+    extent: Extent | None,
+    face: F64 | None,
+    roi_radius: float,
+    context: Context,
+) -> dict[int, Path]:
+    """Files of the pixels that count, by view index; only for views in which not all pixels count. face (468, 3):
+    landmarks."""
     if extent is None:
         return {}
-    points = outline_points(whole_hull([m.camera for m in votes], [m.small for m in votes], extent), extent)
+    cameras = [m.camera for m in votes]
+    hull = whole_hull(cameras, [m.small for m in votes], extent)
+    if face is not None and open_share(hull, roi_radius) > MAX_OPEN:
+        hull = cut_by_head(hull, cameras, face)
+    points = outline_points(hull, extent)
 
     def one(m: Masked) -> tuple[int, Path | None]:
         part = asked(m.camera, read_alpha(_path(m.view.index, context)), extent, points)

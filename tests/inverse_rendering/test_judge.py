@@ -24,7 +24,7 @@ from tests.support.small_ball import SMALL, ball_start, ball_view, fit_of_the_ba
 from tests.support.spread import made_once
 
 REF = FileRef(path="a.png", sha256="0" * 64, size=1)
-FACTS = {
+FACTS: dict[str, dict[str, Any]] = {
     "specular": {"modelled": True, "why": "cross-validation", "error_without": 0.072, "error_with": 0.054},
     "calibration": {"modelled": False, "why": "cross-validation", "error_without": 0.054, "error_with": 0.0529},
     "relief": {
@@ -33,6 +33,7 @@ FACTS = {
         "silhouette_error_of_prior": 0.002,
         "silhouette_error": 0.004,
     },
+    "geometry": {"prior": NAMES["hull"]},
 }
 RISING = (19.3, 25.2, 32.0, 34.3, 33.6, 34.5, 35.2, 36.4, 37.2, 37.5)
 
@@ -141,10 +142,7 @@ def test_histories_too_short_to_judge() -> None:
 
 @pytest.mark.parametrize(("wrong", "level"), [(0.035, "good"), (0.08, "usable"), (0.315, "unusable")])
 def test_a_start_that_the_masks_contradict(wrong: float, level: str) -> None:
-    facts = {
-        "relief": FACTS["relief"] | {"silhouette_error_of_prior": wrong},
-        "geometry": {"prior": NAMES["hull"]},
-    }
+    facts: Any = {"relief": {**FACTS["relief"], "silhouette_error_of_prior": wrong}}
     assert only(sound(facts=facts), "start_silhouette").level == level
     sphere = sound(facts=facts | {"geometry": {"prior": NAMES["sphere"]}})  # which is never the subject's shape
     assert "start_silhouette" not in [f.check for f in findings(sphere)]
