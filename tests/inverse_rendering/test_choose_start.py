@@ -1,0 +1,84 @@
+"""Choice of the initial geometry, with landmarks of the template itself and without stereo."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.errors import StageError
+from pipeline.meshes import F64
+from pipeline.registration.shell import outer_shell, shell_distance
+from pipeline.template.load import load_template
+from stages.inverse_rendering.choose_start import NAMES, ChosenStart, choose_start
+from stages.inverse_rendering.config import Config
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.template_start import FAR, landmarks_off
+
+TEMPLATE = load_template()
+CELL, SHAPE = 0.006, (56, 76, 62)
+LO = np.array([-0.17, -0.26, -0.19])
+CAMERAS: Any = [SimpleNamespace(world_from_cam=np.block([[np.eye(3), np.array([[x], [0.0], [0.9]])], [0, 0, 0, 1]]))
+                for x in (-0.3, 0.0, 0.3)]  # fmt: skip
+
+
+def marks() -> F64:
+    out = np.full((468, 3), np.nan)
+    out[TEMPLATE.landmarks.network] = TEMPLATE.landmark_points(TEMPLATE.vertices)
+    return out
+
+
+def box() -> Start:
+    """What an arc of photos leaves of a head: a block around it, open to the front and the back."""
+    node = np.stack(np.meshgrid(*(LO[a] + CELL * np.arange(SHAPE[a]) for a in range(3)), indexing="ij"), -1)
+    half = np.abs(TEMPLATE.vertices).max(0) + [0, 0, 0.04]
+    return Start(np.max(np.abs(node) - half, axis=-1).astype(np.float32), LO.astype(np.float32), CELL)
+
+
+def head() -> Start:
+    shell = outer_shell(TEMPLATE)
+    found = shell_distance(shell.vertices(TEMPLATE.vertices), shell.faces, LO, CELL, SHAPE)
+    return Start(found.values, LO.astype(np.float32), CELL)
+
+
+def chosen(hull: Start, landmarks: F64 | None, **changes: Any) -> ChosenStart:
+    return choose_start(hull, CAMERAS, landmarks, Config(stereo=False, **changes), "cpu")
+
+
+def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
+    found = chosen(box(), marks())
+    assert found.facts["prior"] == NAMES["template"] and float(found.facts["landmarks_off_hull_mm"]) > 1e3 * FAR
+    assert landmarks_off(found.start, marks(), 1.0) < 0.004
+    assert box().values[found.start.values < 0].max() < CELL  # the hull stays the outer limit
+    assert found.prior is not box() and np.array_equal(found.prior.values, found.start.values)
+
+
+def test_a_hull_with_the_face_stays() -> None:
+    hull = head()
+    found = chosen(hull, marks())
+    assert found.start is hull and found.facts["prior"] == NAMES["hull"]
+    assert float(found.facts["landmarks_off_hull_mm"]) < 1e3 * FAR
+
+
+def test_without_a_face_the_hull_stays() -> None:
+    hull = box()
+    for landmarks in (None, np.random.default_rng(0).standard_normal((468, 3))):
+        found = chosen(hull, landmarks)
+        assert found.start is hull and found.facts["prior"] == NAMES["hull"]
+
+
+def test_the_setting_decides() -> None:
+    hull = box()
+    assert chosen(hull, marks(), prior="hull").start is hull
+    assert chosen(head(), marks(), prior="template").facts["prior"] == NAMES["template"]
+    for landmarks in (None, np.full((468, 3), np.nan)):
+        with pytest.raises(StageError, match="template"):
+            chosen(hull, landmarks, prior="template")
+
+
+def test_landmarks_lie_off_by_their_distance() -> None:
+    values = np.broadcast_to((LO[0] + CELL * np.arange(SHAPE[0]))[:, None, None], SHAPE).astype(np.float32)
+    plane = Start(values.copy(), LO.astype(np.float32), CELL)
+    points = np.full((468, 3), np.nan)
+    points[:5] = [[0.01, 0, 0], [0.02, 0, 0], [-0.03, 0, 0], [0.05, 0, 0], [0.0, 0, 0]]
+    assert landmarks_off(plane, points, 2.0) == pytest.approx(0.01, abs=1e-4)
