@@ -19,7 +19,7 @@ from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
 from stages.poses.progress import progress_of
 from stages.poses.scale import by_world, eyes_of
-from stages.poses.scale_source import find_faces, head_of, known_scale, some_of
+from stages.poses.scale_source import find_faces, head_of, known_scale, size_of_head, some_of
 from stages.poses.write_cameras import camera_of, camera_set
 
 if TYPE_CHECKING:
@@ -61,7 +61,9 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
     if world is not None and config.unit == "auto":
         published, axes = by_world(matrix(world))
         known = published if known is None and config.scale == "auto" else known
-    found = normalise(cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces))
+    found = normalise(
+        cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces), guess=lambda: size_of_head(faces)
+    )
     all_warnings = (*warnings, *found.warnings)
     result = camera_set("given", cameras, found, model, [c.name for c in cameras], names, all_warnings, context)
     return result.model_copy(update={"findings": findings})

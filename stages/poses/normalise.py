@@ -7,7 +7,7 @@ frames' centres (N, 3); roi = region of interest, the ball that the cameras look
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,6 +52,7 @@ class Normalisation:
 def normalise(
     cameras: Sequence[Camera], points: F64 | None = None, *, given: bool, unit: Unit = "guess",
     known: Scale | None = None, eyes: Eyes | None = None, axes: F64 | None = None, head: HeadFrame | None = None,
+    guess: Callable[[], Scale | None] = lambda: None,
 ) -> Normalisation:  # fmt: skip
     """Asset coordinates for cameras whose `world_from_cam` is in the capture's world.
 
@@ -59,7 +60,8 @@ def normalise(
     plausible. unit: of a given world; guess: the one that gives the subject a head's size. known: a known scale, used
     instead of both. eyes: in a solved world; the subject then looks along +Z. axes: (3, 3) asset_from_capture of a
     given world, if known. head: in a given world; the subject is then upright and looks along +Z, unless `axes` is
-    given. Raises StageError if the cameras do not look at a common point, or are all in one spot.
+    given. guess: a plausible scale where none is known; the unit still counts as
+    unknown. Raises StageError if the cameras do not look at a common point, or are all in one spot.
     """
     centres, directions = viewing_rays(cameras)
     warnings: list[str] = []
@@ -88,6 +90,9 @@ def normalise(
         scale, metric, source = given_scale(radius, warnings, unit)
     else:
         scale, metric, source = NOMINAL_ROI / radius, False, NOMINAL
+    guessed = None if metric else guess()
+    if guessed is not None and PLAUSIBLE_ROI[0] <= guessed.metres_per_unit * radius <= PLAUSIBLE_ROI[1]:
+        scale, source = guessed.metres_per_unit, guessed.source
     inverse = similarity(1.0 / scale, rotation.T, centre)
     return Normalisation(inverse, radius * scale, metric, source, tuple(warnings))
 

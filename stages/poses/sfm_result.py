@@ -13,7 +13,8 @@ from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import normalise
 from stages.poses.photos import photos_of
 from stages.poses.progress import progress_of
-from stages.poses.scale_source import find_eyes, known_scale
+from stages.poses.scale import eyes_of
+from stages.poses.scale_source import find_faces, known_scale, size_of_head
 from stages.poses.sfm import solve
 from stages.poses.write_cameras import camera_of, camera_set
 
@@ -40,9 +41,10 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
         raise _not_placed(len(views), len(placed), fitted, why)
     cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     warnings: list[str] = []
-    eyes = find_eyes(capture, cameras, context.check)
+    faces = find_faces(capture, cameras, context.check)
+    eyes = eyes_of([(c, face.pupils) for c, face in faces])
     known = known_scale(capture, cameras, config, eyes, warnings)
-    found = normalise(cameras, model.points, given=False, known=known, eyes=eyes)
+    found = normalise(cameras, model.points, given=False, known=known, eyes=eyes, guess=lambda: size_of_head(faces))
     warnings += found.warnings
     if missing:
         listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())

@@ -11,7 +11,7 @@ from pipeline.errors import StageError
 from pipeline.faces.landmarks3d import HeadFrame
 from pipeline.transforms import F64, apply, matrix, project, rescale_camera, rows, similarity
 from stages.poses.normalise import NOMINAL_ROI, Normalisation, least_turn, nearest_point, normalise, robust_direction
-from stages.poses.scale import Eyes
+from stages.poses.scale import Eyes, Scale
 from stages.poses.write_cameras import in_asset
 from tests.support.textured_ball import camera_on_orbit
 
@@ -73,6 +73,20 @@ def test_implausible_units_are_scaled_to_a_nominal_head(factor: float) -> None:
     assert found.roi_radius == pytest.approx(NOMINAL_ROI)
     np.testing.assert_allclose(apply(found.capture_from_asset, np.zeros((1, 3)))[0], TARGET * factor, rtol=1e-6)
     check_rigid(found)
+
+
+def test_a_guessed_size_counts_only_where_it_is_a_head_s_and_none_is_known() -> None:
+    through = similarity(12.0, np.eye(3), np.zeros(3))
+    args = {"given": False, "points": apply(through, head_points())}
+    plain = normalise(cameras(orbit(), through), **args)
+    radius = plain.roi_radius / np.cbrt(np.linalg.det(np.linalg.inv(plain.capture_from_asset)[:3, :3]))
+    found = normalise(cameras(orbit(), through), **args, guess=lambda: Scale(0.15 / radius, "guessed"))
+    assert found.roi_radius == pytest.approx(0.15) and found.scale == "guessed" and not found.metric
+    huge = normalise(cameras(orbit(), through), **args, guess=lambda: Scale(9.0 / radius, "guessed"))
+    assert huge.roi_radius == pytest.approx(NOMINAL_ROI) and huge.scale != "guessed"
+    known = normalise(cameras(orbit(), through), **args, known=Scale(0.2 / radius, "a tape"),
+                      guess=lambda: Scale(0.15 / radius, "guessed"))  # fmt: skip
+    assert known.roi_radius == pytest.approx(0.2) and known.metric
 
 
 def test_a_world_with_z_up_is_turned() -> None:

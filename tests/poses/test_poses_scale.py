@@ -11,6 +11,8 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
+from pipeline.faces.find import Face
+from pipeline.template.load import load_template
 from pipeline.transforms import F64, inverse_rigid, matrix, project, rows, similarity
 from stages.poses.scale import (
     DICTIONARIES,
@@ -23,6 +25,7 @@ from stages.poses.scale import (
     eyes_of,
     find_markers,
 )
+from stages.poses.scale_source import HEAD_SIZE, size_of_head
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
 SIZE = (640, 480)
@@ -187,3 +190,27 @@ def test_the_published_scale_dictionary(tmp_path: Path, capture_of, place) -> No
     for other in ({"17": {"1": [1, Rt.tolist()]}}, {"9": {}}, []):
         table.write_text(json.dumps(other))
         assert capture_of(folder, drop_blurred=False).artifact.metres_from_world is None
+
+
+def test_the_size_of_a_head_is_guessed_from_its_landmarks() -> None:
+    """The template's own landmarks, in a world of another unit: the guess is the size of the head times its ratio."""
+    template = load_template()
+    K = rows(np.array([[900.0, 0, 320], [0, 900, 320], [0, 0, 1]]))
+    cams = [
+        Camera(index=i, name=f"{i}", width=640, height=640, K=K, distortion=(0.0,) * 5,
+               world_from_cam=rows(camera_on_orbit(azimuth, 5.0, 2.5, np.zeros(3))))
+        for i, azimuth in enumerate((-25.0, 0.0, 25.0))
+    ]  # fmt: skip
+    marks = np.full((468, 3), np.nan)
+    marks[template.landmarks.network] = template.landmark_points(template.vertices)
+    others = np.flatnonzero(np.isnan(marks).any(1))  # no template's landmarks, but the network has them
+    marks[others] = marks[np.resize(template.landmarks.network, len(others))]
+    unit = 2.5
+    world = unit * (marks - marks.mean(0))
+    faces = []
+    for c in cams:
+        uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.zeros(5), world)
+        faces.append((c, Face(uv, 1.0)))
+    found = size_of_head(faces)
+    assert found is not None and found.metres_per_unit == pytest.approx(HEAD_SIZE / unit, rel=0.02)
+    assert "guessed" in found.source and size_of_head([]) is None and size_of_head(faces[:2]) is None
