@@ -10,6 +10,7 @@ from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
 from stages.inverse_rendering.config import AUTO
 from stages.inverse_rendering.config import Config as Config
+from stages.inverse_rendering.systems import COMPARED, paper_config
 
 MIN_VIEWS = 3
 
@@ -26,16 +27,16 @@ class Inputs:
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
     from stages.inverse_rendering.exposure import exposures_differ
-    from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
-    from stages.inverse_rendering.initial_geometry import agreed, hull_start, sphere_start
+    from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.stereo import start_from_photos
-    from stages.inverse_rendering.systems import trainer_for
+    from stages.inverse_rendering.systems import first_surface, trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
+    from stages.inverse_rendering.training_loop import Hooks, run_fit
 
     clock, settings = Clock(), config
     dropped = set(inputs.masks.artifact.dropped)
@@ -56,17 +57,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     radius, extent = inputs.poses.artifact.roi_radius, inputs.masks.artifact.extent
     masks = agreed(cameras, [v.alpha for v in views], radius)
     views = [replace(v, doubtful=masks.doubtful.get(n)) for n, v in enumerate(views)]
-    if settings.prior == "sphere":
-        start = sphere_start(radius, settings.grid_cells, settings.levels)
-    else:
-        start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
+    start = first_surface(settings, cameras, masks.alphas, radius, extent)
     looked = footprint(start, views, settings.image_side)
     if settings.resolution == AUTO:
         settings, cells = supported(settings, looked, start), settings.grid_cells
-        if settings.grid_cells < cells and settings.prior != "sphere":
-            start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
+        if settings.grid_cells < cells:
+            start = first_surface(settings, cameras, masks.alphas, radius, extent)
     prior = start
-    if settings.stereo and settings.prior == "hull":
+    if settings.stereo:
         context.progress(0, settings.steps, "stereo")
         start = start_from_photos(start, views, context.device, context.check)
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
@@ -84,7 +82,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     facts = model_facts(trainer, looked)
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
-    fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts, settings.prior)
+    fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts, model.spec.prior)
     return FittedFace(
         field=context.file("field.npz"),
         light=context.file("light.json"),
@@ -112,4 +110,12 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
-STAGE = Stage(name="inverse_rendering", version=9, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(
+    name="inverse_rendering",
+    version=9,
+    inputs=Inputs,
+    config=Config,
+    output=FittedFace,
+    run=run,
+    variants=dict.fromkeys(COMPARED, paper_config),
+)

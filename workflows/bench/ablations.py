@@ -135,6 +135,7 @@ def unique(tables: Iterable[Table]) -> list[Row]:
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
     """Settings as for `--set`: the budget, the paper's model where the fast one adds to it, the row's own."""
     base = {
+        "preset": "comparison",
         "steps": given.steps,
         "image_side": given.side,
         "batch": given.batch,
