@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import CameraSet, Capture, HeldOutView, Matrix
+from pipeline.artifacts import CameraSet, HeldOutView, Matrix
+from pipeline.capture_artifacts import Capture
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel

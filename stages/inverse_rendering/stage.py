@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
 from stages.inverse_rendering.config import AUTO

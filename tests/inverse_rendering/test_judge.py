@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.artifacts import Capture, CaptureView, FileRef, MaskSet, ViewMask
+from pipeline.artifacts import FileRef, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, worst
 from stages.inverse_rendering.fit import Trainer

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Artifact, Capture, CaptureView, Located
+from pipeline.artifacts import Artifact, Located
+from pipeline.capture_artifacts import Capture, CaptureView
 from workflows.bench.rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.cli.console import Console
 
