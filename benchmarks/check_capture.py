@@ -18,7 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import CameraSet, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import execute
 from pipeline.images import read_alpha
 from pipeline.store import Store

@@ -8,6 +8,7 @@ tests/docs holds the page to it.
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,10 +38,13 @@ def row(s: Setting) -> str:
 def _lines() -> Iterator[str]:
     settings = all_settings()
     for stage in REGISTRY:
-        own = [s for s in settings if s.stage == stage.name]
-        yield f"\n## {stage.name}\n{(stage.config.__doc__ or '').strip()}\n"
-        if own:
-            yield "\n".join([HEAD, *map(row, own)])
+        for config in stage.configs():
+            only = tuple(p for p in stage.variants if stage.config_for(p) is config)
+            title = f"### {stage.name}, preset {' or '.join(only)}" if only else f"## {stage.name}"
+            yield f"\n{title}\n{inspect.cleandoc(config.__doc__ or '')}\n"
+            own = [s for s in settings if (s.stage, s.only) == (stage.name, only)]
+            if own:
+                yield "\n".join([HEAD, *map(row, own)])
 
 
 if __name__ == "__main__":

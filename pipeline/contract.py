@@ -102,7 +102,11 @@ O = TypeVar("O", bound=Artifact)  # noqa: E741
 
 @dataclass(frozen=True, slots=True)
 class Stage(Generic[I, C, O]):
-    """A step of the pipeline. Increase `version` when the meaning of its output changes."""
+    """A step of the pipeline. Increase `version` when the meaning of its output changes.
+
+    variants: further classes of settings, by the value of the setting `preset` that selects them; each extends
+    `config`, and is only imported when it is selected or listed.
+    """
 
     name: str
     version: int
@@ -110,6 +114,16 @@ class Stage(Generic[I, C, O]):
     config: type[C]
     output: type[O]
     run: Callable[[I, C, Context], O]
+    variants: Mapping[str, Callable[[], type[C]]] = field(default_factory=dict)
+
+    def config_for(self, preset: object) -> type[C]:
+        """The class of the settings for a value of `preset`; `config` if no variant has that name."""
+        variant = self.variants.get(str(preset))
+        return variant() if variant else self.config
+
+    def configs(self) -> tuple[type[C], ...]:
+        """Every class of settings, `config` first."""
+        return tuple(dict.fromkeys((self.config, *(variant() for variant in self.variants.values()))))
 
 
 @dataclass(frozen=True, slots=True)

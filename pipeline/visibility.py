@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Camera, CameraSet, Capture, FittedFace, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, FittedFace, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.meshes import F64, Mask, Mesh
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, matrix, project

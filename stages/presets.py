@@ -75,6 +75,8 @@ def configs_for(
     stages = {s.name: s for s in (_registry() if registry is None else registry)}
     known(preset, PRESETS, what="unknown preset", where="--preset")
     merged: dict[str, dict[str, Any]] = {n: {} for n in stages}
+    of_stage = {s: _last(s, "preset", (PRESETS[preset], planned or {}, config_file or {}, sets)) for s in stages}
+    classes = {name: stage.config_for(of_stage[name]) for name, stage in stages.items()}
     for source in (PRESETS[preset], planned or {}, _shared(stages, holdout, name, seed)):
         for stage, own in source.items():
             if stage in merged:
@@ -90,13 +92,35 @@ def configs_for(
                     limit="key = value under the stage's name",
                     remedy=f"write [{stage}] above its keys",
                 )
-            names = stages[stage].config.setting_names()
+            names = classes[stage].setting_names()
             current = without_old_names(stage, values, names, origin)
             for key in current:
+                _not_of_a_variant(stages[stage], key, names, origin)
                 known(key, names, what=f"unknown setting of {stage}", where=f"{origin} {stage}.{key}")
             merged[stage].update(current)
     _tile_size(merged)
-    return {name: _checked(stages[name], values) for name, values in merged.items()}
+    return {name: _checked(name, classes[name], values) for name, values in merged.items()}
+
+
+def _last(stage: str, key: str, sources: Iterable[Settings]) -> object:
+    """The value that the last of the sources gives to a setting; None if none does."""
+    tables = [source.get(stage) for source in sources]
+    return next((t[key] for t in reversed(tables) if isinstance(t, Mapping) and key in t), None)
+
+
+def _not_of_a_variant(stage: Stage[Any, Any, Any], key: str, names: Iterable[str], origin: str) -> None:
+    """Raise a UsageError if only a preset that is not selected has this setting. The message names the preset."""
+    presets = (
+        [p for p, variant in stage.variants.items() if key in variant().setting_names()] if key not in names else []
+    )
+    if presets:
+        raise UsageError(
+            f"a setting of {stage.name} that only other presets have",
+            where=f"{origin} {stage.name}.{key}",
+            value=key,
+            limit=f"with {stage.name}.preset = {' or '.join(presets)}",
+            remedy=f"add --set {stage.name}.preset={presets[0]}, or leave {stage.name}.{key} out",
+        )
 
 
 def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
@@ -125,13 +149,13 @@ def _shared(
     return found
 
 
-def _checked(stage: Stage[Any, Any, Any], values: Mapping[str, Any]) -> StageConfig:
+def _checked(name: str, config: type[StageConfig], values: Mapping[str, Any]) -> StageConfig:
     try:
-        config: StageConfig = stage.config(**values)
+        return config(**values)
     except ValidationError as e:
         first = e.errors()[0]
-        key = ".".join(str(part) for part in (stage.name, *first["loc"]))
-        field = stage.config.model_fields.get(str(first["loc"][0])) if first["loc"] else None
+        key = ".".join(str(part) for part in (name, *first["loc"]))
+        field = config.model_fields.get(str(first["loc"][0])) if first["loc"] else None
         about = f" ({field.description})" if field and field.description else ""
         raise UsageError(
             "a setting is outside its limits",
@@ -140,7 +164,6 @@ def _checked(stage: Stage[Any, Any, Any], values: Mapping[str, Any]) -> StageCon
             limit=first["msg"],
             remedy=f"change {key}{about}",
         ) from e
-    return config
 
 
 def known(word: str, choices: Iterable[str], *, what: str, where: str) -> None:

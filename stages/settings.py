@@ -27,7 +27,8 @@ BOUNDS = (
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting. allowed: its type and limits in words. presets: its value in each preset, by the preset's name."""
+    """One setting. allowed: its type and limits in words. presets: its value in each preset that has it, by the
+    preset's name. only: the values of the stage's setting `preset` that it needs; empty: any."""
 
     stage: str
     name: str
@@ -36,6 +37,7 @@ class Setting:
     allowed: str
     default: Any
     presets: Mapping[str, Any]
+    only: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -96,12 +98,23 @@ def _registry() -> tuple[Stage[Any, Any, Any], ...]:
 
 
 def _settings_of(stage: Stage[Any, Any, Any], presets: Mapping[str, StageConfig]) -> Iterator[Setting]:
-    schemas: dict[str, Any] = stage.config.model_json_schema()["properties"] if stage.config.model_fields else {}
-    for name in stage.config.setting_names():
-        field: FieldInfo = stage.config.model_fields[name]
-        values = {preset: getattr(config, name) for preset, config in presets.items()}
-        unit = next((m.name for m in field.metadata if isinstance(m, Unit)), "")
-        yield Setting(stage.name, name, field.description or "", unit, _allowed(schemas[name]), field.default, values)
+    """The settings that every preset has, then those that a variant adds or for which it allows other values."""
+    for config in stage.configs():
+        only = tuple(p for p in stage.variants if stage.config_for(p) is config)
+        schemas: dict[str, Any] = config.model_json_schema()["properties"] if config.model_fields else {}
+        for name in config.setting_names():
+            field: FieldInfo = config.model_fields[name]
+            if only and _same(field, stage.config.model_fields.get(name)):
+                continue
+            values = {p: getattr(c, name) for p, c in presets.items() if isinstance(c, config)}
+            unit = next((m.name for m in field.metadata if isinstance(m, Unit)), "")
+            allowed = _allowed(schemas[name])
+            yield Setting(stage.name, name, field.description or "", unit, allowed, field.default, values, only)
+
+
+def _same(field: FieldInfo, other: FieldInfo | None) -> bool:
+    """Whether two classes declare a setting alike, by inheritance."""
+    return other is not None and (field.annotation, field.description) == (other.annotation, other.description)
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:

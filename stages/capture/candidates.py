@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
-from pipeline.artifacts import CaptureSource, FileRef, GivenCamera, Located
+from pipeline.artifacts import FileRef, Located
+from pipeline.capture_artifacts import CaptureSource, GivenCamera
 from stages.capture.quality import blurred
 from stages.capture.readers import describe
 from stages.capture.readers.described import indices_of

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.artifacts import CaptureView, ChartFound, ColourChart, FileRef
+from pipeline.artifacts import FileRef
+from pipeline.capture_artifacts import CaptureView, ChartFound, ColourChart
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_linear, write_exr, write_png

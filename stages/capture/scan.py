@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import CaptureKind, CaptureSource, FileRef, Located
+from pipeline.artifacts import FileRef, Located
+from pipeline.capture_artifacts import CaptureKind, CaptureSource
 from pipeline.errors import StageError
 from pipeline.transforms import rows
 from stages.capture.readers import describe, find_reader

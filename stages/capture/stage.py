@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from pipeline.artifacts import Capture, CaptureSource, FileRef, Located
+from pipeline.artifacts import FileRef, Located
+from pipeline.capture_artifacts import Capture, CaptureSource
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.errors import StageError
 from pipeline.units import Unit, Views

@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
-from pipeline.artifacts import CaptureSource, CaptureView, ColourChart, FileRef, Located
+from pipeline.artifacts import FileRef, Located
+from pipeline.capture_artifacts import CaptureSource, CaptureView, ColourChart
 from pipeline.contract import Context
 from stages.capture.candidates import Candidate
 from stages.capture.colour_correction import correct_colours, read_charts

@@ -53,7 +53,7 @@ def choose_start(
     def refined(start: Start, known: Callable[[F64], Mask] | None = None) -> Start:
         return start_from_photos(start, views, device, check, known) if settings.stereo else start
 
-    if settings.prior not in (AUTO, "hull", "template"):
+    if settings.prior not in (AUTO, "hull", "template"):  # a preset of the paper's
         return ChosenStart(hull, hull, {"prior": NAMES[settings.prior], "why": "setting"})
     if settings.prior == "hull" or (settings.prior == AUTO and landmarks is None):
         why = "setting" if settings.prior == "hull" else "the photos agree on no face"

@@ -1,4 +1,4 @@
-"""The settings of the fit, and the presets.
+"""The settings of the fit, and the presets. Those of the paper's own model are in paper/config.py.
 
 A preset is a trade-off between speed and accuracy. The defaults are the draft's. Lengths are in metres, the asset's
 unit. Weights are those of the terms of [NeuFace eq. 20].
@@ -6,26 +6,52 @@ unit. Weights are those of the terms of [NeuFace eq. 20].
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from pipeline.contract import StageConfig
-from pipeline.units import Cells, ContentHash, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
+from pipeline.units import Cells, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
 
 AUTO: Final = "auto"  # decided by cross-validation during the fit (stages.inverse_rendering.cross_validation)
 MAX_RANK, MAX_ORDER = 3, 10  # values until the model selection: the paper's
 
-Preset = Literal["draft", "studio", "film", "paper"]
+Preset = Literal["draft", "studio", "film"]
 Decision = Literal["auto", "on", "off"]
+
+
+# Presets: the settings that differ from the defaults of Config.
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {},
+    "studio": {
+        "image_side": 1024,
+        "steps": 8000,
+        "grid_cells": 320,
+        "hash_fine": 0.0006,
+        "hash_log2_size": 18,
+    },
+    "film": {
+        "image_side": 2048,
+        "steps": 12000,
+        "batch": 8192,
+        "grid_cells": 448,
+        "levels": 3,
+        "hash_fine": 0.0003,
+        "hash_log2_size": 20,
+        "samples": 16,
+    },
+}
 
 
 class Config(StageConfig):
     """Settings of the fit. A preset fills the settings that are not given, before the store's key is computed."""
 
+    presets: ClassVar[dict[str, dict[str, Any]]] = PRESETS
+
     preset: Preset = Field(
         default="draft",
-        description="trade-off between speed and accuracy; fills all settings that are not given",
+        description="trade-off between speed and accuracy; fills all settings that are not given; paper and comparison "
+        "add the settings of the paper's model",
     )
     seed: int = Field(default=0, ge=0, description="seed of all random numbers")
     # size
@@ -67,30 +93,19 @@ class Config(StageConfig):
         description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo",
     )
-    attenuation: Literal["exponential", "exact", "phong"] = Field(
+    attenuation: Literal["exponential", "exact"] = Field(
         default="exponential", description="attenuation of the light's SH bands by the lobe [NeuFace eq. 11]"
-    )
-    basis_inputs: Literal["cosine", "paper"] = Field(
-        default="cosine", description="inputs of the specular bases; cosine: wo . n; paper: wo, n and wo . n"
-    )
-    density: Literal["crossing", "laplace"] = Field(
-        default="crossing",
-        description="density from the SDF; crossing: unbiased at the zero crossing; laplace: the paper's",
     )
     specular: Decision = Field(default=AUTO, description="model a specular term; auto: by cross-validation")
     refine_geometry: Decision = Field(
         default=AUTO,
-        description="optimise the geometry, not only its prior; auto: by cross-validation; off needs method fast",
+        description="optimise the geometry, not only its prior; auto: by cross-validation",
     )
     resolution: Literal["auto", "given"] = Field(
         default=AUTO,
         description="auto: limit grid_cells and hash_fine to the size of a pixel on the surface; given: no limit",
     )
     shadows: bool = Field(default=True, description="model shadows and interreflections of the head onto itself")
-    volumetric: bool = Field(
-        default=False,
-        description="shade every sample of a ray, as the paper does, not only the expected surface point of each ray",
-    )
     precision: Literal["float32", "bfloat16"] = Field(
         default="float32", description="number format of the networks' matrix products during the fit"
     )
@@ -113,39 +128,10 @@ class Config(StageConfig):
     )
     width: int = Field(default=64, ge=8, le=512, description="width of the appearance networks")
     depth: int = Field(default=2, ge=1, le=16, description="hidden layers of the appearance network")
-    # which of the paper's systems (pipeline.fields.build)
-    method: Literal["fast", "paper"] = Field(
-        default="fast", description="fast: SDF grid, shaded once per ray; paper: networks, shaded at every sample"
-    )
-    appearance: Literal["hash", "sinusoidal"] = Field(
-        default="hash",
-        description="encoding of the Spatial MLP; hash: multi-resolution hash table; sinusoidal: the paper's",
-    )
-    shading: Literal["neural", "phong", "disney"] = Field(
-        default="neural", description="the specular term; phong and disney are for comparison"
-    )
-    light: Literal["sh", "cubemap"] = Field(
-        default="sh", description="the captured light; sh: spherical harmonics; cubemap is for comparison"
-    )
-    integral: Literal["low_rank", "direct", "feature"] = Field(
-        default="low_rank", description="the material integral [NeuFace eq. 6]; direct and feature are for comparison"
-    )
-    basis_width: int = Field(default=64, ge=8, le=512, description="width of the Integrated Basis MLP")
-    basis_depth: int = Field(default=2, ge=1, le=16, description="hidden layers of the Integrated Basis MLP")
-    prior: Literal["auto", "hull", "template", "sphere", "imface"] = Field(
+    prior: Literal["auto", "hull", "template"] = Field(
         default=AUTO,
-        description="initial geometry [NeuFace section 4.3]; hull: of the masks; template: the hull, cut by the head "
-        "template on the face landmarks; auto: template where the hull hides the face",
-    )
-    prior_file: str = Field(
-        default="", description="path of an ImFace checkpoint, for prior imface (docs/imface.md)", exclude=True
-    )
-    prior_digest: ContentHash = Field(default="", description="sha256 of prior_file, set automatically")
-    prior_scale: Annotated[float, Unit("metres per unit of ImFace")] = Field(
-        default=0.1, gt=0, le=1e6, description="size of ImFace's unit in the asset"
-    )
-    prior_centre: Annotated[tuple[float, float, float], Unit("metres")] = Field(
-        default=(0.0, 0.0, 0.0), description="ImFace's origin in asset coordinates"
+        description="initial geometry; hull: of the masks; template: the hull, cut by the head template on the face "
+        "landmarks; auto: template where the hull hides the face",
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")
@@ -162,12 +148,6 @@ class Config(StageConfig):
     )
     eikonal: float = Field(default=0.1, ge=0, description="weight of the Eikonal term, lambda 5 [NeuFace eq. 24]")
     smooth: float = Field(default=0.03, ge=0, description="weight of the smoothness of neighbouring normals")
-    embedding: float = Field(
-        default=1e3, ge=0, description="weight of the embedding loss, lambda 4 [NeuFace eq. 24], for prior imface"
-    )
-    displacement: float = Field(
-        default=1e-3, ge=0, description="weight of the displacement loss, lambda 6 [NeuFace eq. 24], for method paper"
-    )
     # learning
     lr_sdf: Annotated[float, Unit("cells per step")] = Field(
         default=0.1, gt=0, le=1, description="learning rate of the SDF"
@@ -191,32 +171,23 @@ class Config(StageConfig):
     @classmethod
     def _filled(cls, data: Any) -> Any:
         given = dict(data) if isinstance(data, dict) else {}
-        filled = {**PRESETS.get(str(given.get("preset", "draft")), {}), **given}
-        if filled.get("prior_file"):
-            from stages.inverse_rendering.prior_file import prior_digest
-
-            filled["prior_digest"] = prior_digest(str(filled["prior_file"]))
-        return filled
+        preset = given.get("preset", cls.model_fields["preset"].default)
+        return {**cls.presets.get(str(preset), {}), **given}
 
     @field_validator("specular", "refine_geometry", mode="before")
     @classmethod
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)
 
-    @model_validator(mode="after")
-    def _possible(self) -> Config:
-        if self.refine_geometry == "off" and self.method != "fast":
-            raise ValueError("refine_geometry = off needs method fast; method paper always fits a displacement")
-        if self.seconds > 0 and self.method != "fast":
-            raise ValueError("seconds needs method fast; the schedule of method paper counts epochs")
-        if self.method == "fast" and self.appearance != "hash":
-            raise ValueError("appearance = sinusoidal needs method paper; method fast optimises a hash table")
-        return self
-
     @property
     def estimates_light(self) -> bool:
-        """Whether the light is estimated from view-dependent residuals (light_from = lobe, and the model allows it)."""
-        return self.judges and (self.light_from, self.appearance, self.basis_inputs) == ("lobe", "hash", "cosine")
+        """Whether the light is estimated from view-dependent residuals."""
+        return self.light_from == "lobe"
+
+    @property
+    def has_open_parts(self) -> bool:
+        """Whether a part of the model is left to the model selection."""
+        return AUTO in (self.specular, self.rank, self.light_order, self.calibration, self.refine_geometry)
 
     @property
     def by_clock(self) -> bool:
@@ -232,67 +203,3 @@ class Config(StageConfig):
     def first_order(self) -> int:
         """SH order at the start of the fit."""
         return MAX_ORDER if isinstance(self.light_order, str) else self.light_order
-
-    @property
-    def judges(self) -> bool:
-        """Whether the model selection supports this model: method fast with the paper's terms."""
-        kind = (self.method, self.shading, self.light, self.integral)
-        return kind == ("fast", "neural", "sh", "low_rank")
-
-
-# Presets: the settings that differ from the defaults of Config.
-PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {},
-    "studio": {
-        "image_side": 1024,
-        "steps": 8000,
-        "grid_cells": 320,
-        "hash_fine": 0.0006,
-        "hash_log2_size": 18,
-    },
-    "film": {
-        "image_side": 2048,
-        "steps": 12000,
-        "batch": 8192,
-        "grid_cells": 448,
-        "levels": 3,
-        "hash_fine": 0.0003,
-        "hash_log2_size": 20,
-        "samples": 16,
-    },
-    # The paper's networks, sampling, losses and schedule (section B): 3,000 epochs of one batch for each of 43 photos.
-    # Tested in short runs only: on a CPU it would take weeks.
-    "paper": {
-        "method": "paper",
-        "stereo": False,
-        "rank": 3,
-        "light_order": 10,
-        "specular": "on",
-        "refine_geometry": "on",
-        "resolution": "given",
-        "shadows": False,
-        "white": 5e-3,
-        "specular_energy": 8e-3,
-        "albedo_sparsity": 0.0,
-        "uniform_albedo_until": 0.0,
-        "image_side": 1024,
-        "steps": 129_000,
-        "batch": 2048,
-        "samples": 32,
-        "levels": 1,
-        "grid_cells": 96,
-        "appearance": "sinusoidal",
-        "width": 256,
-        "depth": 8,
-        "basis_inputs": "paper",
-        "basis_width": 256,
-        "basis_depth": 8,
-        "density": "laplace",
-        "calibration": "on",
-        "mask": 0.0,
-        "shininess_prior": 0.0,
-        "smooth": 0.0,
-        "lr_appearance": 1e-4,
-        "lr_light": 1e-4,
-    },
-}

@@ -1,27 +1,16 @@
-"""The training loop: coarse-to-fine schedule, steps and checkpoints. It needs torch, numpy, scipy and OpenCV.
-
-A fit is deterministic for one seed on one machine: every random number comes from a generator seeded by (seed, step),
-and a checkpoint has everything else, so an interrupted fit continues with the same result. A fit with a time limit
-(settings.seconds) continues too, but its number of steps depends on the time.
-"""
+"""The fit: coarse-to-fine schedule, model selection and updates. It needs torch, numpy, scipy and OpenCV."""
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
-from pipeline.errors import Cancelled, StageError
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
 from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import (
     SELECTION_AT,
@@ -34,9 +23,9 @@ from stages.inverse_rendering.model_selection import (
     validation_views,
 )
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.ray_sampling import Batch, PhotoView, PixelTable
+from stages.inverse_rendering.ray_sampling import Batch, PixelTable
+from stages.inverse_rendering.training_loop import TrainingLoop
 
-OUTSIDE_SHARE = 0.25
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
 UNIFORM_FROM = 0.3  # share of the fit at which the light-only phase with uniform albedo begins
@@ -47,47 +36,21 @@ UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
 KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
 SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
-CHECKPOINT_SHARE = 0.02  # largest share of the time for writing checkpoints
-COUNTED = ("step", "loss", "error", "shadows_solved", "allowance", "spent")  # plain numbers of a checkpoint
-SMOOTHING = 0.98  # of the running loss and error
-NOTED = 10  # number of running PSNR values that are stored during a fit
-
-
-@dataclass(frozen=True, slots=True)
-class Hooks:
-    """Callbacks of the fit: progress, cancellation, and the checkpoint's file."""
-
-    progress: Callable[..., None]
-    cancelled: Callable[[], bool]
-    checkpoint: Path | None = None
 
 
 @dataclass(slots=True)
-class Trainer:
-    """The state of a running fit."""
+class Trainer(TrainingLoop):
+    """The state of a running fit. prior: the surface with which refined geometry is compared."""
 
-    views: list[PhotoView]
-    settings: Config
-    device: str
-    model: FaceModel
+    counted: ClassVar[tuple[str, ...]] = (*TrainingLoop.counted, "shadows_solved")
+
     prior: Start | None = None
-    step: int = 0
     level: int = 0
-    loss: float = float("nan")
-    error: float = float("nan")
     shadows_solved: int = 0
-    allowance: float = 0.0  # seconds to train, by the clock; 0: settings.steps decide
-    spent: float = 0.0
-    table: PixelTable | None = None
-    choices: Choices | None = None
-    history: list[float] = field(default_factory=list)  # running PSNR after each tenth of the fit
     validation: tuple[int, ...] = field(init=False)
-    optimiser: torch.optim.Optimizer = field(init=False)
-    guard: Guard = field(init=False)
 
     def __post_init__(self) -> None:
-        self.optimiser = self.make_optimiser()
-        self.guard = Guard(self.settings.max_dropped)
+        TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
         self.validation = validation_views(len(self.views), self.settings)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
@@ -95,34 +58,11 @@ class Trainer:
         return make_optimiser(self.model, self.settings)
 
     @property
-    def psnr(self) -> float:
-        """Running PSNR in dB over fully covered subject pixels of the fitted views."""
-        return -10 * math.log10(max(self.error, 1e-10)) if math.isfinite(self.error) else float("nan")
-
-    @property
     def grid(self) -> GridSdf:
         """The SDF grid, which has its own optimiser."""
         return grid_of(self.model.geometry)
 
-    @property
-    def pixels(self) -> PixelTable:
-        """The photos' pixels at the current level."""
-        self.enter_level()
-        assert self.table is not None
-        return self.table
-
     # ---------------------------------------------------------------- schedule
-    def share(self) -> float:
-        """Finished share of the fit, in [0, 1]: of the time limit, or of the steps."""
-        done = self.spent / self.allowance if self.allowance else self.step / self.settings.steps
-        return min(done, 1.0)
-
-    def total(self) -> int:
-        """Steps of the whole fit; with a time limit, an estimate from the speed so far."""
-        if not self.allowance:
-            return self.settings.steps
-        return max(round(self.step / max(self.share(), 1e-6)), self.step + (self.share() < 1))
-
     def enter_level(self) -> None:
         """Refine the grid and use larger photos when the schedule requires it."""
         starts = LEVEL_STARTS[self.settings.levels]
@@ -170,6 +110,18 @@ class Trainer:
             self.grid.restore(prior_surface(self).values.detach())
             self.grid.values.requires_grad_(False)
 
+    def prepare(self) -> float:
+        """Select the model, set the rates and solve the shadows when they are due; returns the SDF's rate in asset
+        units."""
+        if self.choices is None and self.share() >= SELECTION_AT:
+            self.select_model()
+        rate = self.set_rates()
+        due = sum(self.share() >= s for s in SHADOWS_AT)
+        if self.shadows_solved < due:
+            self.model.solve_shadows()
+            self.shadows_solved = due
+        return rate
+
     def set_rates(self) -> float:
         """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
 
@@ -204,59 +156,21 @@ class Trainer:
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
-    def advance(self) -> None:
-        """One step, with its time."""
-        begun = time.monotonic()
-        self._advance()
-        self.spent += time.monotonic() - begun
-        while len(self.history) < int(NOTED * self.share()):
-            self.history.append(self.psnr)
-
-    def _advance(self) -> None:
-        """Draw a batch, evaluate the loss, update the parameters."""
-        self.enter_level()
-        assert self.table is not None
-        if self.choices is None and self.share() >= SELECTION_AT:
-            self.select_model()
-        rate = self.set_rates()
-        due = sum(self.share() >= s for s in SHADOWS_AT)
-        if self.shadows_solved < due:
-            self.model.solve_shadows()
-            self.shadows_solved = due
-        seed = (self.settings.seed * 1_000_003 + self.step) & 0x7FFFFFFF
-        batch = self.table.draw(self.settings.batch, OUTSIDE_SHARE, seed)
-        self.optimiser.zero_grad(set_to_none=True)
-        found = self._terms(batch, seed)
-        loss, error = found.total, found.error
-        if loss.requires_grad:  # false if the surface is frozen and no ray hits it
-            loss.backward()
-        if not self._is_finite(loss):
-            self._drop(batch, seed)
-            return
-        if self.model.uniform_albedo:
-            self.model.light.uniform_gradient(UNIFORM_LIGHT_ORDER)
-        self.move(rate)
-        self.step += 1
-        if self.step % BAND_EVERY == 0:
-            self.tend()
-        self._note(float(loss.detach()), error)
-
     def move(self, rate: float) -> None:
         """Update the parameters. rate: of the SDF, asset units."""
+        if self.model.uniform_albedo:
+            self.model.light.uniform_gradient(UNIFORM_LIGHT_ORDER)
         self.optimiser.step()
         self.grid.step(rate)
 
     def tend(self) -> None:
         """Find the narrow band again, every BAND_EVERY steps."""
-        self.grid.find_band()
+        if self.step % BAND_EVERY == 0:
+            self.grid.find_band()
 
     def finish(self) -> None:
         """Make the SDF a distance again, after the last step."""
         self.grid.redistance()
-
-    def _terms(self, batch: Batch, seed: int) -> Terms:
-        generator = torch.Generator().manual_seed(seed + 1)
-        return self.compute_terms(batch, generator)
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
         """The parts of the loss. bfloat16 affects only the networks' matrix products."""
@@ -274,57 +188,9 @@ class Trainer:
         """Whether the gradients outside of the optimiser are finite."""
         return self.grid.gradient_is_finite()
 
-    def _is_finite(self, loss: torch.Tensor) -> bool:
-        finite = math.isfinite(float(loss.detach())) and self.geometry_is_finite()
-        return finite and gradients_are_finite(self.optimiser)
-
-    def _drop(self, batch: Batch, seed: int) -> None:
-        """Skip this step without an update, and record the cause."""
-        parameters: list[tuple[str, torch.Tensor]] = [
-            (n, p) for n, p in self.model.named_parameters() if n != "geometry.values"
-        ]
-        cause = cause_of(self._terms(batch, seed), batch, [v.index for v in self.views], parameters)
-        self.optimiser.zero_grad(set_to_none=True)
-        self.forget()
-        self.step += 1
-        self.guard.drop(self.step, cause)
-
     def forget(self) -> None:
         """Drop the gradients outside of the optimiser."""
         self.grid.drop_gradient()
-
-    def _note(self, loss: float, error: float) -> None:
-        self.loss = loss if not math.isfinite(self.loss) else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
-        if math.isfinite(error):
-            known = math.isfinite(self.error)
-            self.error = SMOOTHING * self.error + (1 - SMOOTHING) * error if known else error
-
-    # ---------------------------------------------------------------- checkpoints
-    def save(self, path: Path) -> None:
-        """Write the state of the fit; the old file is kept until the new one is complete."""
-        state = {
-            "settings": repr(self.settings),
-            "dropped": self.guard.causes,
-            "history": self.history,
-            **{name: getattr(self, name) for name in COUNTED},
-            **self.parts(),
-        }
-        torch.save(state, path.with_suffix(".new"))
-        path.with_suffix(".new").rename(path)
-
-    def load(self, path: Path) -> bool:
-        """Continue from a checkpoint. False if it can't be read, or has other settings."""
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-        except Exception:  # an incomplete or foreign file: start again
-            return False
-        if state["settings"] != repr(self.settings):
-            return False
-        self.restore(state)
-        for name in COUNTED:
-            setattr(self, name, state[name])
-        self.guard.causes, self.history = list(state["dropped"]), list(state["history"])
-        return True
 
     def parts(self) -> dict[str, Any]:
         """Model, choices and optimisers, for a checkpoint."""
@@ -369,32 +235,3 @@ def _hashed(model: FaceModel) -> SpatialField:
     """The Spatial MLP with its hash encoding."""
     assert isinstance(model.spatial, SpatialField)
     return model.spatial
-
-
-def run_fit(trainer: Trainer, hooks: Hooks) -> FaceModel:
-    """Train to the last step. Raises Cancelled after writing a checkpoint."""
-    if hooks.checkpoint is not None and hooks.checkpoint.is_file():
-        trainer.load(hooks.checkpoint)
-    saved = shown = time.monotonic()
-    writing = 0.1  # seconds to write a checkpoint; measured later
-    while trainer.share() < 1.0:
-        try:
-            trainer.advance()
-        except StageError:
-            if hooks.checkpoint is not None:
-                trainer.save(hooks.checkpoint)
-            raise
-        now = time.monotonic()
-        if hooks.cancelled():
-            if hooks.checkpoint is not None:
-                trainer.save(hooks.checkpoint)
-            raise Cancelled("stopped by the user; the next run continues from the checkpoint")
-        if now - shown > 0.5:
-            hooks.progress(trainer.step, trainer.total(), "fitting", loss=trainer.loss, psnr=trainer.psnr)
-            shown = now
-        if hooks.checkpoint is not None and now - saved > writing / CHECKPOINT_SHARE:
-            trainer.save(hooks.checkpoint)
-            saved = time.monotonic()
-            writing = saved - now
-    trainer.finish()
-    return trainer.model

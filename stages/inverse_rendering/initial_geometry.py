@@ -31,7 +31,6 @@ MARGIN = 1.0  # voxels by which the lenient hull may be too thick
 MISSING = (
     0.02  # of the silhouette: a single view may correctly carve a concavity, 1 % at a shoulder (head scan, measured)
 )
-SPHERE = 0.6  # share of the region of interest's radius
 MARGIN_CELLS = 4  # cells around the hull for the narrow band and the spline's border
 
 
@@ -139,14 +138,3 @@ def hull_start(
             remedy="check the masks and the cameras: one of them is wrong, or the views show different subjects",
         )
     return Start(hull_sdf(hull).astype(np.float32), (hull.lo + 0.5 * cell).astype(np.float32), cell)
-
-
-def sphere_start(radius: float, cells: int, levels: int) -> Start:
-    """A sphere of SPHERE times `radius`, the region of interest's (asset units): an initial geometry without a
-    prior."""
-    cell = 2 * radius / cells * 2 ** (levels - 1)
-    n = int(np.ceil(radius / cell)) + MARGIN_CELLS
-    axis = (np.arange(-n, n + 1) * cell).astype(np.float32)
-    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij", sparse=True)
-    values = np.sqrt(x * x + y * y + z * z) - SPHERE * radius
-    return Start(values.astype(np.float32), np.full(3, axis[0], np.float32), cell)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.fields.face import FaceModel
-from pipeline.fields.geometry import GridSdf
+from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.spec import FaceSpec
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
@@ -17,8 +17,8 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import own_parts, pretrain_basis
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 
-DERIVED = {"rank", "light_order", "specular", "hash_fine"}  # fields of FaceSpec that are computed from settings
-SAME = ({f.name for f in fields(FaceSpec)} & Config.model_fields.keys()) - DERIVED  # fields copied from settings
+# Fields of FaceSpec that are computed from settings, or that only the paper's model has with that meaning.
+DERIVED = {"rank", "light_order", "specular", "hash_fine", "prior"}
 ALBEDO_START = 0.4  # mean over the channels; their ratios are those of the photos
 
 
@@ -33,15 +33,26 @@ def new_trainer(
     """A new trainer: geometry from `start`, a uniform white light, a uniform albedo. prior: the surface with which
     refined geometry is compared, if stereo has already moved `start`."""
     torch.manual_seed(settings.seed)
+    model = grid_model(views, start, settings, calibrated, device)
+    pretrain_basis(own_parts(model)[1])
+    return trainer_of(model, views, start, settings, device, prior)
+
+
+def grid_model(views: list[PhotoView], start: Start, settings: Config, calibrated: bool, device: str) -> FaceModel:
+    """A new model on a grid of `start`, on the CPU. device: where the photos are read."""
     spec = spec_for(views, start, settings, calibrated, device)
     values = torch.from_numpy(start.values.copy())  # a copy, because the start may also be the prior
     grid = GridSdf(values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
-    model = FaceModel(spec, grid)
-    if settings.judges and settings.basis_inputs == "cosine":
-        pretrain_basis(own_parts(model)[1])
+    return FaceModel(spec, grid)
+
+
+def trainer_of(
+    model: FaceModel, views: list[PhotoView], start: Start, settings: Config, device: str, prior: Start | None
+) -> Trainer:
+    """A trainer of a model on a grid, which is moved to the device."""
     model.to(device)
-    grid.to_device(device)
-    return Trainer(views, settings, device, model, prior or start)
+    grid_of(model.geometry).to_device(device)
+    return Trainer(views, settings, device, model, prior=prior or start)
 
 
 def spec_for(views: list[PhotoView], start: Start, config: Config, calibrated: bool, device: str) -> FaceSpec:
@@ -50,9 +61,9 @@ def spec_for(views: list[PhotoView], start: Start, config: Config, calibrated: b
     grey = float(colour.mean().clamp(min=1e-4))
     lo, hi = start.lo, start.lo + (np.array(start.values.shape) - 1) * start.cell
     coarse = float((hi - lo).max()) / 16
-    same = {name: getattr(config, name) for name in SAME}
+    same = {f.name: getattr(config, f.name) for f in fields(FaceSpec) if f.name in type(config).model_fields}
     return FaceSpec(
-        **same,
+        **{name: value for name, value in same.items() if name not in DERIVED},
         lo=_triple(lo),
         hi=_triple(hi),
         views=len(views),

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.artifacts import Capture, MaskSet
+from pipeline.artifacts import MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
 from stages.inverse_rendering.cross_validation import more

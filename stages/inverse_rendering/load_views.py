@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import transforms
-from pipeline.artifacts import Camera, CameraSet, Capture, FileRef, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
 from stages.inverse_rendering.ray_sampling import F32, PhotoView, factor_for
 from stages.inverse_rendering.residuals import U8

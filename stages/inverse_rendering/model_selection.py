@@ -88,34 +88,34 @@ def restored(plain: dict[str, Any]) -> Choices:
     return Choices(**{**plain, "columns": tuple(plain["columns"])})
 
 
-def open_questions(s: Config) -> bool:
-    """Whether any setting is left to the model selection."""
-    return s.judges and AUTO in (s.specular, s.rank, s.light_order, s.calibration, s.refine_geometry)
-
-
 def validation_views(count: int, settings: Config) -> tuple[int, ...]:
     """Positions of the validation views among `count` views: about one in eight, evenly spaced."""
-    if count < MIN_VIEWS or not open_questions(settings):
+    if count < MIN_VIEWS or not settings.has_open_parts:
         return ()
     n = min(max(round(VALIDATION_SHARE * count), 2), MAX_VALIDATION)
     return tuple(int((i + 0.5) * count / n) for i in range(n))
 
 
 # ------------------------------------------------------------------ deciding
-def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
-    """Select the model on the validation views, and estimate the light from view-dependent residuals."""
-    s, model = fit.settings, fit.model
+def given_model(s: Config, *, calibrated: bool) -> Choices:
+    """The model of the settings, without selection. calibrated: whether it has colour matrices."""
     given = Choices(
         s.specular != "off",
         s.first_order,
         tuple(range(s.first_rank)),
-        model.spec.calibrated,
+        calibrated,
         s.refine_geometry != "off",
         {},
     )
+    why = f"fewer than {MIN_VIEWS} views: no validation views" if s.has_open_parts else "setting"
+    return replace(given, facts=_facts(given, s, why))
+
+
+def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
+    """Select the model on the validation views, and estimate the light from view-dependent residuals."""
+    s, model = fit.settings, fit.model
+    out = given = given_model(s, calibrated=model.spec.calibrated)
     wanted = s.estimates_light and s.specular != "off"
-    why = "setting" if not open_questions(s) else f"fewer than {MIN_VIEWS} views: no validation views"
-    out = replace(given, facts=_facts(given, s, why))
     if not fit.validation and not wanted:
         return out, None
     shots = pictures(fit.views)

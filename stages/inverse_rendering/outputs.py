@@ -8,17 +8,18 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import CameraSet, Capture, HeldOutView, Matrix
+from pipeline.artifacts import CameraSet, HeldOutView, Matrix
+from pipeline.capture_artifacts import Capture
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel
 from pipeline.images import write_exr, write_png_from_linear
 from pipeline.transforms import rows
-from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.load_views import camera_only
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
 from stages.inverse_rendering.systems import render_any
+from stages.inverse_rendering.training_loop import TrainingLoop
 
 F32 = npt.NDArray[np.float32]
 
@@ -97,30 +98,31 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
 
 
 def model_facts(
-    trainer: Trainer, looked: Footprint | None, geometry: dict[str, str | float | bool]
+    trainer: TrainingLoop, looked: Footprint | None, geometry: dict[str, str | float | bool]
 ) -> dict[str, dict[str, str | float | bool]]:
     """The selected model and the figures of each decision, for the report. geometry: of the initial geometry."""
     settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
+    spec = model.spec
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
         **decided,
         "geometry": {**geometry, "cell_mm": round(model.geometry.cell * 1e3, 4)},
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
-        "density": {"kind": settings.density, "why": "setting"},
+        "density": {"kind": spec.density, "why": "setting"},
         "system": {
-            "method": settings.method,
-            "shading": settings.shading,
-            "light": settings.light,
-            "integral": settings.integral,
-            "attenuation": settings.attenuation,
+            "method": {"grid": "fast", "displaced": "paper"}[spec.geometry],
+            "shading": spec.shading,
+            "light": spec.light,
+            "integral": spec.integral,
+            "attenuation": spec.attenuation,
             "why": "setting",
         },
         "faults": {"dropped_steps": guard.dropped, "why": guard.causes[-1] if guard.causes else "none"},
     }
 
 
-def _schedule(trainer: Trainer) -> dict[str, str | float | bool]:
+def _schedule(trainer: TrainingLoop) -> dict[str, str | float | bool]:
     """Length of the fit, and what determined it. No measured seconds, because they are not repeatable."""
     if not trainer.settings.by_clock:
         return {"steps": trainer.step, "why": "setting"}

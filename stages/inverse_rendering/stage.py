@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
 from stages.inverse_rendering.config import AUTO
 from stages.inverse_rendering.config import Config as Config
+from stages.inverse_rendering.systems import COMPARED, paper_config
 
 MIN_VIEWS = 3
 
@@ -28,15 +30,15 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from pipeline.faces.landmarks3d import load_landmarks
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import exposures_differ
-    from stages.inverse_rendering.fit import Hooks, run_fit
     from stages.inverse_rendering.footprint import footprint, supported
-    from stages.inverse_rendering.initial_geometry import agreed, hull_start, sphere_start
+    from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
-    from stages.inverse_rendering.systems import trainer_for
+    from stages.inverse_rendering.systems import first_surface, trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
+    from stages.inverse_rendering.training_loop import Hooks, run_fit
 
     clock, settings = Clock(), config
     dropped = set(inputs.masks.artifact.dropped)
@@ -57,15 +59,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     radius, extent = inputs.poses.artifact.roi_radius, inputs.masks.artifact.extent
     masks = agreed(cameras, [v.alpha for v in views], radius)
     views = [replace(v, doubtful=masks.doubtful.get(n)) for n, v in enumerate(views)]
-    if settings.prior == "sphere":
-        start = sphere_start(radius, settings.grid_cells, settings.levels)
-    else:
-        start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
+    start = first_surface(settings, cameras, masks.alphas, radius, extent)
     looked = footprint(start, views, settings.image_side)
     if settings.resolution == AUTO:
         settings, cells = supported(settings, looked, start), settings.grid_cells
-        if settings.grid_cells < cells and settings.prior != "sphere":
-            start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
+        if settings.grid_cells < cells:
+            start = first_surface(settings, cameras, masks.alphas, radius, extent)
     context.progress(0, settings.steps, "initial geometry")
     ref = inputs.masks.artifact.landmarks
     landmarks = None if ref is None else load_landmarks(inputs.masks.path(ref))
@@ -114,4 +113,12 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
-STAGE = Stage(name="inverse_rendering", version=10, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(
+    name="inverse_rendering",
+    version=10,
+    inputs=Inputs,
+    config=Config,
+    output=FittedFace,
+    run=run,
+    variants=dict.fromkeys(COMPARED, paper_config),
+)

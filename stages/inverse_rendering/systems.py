@@ -1,5 +1,6 @@
-"""Choice between method fast and method paper. Only this module imports stages.inverse_rendering.paper, and only when
-it is used. It does not import torch itself, so that settings are checked quickly."""
+"""Choice between our own fit and the systems that the paper compares, by the preset. Only this module imports
+stages.inverse_rendering.paper, and only when it is used. It does not import torch itself, so that settings are checked
+quickly."""
 
 from __future__ import annotations
 
@@ -8,24 +9,59 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pipeline.artifacts import Camera, Extent
     from pipeline.fields.face import FaceModel
     from stages.inverse_rendering.config import Config
-    from stages.inverse_rendering.fit import Trainer
-    from stages.inverse_rendering.initial_geometry import Start
+    from stages.inverse_rendering.initial_geometry import F32, Start
+    from stages.inverse_rendering.paper.config import PaperConfig
     from stages.inverse_rendering.ray_sampling import PhotoView, Rays
+    from stages.inverse_rendering.training_loop import TrainingLoop
+
+COMPARED = ("paper", "comparison")  # presets with the settings of paper/config.py
+
+
+def paper_config() -> type[PaperConfig]:
+    """The settings of the paper's model and of the systems that it compares."""
+    from stages.inverse_rendering.paper.config import PaperConfig
+
+    return PaperConfig
+
+
+def first_surface(
+    settings: Config, cameras: list[Camera], alphas: list[F32], radius: float, extent: Extent | None
+) -> Start:
+    """The initial geometry of these settings. radius: of the region of interest, asset units."""
+    if settings.preset not in COMPARED:
+        from stages.inverse_rendering.initial_geometry import hull_start
+
+        return hull_start(cameras, alphas, radius, settings.grid_cells, settings.levels, extent)
+    from stages.inverse_rendering.paper import comparison
+
+    return comparison.first_surface(of_the_paper(settings), cameras, alphas, radius, extent)
+
+
+def of_the_paper(settings: Config) -> PaperConfig:
+    """The settings by their own class."""
+    assert isinstance(settings, paper_config())
+    return settings
 
 
 def trainer_for(
     views: list[PhotoView], start: Start, settings: Config, calibrated: bool, device: str, prior: Start
-) -> Trainer:
-    """A new trainer of the settings' method. prior: the surface with which refined geometry is compared."""
-    if settings.method == "fast":
+) -> TrainingLoop:
+    """A new trainer for these settings. prior: the surface with which refined geometry is compared."""
+    if settings.preset not in COMPARED:
         from stages.inverse_rendering.initialise import new_trainer
 
         return new_trainer(views, start, settings, calibrated, device, prior)
+    paper = of_the_paper(settings)
+    if paper.method == "fast":
+        from stages.inverse_rendering.paper.comparison import new_compared_trainer
+
+        return new_compared_trainer(views, start, paper, calibrated, device, prior)
     from stages.inverse_rendering.paper.trainer import new_paper_trainer
 
-    return new_paper_trainer(views, start, settings, calibrated, device)
+    return new_paper_trainer(views, start, paper, calibrated, device)
 
 
 def render_any(model: FaceModel, rays: Rays, samples: int) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,8 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, Extent, FileRef, Located, MaskSet, ViewMask
+from pipeline.artifacts import Camera, CameraSet, Extent, FileRef, Located, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent

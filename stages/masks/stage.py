@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import CameraSet, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from stages.masks.config import Config as Config
 

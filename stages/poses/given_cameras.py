@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, Located
+from pipeline.artifacts import Camera, CameraSet, Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid, matrix

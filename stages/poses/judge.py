@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView
+from pipeline.artifacts import Camera, CameraSet
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.directions import Counts, around, count_seen, parts, share_seen, spread, view_directions
 from pipeline.transforms import F64, matrix
 from pipeline.verdict import Finding, Limits, judged

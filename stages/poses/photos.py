@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Capture, CaptureView, Located
+from pipeline.artifacts import Located
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, read_encoded
 
 

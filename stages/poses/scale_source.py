@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.artifacts import Camera, Capture, CaptureView, Located
+from pipeline.artifacts import Camera, Located
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.errors import StageError
 from pipeline.faces.find import Face, find_face
 from pipeline.faces.landmarks3d import HeadFrame, head_frame, triangulate

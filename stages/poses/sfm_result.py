@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipeline.artifacts import CameraSet, Capture, Located
+from pipeline.artifacts import CameraSet, Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from stages.poses.config import Config

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.artifacts import CameraSet, Capture, Located
+from pipeline.artifacts import CameraSet, Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import UsageError
 from stages.poses.config import Config as Config

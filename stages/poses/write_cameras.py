@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, CaptureView
+from pipeline.artifacts import Camera, CameraSet
+from pipeline.capture_artifacts import CaptureView
 from pipeline.contract import Context
 from pipeline.transforms import F64, apply, matrix, rescale_camera, rows
 

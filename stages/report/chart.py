@@ -15,7 +15,8 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Capture, FittedFace, Located
+from pipeline.artifacts import Camera, CameraSet, FittedFace, Located
+from pipeline.capture_artifacts import Capture
 from pipeline.colour import LUMA
 from pipeline.transforms import F64, matrix, undistort
 

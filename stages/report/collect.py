@@ -5,17 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from pipeline.artifacts import (
-    CameraSet,
-    Capture,
-    FittedFace,
-    Located,
-    MaskSet,
-    Surface,
-    TextureSet,
-    UsdAsset,
-    UvMesh,
-)
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureSet, UsdAsset, UvMesh
+from pipeline.capture_artifacts import Capture
 from pipeline.tiles import FIRST
 from stages.report.chart import chart_figures
 

@@ -4,18 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.artifacts import (
-    CameraSet,
-    Capture,
-    FittedFace,
-    Located,
-    MaskSet,
-    Report,
-    Surface,
-    TextureSet,
-    UsdAsset,
-    UvMesh,
-)
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Report, Surface, TextureSet, UsdAsset, UvMesh
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 
 PICTURE_SIDE = 360  # pixels: longer side of a picture on the page

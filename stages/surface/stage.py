@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, Surface
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.units import Cells, Unit
 

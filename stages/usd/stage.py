@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pipeline.artifacts import (
     CameraSet,
-    Capture,
     FileRef,
     FittedFace,
     HeldOutView,
@@ -22,6 +21,7 @@ from pipeline.artifacts import (
     UsdAsset,
     UvMesh,
 )
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from stages.usd.config import Config as Config
 

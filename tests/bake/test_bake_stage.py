@@ -11,7 +11,8 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, UvMesh, ViewMask
+from pipeline.artifacts import FileRef, Located, MaskSet, Surface, UvMesh, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.contract import Context
 from pipeline.errors import Cancelled

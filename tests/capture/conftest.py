@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.artifacts import Capture, Located
+from pipeline.artifacts import Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from stages.capture.scan import scan_capture
 from stages.capture.stage import Config, Inputs, run

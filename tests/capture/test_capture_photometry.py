@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.artifacts import CameraSet, Capture, FileRef, Located, MaskSet, ViewMask
+from pipeline.artifacts import CameraSet, FileRef, Located, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_alpha
 from stages.capture.photometry import clipped, exposures, mean_light

@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from pipeline.artifacts import CaptureView
+from pipeline.capture_artifacts import CaptureView
 from pipeline.errors import StageError
 from pipeline.transforms import F64, inverse_rigid, matrix, project
 from stages.capture.readers import find_reader

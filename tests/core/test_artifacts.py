@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from pipeline.artifacts import Capture, CaptureView, FileRef, MaskSet, TextureMap, ViewMask, sha256_of
+from pipeline.artifacts import FileRef, MaskSet, TextureMap, ViewMask, sha256_of
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.store import file_refs
 
 

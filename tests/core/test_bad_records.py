@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.artifacts import CaptureSource, FileRef
+from pipeline.artifacts import FileRef
+from pipeline.capture_artifacts import CaptureSource
 from pipeline.errors import DiskError, StageError, UsageError, stage_error_from_os_error
 from pipeline.store import LINEAGE, MANIFEST, RUN, Store, lineage
 from stages.presets import configs_for, parse_sets, read_config_file

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline import meshes
-from pipeline.artifacts import Capture, CaptureView, FileRef, Located, MaskSet, Surface, ViewMask
+from pipeline.artifacts import FileRef, Located, MaskSet, Surface, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import Context
 from pipeline.images import write_png
 from pipeline.verdict import worst

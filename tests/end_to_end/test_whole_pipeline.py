@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.artifacts import Capture, Located
+from pipeline.artifacts import Located
+from pipeline.capture_artifacts import Capture
 from pipeline.demo.capture import write_demo_capture
 from tests.support.points import PATIENCE, kill
 

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, MaskSet
+from pipeline.artifacts import CameraSet, FittedFace, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.demo.capture import write_demo_capture
 from pipeline.images import read_exr, read_linear
 from workflows.run.plan import make_plan

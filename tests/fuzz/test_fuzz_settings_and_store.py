@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.artifacts import CaptureSource, FileRef
+from pipeline.artifacts import FileRef
+from pipeline.capture_artifacts import CaptureSource
 from pipeline.store import LINEAGE, MANIFEST, RUN, Store, lineage
 from stages.presets import read_config_file
 from tests.support.fuzzing import bounded, fuzzed

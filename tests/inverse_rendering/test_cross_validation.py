@@ -23,6 +23,7 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.model_selection import Choices, restored, select_model, validation_views
 from stages.inverse_rendering.observations import observe, pictures, surface_points
+from stages.inverse_rendering.paper.config import PaperConfig
 from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
 SMALL = Config(
@@ -186,7 +187,7 @@ def test_waiting_views_are_few_and_spread() -> None:
     for count in (8, 11, 43, 200):
         out = validation_views(count, Config())
         assert len(set(out)) == len(out) and 2 <= len(out) <= 6 and max(out) < count
-    assert validation_views(43, Config(preset="paper")) == ()
+    assert validation_views(43, PaperConfig()) == ()
     t = trainer(Ball())
     assert t.table is not None
     assert not np.isin(t.table.draw(2000, 0.25, 0).view.numpy(), t.validation).any()

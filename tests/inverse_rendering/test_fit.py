@@ -12,11 +12,12 @@ import torch
 
 from pipeline import transforms
 from pipeline.errors import Cancelled, StageError
-from stages.inverse_rendering.fit import Trainer, run_fit
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, factor_for, image_rays
+from stages.inverse_rendering.training_loop import run_fit
 from tests.support.small_ball import RADIUS, SIDE, SMALL, ball_view, fit_of_the_ball, hooks, trainer
 from tests.support.spread import made_once
 

@@ -13,11 +13,12 @@ import torch
 from pipeline.errors import StageError
 from stages.inverse_rendering import objective
 from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.guard import Guard
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.ray_sampling import PhotoView
+from stages.inverse_rendering.training_loop import Hooks, run_fit
 from tests.support.small_ball import SMALL, ball_start, ball_view, hooks
 
 SHORT = SMALL.changed(steps=8, batch=256, levels=1, shadows=False, max_dropped=3)

@@ -10,16 +10,18 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.artifacts import Capture, CaptureView, FileRef, MaskSet, ViewMask
+from pipeline.artifacts import FileRef, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, worst
 from stages.inverse_rendering.choose_start import NAMES
-from stages.inverse_rendering.fit import Trainer, run_fit
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.judge import Fitted, findings
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.residuals import LabelError, ViewError, photo_noise, view_errors
+from stages.inverse_rendering.training_loop import run_fit
 from tests.support.small_ball import SMALL, ball_start, ball_view, fit_of_the_ball, hooks, trainer
 from tests.support.spread import made_once
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, FittedFace, Located, MaskSet, ViewMask
+from pipeline.artifacts import Camera, CameraSet, FileRef, FittedFace, Located, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import Context
 from pipeline.images import write_png, write_png_from_linear
 from pipeline.transforms import rows

@@ -187,7 +187,6 @@ def test_a_fit_takes_the_light_over() -> None:
     "changes",
     [
         {"light_from": "uniform_albedo"},
-        pytest.param({"basis_inputs": "paper"}, marks=pytest.mark.slow),
         {"specular": "off"},
     ],
 )

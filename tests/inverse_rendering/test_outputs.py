@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.artifacts import Capture, CaptureView, FileRef
+from pipeline.artifacts import FileRef
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import as_photographed
 from stages.inverse_rendering.outputs import held_out_responses
 

@@ -13,9 +13,11 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.errors import Cancelled
 from stages.inverse_rendering import fit, time_budget
-from stages.inverse_rendering.fit import Trainer, run_fit
+from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.paper.config import PaperConfig
 from stages.inverse_rendering.stage import Config
 from stages.inverse_rendering.time_budget import FINER, seconds_to_predict
+from stages.inverse_rendering.training_loop import run_fit
 from tests.support.small_ball import SMALL, ball_view, hooks, trainer
 
 TICK = 0.25  # seconds between two looks at the clock
@@ -89,5 +91,5 @@ def test_rendering_the_held_out_views_is_kept_free(monkeypatch: pytest.MonkeyPat
 
 def test_the_papers_schedule_has_no_clock() -> None:
     with pytest.raises(ValueError, match="counts epochs"):
-        Config(preset="paper", seconds=60.0)
+        PaperConfig(seconds=60.0)
     assert np.isclose(Config(seconds=60.0).seconds, 60.0)

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import execute
 from pipeline.errors import Cancelled, StageError, UsageError
 from pipeline.images import read_alpha, write_png

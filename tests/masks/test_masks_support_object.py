@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.artifacts import Camera, CameraSet, Capture, CaptureView, FileRef, Located
+from pipeline.artifacts import Camera, CameraSet, FileRef, Located
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import execute
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, write_png

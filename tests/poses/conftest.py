@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.artifacts import CameraSet, Capture, Located
+from pipeline.artifacts import CameraSet, Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from stages.capture.scan import scan_capture
 from stages.capture.stage import Config as CaptureConfig

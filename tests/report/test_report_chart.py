@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
-from pipeline.artifacts import Camera, ChartFound, ColourChart, FileRef, Located
+from pipeline.artifacts import Camera, FileRef, Located
+from pipeline.capture_artifacts import ChartFound, ColourChart
 from pipeline.contract import Context
 from pipeline.transforms import inverse_rigid, rigid, rows
 from stages.report.chart import normal_of, white_under

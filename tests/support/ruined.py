@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import CameraSet, Capture, Located, MaskSet
+from pipeline.artifacts import CameraSet, Located, MaskSet
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.verdict import Finding
 from stages.capture import stage as capture_stage

@@ -10,10 +10,11 @@ import numpy as np
 
 from pipeline import transforms
 from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.fit import Hooks, Trainer, run_fit
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.ray_sampling import PhotoView
+from stages.inverse_rendering.training_loop import Hooks, run_fit
 
 RADIUS, SIDE = 0.1, 64
 SMALL = Config(

@@ -13,8 +13,6 @@ import numpy as np
 from pipeline.artifacts import (
     Camera,
     CameraSet,
-    Capture,
-    CaptureView,
     FileRef,
     FittedFace,
     HeldOutView,
@@ -25,6 +23,7 @@ from pipeline.artifacts import (
     TextureSet,
     UvMesh,
 )
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import rows
 

@@ -10,7 +10,6 @@ from support.synthetic_asset import SyntheticInputs, write_inputs
 
 from pipeline.artifacts import (
     CameraSet,
-    Capture,
     FileRef,
     FittedFace,
     HeldOutView,
@@ -22,6 +21,7 @@ from pipeline.artifacts import (
     UvMesh,
     ViewMask,
 )
+from pipeline.capture_artifacts import Capture
 from pipeline.images import write_exr, write_png
 
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from pipeline import meshes
-from pipeline.artifacts import Capture, Located, MaskSet, ViewMask
+from pipeline.artifacts import Located, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.meshes import Mesh
 from stages.surface import build as building

@@ -10,7 +10,8 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline import meshes
-from pipeline.artifacts import Capture, Located, MaskSet, Surface
+from pipeline.artifacts import Located, MaskSet, Surface
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
 from stages.surface import build as building

@@ -78,7 +78,8 @@ def test_every_setting_that_names_a_file_is_known() -> None:
     told = {
         (stage.name, name)
         for stage in REGISTRY
-        for name, field in stage.config.model_fields.items()
+        for config in stage.configs()
+        for name, field in config.model_fields.items()
         if field.annotation is str and any(w in (field.description or "") for w in (" file", "checkpoint"))
     }
     digests = {(s, n) for s, n in told if n.endswith(("_sha256", "_digest"))}

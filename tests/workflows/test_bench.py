@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UsageError
-from stages.inverse_rendering.stage import Config
+from stages.inverse_rendering.stage import STAGE
 from workflows.bench import ablations as bench
 from workflows.bench.ablations import FULL, TABLES, Result, Row, ordering, report, settings_of, unique
 from workflows.cli.console import Console
@@ -27,7 +27,7 @@ def test_every_row_is_a_setting_of_the_stage(tmp_path: Path) -> None:
     for row in unique(TABLES):
         sets = dict(s.split("=", 1) for s in settings_of(row, options(tmp_path)))
         own = {k.split(".", 1)[1]: v for k, v in sets.items() if k.startswith("inverse_rendering.")}
-        config = Config(**own)
+        config = STAGE.config_for(own.get("preset"))(**own)
         for key, value in row.settings.items():
             assert getattr(config, key) == value, (row.name, key)
 

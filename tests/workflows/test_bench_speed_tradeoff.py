@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import UsageError
-from stages.inverse_rendering.stage import Config
+from stages.inverse_rendering.stage import STAGE
 from workflows.bench import speed, tradeoff, tradeoff_measure
 from workflows.bench.tradeoff import KNOBS, front
 from workflows.bench.tradeoff_measure import Measured
@@ -101,7 +101,7 @@ def test_every_point_is_a_setting_of_the_stage(tmp_path: Path) -> None:
     for knob in KNOBS:
         sets = dict(s.split("=", 1) for s in tradeoff_measure.settings_of(knob, given))
         own = {k.split(".", 1)[1]: v for k, v in sets.items() if k.startswith("inverse_rendering.")}
-        config = Config(**own)
+        config = STAGE.config_for(own.get("preset"))(**own)
         for key, value in knob.settings.items():
             assert getattr(config, key) == (round(value * getattr(given, key)) if key in ("steps", "batch") else value)
     assert len({k.name for k in KNOBS}) == len(KNOBS)

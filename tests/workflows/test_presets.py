@@ -79,6 +79,47 @@ def test_wrong_words_are_named(preset: str, sets: list[str], told: list[str]) ->
         assert part in str(e.value)
 
 
+FIT = "inverse_rendering"
+
+
+@pytest.mark.parametrize(
+    ("preset", "sets", "file"),
+    [
+        ("paper", ["inverse_rendering.shading=phong"], {}),
+        ("draft", ["inverse_rendering.preset=comparison", "inverse_rendering.shading=phong"], {}),
+        ("draft", ["inverse_rendering.preset=comparison"], {FIT: {"shading": "phong"}}),
+        ("draft", ["inverse_rendering.shading=phong"], {FIT: {"preset": "comparison"}}),
+    ],
+)
+def test_the_papers_settings_need_one_of_its_presets(
+    preset: str, sets: list[str], file: dict[str, dict[str, str]]
+) -> None:
+    """From whatever source the preset and the setting come."""
+    assert configs_for(preset, parse_sets(sets), file)[FIT].model_dump()["shading"] == "phong"
+
+
+@pytest.mark.parametrize(
+    ("preset", "sets", "told"),
+    [
+        ("draft", ["inverse_rendering.shading=phong"], ["only other presets have", "preset=paper", "comparison"]),
+        (
+            "paper",
+            ["inverse_rendering.preset=draft", "inverse_rendering.shading=phong"],
+            ["only other presets have", "preset=paper"],
+        ),
+        ("paper", ["inverse_rendering.shadin=phong"], ["unknown setting", "did you mean shading?"]),
+        ("draft", ["inverse_rendering.shadow=false"], ["unknown setting", "did you mean shadows?"]),
+        ("paper", ["inverse_rendering.shading=matt"], ["inverse_rendering.shading", "'neural', 'phong' or 'disney'"]),
+        ("draft", ["inverse_rendering.attenuation=phong"], ["'exponential' or 'exact'"]),
+        ("draft", ["inverse_rendering.preset=papr"], ["inverse_rendering.preset", "paper and comparison"]),
+    ],
+)
+def test_wrong_settings_of_the_paper_are_told(preset: str, sets: list[str], told: list[str]) -> None:
+    with pytest.raises(UsageError) as e:
+        configs_for(preset, parse_sets(sets))
+    assert [part for part in told if part not in str(e.value)] == []
+
+
 def test_config_files(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text("[first]\nplus = 3\n")
     (tmp_path / "s.json").write_text(json.dumps({"first": {"plus": 3}}))

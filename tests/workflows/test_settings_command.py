@@ -30,13 +30,23 @@ def test_the_list_has_every_setting_with_its_default_its_limits_and_what_presets
     assert "  rank = auto   (whole number, 1 to 8, or auto; paper 3)" in lines
     assert '  author = ""   (text of up to 1000 characters)' in lines
     assert not any("sha256" in line or "digest" in line for line in lines)  # filled in by the stages
-    assert len(lines) == 2 * len(all_settings()) + sum(bool(s.config.setting_names()) for s in REGISTRY)
+    assert len(lines) == 2 * len(all_settings()) + len({(s.stage, s.only) for s in all_settings()})
 
 
 def test_every_setting_says_what_it_means_and_what_it_may_be() -> None:
     for s in all_settings():
         assert len(s.meaning) > 10 and s.allowed, s.key
-        assert set(s.presets) == set(PRESETS), s.key
+        assert set(s.presets) == ({"paper"} if s.only else set(PRESETS)), s.key
+
+
+def test_those_of_the_papers_model_are_listed_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    lines = shown(capsys, "inverse_rendering").splitlines()
+    title = "inverse_rendering, only with inverse_rendering.preset = paper or comparison"
+    ours, papers = lines[: lines.index(title)], lines[lines.index(title) :]
+    assert "  shading = neural   (neural, phong or disney)" in papers
+    assert not any(line.startswith(("  shading", "  prior", "  method")) for line in ours)
+    assert any(line.startswith("  batch = ") for line in ours) and not any(x.startswith("  batch") for x in papers)
+    assert "  only with inverse_rendering.preset = paper or comparison" in shown(capsys, "inverse_rendering.shading")
 
 
 def test_one_is_explained_with_its_value_in_each_preset(capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,7 +74,7 @@ def test_json_has_a_record_for_each(capsys: pytest.CaptureFixture[str]) -> None:
     (one,) = json.loads(shown(capsys, "surface.resolution", "--json"))
     assert one == {
         "key": "surface.resolution", "stage": "surface", "name": "resolution", "unit": "grid cells", "default": 256,
-        "allowed": "whole number, 16 to 1024", "meaning": one["meaning"],
+        "allowed": "whole number, 16 to 1024", "meaning": one["meaning"], "only": [],
         "presets": {"draft": 288, "studio": 320, "film": 512, "paper": 320},
     }  # fmt: skip
 

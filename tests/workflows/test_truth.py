@@ -10,7 +10,8 @@ import pytest
 import trimesh
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from pipeline.artifacts import Capture, CaptureView, FileRef, GivenCamera
+from pipeline.artifacts import FileRef
+from pipeline.capture_artifacts import Capture, CaptureView, GivenCamera
 from pipeline.colour import srgb_from_linear
 from pipeline.images import write_exr, write_png
 from pipeline.transforms import inverse_rigid, rigid, rows

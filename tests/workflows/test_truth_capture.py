@@ -12,8 +12,9 @@ import trimesh
 from pxr import Sdf, Usd, UsdGeom
 
 from pipeline import meshes
-from pipeline.artifacts import CaptureView, FileRef, GivenCamera
+from pipeline.artifacts import FileRef
 from pipeline.camera import PinholeCamera
+from pipeline.capture_artifacts import CaptureView, GivenCamera
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import apply, centre_K_from_corner_K, inverse_rigid, rigid, rows, similarity
 from workflows.bench.captures_figures import Run, figures_of, texture_of

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.artifacts import Capture, Located
+from pipeline.artifacts import Located
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Done
 from pipeline.verdict import Level
 from stages import registry

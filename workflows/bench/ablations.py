@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Artifact, Capture, CaptureView, Located
+from pipeline.artifacts import Artifact, Located
+from pipeline.capture_artifacts import Capture, CaptureView
 from workflows.bench.rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.cli.console import Console
 
@@ -135,6 +136,7 @@ def unique(tables: Iterable[Table]) -> list[Row]:
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
     """Settings as for `--set`: the budget, the paper's model where the fast one adds to it, the row's own."""
     base = {
+        "preset": "comparison",
         "steps": given.steps,
         "image_side": given.side,
         "batch": given.batch,

@@ -110,7 +110,7 @@ def demo_command(options: argparse.Namespace, console: Console) -> int:
 
 
 def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest) -> None:
-    from pipeline.artifacts import Capture
+    from pipeline.capture_artifacts import Capture
     from pipeline.store import Store
     from workflows.evaluation.demo import measure
 

@@ -34,8 +34,8 @@ def settings_command(options: argparse.Namespace, console: Console) -> int:
 
 def listed(settings: Sequence[Setting]) -> Iterator[str]:
     """Two lines for each setting, under the name of its stage: what it is set to and may be, and what it means."""
-    for stage, own in groupby(settings, lambda s: s.stage):
-        yield f"{stage}"
+    for (stage, only), own in groupby(settings, lambda s: (s.stage, s.only)):
+        yield f"{stage}" + (f", only with {stage}.preset = {' or '.join(only)}" if only else "")
         for s in own:
             presets = "".join(f"; {name} {value_in_words(v)}" for name, v in s.differing().items())
             yield f"  {s.name} = {_with_unit(s)}   ({s.allowed}{presets})"
@@ -50,6 +50,8 @@ def explained(s: Setting) -> Iterator[str]:
     width = max(map(len, rows))
     for what, text in rows.items():
         yield f"  {what:{width}}  {text}"
+    if s.only:
+        yield f"  only with {s.stage}.preset = {' or '.join(s.only)}"
     yield f"  set it with --set {s.key}=VALUE, or under [{s.stage}] in a --config file"
 
 

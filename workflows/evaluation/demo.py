@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Capture, CaptureView
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, read_encoded, read_exr, shrink
 from pipeline.transforms import matrix
 from workflows.evaluation import geometry

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Capture, CaptureView
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, write_png_from_linear
 from pipeline.transforms import apply, pixel_centres
 

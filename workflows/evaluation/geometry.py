@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import CaptureView
 from pipeline.camera import PinholeCamera
+from pipeline.capture_artifacts import CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.transforms import apply, inverse_rigid, matrix
 

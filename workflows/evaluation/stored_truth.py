@@ -17,8 +17,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pipeline.artifacts import CaptureView
 from pipeline.camera import PinholeCamera
+from pipeline.capture_artifacts import CaptureView
 from pipeline.transforms import matrix
 from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry

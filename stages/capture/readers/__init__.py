@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.artifacts import CaptureKind
+from pipeline.capture_artifacts import CaptureKind
 from stages.capture.readers import colmap, facescape, idr, metashape, realityscan, transforms
 from stages.capture.readers.described import Described, Reader
 

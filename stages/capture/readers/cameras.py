@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.artifacts import GivenCamera
+from pipeline.capture_artifacts import GivenCamera
 from pipeline.transforms import F64, rigid, rows
 from stages.capture.readers.values import fault, finite
 

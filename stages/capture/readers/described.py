@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pipeline.artifacts import GivenCamera
+from pipeline.capture_artifacts import GivenCamera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, distort
 from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fault, printable

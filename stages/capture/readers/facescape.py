@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import GivenCamera
+from pipeline.capture_artifacts import GivenCamera
 from pipeline.errors import StageError
 from pipeline.transforms import F64, corner_K_from_centre_K
 from stages.capture.readers.cameras import checked_frame, checked_K, checked_lens, given_camera

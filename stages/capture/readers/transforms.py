@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import GivenCamera
+from pipeline.capture_artifacts import GivenCamera
 from pipeline.transforms import F64, OPENCV_CAM_FROM_OPENGL_CAM, inverse_rigid
 from stages.capture.readers.cameras import checked_frame, checked_K, checked_lens, checked_pose, given_camera
 from stages.capture.readers.described import (

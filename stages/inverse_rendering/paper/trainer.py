@@ -6,7 +6,7 @@ are left out, and the background is black: the masks replace the paper's ground-
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +22,14 @@ from pipeline.fields.paper.prior_imface import ImFacePrior
 from pipeline.fields.paper.priors import HullPrior
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import losses
-from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import spec_for
+from stages.inverse_rendering.model_selection import given_model
 from stages.inverse_rendering.objective import Terms, calibrated_colours
+from stages.inverse_rendering.paper.config import PaperConfig
 from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.ray_sampling import WHOLE, Batch, PhotoView, PixelTable
+from stages.inverse_rendering.training_loop import TrainingLoop
 
 HALVED_EVERY, HALVED_UNTIL = 0.125, 0.75  # shares of the run: every 375 of 3,000 epochs, until 75 %
 EMPTY = 0.01  # alpha of background is below
@@ -39,7 +40,7 @@ def rate_factor(share: float) -> float:
     return float(0.5 ** int(min(share, HALVED_UNTIL) / HALVED_EVERY + 1e-9))
 
 
-def paper_terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator) -> Terms:
+def paper_terms(model: FaceModel, batch: Batch, settings: PaperConfig, generator: torch.Generator) -> Terms:
     """All parts of [NeuFace eq. 20] with the paper's samples."""
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(batch.alpha.device)
     got = render_samples(model, batch.rays, settings.samples, jitter)
@@ -72,8 +73,15 @@ def paper_terms(model: FaceModel, batch: Batch, settings: Config, generator: tor
     return out
 
 
-class PaperTrainer(Trainer):
-    """The paper's fit; the loop, the guard and the ray sampling are those of method fast."""
+@dataclass(slots=True)
+class PaperTrainer(TrainingLoop):
+    """The paper's fit; the loop, the guard and the ray sampling are those of every fit."""
+
+    settings: PaperConfig
+
+    def __post_init__(self) -> None:
+        TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
+        self.choices = given_model(self.settings, calibrated=self.model.spec.calibrated)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Adam with its default betas."""
@@ -84,7 +92,7 @@ class PaperTrainer(Trainer):
         if self.table is None:
             self.table = PixelTable(self.views, self.settings.image_side, self.device)
 
-    def set_rates(self) -> float:
+    def prepare(self) -> float:
         """Set the scheduled rates; beta is learnt, and copied to the model for its readers."""
         factor = rate_factor(self.share())
         for group in self.optimiser.param_groups:
@@ -96,19 +104,9 @@ class PaperTrainer(Trainer):
         """The paper's terms."""
         return paper_terms(self.model, batch, self.settings, generator)
 
-    def geometry_is_finite(self) -> bool:
-        """Always true: the optimiser has all geometry parameters."""
-        return True
-
     def move(self, rate: float) -> None:
         """Update the parameters."""
         self.optimiser.step()
-
-    def tend(self) -> None:
-        """Nothing to do."""
-
-    def forget(self) -> None:
-        """Nothing to do: the optimiser has all gradients."""
 
     def finish(self) -> None:
         """Copy the final beta to the model."""
@@ -124,7 +122,7 @@ class PaperTrainer(Trainer):
         self.optimiser.load_state_dict(state["optimiser"])
 
 
-def paper_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
+def paper_optimiser(model: FaceModel, settings: PaperConfig) -> torch.optim.Optimizer:
     """Adam; the prior's networks have a reduced rate, its codes and everything else the full rate."""
     prior = geometry_of(model).known
     codes = {id(p) for n, p in model.named_parameters() if n.startswith("geometry.prior.z_")}
@@ -144,24 +142,24 @@ def paper_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer
 def new_paper_trainer(
     views: list[PhotoView],
     start: Start,
-    settings: Config,
+    settings: PaperConfig,
     calibrated: bool,
     device: str,
 ) -> PaperTrainer:
     """A new trainer of method paper. Raises StageError if prior is imface and its checkpoint can't be read."""
     torch.manual_seed(settings.seed)
-    spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced")
+    spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced", prior=settings.prior)
     prior = prior_for(spec, start, settings)
     model = FaceModel(spec, build.displaced(spec, prior))
     model.to(device)
     return PaperTrainer(views, settings, device, model)
 
 
-def prior_for(spec: FaceSpec, start: Start, settings: Config) -> nn.Module:
+def prior_for(spec: FaceSpec, start: Start, settings: PaperConfig) -> nn.Module:
     """The geometry prior of the settings."""
     if settings.prior == "sphere":
         return build.sphere_prior(spec)
-    if settings.prior != "imface":  # the hull, whether the head template has cut it or not
+    if settings.prior == "hull":
         return HullPrior(torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     if not settings.prior_file:
         raise StageError(

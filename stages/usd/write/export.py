@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, Surface, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, TextureSet, UvMesh
+from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd.config import Config

@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from pipeline.contract import Context
 from pipeline.fields.face import load_face
-from stages.inverse_rendering.stage import Config, run
+from stages.inverse_rendering.stage import STAGE, Config, run
 from tests.inverse_rendering.test_judge_stage import SETTINGS, inputs
 
 def loaded():
@@ -24,7 +24,8 @@ settings = {**SETTINGS, "stereo": False, "steps": 4, "batch": 64}
 run(inputs(folder), Config(**settings), Context(folder, folder))
 load_face(folder / "field.npz")
 print(len(loaded()), *loaded())
-run(inputs(folder), Config(**{**settings, "shading": "phong"}), Context(folder, folder))
+compared = STAGE.config_for("comparison")
+run(inputs(folder), compared(**{**settings, "preset": "comparison", "shading": "phong"}), Context(folder, folder))
 print(len(loaded()))
 """
 

@@ -15,25 +15,26 @@ from pipeline.fields.face import FaceModel, FittedField, load_model
 from pipeline.fields.paper.sinusoidal import SinusoidalField, positional_encoding
 from pipeline.maths.density import laplace_density, ray_weights
 from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.fit import run_fit
-from stages.inverse_rendering.initial_geometry import sphere_start
-from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.objective import Terms
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.paper import trainer as paper
+from stages.inverse_rendering.paper.comparison import new_compared_trainer, sphere_start
+from stages.inverse_rendering.paper.config import PaperConfig
 from stages.inverse_rendering.paper.render import geometry_of, render_samples
 from stages.inverse_rendering.ray_sampling import Rays
+from stages.inverse_rendering.training_loop import run_fit
 from tests.support.imface_checkpoint import ours, published
 from tests.support.small_ball import RADIUS, SMALL, ball_start, ball_view, hooks
 
-PAPER = Config(preset="paper")
+PAPER = PaperConfig(preset="paper")
+COMPARED = PaperConfig(**{**SMALL.model_dump(), "preset": "comparison"})
 TINY = PAPER.changed(
     image_side=64, steps=6, batch=64, samples=8, width=24, depth=5, basis_width=16, basis_depth=2,
     lr_appearance=2e-3, lr_light=1e-2,
 )  # fmt: skip
 
 
-def trainer(settings: Config = TINY, **changes: Any) -> paper.PaperTrainer:
+def trainer(settings: PaperConfig = TINY, **changes: Any) -> paper.PaperTrainer:
     views = [ball_view(i) for i in range(0, 12, 2)]
     return paper.new_paper_trainer(views, ball_start(0.1), settings.changed(**changes), True, "cpu")
 
@@ -275,7 +276,9 @@ SYSTEMS: dict[str, dict[str, Any]] = {
 def test_every_system_fits_saves_and_loads(name: str, tmp_path: Path) -> None:
     """One code, other settings: each learns the ball, every parameter of it moves, and its file gives it back."""
     views = [ball_view(i) for i in range(0, 12, 2)]
-    t = new_trainer(views, ball_start(), SMALL.changed(steps=40, batch=512, levels=1, **SYSTEMS[name]), True, "cpu")
+    t = new_compared_trainer(
+        views, ball_start(), COMPARED.changed(steps=40, batch=512, levels=1, **SYSTEMS[name]), True, "cpu"
+    )
     t.advance()
     first = t.error
     before = {n: p.detach().clone() for n, p in t.model.named_parameters()}
@@ -299,7 +302,7 @@ def test_every_system_fits_saves_and_loads(name: str, tmp_path: Path) -> None:
 
 
 def model_of(**changes: Any) -> FaceModel:
-    return new_trainer([ball_view(0)], ball_start(), SMALL.changed(**changes), False, "cpu").model
+    return new_compared_trainer([ball_view(0)], ball_start(), COMPARED.changed(**changes), False, "cpu").model
 
 
 def test_disney_splits_energy_by_metal() -> None:
@@ -343,9 +346,39 @@ def test_without_a_prior_the_grid_starts_as_a_sphere() -> None:
     [
         ({"preset": "paper", "refine_geometry": "off"}, "refine_geometry = off"),
         ({"preset": "paper", "seconds": 10.0}, "seconds needs"),
-        ({"appearance": "sinusoidal"}, "needs method paper"),
+        ({"preset": "comparison", "appearance": "sinusoidal"}, "needs method paper"),
+        ({"preset": "comparison", "prior": "sphere", "stereo": True}, "needs prior hull"),
+        ({"preset": "comparison", "prior": "sphere", "resolution": "auto"}, "resolution = auto"),
     ],
 )
 def test_settings_that_only_one_method_knows_are_refused(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Config(**values)
+        PaperConfig(**values)
+
+
+def test_the_comparison_is_our_own_fit_with_other_settings_for_its_parts() -> None:
+    """Without a setting of its own it has the values of the draft; each part that differs from ours is refused by the
+    model selection."""
+    ours, compared = Config(), PaperConfig(preset="comparison")
+    assert {k: v for k, v in compared.model_dump().items() if k in Config.model_fields and k != "preset"} == {
+        k: v for k, v in ours.model_dump().items() if k != "preset"
+    }
+    assert ours.has_open_parts and ours.estimates_light and compared.has_open_parts and compared.estimates_light
+    for part in ({"shading": "phong"}, {"light": "cubemap"}, {"integral": "direct"}, {"method": "paper"}):
+        other = PaperConfig(preset="comparison", **part)
+        assert not other.has_open_parts and not other.estimates_light, part
+    other = PaperConfig(preset="comparison", basis_inputs="paper")
+    assert other.has_open_parts and not other.estimates_light
+    sphere = PaperConfig(preset="comparison", prior="sphere")
+    assert not sphere.stereo and sphere.resolution == "given"
+
+
+def test_the_key_depends_on_the_content_of_the_priors_file(tmp_path: Path) -> None:
+    path = tmp_path / "envs_last.pth"
+    digests = set()
+    for content in (b"a", b"b"):
+        path.write_bytes(content)
+        settings = PaperConfig(prior="imface", prior_file=str(path))
+        digests.add(settings.prior_digest)
+        assert "prior_file" not in settings.model_dump()
+    assert len(digests) == 2 and PaperConfig().prior_digest not in digests

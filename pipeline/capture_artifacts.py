@@ -1,0 +1,113 @@
+"""The artifacts of the capture: the user's files by content, and the imported photos with what is known of them.
+
+They are manifests as in pipeline/artifacts.py.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pipeline.artifacts import Artifact, FileRef, Matrix
+from pipeline.verdict import Finding
+
+CaptureKind = Literal[
+    "facescape", "transforms", "idr", "metashape", "realityscan", "colmap", "photos", "video"
+]  # fmt: skip
+
+
+class CaptureSource(Artifact):
+    """The files in the user's folder, by content; the folder itself is not part of it.
+
+    photos: or the single video file. cameras: files that describe cameras, for the kinds that have them. plates: photos
+    of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the face along +Z, if
+    a file beside the capture contains it. passed_over: names of pictures whose format is not supported.
+    """
+
+    kind: CaptureKind
+    photos: tuple[FileRef, ...]
+    cameras: tuple[FileRef, ...] = ()
+    masks: tuple[FileRef, ...] = ()
+    plates: tuple[FileRef, ...] = ()
+    metres_from_world: Matrix | None = None
+    passed_over: tuple[str, ...] = ()
+
+
+class GivenCamera(Artifact):
+    """A camera that came with the capture, in the capture's own coordinates.
+
+    K: pixels, centre of the first pixel at (0.5, 0.5). cam_from_world: OpenCV axes. distortion: k1 k2 p1 p2 k3.
+    """
+
+    K: Matrix
+    cam_from_world: Matrix
+    distortion: tuple[float, ...]
+
+
+class CaptureView(Artifact):
+    """One photo. `index`: its number for the user; `holdout`: excluded from every fit; `plate`: the same view without
+    the subject.
+
+    place_m: east, north and up in metres, relative to the capture's first photo with a GPS position. clipped: mask
+    (255) of the pixels at the end of the file's range, whose value is only a lower bound. exposure: relative to the
+    median photo of the capture, from EXIF; linear values are proportional to it; 1 if unknown.
+    """
+
+    index: int
+    name: str
+    image: FileRef
+    width: int
+    height: int
+    camera: GivenCamera | None = None
+    mask: FileRef | None = None
+    plate: FileRef | None = None
+    focal_px: float | None = None
+    camera_group: str = ""
+    place_m: tuple[float, float, float] | None = None
+    clipped: FileRef | None = None
+    exposure: float = 1.0
+    holdout: bool = False
+
+
+class ChartFound(Artifact):
+    """The colour checker as seen by one camera, in the photo with the best fit.
+
+    camera_group: as in CaptureView. corners: (4, 2) pixels around the checker, starting at the first patch (dark skin).
+    matrix: 3 x 3, from the photo's original linear colours, divided by its exposure, to reflectance of the checker.
+    way: its degrees of freedom. error: relative root mean square error on patches that were left out. white: linear
+    colour of a perfect white in place of the checker in the photo.
+    """
+
+    camera_group: str
+    photo: str
+    index: int
+    corners: Matrix
+    matrix: Matrix
+    way: Literal["gains", "matrix"]
+    error: float
+    patches: int
+    white: tuple[float, float, float]
+
+
+class ColourChart(Artifact):
+    """The colour checker of a capture, by which all photos were white-balanced. photos: names of those that show it.
+    level: linear value, divided by the photo's exposure, of a perfect white in place of the checker, in the original
+    files."""
+
+    photos: tuple[str, ...]
+    level: float
+    fits: tuple[ChartFound, ...]
+
+
+class Capture(Artifact):
+    """The imported photos, checked. colours_drift: white balance or exposure differ between the photos, so that one
+    colour has several values. metres_from_world: see CaptureSource. chart: None if no colour checker was found, or the
+    search is off."""
+
+    kind: CaptureKind
+    views: tuple[CaptureView, ...]
+    colours_drift: bool = False
+    chart: ColourChart | None = None
+    metres_from_world: Matrix | None = None
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
