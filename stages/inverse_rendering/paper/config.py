@@ -97,8 +97,9 @@ class PaperConfig(Config):
         default=False,
         description="shade every sample of a ray, as the paper does, not only the expected surface point of each ray",
     )
-    prior: Literal["hull", "sphere", "imface"] = Field(  # type: ignore[assignment]
-        default="hull", description="initial geometry [NeuFace section 4.3]"
+    prior: Literal["auto", "hull", "template", "sphere", "imface"] = Field(  # type: ignore[assignment]
+        default="hull",
+        description="initial geometry [NeuFace section 4.3]; auto, hull, template: as in our fit",
     )
     prior_file: str = Field(
         default="", description="path of an ImFace checkpoint, for prior imface (docs/imface.md)", exclude=True
@@ -127,7 +128,7 @@ class PaperConfig(Config):
             from pipeline.fields.paper.imface_layout import digest
 
             given["prior_digest"] = digest(str(given["prior_file"]))
-        if given.get("prior", "hull") != "hull":
+        if given.get("prior") in ("sphere", "imface"):
             given.setdefault("stereo", False)
         if given.get("prior") == "sphere":
             given.setdefault("resolution", "given")
@@ -141,7 +142,7 @@ class PaperConfig(Config):
             raise ValueError("seconds needs method fast; the schedule of method paper counts epochs")
         if self.method == "fast" and self.appearance != "hash":
             raise ValueError("appearance = sinusoidal needs method paper; method fast optimises a hash table")
-        if self.stereo and self.prior != "hull":
+        if self.stereo and self.prior in ("sphere", "imface"):
             raise ValueError("stereo = true needs prior hull, which is what stereo refines")
         if self.resolution == "auto" and self.prior == "sphere":
             raise ValueError("resolution = auto needs another prior: on a sphere the pixels' size is not the subject's")

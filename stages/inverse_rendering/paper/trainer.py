@@ -148,18 +148,25 @@ def new_paper_trainer(
 ) -> PaperTrainer:
     """A new trainer of method paper. Raises StageError if prior is imface and its checkpoint can't be read."""
     torch.manual_seed(settings.seed)
-    spec = replace(spec_for(views, start, settings, calibrated, device), geometry="displaced", prior=settings.prior)
+    spec = replace(
+        spec_for(views, start, settings, calibrated, device), geometry="displaced", prior=stored_prior(settings)
+    )
     prior = prior_for(spec, start, settings)
     model = FaceModel(spec, build.displaced(spec, prior))
     model.to(device)
     return PaperTrainer(views, settings, device, model)
 
 
+def stored_prior(settings: PaperConfig) -> str:
+    """Kind of the prior in the model's file. The hull is one whether the head template has cut it or not."""
+    return settings.prior if settings.prior in ("sphere", "imface") else "hull"
+
+
 def prior_for(spec: FaceSpec, start: Start, settings: PaperConfig) -> nn.Module:
     """The geometry prior of the settings."""
     if settings.prior == "sphere":
         return build.sphere_prior(spec)
-    if settings.prior == "hull":
+    if stored_prior(settings) == "hull":
         return HullPrior(torch.from_numpy(start.values), torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     if not settings.prior_file:
         raise StageError(

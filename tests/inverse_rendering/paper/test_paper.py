@@ -359,7 +359,7 @@ def test_settings_that_only_one_method_knows_are_refused(values: dict[str, Any],
 def test_the_comparison_is_our_own_fit_with_other_settings_for_its_parts() -> None:
     """Without a setting of its own it has the values of the draft; each part that differs from ours is refused by the
     model selection."""
-    ours, compared = Config(), PaperConfig(preset="comparison")
+    ours, compared = Config(prior="hull"), PaperConfig(preset="comparison")
     assert {k: v for k, v in compared.model_dump().items() if k in Config.model_fields and k != "preset"} == {
         k: v for k, v in ours.model_dump().items() if k != "preset"
     }
