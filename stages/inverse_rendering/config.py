@@ -51,8 +51,10 @@ class Config(StageConfig):
     levels: int = Field(
         default=2, ge=1, le=4, description="number of grid resolutions, coarse to fine; each halves the cell size"
     )
-    stereo: bool = Field(
-        default=True, description="refine the visual hull by plane-sweep stereo before the fit (prior hull)"
+    stereo: Literal["auto", "sweep", "dense", "off"] = Field(
+        default=AUTO,
+        description="stereo before the fit (prior hull); sweep: plane sweep along the hull's normals; dense: a depth "
+        "map for each photo; auto: the one that shows validation views better; off: the visual hull as it is",
     )
     # model
     rank: Annotated[int, Field(ge=1, le=8)] | Literal["auto"] = Field(
@@ -200,6 +202,11 @@ class Config(StageConfig):
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)
 
+    @field_validator("stereo", mode="before")
+    @classmethod
+    def _stereo(cls, value: Any) -> Any:
+        return {"true": AUTO, "false": "off"}.get(str(value).lower(), value)
+
     @model_validator(mode="after")
     def _possible(self) -> Config:
         if self.refine_geometry == "off" and self.method != "fast":
@@ -261,7 +268,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Tested in short runs only: on a CPU it would take weeks.
     "paper": {
         "method": "paper",
-        "stereo": False,
+        "stereo": "off",
         "rank": 3,
         "light_order": 10,
         "specular": "on",

@@ -33,7 +33,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
-    from stages.inverse_rendering.stereo import start_from_photos
+    from stages.inverse_rendering.start_choice import Facts, stereo_start
     from stages.inverse_rendering.systems import trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
 
@@ -66,9 +66,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         if settings.grid_cells < cells and settings.prior != "sphere":
             start = hull_start(cameras, masks.alphas, radius, settings.grid_cells, settings.levels, extent)
     prior = start
-    if settings.stereo and settings.prior == "hull":
+    stereo: Facts = {"start": "visual hull", "why": "setting"}
+    if settings.stereo != "off" and settings.prior == "hull":
         context.progress(0, settings.steps, "stereo")
-        start = start_from_photos(start, views, context.device, context.check)
+        start, stereo = stereo_start(start, views, settings.stereo, context.device, context.check)
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
     trainer = trainer_for(views, start, settings, own_colours, context.device, prior)
     if settings.by_clock:
@@ -81,7 +82,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     held_out = predict_held_out(
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
-    facts = model_facts(trainer, looked)
+    facts = {**model_facts(trainer, looked), **({"stereo": stereo} if settings.prior == "hull" else {})}
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
     fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts, settings.prior)
@@ -112,4 +113,4 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
 
-STAGE = Stage(name="inverse_rendering", version=9, inputs=Inputs, config=Config, output=FittedFace, run=run)
+STAGE = Stage(name="inverse_rendering", version=10, inputs=Inputs, config=Config, output=FittedFace, run=run)
