@@ -13,6 +13,7 @@ from scipy import ndimage
 from pipeline import transforms
 from stages.inverse_rendering import dense_stereo as dense
 from stages.inverse_rendering import stereo_kernels as kernels
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.depth_fusion import closed, fused
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
@@ -128,6 +129,7 @@ def test_a_bowl_is_found_that_no_silhouette_shows() -> None:
     assert along_axis(found) == pytest.approx(bottom, abs=0.5 * found.cell)
 
 
+@pytest.mark.slow
 def test_blank_photos_leave_the_hull() -> None:
     found = fused(hull(), maps_of(blank=True))
     assert np.array_equal(found.values, hull().values)
@@ -295,3 +297,15 @@ def test_blank_photos_keep_the_sweep() -> None:
 def test_few_views_give_no_choice() -> None:
     _, facts = stereo_start(hull(), photos()[:3], "auto", "cpu")
     assert facts == {"start": "sweep", "why": "fewer than 8 views"}
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"), [(True, "auto"), ("false", "off"), (False, "off"), ("dense", "dense"), ("sweep", "sweep")]
+)
+def test_the_setting_reads_its_old_values(given: object, meant: str) -> None:
+    assert Config.model_validate({"stereo": given}).stereo == meant
+
+
+def test_an_unknown_kind_of_stereo_is_refused() -> None:
+    with pytest.raises(ValueError, match="stereo"):
+        Config.model_validate({"stereo": "psychic"})
