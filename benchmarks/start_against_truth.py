@@ -21,10 +21,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.artifacts import Located
 from pipeline.store import Store
-from stages.inverse_rendering.dense_stereo import depth_maps
-from stages.inverse_rendering.depth_fusion import fused
 from stages.inverse_rendering.initial_geometry import Start, hull_start
 from stages.inverse_rendering.load_views import read_views
+from stages.inverse_rendering.start_choice import stereo_start
 from stages.inverse_rendering.stereo import start_from_photos, surface_points
 from stages.registry import REGISTRY
 
@@ -83,7 +82,7 @@ def main() -> None:
     moved = start_from_photos(hull, views, "cpu")
     print("sweep       ", told(moved, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
     begun = time.perf_counter()
-    dense = fused(hull, depth_maps(hull, views))
+    dense, _ = stereo_start(hull, views, "dense", "cpu")
     print("depth maps  ", told(dense, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
 
 

@@ -31,7 +31,7 @@ from stages.inverse_rendering.dense_stereo import (
 from stages.inverse_rendering.depth_fusion import fused
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.stereo import start_from_photos
+from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -58,16 +58,22 @@ def stereo_start(
     if kind == "sweep" or (kind == "auto" and len(views) < MIN_VIEWS):
         why = "setting" if kind == "sweep" else f"fewer than {MIN_VIEWS} views"
         return start_from_photos(hull, views, device, check), {"start": "sweep", "why": why}
+
+    def dense_start(maps: DepthMaps, seen: list[PhotoView]) -> Start:
+        """The fused surface; the short sweeps along its normals, which are right by now, add what fusion smoothed."""
+        return start_from_photos(fused(hull, maps, check), seen, device, check, SWEEPS[1:])
+
     if kind == "dense":
-        return fused(hull, depth_maps(hull, views, check), check), {"start": "dense", "why": "setting"}
+        return dense_start(depth_maps(hull, views, check), views), {"start": "dense", "why": "setting"}
     waiting = validation_views(len(views))
     maps = depth_maps(hull, views, check, waiting)
-    swept, dense = start_from_photos(hull, views, device, check), fused(hull, without(maps, waiting), check)
+    swept = start_from_photos(hull, views, device, check)
+    dense = dense_start(without(maps, waiting), [v for n, v in enumerate(views) if n not in waiting])
     known = pictures_of(views, None, SIDE)
     neighbours = neighbours_of(hull, views, waiting)
     poses = np.stack([v.world_from_cam for v in views])
     scores = [correlation(s, known, poses, waiting, neighbours, check) for s in (swept, dense)]
-    start, name = (fused(hull, maps, check), "dense") if scores[1] > scores[0] + GAIN else (swept, "sweep")
+    start, name = (dense_start(maps, views), "dense") if scores[1] > scores[0] + GAIN else (swept, "sweep")
     facts: Facts = {"start": name, "sweep_correlation": round(scores[0], 4), "dense_correlation": round(scores[1], 4)}
     log.info("start from stereo: %s", facts)
     return start, {**facts, "why": "correlation of the photos on validation views"}

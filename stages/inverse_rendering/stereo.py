@@ -84,15 +84,19 @@ class Photos:
 
 
 def start_from_photos(
-    hull: Start, views: list[PhotoView], device: str, check: Callable[[], None] = lambda: None
+    hull: Start,
+    views: list[PhotoView],
+    device: str,
+    check: Callable[[], None] = lambda: None,
+    sweeps: tuple[Sweep, ...] | None = None,
 ) -> Start:
     """The hull's SDF moved to where the photos agree; unchanged where they do not determine depth, as on smooth skin.
 
-    check: called about every second; it raises if the run was cancelled.
+    check: called about every second; it raises if the run was cancelled. sweeps: all of SWEEPS if None.
     """
     photos = photos_of(views, device)
     values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
-    for sweep in SWEEPS:
+    for sweep in SWEEPS if sweeps is None else sweeps:
         check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
