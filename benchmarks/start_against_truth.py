@@ -1,4 +1,4 @@
-"""How far the fit's start lies from the truth: the visual hull, and the hull moved to where the photos agree.
+"""How far the fit's start lies from the truth: the visual hull, the hull moved by the sweep, and fused depth maps.
 
     python benchmarks/start_against_truth.py RUN_DIR TRUTH_MESH [--side 512] [--cells 288]
 
@@ -23,6 +23,7 @@ from pipeline.artifacts import Located
 from pipeline.store import Store
 from stages.inverse_rendering.initial_geometry import Start, hull_start
 from stages.inverse_rendering.load_views import read_views
+from stages.inverse_rendering.start_choice import stereo_start
 from stages.inverse_rendering.stereo import start_from_photos, surface_points
 from stages.registry import REGISTRY
 
@@ -62,7 +63,7 @@ def told(start: Start, to_world: F64, truth: trimesh.Trimesh) -> str:
 
 
 def main() -> None:
-    """Build the start twice and measure it."""
+    """Build the starts and measure them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("truth", type=Path)
@@ -79,7 +80,10 @@ def main() -> None:
     print("hull        ", told(hull, to_world, truth))
     begun = time.perf_counter()
     moved = start_from_photos(hull, views, "cpu")
-    print("from photos ", told(moved, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
+    print("sweep       ", told(moved, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
+    begun = time.perf_counter()
+    dense, _ = stereo_start(hull, views, "dense", "cpu")
+    print("depth maps  ", told(dense, to_world, truth), f"({time.perf_counter() - begun:.0f} s)")
 
 
 if __name__ == "__main__":

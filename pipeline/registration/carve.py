@@ -116,17 +116,6 @@ def _allowance(template: Template, head: PlacedHead, centres: F64) -> F64:
     return np.asarray(np.minimum(base, _smoothed(base, template)), np.float64)
 
 
-def on_face(template: Template, head: PlacedHead, points: F64, within: float) -> Mask:
-    """(N,) points (N, 3) of the world at most `within` metres from the template's face: its skin without scalp, ears
-    and neck."""
-    names = [name for name in template.regions if name not in FACED]
-    rows = np.intersect1d(
-        template.quads[np.concatenate([template.regions[n] for n in names])], template.part_vertices(SKIN)
-    )
-    distance, _ = cKDTree(head.vertices[rows]).query(points)
-    return np.asarray(distance <= within * head.scale, np.bool_)
-
-
 def _near_hair(template: Template) -> F64:
     """(V,) 1 at the scalp and the ears, 0 from HAIR metres on: hair may hang over the jaw's side."""
     names = [name for name in ("scalp", "ears") if name in template.regions]

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.meshes import F64, Mask
+from pipeline.meshes import F64
+from pipeline.registration.carve import placed_on_face
+from pipeline.registration.identity_fit import PlacedHead
+from pipeline.template.load import load_template
 from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-
-FACE = 0.008  # metres from the placed template within which long sweeps do not move the start: on smooth skin they
-# find depths at random
+from stages.inverse_rendering.start_choice import Facts, stereo_start
+from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
+from stages.inverse_rendering.template_start import FAR, carved_by_template, landmarks_off
 
 NAMES = {
     "hull": "visual hull",
@@ -26,11 +29,12 @@ NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class ChosenStart:
-    """start: after stereo; prior: before it, with which refined geometry is compared. facts: for the report."""
+    """start: after stereo; prior: before it, with which refined geometry is compared. facts: for the report, of the
+    geometry and of stereo."""
 
     start: Start
     prior: Start
-    facts: dict[str, str | float | bool]
+    facts: dict[str, Facts]
 
 
 def choose_start(
@@ -48,53 +52,53 @@ def choose_start(
     Raises:
         StageError: `prior` is template, and the photos show no face that the template fits.
     """
-    from stages.inverse_rendering.stereo import start_from_photos
-
-    def refined(start: Start, known: Callable[[F64], Mask] | None = None) -> Start:
-        return start_from_photos(start, views, device, check, known) if settings.stereo else start
-
     if settings.prior not in (AUTO, "hull", "template"):  # a preset of the paper's
-        return ChosenStart(hull, hull, {"prior": NAMES[settings.prior], "why": "setting"})
-    if settings.prior == "hull" or (settings.prior == AUTO and landmarks is None):
-        why = "setting" if settings.prior == "hull" else "the photos agree on no face"
-        return ChosenStart(refined(hull), hull, {"prior": NAMES["hull"], "why": why})
-    return _with_face(hull, views, landmarks, settings, refined)
-
-
-def _with_face(
-    hull: Start,
-    views: list[PhotoView],
-    landmarks: F64 | None,
-    settings: Config,
-    refined: Callable[..., Start],
-) -> ChosenStart:
-    from pipeline.registration.carve import on_face, placed_on_face
-    from pipeline.template.load import load_template
-    from stages.inverse_rendering import template_start as template
-
-    forced, model = settings.prior == "template", load_template()
-    head = placed_on_face(model, landmarks) if landmarks is not None else None
+        return ChosenStart(hull, hull, _facts(settings.prior, "setting"))
+    head = _placed(landmarks) if settings.prior != "hull" else None
     if head is None or landmarks is None:
-        if forced:
+        if settings.prior == "template":
             raise _no_face(landmarks is not None)
-        return ChosenStart(refined(hull), hull, {"prior": NAMES["hull"], "why": "the face landmarks fit no template"})
-    facts: dict[str, str | float | bool] = {
+        why = (
+            "setting" if settings.prior == "hull"
+            else "the photos agree on no face" if landmarks is None
+            else "the face landmarks fit no head"
+        )  # fmt: skip
+        start, stereo = _after_stereo(hull, views, settings, device, check)
+        return ChosenStart(start, hull, _facts("hull", why, stereo=stereo))
+    known: Facts = {
         "template_residual_mm": round(1e3 * float(np.median(head.residual)), 3),
         "template_scale": round(head.scale, 4),
     }
-    if not forced:
-        start = refined(hull)
-        off = template.landmarks_off(start, landmarks, head.scale)
-        facts["landmarks_off_hull_mm"] = round(1e3 * off, 3)
-        if off <= template.FAR:
+    if settings.prior == AUTO:
+        start, stereo = _after_stereo(hull, views, settings, device, check)
+        off = landmarks_off(start, landmarks, head.scale)
+        known["landmarks_off_hull_mm"] = round(1e3 * off, 3)
+        if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
-            return ChosenStart(start, hull, {"prior": NAMES["hull"], "why": why, **facts})
-    centres = np.stack([v.world_from_cam[:3, 3] for v in views])
-    cut = template.carved_by_template(hull, model, head, centres)
-    start = refined(cut, lambda points: on_face(model, head, points, FACE))
-    facts["landmarks_off_mm"] = round(1e3 * template.landmarks_off(start, landmarks, head.scale), 3)
-    why = "setting" if forced else "the hull's surface does not have the face"
-    return ChosenStart(start, cut, {"prior": NAMES["template"], "why": why, **facts})
+            return ChosenStart(start, hull, _facts("hull", why, known, stereo))
+    cut = carved_by_template(hull, load_template(), head, np.stack([v.world_from_cam[:3, 3] for v in views]))
+    # on smooth skin, longer sweeps find depths at random, and eat hair away
+    start = start_from_photos(cut, views, device, check, SWEEPS[-1:]) if settings.stereo != "off" else cut
+    known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)
+    why = "setting" if settings.prior == "template" else "the hull's surface does not have the face"
+    return ChosenStart(start, cut, _facts("template", why, known, {"start": "short sweep", "why": "head template"}))
+
+
+def _placed(landmarks: F64 | None) -> PlacedHead | None:
+    return None if landmarks is None else placed_on_face(load_template(), landmarks)
+
+
+def _after_stereo(
+    hull: Start, views: list[PhotoView], settings: Config, device: str, check: Callable[[], None]
+) -> tuple[Start, Facts]:
+    if settings.stereo == "off":
+        return hull, {"start": "visual hull", "why": "setting"}
+    return stereo_start(hull, views, settings.stereo, device, check)
+
+
+def _facts(prior: str, why: str, more: Facts | None = None, stereo: Facts | None = None) -> dict[str, Facts]:
+    geometry: Facts = {"prior": NAMES[prior], "why": why, **(more or {})}
+    return {"geometry": geometry} | ({} if stereo is None else {"stereo": stereo})
 
 
 def _no_face(found: bool) -> StageError:

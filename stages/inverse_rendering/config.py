@@ -77,9 +77,10 @@ class Config(StageConfig):
     levels: int = Field(
         default=2, ge=1, le=4, description="number of grid resolutions, coarse to fine; each halves the cell size"
     )
-    stereo: bool = Field(
-        default=True,
-        description="refine the visual hull by plane-sweep stereo before the fit (prior auto, hull or template)",
+    stereo: Literal["auto", "sweep", "dense", "off"] = Field(
+        default=AUTO,
+        description="stereo before the fit (prior auto, hull or template); sweep: plane sweep along the hull's normals; dense: a depth "
+        "map for each photo; auto: the one that shows validation views better; off: the visual hull as it is",
     )
     # model
     rank: Annotated[int, Field(ge=1, le=8)] | Literal["auto"] = Field(
@@ -178,6 +179,11 @@ class Config(StageConfig):
     @classmethod
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)
+
+    @field_validator("stereo", mode="before")
+    @classmethod
+    def _stereo(cls, value: Any) -> Any:
+        return {"true": AUTO, "false": "off"}.get(str(value).lower(), value)
 
     @property
     def estimates_light(self) -> bool:

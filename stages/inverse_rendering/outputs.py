@@ -98,15 +98,16 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
 
 
 def model_facts(
-    trainer: TrainingLoop, looked: Footprint | None, geometry: dict[str, str | float | bool]
+    trainer: TrainingLoop, looked: Footprint | None, start: dict[str, dict[str, str | float | bool]]
 ) -> dict[str, dict[str, str | float | bool]]:
-    """The selected model and the figures of each decision, for the report. geometry: of the initial geometry."""
+    """The selected model and the figures of each decision, for the report. start: those of the initial geometry."""
     settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
     spec = model.spec
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
     return {
         **decided,
-        "geometry": {**geometry, "cell_mm": round(model.geometry.cell * 1e3, 4)},
+        **start,
+        "geometry": {**start["geometry"], "cell_mm": round(model.geometry.cell * 1e3, 4)},
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
         "density": {"kind": spec.density, "why": "setting"},

@@ -88,16 +88,15 @@ def start_from_photos(
     views: list[PhotoView],
     device: str,
     check: Callable[[], None] = lambda: None,
-    known: Callable[[F64], npt.NDArray[np.bool_]] | None = None,
+    sweeps: tuple[Sweep, ...] | None = None,
 ) -> Start:
     """The hull's SDF moved to where the photos agree; unchanged where they do not determine depth, as on smooth skin.
 
-    check: called about every second; it raises if the run was cancelled. known: which points (N, 3) are so close to the
-    true surface already that only the shortest sweep moves them.
+    check: called about every second; it raises if the run was cancelled. sweeps: all of SWEEPS if None.
     """
     photos = photos_of(views, device)
     values, side = hull.values, hull.cell * max(np.ptp(np.argwhere(hull.values < 0), axis=0), default=1)
-    for sweep in SWEEPS:
+    for sweep in SWEEPS if sweeps is None else sweeps:
         check()
         points, normals = surface_points(values, hull.lo, hull.cell)
         order, seen, pixel = best_views(points, normals, Start(values, hull.lo, hull.cell), photos)
@@ -105,8 +104,6 @@ def start_from_photos(
         offsets = np.arange(sweep.outward * side, -inward * side, -sweep.step * pixel)
         scores = sweep_scores(points, normals, offsets, order, seen, pixel, photos, check)
         kept = scores.max(1) > -1
-        if known is not None and sweep is not SWEEPS[-1]:
-            kept &= ~known(points)
         if kept.sum() < sweep.voters:
             break
         points, normals, scores = points[kept], normals[kept], scores[kept]

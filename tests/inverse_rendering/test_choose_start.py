@@ -42,12 +42,15 @@ def head() -> Start:
 
 
 def chosen(hull: Start, landmarks: F64 | None, **changes: Any) -> ChosenStart:
-    return choose_start(hull, CAMERAS, landmarks, Config(stereo=False, **changes), "cpu")
+    return choose_start(hull, CAMERAS, landmarks, Config(stereo="off", **changes), "cpu")
 
 
 def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
     found = chosen(box(), marks())
-    assert found.facts["prior"] == NAMES["template"] and float(found.facts["landmarks_off_hull_mm"]) > 1e3 * FAR
+    assert (
+        found.facts["geometry"]["prior"] == NAMES["template"]
+        and float(found.facts["geometry"]["landmarks_off_hull_mm"]) > 1e3 * FAR
+    )
     assert landmarks_off(found.start, marks(), 1.0) < 0.004
     assert box().values[found.start.values < 0].max() < CELL  # the hull stays the outer limit
     assert found.prior is not box() and np.array_equal(found.prior.values, found.start.values)
@@ -56,21 +59,21 @@ def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
 def test_a_hull_with_the_face_stays() -> None:
     hull = head()
     found = chosen(hull, marks())
-    assert found.start is hull and found.facts["prior"] == NAMES["hull"]
-    assert float(found.facts["landmarks_off_hull_mm"]) < 1e3 * FAR
+    assert found.start is hull and found.facts["geometry"]["prior"] == NAMES["hull"]
+    assert float(found.facts["geometry"]["landmarks_off_hull_mm"]) < 1e3 * FAR
 
 
 def test_without_a_face_the_hull_stays() -> None:
     hull = box()
     for landmarks in (None, np.random.default_rng(0).standard_normal((468, 3))):
         found = chosen(hull, landmarks)
-        assert found.start is hull and found.facts["prior"] == NAMES["hull"]
+        assert found.start is hull and found.facts["geometry"]["prior"] == NAMES["hull"]
 
 
 def test_the_setting_decides() -> None:
     hull = box()
     assert chosen(hull, marks(), prior="hull").start is hull
-    assert chosen(head(), marks(), prior="template").facts["prior"] == NAMES["template"]
+    assert chosen(head(), marks(), prior="template").facts["geometry"]["prior"] == NAMES["template"]
     for landmarks in (None, np.full((468, 3), np.nan)):
         with pytest.raises(StageError, match="template"):
             chosen(hull, landmarks, prior="template")

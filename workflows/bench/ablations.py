@@ -152,7 +152,7 @@ def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
         "albedo_sparsity": 0.0,
         "uniform_albedo_until": 0.0,
         "light_from": "uniform_albedo",
-        "stereo": False,
+        "stereo": "off",
         "levels": 3,
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}

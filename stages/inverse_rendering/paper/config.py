@@ -19,7 +19,7 @@ PAPER_PRESETS: dict[str, dict[str, Any]] = {
     # Tested in short runs only: on a CPU it would take weeks.
     "paper": {
         "method": "paper",
-        "stereo": False,
+        "stereo": "off",
         "rank": 3,
         "light_order": 10,
         "specular": "on",
@@ -129,7 +129,7 @@ class PaperConfig(Config):
 
             given["prior_digest"] = digest(str(given["prior_file"]))
         if given.get("prior") in ("sphere", "imface"):
-            given.setdefault("stereo", False)
+            given.setdefault("stereo", "off")
         if given.get("prior") == "sphere":
             given.setdefault("resolution", "given")
         return given
@@ -142,8 +142,8 @@ class PaperConfig(Config):
             raise ValueError("seconds needs method fast; the schedule of method paper counts epochs")
         if self.method == "fast" and self.appearance != "hash":
             raise ValueError("appearance = sinusoidal needs method paper; method fast optimises a hash table")
-        if self.stereo and self.prior in ("sphere", "imface"):
-            raise ValueError("stereo = true needs prior hull, which is what stereo refines")
+        if self.stereo != "off" and self.prior in ("sphere", "imface"):
+            raise ValueError("stereo needs prior hull, which is what it refines: set stereo=off")
         if self.resolution == "auto" and self.prior == "sphere":
             raise ValueError("resolution = auto needs another prior: on a sphere the pixels' size is not the subject's")
         return self
