@@ -47,10 +47,8 @@ def chosen(hull: Start, landmarks: F64 | None, **changes: Any) -> ChosenStart:
 
 def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
     found = chosen(box(), marks())
-    assert (
-        found.facts["geometry"]["prior"] == NAMES["template"]
-        and float(found.facts["geometry"]["landmarks_off_hull_mm"]) > 1e3 * FAR
-    )
+    facts = found.facts["geometry"]
+    assert facts["prior"] == NAMES["template"] and float(facts["landmarks_off_hull_mm"]) > 1e3 * FAR
     assert landmarks_off(found.start, marks(), 1.0) < 0.004
     assert box().values[found.start.values < 0].max() < CELL  # the hull stays the outer limit
     assert found.prior is not box() and np.array_equal(found.prior.values, found.start.values)

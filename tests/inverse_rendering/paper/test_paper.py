@@ -370,7 +370,7 @@ def test_the_comparison_is_our_own_fit_with_other_settings_for_its_parts() -> No
     other = PaperConfig(preset="comparison", basis_inputs="paper")
     assert other.has_open_parts and not other.estimates_light
     sphere = PaperConfig(preset="comparison", prior="sphere")
-    assert not sphere.stereo and sphere.resolution == "given"
+    assert sphere.stereo == "off" and sphere.resolution == "given"
 
 
 def test_the_key_depends_on_the_content_of_the_priors_file(tmp_path: Path) -> None:
