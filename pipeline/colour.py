@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 T = TypeVar("T")  # numpy.ndarray or torch.Tensor, any shape
 
-LUMA = (0.2126, 0.7152, 0.0722)
+LUMA = (0.2126, 0.7152, 0.0722)  # luminance of linear Rec.709
+LUMA_OF_ENCODED = (0.299, 0.587, 0.114)  # Rec.601 luma of encoded values, as OpenCV's grey: for feature detectors
 Chromaticities = tuple[float, float, float, float, float, float, float, float]  # x, y of red, green, blue, white
 REC709: Chromaticities = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 ACESCG: Chromaticities = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)

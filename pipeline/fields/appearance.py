@@ -15,7 +15,6 @@ from torch.nn import functional
 
 from pipeline.fields.encodings import HashEncoding
 
-SKIN_F0 = 0.03  # reflectance at normal incidence; index of refraction 1.42
 START_RHO = 0.05
 LESSONS, LESSON_RATE = 500, 1e-2
 TYPICAL_INV_KAPPA = 0.1  # kappa = 10, a GGX roughness of 0.44: typical for skin

@@ -14,7 +14,6 @@ from torch import Tensor
 from pipeline.maths.precision import full_precision
 
 SIZE, SAMPLES = 32, 4096
-ALPHA_MIN = 0.02
 
 
 def ggx_kernel(cosine: Tensor, alpha: float) -> Tensor:
@@ -64,10 +63,3 @@ def environment_brdf(f0: Tensor, nv: Tensor, alpha: Tensor) -> Tensor:
     fx, fy = (x - i)[:, None], (y - j)[:, None]
     ab = (1 - fx) * ((1 - fy) * t[i, j] + fy * t[i, j + 1]) + fx * ((1 - fy) * t[i + 1, j] + fy * t[i + 1, j + 1])
     return f0 * ab[:, :1] + ab[:, 1:]
-
-
-@full_precision
-def alpha_from_inv_kappa(inv_kappa: Tensor) -> Tensor:
-    """GGX width of a lobe of 1 / kappa, sqrt(1 / (2 kappa)) for narrow ones, in [ALPHA_MIN, 1)."""
-    s = inv_kappa.clamp(min=1e-8)
-    return ALPHA_MIN + (1 - ALPHA_MIN) * torch.sqrt(s / (2 + s))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from pipeline.maths import microfacet
+from pipeline.maths import ggx_width
 from stages.bake import detail
 from stages.bake.texels import Samples
 
@@ -93,7 +93,7 @@ def statistics_of(s: Samples, size: int) -> Statistics:
         clamped=int((s.clamped > 0).sum()),
         detailed=int((s.support > detail.HALF_WEIGHT).sum()),
         sharp=int((s.inv_kappa < 1 / SHARP_KAPPA).sum()),
-        rough=int(((1 / np.maximum(s.inv_kappa, 1e-6)) < microfacet.KAPPA_RANGE[0]).sum()),
+        rough=int(((1 / np.maximum(s.inv_kappa, 1e-6)) < ggx_width.KAPPA_RANGE[0]).sum()),
     )
 
 

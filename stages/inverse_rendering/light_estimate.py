@@ -22,9 +22,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.fields.appearance import SKIN_F0, TYPICAL_INV_KAPPA
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.maths import sh
-from pipeline.maths.split_sum import alpha_from_inv_kappa, environment_brdf
+from pipeline.maths.ggx_width import gauge_alpha
+from pipeline.maths.microfacet import SKIN_F0
+from pipeline.maths.split_sum import environment_brdf
 from pipeline.maths.vmf import ATTENUATIONS
 from stages.inverse_rendering.observations import Observations, lobe_basis, point_means
 
@@ -51,7 +53,7 @@ class LightEstimate:
 def reflectance(cosine: F64) -> F64:
     """w(n . wo) (N,): specular reflectance of skin under a uniform light, for n . wo (N,) in [0, 1]."""
     c = torch.from_numpy(np.asarray(cosine, np.float64))
-    alpha = alpha_from_inv_kappa(torch.full_like(c, TYPICAL_INV_KAPPA))
+    alpha = gauge_alpha(torch.full_like(c, TYPICAL_INV_KAPPA))
     return np.asarray(
         environment_brdf(torch.full((len(c), 1), SKIN_F0, dtype=c.dtype), c, alpha)[:, 0].numpy(), np.float64
     )

@@ -40,7 +40,9 @@ VIEWS = 6  # number of views, those nearest to a point's normal, that are compar
 MIN_COSINE = 0.25  # between a normal and the direction to a camera
 POINTS = 12_000  # surface points of one sweep
 CERTAIN = 4e-3  # squared confidence, mean over the neighbours, at which a point moves half way: noise reaches 6e-2
-GREY = np.array([0.3, 0.6, 0.1], np.float32)
+# Grey for the correlation of photos only, in which any smooth weights and encoding serve. Not those of
+# pipeline.colour: with them the scanned head loses 0.2 dB of albedo (docs/benchmarks.md).
+GREY, ENCODING = np.array([0.3, 0.6, 0.1], np.float32), np.float32(1 / 2.2)
 LAPLACIAN: F32 = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
 INSIDE, MIN_PIXELS = 0.99, 500  # smallest alpha and number of pixels for the noise estimate
 
@@ -119,7 +121,7 @@ def photos_of(views: list[PhotoView], device: str) -> Photos:
     grey, matrices, sizes, noise = [], [], [], []
     for view in views:
         f = factor_for(view.size, SIDE)
-        image = np.clip(shrink_whole(view.rgb, f) @ GREY, 0, None) ** np.float32(1 / 2.2)
+        image = np.clip(shrink_whole(view.rgb, f) @ GREY, 0, None) ** ENCODING
         K = view.K.copy()
         K[:2] /= f
         noise.append(noise_of(image, shrink_whole(view.alpha, f) > INSIDE))

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.colour import srgb_from_linear
+from pipeline.colour import LUMA_OF_ENCODED, srgb_from_linear
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
@@ -66,7 +66,7 @@ def grey8(image: npt.NDArray[np.generic], max_edge: int) -> U8:
         plane = np.asarray(srgb_from_linear((plane / white).clip(0, 1)) * 255, np.float32)
     elif image.dtype == np.uint16:
         plane = plane / np.float32(257)
-    grey: F32 = plane[..., 0] if plane.shape[2] == 1 else plane @ np.array([0.299, 0.587, 0.114], np.float32)
+    grey: F32 = plane[..., 0] if plane.shape[2] == 1 else plane @ np.array(LUMA_OF_ENCODED, np.float32)
     h, w = grey.shape
     scale = min(1.0, max_edge / max(h, w))
     if scale < 1:

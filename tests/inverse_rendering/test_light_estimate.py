@@ -10,9 +10,10 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from pipeline.fields.appearance import SKIN_F0, TYPICAL_INV_KAPPA
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.maths import sh
-from pipeline.maths.split_sum import alpha_from_inv_kappa
+from pipeline.maths.ggx_width import gauge_alpha
+from pipeline.maths.microfacet import SKIN_F0
 from stages.inverse_rendering import light_estimate as lamp_module
 from stages.inverse_rendering.light_estimate import MIN_EXPLAINED, light_from_lobe, reflectance
 from stages.inverse_rendering.observations import MIN_COSINE, Observations
@@ -130,7 +131,7 @@ def test_black_and_constant_photos_have_no_light() -> None:
 def test_reflectance_is_the_hemisphere_integral_of_a_rough_dielectric() -> None:
     """GGX with height-correlated Smith shadowing and Schlick's Fresnel, integrated over the light's direction by the
     midpoint rule on a fine grid."""
-    alpha = float(alpha_from_inv_kappa(torch.tensor([TYPICAL_INV_KAPPA], dtype=torch.float64))[0])
+    alpha = float(gauge_alpha(torch.tensor([TYPICAL_INV_KAPPA], dtype=torch.float64))[0])
     count = 400
     z = (np.arange(count) + 0.5) / count
     phi = (np.arange(count) + 0.5) / count * 2 * np.pi

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pipeline.maths
-from pipeline.maths import brdf, correlation, cubemap, density, losses, sdf, sh, split_sum, vmf
+from pipeline.maths import brdf, correlation, cubemap, density, ggx_width, losses, sdf, sh, split_sum, vmf
 
 
 def draw(*shape: int, seed: int = 0, low: float = 0.1, high: float = 0.9) -> torch.Tensor:
@@ -85,7 +85,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
         split_sum.environment_brdf,
         (draw(5, 3), draw(5, seed=1, low=0.2, high=0.8), draw(5, seed=2, low=0.2, high=0.8)),
     ),
-    "split_sum.alpha_from_inv_kappa": (split_sum.alpha_from_inv_kappa, (draw(5),)),
+    "ggx_width.gauge_alpha": (ggx_width.gauge_alpha, (draw(5),)),
     "vmf.attenuation_phong": (lambda s: vmf.attenuation_phong(s, 6), (draw(5),)),
     "vmf.attenuation_exponential": (lambda s: vmf.attenuation_exponential(s, 6), (draw(5),)),
     "vmf.attenuation_exact": (lambda s: vmf.attenuation_exact(s, 6), (draw(5),)),
@@ -97,6 +97,7 @@ WITHOUT = {
     "tracing": {"box_interval", "sphere_interval", "sphere_trace", "aggressive_trace"},  # searches, without gradients
     "cubemap": {"texel_directions", "solid_angles", "padded"},
     "split_sum": {"table"},
+    "ggx_width": {"best_fit_alpha"},  # numpy, after the fit
     "precision": {"full_precision", "raise_half"},
     "sh_recurrence": {"recurrence"},
     "sh_compiled": {"tables"},  # float32 alone; held to its twin in test_sh

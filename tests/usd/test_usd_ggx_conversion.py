@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.maths import microfacet
+from pipeline.maths import ggx_width, microfacet
 from stages.usd.write.ggx_conversion import (
     COSINES,
     INV_KAPPA_SCALE,
@@ -27,7 +27,7 @@ def test_table_times_the_layers_reflectance_is_the_basis() -> None:
     for row in (0, 10, 40, ROWS - 1):
         s = (1 - (row + 0.5) / ROWS) / INV_KAPPA_SCALE
         for column in (3, 20, 63):
-            a, b = microfacet.split_albedo((column + 0.5) / 64, microfacet.alpha_from_kappa(1 / s))
+            a, b = microfacet.split_albedo((column + 0.5) / 64, ggx_width.best_fit_alpha(1 / s))
             tint = table[row, column] @ coefficients
             assert tint * (REFERENCE_F0 * a + b) == pytest.approx(basis[column] @ coefficients, rel=1e-4)
 
@@ -42,7 +42,7 @@ def test_groups_hold_every_coefficient_and_nothing_else() -> None:
 
 def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
     """One basis function that is the reflectance of GGX at kappa = 12 and F0 = 0.03; then twice that."""
-    alpha = microfacet.alpha_from_kappa(12.0)
+    alpha = ggx_width.best_fit_alpha(12.0)
     c = (np.arange(512) + 0.5) / 512
     a, b = microfacet.split_albedo(c, alpha)
     basis = (0.03 * a + b)[:, None].astype(np.float32)
@@ -68,7 +68,7 @@ def test_where_there_is_no_lobe_nothing_is_left_over() -> None:
 def test_a_lobe_counts_by_what_it_reflects() -> None:
     """One texel with half of its lobe explained, and a hundred with next to no lobe, whose ratios are huge; each tile
     adds its sums. Against sums of its own, by quadrature in float64."""
-    alpha = microfacet.alpha_from_kappa(12.0)
+    alpha = ggx_width.best_fit_alpha(12.0)
     c = (np.arange(512) + 0.5) / 512
     a, b = microfacet.split_albedo(c, alpha)
     basis = (2 * (0.03 * a + b))[:, None].astype(np.float32)

@@ -8,7 +8,7 @@ from support.render_stand_ins import asset, fine_ball, sphere_points
 from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
-from pipeline.maths.microfacet import KAPPA_RANGE
+from pipeline.maths.ggx_width import KAPPA_RANGE
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.median_cut import Lamps, checked_environment, lamps
 from stages.usd.render.relight import Environment, table_of

@@ -10,7 +10,7 @@ from pipeline.errors import StageError
 from pipeline.fields.parts import Integral, Light, Skin
 from pipeline.fields.protocol import F32
 from pipeline.fields.spec import FaceSpec
-from pipeline.maths import brdf, split_sum
+from pipeline.maths import brdf, ggx_width, split_sum
 
 DIELECTRIC = 0.04  # F0 of non-metals
 
@@ -81,7 +81,7 @@ class DisneyShading(IntegralShading):
 
     def specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor) -> Tensor:
         """L_s (N, 3)."""
-        m, alpha = skin.rho[:, None], split_sum.alpha_from_inv_kappa(skin.inv_kappa)
+        m, alpha = skin.rho[:, None], ggx_width.gauge_alpha(skin.inv_kappa)
         f0 = DIELECTRIC * (1 - m) + skin.albedo * m
         width = alpha if self.spec.light == "cubemap" else skin.inv_kappa
         incident = self.light.reflected(brdf.reflect(wo, n), width, self.spec.attenuation)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.colour import LUMA
 from pipeline.errors import StageError
 from stages.usd.write.light import latlong_directions, latlong_weights
 
@@ -20,7 +21,6 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Piece = tuple[int, int, int, int]  # rows y0..y1 and columns x0..x1
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST = 1024  # columns: a finer picture is first reduced, with the same energy
 HALF_MAX = 65504.0  # largest 16-bit float; suns are often stored with more, or as infinite
 
@@ -61,7 +61,7 @@ def lamps(image: F32, count: int) -> Lamps:
     image = _shrunk(image)
     height, width = image.shape[:2]
     weights = np.broadcast_to(latlong_weights(width, height), (height, width))
-    energy = (image.astype(np.float64) @ LUMINANCE) * weights
+    energy = (image.astype(np.float64) @ np.array(LUMA)) * weights
     total = max(float(energy.sum()), 1e-30)
     measure = 0.5 * energy / total + 0.5 * weights / (4 * np.pi)
     sums = np.zeros((height + 1, width + 1))

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.maths.microfacet import KAPPA_RANGE
+from pipeline.maths.ggx_width import KAPPA_RANGE
 from stages.usd.render import kernels
 from stages.usd.render.median_cut import Lamps, checked_environment, lamps
 from stages.usd.render.render import Points, Renderer

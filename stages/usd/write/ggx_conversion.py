@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.maths import microfacet
+from pipeline.maths import ggx_width, microfacet
 from stages.usd.render.render import lookup
 
 F32 = npt.NDArray[np.float32]
@@ -78,7 +78,7 @@ def basis_table(basis: F32) -> F32:
     width = len(basis)
     c = (np.arange(width) + 0.5) / width
     s = (1 - (np.arange(ROWS) + 0.5) / ROWS) / INV_KAPPA_SCALE
-    alpha = microfacet.alpha_from_kappa(1 / s)
+    alpha = ggx_width.best_fit_alpha(1 / s)
     a, b = microfacet.split_albedo(c[None], alpha[:, None])
     reflected = REFERENCE_F0 * a + b
     return np.asarray(basis[None].astype(np.float64) / reflected[..., None], np.float32)
@@ -99,13 +99,13 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
     weights = COSINES / COSINES.sum()
     at = lookup(basis, COSINES).T.astype(np.float64)  # (k, 16)
     rows, columns = np.nonzero(covered)
-    sharpest, roughest = (float(microfacet.alpha_from_kappa(k)) for k in microfacet.KAPPA_RANGE[::-1])
+    sharpest, roughest = (float(ggx_width.best_fit_alpha(k)) for k in ggx_width.KAPPA_RANGE[::-1])
     table_alpha = np.linspace(sharpest, roughest, 24)
     a, b = microfacet.split_albedo(COSINES[None], table_alpha[:, None])
     for some in np.array_split(np.arange(len(rows)), max(1, len(rows) // 200_000)):
         y, x = rows[some], columns[some]
         fitted = coefficients[y, x].astype(np.float64) @ at
-        alpha = microfacet.alpha_from_kappa(1 / np.maximum(inv_kappa[y, x].astype(np.float64), 1e-9))
+        alpha = ggx_width.best_fit_alpha(1 / np.maximum(inv_kappa[y, x].astype(np.float64), 1e-9))
         ggx = f0[y, x, None].astype(np.float64) * _rows_at(a, table_alpha, alpha) + _rows_at(b, table_alpha, alpha)
         error = ((fitted - ggx) ** 2 * weights).sum(1)
         scale = (fitted**2 * weights).sum(1)

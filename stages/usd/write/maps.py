@@ -16,7 +16,7 @@ from pipeline.artifacts import Located, TextureSet
 from pipeline.colour import ACESCG, acescg_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
-from pipeline.maths import sh
+from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
 from stages.usd.render.exported import numbered
@@ -33,7 +33,6 @@ F64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
-SKIN_F0 = 0.028  # used if no F0 was baked
 RAYS = 4_000_000  # about the number of rays for the lamps' visibility
 LAMPS = (96, 384)
 LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
@@ -234,7 +233,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
         str(found("albedo", "png")),
         found("roughness", "png"),
         found("normal", "png"),
-        round(ior_from_f0(f0 / texels if has_f0 else SKIN_F0), 5),
+        round(ior_from_f0(f0 / texels if has_f0 else microfacet.SKIN_F0), 5),
         (red, green, blue),
         specular=found("specular_color", "png"),
         f0=found("f0", "exr"),
