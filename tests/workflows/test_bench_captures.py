@@ -19,7 +19,7 @@ from stages.capture.scan import scan_capture
 from workflows.bench import captures as bench
 from workflows.bench import captures_child as child
 from workflows.bench.captures_against import compare
-from workflows.bench.captures_find import HELD_OUT, NO_ALL_ON, NO_PHOTOS, find, root_of
+from workflows.bench.captures_find import DEFAULT_ROOT, HELD_OUT, NO_ALL_ON, NO_PHOTOS, find, root_of
 from workflows.bench.captures_table import FIGURES, markdown
 from workflows.cli.console import Console
 from workflows.cli.main import parser
@@ -323,3 +323,11 @@ def test_against_is_printed_at_the_end(root: Path, capsys: pytest.CaptureFixture
     assert "1 captures compared" in summary_line and "bad_3" not in summary_line
     with pytest.raises(UsageError, match="table can't be read"):
         run(root, "--against", str(root.parent / "nothing.json"))
+
+
+def test_the_folders_beside_the_project_are_where_the_project_is() -> None:
+    """They are counted from the modules' own places, which move."""
+    root = Path(__file__).resolve().parents[2]
+    assert bench.PROJECT == root and bench.TABLE.is_file()
+    assert DEFAULT_ROOT == root.parent / "shared" / "captures"
+    assert child._environment()["PYTHONPATH"].split(os.pathsep)[0] == str(root)

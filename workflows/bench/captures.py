@@ -29,7 +29,7 @@ from workflows.bench.captures_find import Found
 from workflows.bench.captures_table import FIGURES, markdown, shown
 from workflows.cli.console import Console
 
-PROJECT = Path(__file__).resolve().parents[1]
+PROJECT = Path(__file__).resolve().parents[2]
 TABLE = PROJECT / "docs" / "benchmarks" / "captures.json"
 FORMAT = 1
 LIMIT = 40.0  # minutes: a draft takes three to ten on two cores

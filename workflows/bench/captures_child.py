@@ -81,7 +81,7 @@ def _signal(group: int, number: int) -> None:
 
 
 def _environment() -> dict[str, str]:
-    here = str(Path(__file__).resolve().parents[1])
+    here = str(Path(__file__).resolve().parents[2])
     paths = os.pathsep.join(p for p in (here, os.environ.get("PYTHONPATH", "")) if p)
     return {**os.environ, "PYTHONPATH": paths}
 
