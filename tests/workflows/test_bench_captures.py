@@ -328,6 +328,6 @@ def test_against_is_printed_at_the_end(root: Path, capsys: pytest.CaptureFixture
 def test_the_folders_beside_the_project_are_where_the_project_is() -> None:
     """They are counted from the modules' own places, which move."""
     root = Path(__file__).resolve().parents[2]
-    assert bench.PROJECT == root and bench.TABLE.is_file()
-    assert DEFAULT_ROOT == root.parent / "shared" / "captures"
+    assert root == bench.PROJECT and bench.TABLE.is_file()
+    assert root.parent / "shared" / "captures" == DEFAULT_ROOT
     assert child._environment()["PYTHONPATH"].split(os.pathsep)[0] == str(root)
