@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.meshes import F64, Indices, Mask, Mesh, unit
+from pipeline.meshes import F64, Indices, Mesh, unit
 from pipeline.ray_casting import RayCaster
 
 COMPATIBLE = 0.5  # least cosine between the normals: 60 degrees
@@ -53,6 +53,11 @@ class Scan:
         plane = np.abs(((points - where) * there).sum(1))
         return Pairs(where, there, np.where(found, plane, np.inf), weight)
 
+    def nearest(self, points: F64) -> tuple[F64, F64]:
+        """(N, 3) nearest vertex of the surface to points (N, 3), and (N,) its distance."""
+        away, row = self._tree.query(points)
+        return self.mesh.vertices[row].astype(np.float64), np.asarray(away)
+
     def along(self, points: F64, normals: F64, reach: float) -> tuple[F64, F64]:
         """(N,) signed distance from points (N, 3) along unit normals (N, 3) to the surface, NaN where it is further
         than reach or faces otherwise; (N,) how well the place is seen, 0 to 1."""
@@ -72,8 +77,3 @@ class Scan:
     def _face_normals(self, faces: Indices) -> F64:
         corners = self.mesh.vertices[self.mesh.faces[faces]].astype(np.float64)
         return unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-
-    @property
-    def visible(self) -> Mask:
-        """(V,) vertices that a photo sees."""
-        return np.asarray(self.seen > 0)
