@@ -33,9 +33,8 @@ class RayCaster:
         """(N,) distance and (N,) face of the first hit from each origin (N, 3) along its unit direction (N, 3);
         infinite and -1 for none."""
         found = self._run(origins, directions, output=True)
-        face = np.asarray(found["primID"]).astype(np.int64)
-        far = np.where(face >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
-        return far, np.where(face >= 0, face, -1)
+        far = np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
+        return far, np.where(np.isfinite(far), found["primID"].astype(np.int64), -1)
 
     def distances(self, origins: F64, directions: F64) -> F64:
         """(N,) distance to the mesh from each origin (N, 3) along its unit direction (N, 3), infinite for no hit."""

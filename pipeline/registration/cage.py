@@ -20,7 +20,14 @@ from pipeline.registration.subdivision import edges_of, limit, subdivided
 from pipeline.template.model import SKIN, Template
 
 HIDDEN = ("mouth_inside", "sockets", "nostrils")  # regions that no surface of the photos shows as they are
-STIFFER: Mapping[str, float] = {"lids": 3.0, "lips": 3.0, "nostrils": 6.0, "ears": 2.0, "mouth_inside": 4.0, "sockets": 4.0}
+STIFFER: Mapping[str, float] = {
+    "lids": 3.0,
+    "lips": 3.0,
+    "nostrils": 6.0,
+    "ears": 2.0,
+    "mouth_inside": 4.0,
+    "sockets": 4.0,
+}
 LOOSE = ("scalp", "neck")  # hair and clothes stand out of these: only a surface that is near counts there
 DIAGONAL = 0.5  # stiffness of a quad's diagonals over that of its sides: against shear
 
@@ -29,9 +36,9 @@ DIAGONAL = 0.5  # stiffness of a quad's diagonals over that of its sides: agains
 class Cage:
     """of_template (V,): the skin's vertices in the template; quads (Q, 4) into V; region (Q,) into names.
 
-    finer (16 Q, 4): the second subdivision; at_finer (n, V): its limit points. stencil (M, V): limit points of the first; along, across (M, V): of their tangents.
-    shown (M,): points that a surface can show; loose (M,): those on scalp and neck. difference (E, V): end minus start
-    of every edge and diagonal; stiffness (E,)."""
+    finer (16 Q, 4): the second subdivision; at_finer (n, V): its limit points. stencil (M, V): limit points of the
+    first; along, across (M, V): of their tangents. shown (M,): points that a surface can show; loose (M,): those on
+    scalp and neck. difference (E, V): end minus start of every edge and diagonal; stiffness (E,)."""
 
     of_template: Indices
     quads: Indices

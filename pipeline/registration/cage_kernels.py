@@ -27,14 +27,30 @@ def rows_of(matrix: csr_array) -> Rows:
 
 
 def solved(
-    alike: csr_array, stencil: csr_array, normals: F64, weights: F64, right: F64, start: F64, tolerance: float, most: int
+    alike: csr_array,
+    stencil: csr_array,
+    normals: F64,
+    weights: F64,
+    right: F64,
+    start: F64,
+    tolerance: float,
+    most: int,
 ) -> tuple[F64, int]:
     """x (V, 3) from start (V, 3), and the number of steps. tolerance: of the residual's length over that at the start;
     most: steps."""
     transposed = csr_array(stencil.T)
     blocks = _inverse_blocks(*rows_of(alike), *rows_of(transposed), normals, weights)
     x, steps = _conjugate_gradients(
-        *rows_of(alike), *rows_of(stencil), *rows_of(transposed), normals, weights, blocks, right, start, tolerance, most
+        *rows_of(alike),
+        *rows_of(stencil),
+        *rows_of(transposed),
+        normals,
+        weights,
+        blocks,
+        right,
+        start,
+        tolerance,
+        most,
     )
     return np.asarray(x), int(steps)
 
@@ -111,7 +127,9 @@ def _conjugate_gradients(  # type: ignore[no-untyped-def]
         for i in range(count):
             for a in range(3):
                 z[i, a] = (
-                    blocks[i, a, 0] * residual[i, 0] + blocks[i, a, 1] * residual[i, 1] + blocks[i, a, 2] * residual[i, 2]
+                    blocks[i, a, 0] * residual[i, 0]
+                    + blocks[i, a, 1] * residual[i, 1]
+                    + blocks[i, a, 2] * residual[i, 2]
                 )
                 now += z[i, a] * residual[i, a]
         ratio = now / before if steps else 0.0

@@ -20,11 +20,9 @@ SPREAD = 2  # rings of quads over which it fades to its borders
 TAKEN_BACK = 6  # rounds of taking it back
 
 
-def displacement(
-    points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float
-) -> tuple[F64, F64]:
-    """(n,) metres along normals (n, 3) from points (n, 3), and (n,) how well the place is seen. quads (Q, 4); free (Q,):
-    those that may be displaced. unit: world units per metre of the template."""
+def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float) -> tuple[F64, F64]:
+    """(n,) metres along normals (n, 3) from points (n, 3), and (n,) how well the place is seen. quads (Q, 4); free
+    (Q,): those that may be displaced. unit: world units per metre of the template."""
     signed, seen = scan.along(points, normals, REACH * unit)
     pairs = scan.pairs(points, normals, 2 * REACH * unit)
     agrees = np.isfinite(signed) & (np.abs(np.nan_to_num(signed)) <= AGREE * pairs.distance + CLOSE * unit)

@@ -1,7 +1,7 @@
 """Where a deformed mesh of quads folds, and where it passes through itself.
 
-Symbols: at corner i of a quad, J_i = (x_next - x_i) x (x_before - x_i), the corner's oriented area; J0 that of the rest,
-turned by the quad's rotation.
+Symbols: at corner i of a quad, J_i = (x_next - x_i) x (x_before - x_i), the corner's oriented area; J0 that of the
+rest, turned by the quad's rotation.
 
     folded: J_i . J0_i < LEAST |J_i| |J0_i| at any corner, or a corner's angle close to 0 or 180 degrees
 """
@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Faces, Indices, Mask
+from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, unit
 from pipeline.ray_casting import RayCaster
 
 LEAST = 0.1  # cosine between the corner's normal and that of the turned rest
 CLEAR = 0.02  # share of an edge at each end in which a hit is its own corner
+GRAZING = 1e-4  # cosine: an edge in the plane of a triangle does not pierce it
 PASSES = 4  # hits along an edge that are looked at
 SHORT = 0.05  # corner areas below this share of the rest's are degenerate
 
@@ -49,7 +50,7 @@ def piercing_edges(vertices: F64, faces: Faces) -> Indices:
     live = np.flatnonzero(length > 1e-6 * caster.span)
     direction = way / np.maximum(length, 1e-30)[:, None]
     at = CLEAR * length
-    pierced = np.zeros(len(ends), np.bool_)
+    pierced, facing = np.zeros(len(ends), np.bool_), unit(area_vectors(vertices, faces))
     for _ in range(PASSES):
         start = vertices[ends[live, 0]] + at[live, None] * direction[live]
         far, hit = caster.hits(start, direction[live])
@@ -57,6 +58,7 @@ def piercing_edges(vertices: F64, faces: Faces) -> Indices:
         near = at[live] < (1 - CLEAR) * length[live]
         live, hit = live[near], hit[near]
         own = (f[hit][:, :, None] == ends[live][:, None, :]).any((1, 2))
+        own |= np.abs((facing[hit] * direction[live]).sum(1)) < GRAZING
         pierced[live[~own]] = True
         live = live[own]
         at[live] += CLEAR * length[live]
@@ -64,7 +66,8 @@ def piercing_edges(vertices: F64, faces: Faces) -> Indices:
 
 
 def pierced_quads(points: F64, fine: Indices) -> Indices:
-    """(Q,) number of piercing edges at each quad of the cage. points (M, 3), fine (16 Q, 4): of the second subdivision."""
+    """(Q,) number of piercing edges at each quad of the cage. points (M, 3), fine (16 Q, 4): of the second
+    subdivision."""
     edges = piercing_edges(points, np.asarray(fine[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32))
     hits = np.bincount(edges.ravel(), minlength=len(points))
     return np.asarray(hits[fine].reshape(-1, 64).sum(1), np.int64)

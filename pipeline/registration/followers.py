@@ -1,8 +1,8 @@
 """Parts that are not skin (eyes, teeth, tongue, lashes) follow the skin that is near them.
 
-A part keeps its own shape: it makes the rigid motion that the nearest skin makes from rest to the registered head, least
-squares with weights that fall with the distance. Lashes lie on the lids, whose shape changes: each of their vertices
-moves with the skin nearest to it.
+A part keeps its own shape: it makes the rigid motion that the nearest skin makes from rest to the registered head,
+least squares with weights that fall with the distance. Lashes lie on the lids, whose shape changes: each of their
+vertices moves with the skin nearest to it.
 
 Source: Horn, Hilden and Negahdaripour 1988, for the rigid motion (by the singular value decomposition).
 """

@@ -46,7 +46,7 @@ class Head:
 
     def save(self, path: Path) -> None:
         """Write the npz."""
-        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
 
 
 def load_head(path: Path) -> Head:

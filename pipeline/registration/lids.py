@@ -79,8 +79,8 @@ def closing(template: Template, head: PlacedHead, cage: Cage) -> tuple[csr_array
 
 
 def _margins(template: Template) -> list[tuple[Indices, Indices]]:
-    """Of each eye and each ring of the margin: vertices of the upper and of the lower lid, from the right to the left of
-    the person."""
+    """Of each eye and each ring of the margin: vertices of the upper and of the lower lid, from the right to the
+    left of the person."""
     out = []
     for ring in _rings(template) if _closable(template) else ():
         down = -blink(template)[ring, 1]

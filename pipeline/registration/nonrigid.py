@@ -6,10 +6,10 @@ R_i rotations of the vertices' surroundings; s_e, the stiffness of edge e from i
 
     E(x) = sum w_k (n_k . (S_k x - y_k))^2 + sum h_l |B_l x - z_l|^2 + c sum s_e |x_j - x_i - R_e (p_j - p_i)|^2
 
-R_e is the mean of R_i and R_j; R_i takes the edges of i and of its neighbours from rest to now as well as a rotation can
-(so that bending costs something too). c falls from step to step; pairs, rotations and x change in turn. Where nothing
-is seen only the last term acts: the identity's shape is kept. Where a quad folds or the skin passes through itself, the
-surroundings become stiffer, the data count less there, and the steps run again.
+R_e is the mean of R_i and R_j; R_i takes the edges of i and of its neighbours from rest to now as well as a rotation
+can (so that bending costs something too). c falls from step to step; pairs, rotations and x change in turn. Where
+nothing is seen only the last term acts: the identity's shape is kept. Where a quad folds or the skin passes through
+itself, the surroundings become stiffer, the data count less there, and the steps run again.
 
 Source: Amberg, Romdhani and Vetter, Optimal step nonrigid ICP (2007), for the steps; Sorkine and Alexa,
 As-rigid-as-possible surface modeling (2007); Levi and Gotsman, Smooth rotation enhanced ARAP (2015).
@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from pipeline.meshes import F64, Indices, Mask
+from pipeline.meshes import F64, Indices
 from pipeline.registration.cage import Cage
 from pipeline.registration.cage_kernels import solved
 from pipeline.registration.folds import folded_quads, pierced_quads
@@ -84,7 +84,15 @@ def fitted(cage: Cage, rest: F64, scan: Scan, guides: Guides, unit: float, check
 
 
 def _steps(
-    cage: Cage, rest: F64, x: F64, scan: Scan, guides: Guides, calm: F64, unit: float, steps: Steps, check: Callable[[], None]
+    cage: Cage,
+    rest: F64,
+    x: F64,
+    scan: Scan,
+    guides: Guides,
+    calm: F64,
+    unit: float,
+    steps: Steps,
+    check: Callable[[], None],
 ) -> tuple[F64, F64]:
     """x (V, 3) after the steps, and the rotations there (V, 3, 3). calm (V,) >= 1: how much less the data count there,
     and how much stiffer it is."""

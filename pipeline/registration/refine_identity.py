@@ -49,5 +49,7 @@ def surface_data(template: Template, head: PlacedHead, scan: Scan, reach: float)
 def _outer(template: Template) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     """(N,) vertices of the skin that photos can show."""
     skin = template.part_vertices(SKIN)
-    inside = sum((template.region_weights(n) for n in HIDDEN if n in template.regions), np.zeros(len(template.vertices)))
+    inside = sum(
+        (template.region_weights(n) for n in HIDDEN if n in template.regions), np.zeros(len(template.vertices))
+    )
     return np.asarray(skin[inside[skin] == 0], np.int64)

@@ -26,16 +26,15 @@ from scipy.sparse import csr_array, eye_array
 from pipeline.meshes import F64, Indices, Mask, unit
 
 Border = Literal["smooth", "sharp"]
-Stencil = csr_array  # (points, V): each row has the weights of one point, of sum 1
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Quads (Q 4^n, 4) after n steps, and the stencil (V', V) of their vertices. The children of quad q are the rows
-    q 4^n to (q + 1) 4^n."""
+    """Quads (Q 4^n, 4) after n steps, and the stencil (V', V) of their vertices: each row has weights of sum 1. The
+    children of quad q are the rows q 4^n to (q + 1) 4^n."""
 
     quads: Indices
-    stencil: Stencil
+    stencil: csr_array
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class Limit:
     """Stencils (V, V) of the vertices' limit points, and of two tangents there. rough: vertices without tangents
     (corners and irregular places of a border); their normals are those of the quads."""
 
-    point: Stencil
+    point: csr_array
     along: csr_array
     across: csr_array
     rough: Mask
@@ -69,9 +68,7 @@ class Edges:
 def edges_of(quads: Indices, count: int) -> Edges:
     """The edges of quads (Q, 4) over `count` vertices. ValueError if more than two quads share one."""
     a, b = quads.ravel().astype(np.int64), np.roll(quads, -1, axis=1).ravel().astype(np.int64)
-    key, inverse, uses = np.unique(
-        np.minimum(a, b) * count + np.maximum(a, b), return_inverse=True, return_counts=True
-    )
+    key, inverse, uses = np.unique(np.minimum(a, b) * count + np.maximum(a, b), return_inverse=True, return_counts=True)
     if len(uses) and uses.max() > 2:
         raise ValueError("an edge of more than two quads")
     ends = np.stack([key // count, key % count], 1)
@@ -137,9 +134,7 @@ def limit(quads: Indices, count: int) -> Limit:
     return Limit(csr_array(point), along, across, ~regular, np.asarray(quads, np.int64))
 
 
-def _tangents(
-    quads: Indices, count: int, edges: Edges, on_border: Mask, n: F64
-) -> tuple[csr_array, csr_array, Mask]:
+def _tangents(quads: Indices, count: int, edges: Edges, on_border: Mask, n: F64) -> tuple[csr_array, csr_array, Mask]:
     """Tangents of all vertices inside, and of those of a border with two quads, where they are those of a B-spline."""
     turn = _place_in_ring(quads, count, edges, on_border)
     v, e, f = (np.roll(quads, -i, axis=1).ravel() for i in range(3))

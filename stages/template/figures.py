@@ -15,7 +15,9 @@ def region_figures(found: Registration, regions: tuple[str, ...], scan: Scan) ->
     """Distances by region, rounded to micrometres."""
     measured = distances(found.head, regions, scan, found.placed.scale)
     return {
-        n: Distances(*(round(x, 3) for x in (d.median, d.most, d.displaced_median, d.displaced_most)), d.count)
+        n: Distances(
+            round(d.median, 3), round(d.most, 3), round(d.displaced_median, 3), round(d.displaced_most, 3), d.count
+        )
         for n, d in measured.items()
     }
 

@@ -38,7 +38,7 @@ def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
 
 
 MAX_RESIDUAL = 6.0  # mm: landmarks further off are not those of a face
-SCALES = (0.75, 1.6)  # metres per metre of the template: a child's head to the largest of adults
+SCALES = (0.75, 1.75)  # metres per metre of the template: a child's head to the largest of adults
 MAX_WEIGHT = 3.0  # root mean square of the identity weights: persons have 1
 MAX_DISTANCE = 3.0  # mm, median: the template is not on this head
 MIN_SEEN = 0.03  # of the skin
@@ -56,7 +56,10 @@ def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:
 def refused_fit(figures: Mapping[str, float]) -> str:
     """Why the finished registration does not hold; "" if it does."""
     checks = (
-        (figures["identity_rms"] <= MAX_WEIGHT, f"identity weights of {figures['identity_rms']:.2g} (root mean square)"),
+        (
+            figures["identity_rms"] <= MAX_WEIGHT,
+            f"identity weights of {figures['identity_rms']:.2g} (root mean square)",
+        ),
         (figures["distance_mm"] <= MAX_DISTANCE, f"{figures['distance_mm']:.2g} mm (median) from the fitted surface"),
         (figures["seen"] >= MIN_SEEN, f"the photos show {figures['seen']:.1%} of its skin"),
     )

@@ -16,8 +16,8 @@ from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.identity_fit import PlacedHead, landmark_data, place
 from pipeline.registration.lids import REST, closing, lids_closed, with_lids
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
-from pipeline.registration.refine_identity import LANDMARK_SIGMA, refined
 from pipeline.registration.quality import outer_quads
+from pipeline.registration.refine_identity import LANDMARK_SIGMA, refined
 from pipeline.registration.scan import Scan
 from pipeline.registration.subdivision import limit, subdivided
 from pipeline.template.model import Template
@@ -72,7 +72,9 @@ def _seen(part: Mesh, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
     return np.asarray(seen[nearest], np.float64)
 
 
-def register(template: Template, landmarks: F64, placed: PlacedHead, scan: Scan, levels: int, step: Step) -> Registration:
+def register(
+    template: Template, landmarks: F64, placed: PlacedHead, scan: Scan, levels: int, step: Step
+) -> Registration:
     """The template on the scan, from where the landmarks (468, 3) place it."""
     step(0, 4, "identity")
     placed = refined(template, landmarks, placed, scan)
@@ -98,9 +100,7 @@ def register(template: Template, landmarks: F64, placed: PlacedHead, scan: Scan,
     return Registration(placed, cage, found, head, 1000 * float(np.median(away)) / placed.scale, closed)
 
 
-def guides_for(
-    template: Template, placed: PlacedHead, cage: Cage, scan: Scan, landmarks: F64, closed: bool
-) -> Guides:
+def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, landmarks: F64, closed: bool) -> Guides:
     """The landmarks, laid on the scan (their depth is less certain than the surface's), and closed lids."""
     points = template.landmarks
     where = landmarks[points.network]

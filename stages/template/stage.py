@@ -53,9 +53,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     placed = placed_on(template, landmarks)
     if placed is None:
         return _refused(config, "too few landmarks of the face are known")
-    why = refused_placing(
-        1000 * float(np.median(placed.residual)), placed.scale, metric=inputs.poses.artifact.metric
-    )
+    why = refused_placing(1000 * float(np.median(placed.residual)), placed.scale, metric=inputs.poses.artifact.metric)
     if why:
         return _refused(config, why)
     step(0, 4, "visibility")
@@ -65,7 +63,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     return _registered(found, template, scan, config, context)
 
 
-def _registered(found: Registration, template: Template, scan: Scan, config: Config, context: Context) -> RegisteredHead:
+def _registered(
+    found: Registration, template: Template, scan: Scan, config: Config, context: Context
+) -> RegisteredHead:
     from stages.template.figures import figures_of, region_figures
     from stages.template.judge import judge, refused_fit
 

@@ -75,8 +75,8 @@ def test_limit_is_what_many_steps_converge_to(n: int) -> None:
     centre = here[0]
     touching = local[(local == 0).any(1)]
     corners = here[touching] - centre
-    normal = unit(np.cross(corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0]))
-    assert (np.abs(normal @ found.normals(at)[0]) > 0.999).all()
+    normal = np.cross(corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0])
+    assert abs(unit(normal.sum(0)[None])[0] @ found.normals(at)[0]) > 0.9995
 
 
 def test_a_fine_closed_mesh_converges_to_its_limit_by_a_quarter_a_step() -> None:
