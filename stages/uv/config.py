@@ -18,6 +18,11 @@ class Config(StageConfig):
         description="what the asset is made of: the decimated scan, or the registered template (its topology and "
         "texture layout; the scan where the template does not hold)",
     )
+    rest: bool = Field(
+        True,
+        description="with mesh=template: add what the scan shows beside the template (hair, clothes, shoulders), on a "
+        "tile of its own",
+    )
     target_faces: Triangles = Field(50_000, ge=200, le=2_000_000, description="triangles of the textured mesh")
     remesh: Literal["adaptive", "uniform"] = Field(
         "adaptive",

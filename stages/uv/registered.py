@@ -19,16 +19,20 @@ from pipeline.registration.subdivision import subdivided
 from stages.uv import decimate
 from stages.uv.build import Built, Step, crumpled
 from stages.uv.chart_quality import Quality, measure
+from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import face_share
 from stages.uv.judge import judge
+from stages.uv.remainder import left_over, together
+from stages.uv.unwrap import unwrap
 
 LEFT_OUT = ("lashes",)
 SAMPLES = 20_000
+REST = 2  # share of uv.target_faces for what is beside the head
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
-def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, step: Step) -> Built:
+def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step) -> Built:
     """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to."""
     step(0, 3, "subdividing")
     kept = np.array([n not in LEFT_OUT for n in regions])[head.region]
@@ -40,16 +44,30 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, step: St
     proxy, _ = compacted(points, normals, head.quads[kept])
     face = np.repeat(face_quads(head, regions)[fine], 2)
     shown = _shown(head, regions, fine)
+    whole, laid = _with_rest(mesh, charts, shown, dense, config) if config.rest else (mesh, charts)
+    face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
         step(1, 3, "measuring charts")
-        quality = _skin_share(measure(mesh, charts, face), charts, face)
+        quality = _skin_share(measure(whole, laid, face), laid, face)
         step(2, 3, "measuring distances")
         deviation, rough, against = away.result()
     step(3, 3, "done")
-    span = float(np.ptp(mesh.vertices, axis=0).max())
-    findings = judge(quality, deviation, span, against, 0.0, crumpled(mesh))
-    return Built(mesh, charts, proxy, quality, deviation, rough, (), findings)
+    span = float(np.ptp(whole.vertices, axis=0).max())
+    findings = judge(quality, deviation, span, against, 0.0, crumpled(whole))
+    return Built(whole, laid, proxy, quality, deviation, rough, (), findings)
+
+
+def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Config) -> tuple[Mesh, Charts]:
+    """The head, and what the scan shows beside it on the next tile."""
+    vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
+    rest = left_over(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
+    if rest is None:
+        return mesh, charts
+    rest = decimate.decimated(rest, config.target_faces // REST)
+    own = unwrap(rest, config.changed(tiles=1))
+    moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
+    return together([(mesh, charts), (rest, moved)])
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:

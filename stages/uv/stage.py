@@ -45,7 +45,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         from stages.uv.registered import build_registered
 
         registered = load_head(head.path(head.artifact.head))
-        built = build_registered(registered, head.artifact.regions, dense, step)
+        built = build_registered(registered, head.artifact.regions, dense, config, step)
     else:
         built = _of_scan(dense, inputs, config, step)
         if config.mesh == "template":

@@ -89,14 +89,15 @@ def test_checks_and_reasons() -> None:
         assert refused_fit(fit | {name: bad})
 
 
-def ball_files(tmp_path: Path) -> tuple[Located[Surface], Located[RegisteredHead], Head]:
-    """A ball as scan and as registered head, with eyes' region on tile 1002 and a part that is left out."""
+def ball_files(tmp_path: Path, eyes: bool = True) -> tuple[Located[Surface], Located[RegisteredHead], Head]:
+    """A ball as scan and as registered head on two tiles; with eyes, half of it is theirs and a part is left out."""
     ball = ball_template(6)
     n = len(ball.quads)
     uvs = ball.uvs.copy().reshape(n, 4, 2)
     uvs[n // 2 :, :, 0] += 1
     region = np.zeros(n, np.int64)
-    region[n // 2 :], region[-3:] = 1, 2
+    if eyes:
+        region[n // 2 :], region[-3:] = 1, 2
     count = subdivided(ball.quads, len(ball.vertices), 1).stencil.shape[0]
     some = np.full(count, 1e-3, np.float32)
     head = Head(ball.vertices, ball.quads, uvs.reshape(-1, 2), ball.uv_quads, region, 0 * region, some, some + 1, 1)
@@ -115,7 +116,7 @@ def test_the_uv_stage_takes_the_registered_head(tmp_path: Path) -> None:
     masks = Located(MaskSet(masks=()), tmp_path)
     files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
     (tmp_path / "out").mkdir()
-    uv = uv_stage.run(files, UvConfig(mesh="template"), Context(tmp_path / "out", tmp_path))
+    uv = uv_stage.run(files, UvConfig(mesh="template", rest=False), Context(tmp_path / "out", tmp_path))
     path = tmp_path / "out" / uv.mesh.path
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     kept = len(head.quads) - 3
@@ -130,6 +131,31 @@ def test_the_uv_stage_takes_the_registered_head(tmp_path: Path) -> None:
     assert len(meshes.load(tmp_path / "out" / uv.proxy.path).faces) == 2 * kept
     facing = (meshes.vertex_normals(mesh.vertices, mesh.faces) * mesh.normals).sum(1)
     assert facing.min() > 0.9
+
+
+def test_what_lies_beside_the_head_is_on_the_next_tile(tmp_path: Path) -> None:
+    """A ball above the head as hair, and a dent in the head that is not left over."""
+    surface, registered, _ = ball_files(tmp_path, eyes=False)
+    inner, hair = ball_scan(0.1), ball_scan(0.03, 12, (0, 0.16, 0))
+    dented = inner.vertices * np.where(inner.vertices[:, 2:] > 0.09, 0.9, 1.0).astype(np.float32)
+    both = meshes.Mesh(
+        np.concatenate([dented, hair.vertices]), np.concatenate([inner.normals, hair.normals]),
+        np.concatenate([inner.faces, hair.faces + len(dented)]),
+    )  # fmt: skip
+    meshes.save(tmp_path / "surface.npz", both)
+    masks = Located(MaskSet(masks=()), tmp_path)
+    files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
+    made = {}
+    for rest in (False, True):
+        (tmp_path / str(rest)).mkdir()
+        config = UvConfig(mesh="template", rest=rest)
+        made[rest] = uv_stage.run(files, config, Context(tmp_path / str(rest), tmp_path))
+    path = tmp_path / "True" / made[True].mesh.path
+    mesh, charts = meshes.load(path), meshes.load_charts(path)
+    assert made[False].tiles == 2 and made[True].tiles == 3
+    added = mesh.vertices[np.unique(mesh.faces[made[False].faces :])]
+    assert np.allclose(np.linalg.norm(added - [0, 0.16, 0], axis=1), 0.03, atol=1e-5)
+    assert (tiles.of_face(charts)[made[False].faces :] == 2).all() and made[True].face_share == 1.0
 
 
 def test_the_scan_is_used_where_the_template_does_not_hold(tmp_path: Path) -> None:

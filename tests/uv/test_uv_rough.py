@@ -199,5 +199,5 @@ def test_distance_from_the_dense_mesh_is_judged() -> None:
     assert levels(1e-5, 0, 0.2) == {"opened": "unusable"}
     assert levels(1e-5, 0, 0, 0.01) == {"crumpled": "usable"}
     assert levels(1e-5, 0, 0, 0.3) == {"crumpled": "unusable"}
-    assert building._crumpled(shredded(3, 2.0)) > 0.02 and building._crumpled(shredded(2, 0)) == 0
+    assert building.crumpled(shredded(3, 2.0)) > 0.02 and building.crumpled(shredded(2, 0)) == 0
     assert building._opened(meshes.topology(np.zeros((0, 3), np.int32), 0), shredded(1, 0)) == 0
