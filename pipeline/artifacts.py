@@ -245,6 +245,33 @@ class Surface(Artifact):
     findings: tuple[Finding, ...] = ()
 
 
+class RegisteredHead(Artifact):
+    """The head template on the fitted surface; if it does not hold, registered is false and reason says why.
+
+    head: npz of pipeline.registration.head. template, licence: its name and licence. regions, parts: names that the
+    file's indices refer to. levels: subdivisions of the displacement. quads: of the control cage. world_from_template:
+    4x4 similarity to asset coordinates; identity: weights in standard deviations. figures: by name, see
+    docs/stages/template.md. distances_mm: by region (median and 95 % of the subdivided head's distance from the fitted
+    surface, then both with displacement), over skin that the photos show.
+    """
+
+    registered: bool
+    reason: str = ""
+    head: FileRef | None = None
+    template: str = ""
+    licence: str = ""
+    regions: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
+    levels: int = 0
+    quads: int = 0
+    world_from_template: Matrix = ()
+    identity: tuple[float, ...] = ()
+    figures: dict[str, float] = {}
+    distances_mm: dict[str, tuple[float, float, float, float]] = {}
+    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+
 class UvMesh(Artifact):
     """A mesh with charts. npz: vertices (V, 3), normals (V, 3), faces (F, 3), uvs (U, 2) float32, uv_faces (F, 3).
 

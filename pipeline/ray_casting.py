@@ -29,10 +29,16 @@ class RayCaster:
         """(N,) first face on the ray from each origin (N, 3) along its direction (N, 3), -1 for none."""
         return np.asarray(self._run(origins, directions), np.int64)
 
+    def hits(self, origins: F64, directions: F64) -> tuple[F64, npt.NDArray[np.int64]]:
+        """(N,) distance and (N,) face of the first hit from each origin (N, 3) along its unit direction (N, 3);
+        infinite and -1 for none."""
+        found = self._run(origins, directions, output=True)
+        far = np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
+        return far, np.where(np.isfinite(far), found["primID"].astype(np.int64), -1)
+
     def distances(self, origins: F64, directions: F64) -> F64:
         """(N,) distance to the mesh from each origin (N, 3) along its unit direction (N, 3), infinite for no hit."""
-        found = self._run(origins, directions, output=True)
-        return np.where(found["primID"] >= 0, found["tfar"].astype(np.float64) / self._scale, np.inf)
+        return self.hits(origins, directions)[0]
 
     def _run(
         self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating], output: bool = False

@@ -16,6 +16,7 @@ from stages.masks.stage import STAGE as MASKS
 from stages.poses.stage import STAGE as POSES
 from stages.report.stage import STAGE as REPORT
 from stages.surface.stage import STAGE as SURFACE
+from stages.template.stage import STAGE as TEMPLATE
 from stages.usd.stage import STAGE as USD
 from stages.uv.stage import STAGE as UV
 
@@ -28,6 +29,7 @@ REGISTRY: tuple[Stage[Any, Any, Any], ...] = (
     MASKS,
     INVERSE_RENDERING,
     SURFACE,
+    TEMPLATE,
     UV,
     BAKE,
     USD,

@@ -82,7 +82,7 @@ def build(
     others = Mesh(mesh.vertices, mesh.normals, mesh.faces[rest]), Charts(charts.uvs, charts.faces[rest])
     short = _too_few(config, texel, tiles, footprint.texel(*others, config.tile_size))
     span = float(np.ptp(mesh.vertices, axis=0).max())
-    findings = judge(quality, deviation, span, against, _opened(found, mesh), _crumpled(mesh))
+    findings = judge(quality, deviation, span, against, _opened(found, mesh), crumpled(mesh))
     return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
 
 
@@ -93,7 +93,7 @@ def _opened(dense: meshes.Topology, mesh: Mesh) -> float:
     return meshes.topology(mesh.faces, len(mesh.vertices)).boundary_edges / max(1.5 * len(mesh.faces), 1.0)
 
 
-def _crumpled(mesh: Mesh) -> float:
+def crumpled(mesh: Mesh) -> float:
     """Share of the faces that point against the normals at their own corners."""
     mean = mesh.normals[mesh.faces].astype(np.float64).sum(1)
     return float(((meshes.area_vectors(mesh.vertices, mesh.faces) * mean).sum(1) < 0).mean())

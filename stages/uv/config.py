@@ -13,6 +13,16 @@ from pipeline.units import Texels, Triangles
 class Config(StageConfig):
     """Settings of the uv stage."""
 
+    mesh: Literal["scan", "template"] = Field(
+        "scan",
+        description="what the asset is made of: the decimated scan, or the registered template (its topology and "
+        "texture layout; the scan where the template does not hold)",
+    )
+    rest: bool = Field(
+        True,
+        description="with mesh=template: add what the scan shows beside the template (hair, clothes, shoulders), on a "
+        "tile of its own",
+    )
     target_faces: Triangles = Field(50_000, ge=200, le=2_000_000, description="triangles of the textured mesh")
     remesh: Literal["adaptive", "uniform"] = Field(
         "adaptive",

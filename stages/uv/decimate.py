@@ -145,11 +145,12 @@ class Deviation:
 def deviation(a: Mesh, b: Mesh, samples: int = 20_000) -> Deviation:
     """Distance between two meshes. It is exact for the candidate triangles, so it can only be too large: large
     triangles are found by points spread over them, small ones by their centroids."""
-    d = np.concatenate([_one_way(a, b, samples), _one_way(b, a, samples)])
+    d = np.concatenate([one_way(a, b, samples), one_way(b, a, samples)])
     return Deviation(float(d.mean()), float(np.sqrt((d * d).mean())))
 
 
-def _one_way(start: Mesh, goal: Mesh, samples: int) -> F64:
+def one_way(start: Mesh, goal: Mesh, samples: int) -> F64:
+    """(samples,) distances from points of one mesh to another."""
     from scipy.spatial import cKDTree
 
     points, _ = sampled(start, samples)

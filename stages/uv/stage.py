@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, RegisteredHead, Surface, UvMesh
 from pipeline.contract import Context, Stage
 from stages.uv.config import Config as Config
+
+if TYPE_CHECKING:
+    from pipeline.meshes import Mesh
+    from stages.uv.build import Built, Step
 
 MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The dense mesh; the fitted photos and their cameras, for the pixel size on the mesh; the face's landmarks."""
+    """The dense mesh; the fitted photos and their cameras, for the pixel size on the mesh; the face's landmarks; the
+    registered template."""
 
     surface: Located[Surface]
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     masks: Located[MaskSet]
+    template: Located[RegisteredHead]
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     """Decimate, cut, parameterise, pack, measure. Raises StageError if the mesh can't be unwrapped."""
-    from pipeline import footprint, meshes
-    from pipeline.faces.landmarks3d import load_landmarks
-    from stages.uv.build import build
+    from pipeline import meshes
 
     surface = inputs.surface
     dense = meshes.load(surface.path(surface.artifact.mesh))
@@ -34,15 +39,38 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.check()
         context.progress(done, total, message)
 
+    head, notes = inputs.template, list[str]()
+    if config.mesh == "template" and head.artifact.head is not None:
+        from pipeline.registration.head import load_head
+        from stages.uv.registered import build_registered
+
+        registered = load_head(head.path(head.artifact.head))
+        built = build_registered(registered, head.artifact.regions, dense, config, step)
+    else:
+        built = _of_scan(dense, inputs, config, step)
+        if config.mesh == "template":
+            notes.append(f"the mesh is the scan's: {head.artifact.reason}")
+    meshes.save(context.workdir / MESH, built.mesh, built.charts)
+    meshes.save(context.workdir / PROXY, built.proxy)
+    return _artifact(built, tuple(notes), context)
+
+
+def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
+    """The decimated scan with charts of its own."""
+    from pipeline import footprint
+    from pipeline.faces.landmarks3d import load_landmarks
+    from stages.uv.build import build
+
     texel = None
     if config.tiles == "auto":
         fitted = set(inputs.inverse_rendering.artifact.fitted_views)
         texel = footprint.pixel(dense, (c for c in inputs.poses.artifact.cameras if c.index in fitted))
     ref = inputs.masks.artifact.landmarks
     landmarks = load_landmarks(inputs.masks.path(ref)) if ref is not None and config.face else None
-    built = build(dense, config, step, texel=texel, landmarks=landmarks)
-    meshes.save(context.workdir / MESH, built.mesh, built.charts)
-    meshes.save(context.workdir / PROXY, built.proxy)
+    return build(dense, config, step, texel=texel, landmarks=landmarks)
+
+
+def _artifact(built: Built, notes: tuple[str, ...], context: Context) -> UvMesh:
     return UvMesh(
         mesh=context.file(MESH),
         proxy=context.file(PROXY),
@@ -60,9 +88,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         deviation_rms_mm=1000 * built.deviation.rms,
         proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
         face_share=None if built.quality.face_share is None else round(built.quality.face_share, 5),
-        warnings=built.warnings,
+        warnings=(*notes, *built.warnings),
         findings=built.findings,
     )
 
 
-STAGE = Stage(name="uv", version=7, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=8, inputs=Inputs, config=Config, output=UvMesh, run=run)

@@ -17,6 +17,7 @@ from stages.bake import stage as bake
 from stages.usd import stage as usd
 from stages.uv import stage as uv
 from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.ball_head import no_head
 from tests.support.field_artifacts import fitted, poses
 from tests.support.shreds import shredded, with_worthless_faces
 from tests.support.synthetic_asset import smooth_light
@@ -52,7 +53,7 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
         return Context(folders[name], folders[name] / "scratch")
 
     textured = uv.run(
-        uv.Inputs(surface, face, rig, masks),
+        uv.Inputs(surface, face, rig, masks, no_head(surface.folder)),
         uv.Config(target_faces=5000, proxy_faces=300, texture_size=512),
         context("uv"),
     )

@@ -22,6 +22,7 @@ from stages.uv.decimate import Deviation
 from stages.uv.judge import judge
 from stages.uv.stage import Config, Inputs, run
 from tests.support.analytic_fields import AnalyticField, bumpy_head, sphere
+from tests.support.ball_head import no_head
 
 GOOD = Quality(
     charts=7, fragments=0, utilisation=0.7, overlap=0.0, stretch=1.2, stretch_max=3.0, flipped=0.0, empty=0.0,
@@ -146,7 +147,7 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
         components=1, removed_components=0, cell=0.006,
     )  # fmt: skip
     masks = Located(MaskSet(masks=()), tmp_path)
-    inputs = Inputs(Located(artifact, tmp_path), None, None, masks)  # type: ignore[arg-type]
+    inputs = Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
     uv = run(inputs, Config(target_faces=3000, proxy_faces=300, texture_size=512), Context(tmp_path, tmp_path))
     assert len(uv.findings) == 10 and {f.level for f in uv.findings} == {"good"}, [str(f) for f in uv.findings]
 
@@ -198,5 +199,5 @@ def test_distance_from_the_dense_mesh_is_judged() -> None:
     assert levels(1e-5, 0, 0.2) == {"opened": "unusable"}
     assert levels(1e-5, 0, 0, 0.01) == {"crumpled": "usable"}
     assert levels(1e-5, 0, 0, 0.3) == {"crumpled": "unusable"}
-    assert building._crumpled(shredded(3, 2.0)) > 0.02 and building._crumpled(shredded(2, 0)) == 0
+    assert building.crumpled(shredded(3, 2.0)) > 0.02 and building.crumpled(shredded(2, 0)) == 0
     assert building._opened(meshes.topology(np.zeros((0, 3), np.int32), 0), shredded(1, 0)) == 0

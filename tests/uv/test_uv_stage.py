@@ -18,6 +18,7 @@ from stages.surface.build import build
 from stages.uv import unwrap
 from stages.uv.stage import Config, Inputs, run
 from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.ball_head import no_head
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def inputs(tmp_path: Path) -> Inputs:
     )
     # fitted photos and cameras are only asked for with tiles=auto (test_uv_tiles)
     masks = Located(MaskSet(masks=()), tmp_path)
-    return Inputs(Located(artifact, tmp_path), None, None, masks)  # type: ignore[arg-type]
+    return Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from stages.uv import unwrap
 from stages.uv.chart_quality import measure
 from stages.uv.stage import Config, Inputs, run
 from stages.uv.tile_count import Tiling, packed
+from tests.support.ball_head import no_head
 from tests.uv.test_uv_build import random_charts
 
 RADIUS = 0.1
@@ -163,7 +164,8 @@ def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Pat
         fitted_views=(0,), held_out=(), steps=1, loss=0, psnr=1, beta=1, cell=1, model={},
     )  # fmt: skip
     masks = Located(MaskSet(masks=()), tmp_path)
-    inputs = Inputs(Located(surface, tmp_path), Located(face, tmp_path), Located(poses, tmp_path), masks)
+    rig = Located(face, tmp_path), Located(poses, tmp_path)
+    inputs = Inputs(Located(surface, tmp_path), *rig, masks, no_head(tmp_path))
     out = run(inputs, Config(target_faces=1200, tile_size=256, tiles="auto"), Context(tmp_path, tmp_path))
     mesh, charts = meshes.load(tmp_path / out.mesh.path), meshes.load_charts(tmp_path / out.mesh.path)
     assert 1 < out.tiles == int(tiles.of_face(charts).max()) + 1 == len(out.tile_utilisation) <= 4

@@ -1,0 +1,54 @@
+"""Displacement of the subdivided head along its limit normals onto the fitted surface.
+
+Symbols: p, N limit points and normals; t the distance from p along N to the surface, e that to its nearest place. A
+point is displaced if the surface there faces as the head does, photos see it, and t <= AGREE e + CLOSE: else the normal
+meets another part (the other lip, the lid below). Where displaced places pass through each other, the displacement is
+taken back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.meshes import F64, Indices, Mask
+from pipeline.registration.folds import piercing_edges
+from pipeline.registration.scan import Scan
+
+REACH = 0.003  # metres of the template: largest displacement
+AGREE, CLOSE = 2.0, 2e-4  # the latter in metres of the template
+SPREAD = 2  # rings of quads over which it fades to its borders
+TAKEN_BACK = 6  # rounds of taking it back
+
+
+def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float) -> tuple[F64, F64]:
+    """(n,) metres along normals (n, 3) from points (n, 3), and (n,) how well the place is seen. quads (Q, 4); free
+    (Q,): those that may be displaced. unit: world units per metre of the template."""
+    signed, seen = scan.along(points, normals, REACH * unit)
+    pairs = scan.pairs(points, normals, 2 * REACH * unit)
+    agrees = np.isfinite(signed) & (np.abs(np.nan_to_num(signed)) <= AGREE * pairs.distance + CLOSE * unit)
+    blocked = np.zeros(len(points), np.bool_)
+    blocked[quads[~free]] = True
+    use = agrees & (seen > 0) & ~blocked
+    moved = np.where(use, np.nan_to_num(signed), 0.0) * _faded(use, quads)
+    faces = np.asarray(quads[free][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
+    before = np.unique(piercing_edges(points, faces))
+    for _ in range(TAKEN_BACK):
+        hit = np.setdiff1d(piercing_edges(points + moved[:, None] * normals, faces), before)
+        if not len(hit):
+            break
+        bad = np.zeros(len(points), np.bool_)
+        bad[hit] = True
+        moved = moved * _faded(~bad, quads)
+    return moved, np.where(use, seen, 0.0)
+
+
+def _faded(use: Mask, quads: Indices) -> F64:
+    """(n,) 1 inside of use (n,), 0 outside, in steps over SPREAD rings between."""
+    outside = ~use
+    total = (~outside).astype(np.float64)
+    for _ in range(SPREAD):
+        grown = outside.copy()
+        grown[quads[outside[quads].any(1)]] = True
+        outside = grown
+        total += ~outside
+    return total / (SPREAD + 1)

@@ -1,0 +1,63 @@
+"""A registered head: its control cage, texture layout and displacement, as one file.
+
+Symbols: V vertices of the cage, Q quads, n vertices after `levels` subdivisions; limit points p and normals N of the
+subdivided cage. displacement (n,): metres from p along N to the fitted surface; 0 where none is near or nobody saw it.
+seen (n,): 0 to 1, how well the photos show that place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.meshes import F32, F64, Indices
+from pipeline.registration.subdivision import Level, limit, subdivided
+
+
+@dataclass(frozen=True, slots=True)
+class Head:
+    """vertices (V, 3) asset coordinates; quads (Q, 4); uvs (U, 2), uv_quads (Q, 4): UDIM tiles in one row; region, part
+    (Q,): index into the names of the artifact; displacement, seen (n,); levels ()."""
+
+    vertices: F64
+    quads: Indices
+    uvs: F64
+    uv_quads: Indices
+    region: Indices
+    part: Indices
+    displacement: F32
+    seen: F32
+    levels: int
+
+    def fine(self) -> Level:
+        """The subdivided cage."""
+        return subdivided(self.quads, len(self.vertices), self.levels)
+
+    def surface(self) -> tuple[F64, F64, Indices]:
+        """Limit points (n, 3), unit normals (n, 3) and quads (Q 4^levels, 4), without displacement."""
+        return limit_surface(self.vertices, self.fine())
+
+    def fine_uvs(self) -> tuple[F64, Indices]:
+        """(U', 2) texture coordinates and quads (Q 4^levels, 4), linear along the borders of charts."""
+        level = subdivided(self.uv_quads, len(self.uvs), self.levels, "sharp")
+        return np.asarray(level.stencil @ self.uvs), level.quads
+
+    def save(self, path: Path) -> None:
+        """Write the npz."""
+        np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+
+
+def load_head(path: Path) -> Head:
+    """The head of an npz that `save` wrote."""
+    with np.load(path, allow_pickle=False) as z:
+        arrays = {f.name: z[f.name] for f in fields(Head) if f.name != "levels"}
+        return Head(**arrays, levels=int(z["levels"]))
+
+
+def limit_surface(vertices: F64, level: Level) -> tuple[F64, F64, Indices]:
+    """Limit points (n, 3), unit normals (n, 3) and quads of the cage's vertices (V, 3) after the steps of level."""
+    points = np.asarray(level.stencil @ vertices)
+    at = limit(level.quads, len(points))
+    return np.asarray(at.point @ points), at.normals(points), level.quads

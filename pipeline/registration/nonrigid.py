@@ -1,0 +1,162 @@
+"""Deforms the template's skin from the person's identity shape onto the fitted surface.
+
+Symbols: x (V, 3) the cage, p (V, 3) its rest (the identity shape); S_k, n_k the stencil of a limit point and the
+surface's normal at the place y_k that it is paired with, w_k its weight; B_l, z_l a landmark's stencil and place;
+R_i rotations of the vertices' surroundings; s_e, the stiffness of edge e from i to j; c the stiffness of a step.
+
+    E(x) = sum w_k (n_k . (S_k x - y_k))^2 + sum h_l |B_l x - z_l|^2 + c sum s_e |x_j - x_i - R_e (p_j - p_i)|^2
+
+R_e is the mean of R_i and R_j; R_i takes the edges of i and of its neighbours from rest to now as well as a rotation
+can (so that bending costs something too). c falls from step to step; pairs, rotations and x change in turn. Where
+nothing is seen only the last term acts: the identity's shape is kept. Where a quad folds or the skin passes through
+itself, the surroundings become stiffer, the data count less there, and the steps run again.
+
+Source: Amberg, Romdhani and Vetter, Optimal step nonrigid ICP (2007), for the steps; Sorkine and Alexa,
+As-rigid-as-possible surface modeling (2007); Levi and Gotsman, Smooth rotation enhanced ARAP (2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array, eye_array
+
+from pipeline.meshes import F64, Indices
+from pipeline.registration.cage import Cage
+from pipeline.registration.cage_kernels import solved
+from pipeline.registration.folds import folded_quads, pierced_quads
+from pipeline.registration.scan import Scan
+
+# stiffness c, and metres of the template within which a pair counts; each for ROUNDS turns
+STEPS = ((30.0, 0.015), (10.0, 0.012), (3.0, 0.010), (1.0, 0.008), (0.3, 0.006), (0.1, 0.005), (0.03, 0.004))
+ROUNDS = 3
+AGAIN = 3  # first of the steps that run again after a repair: above, nothing folds
+SOFT = 0.5  # of the reach: distance at which a pair has half of its weight
+LOOSE_REACH = 0.004  # metres: on scalp and neck a surface further away is hair or clothes
+LANDMARK = 1.0  # h_l over c of the same step: landmarks guide, and let go with the stiffness
+FIXED = 1e-6  # of c: keeps the system positive definite where nothing else does
+TOLERANCE, MOST = 0.01, 200  # of the solver: of the residual at its start, which the last round left; steps
+REPAIRS, CALMER = 5, 4.0  # rounds of repair, and how much calmer the surroundings of a fault become in each
+
+
+Steps = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Guides:
+    """stencil (L, V), where (L, 3): places of the cage's limit points, or of differences between vertices. least (L,):
+    what h does not fall below, 0 for landmarks."""
+
+    stencil: csr_array
+    where: F64
+    least: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """vertices (V, 3) of the cage; rotations (V, 3, 3) from rest; folded, pierced: quads that still fold, or pass
+    through another; repairs: rounds of them."""
+
+    vertices: F64
+    rotations: F64
+    folded: int
+    pierced: int
+    repairs: int
+
+
+def fitted(cage: Cage, rest: F64, scan: Scan, guides: Guides, unit: float, check: Callable[[], None]) -> Fitted:
+    """The cage with rest (V, 3) on the scan. unit: world units per metre of the template."""
+    calm = np.ones(len(rest))
+    near = _around(cage)
+    start, _ = _steps(cage, rest, rest, scan, guides, calm, unit, STEPS[:AGAIN], check)
+    repairs = 0
+    while True:
+        x, turn = _steps(cage, rest, start, scan, guides, calm, unit, STEPS[AGAIN:], check)
+        folded, pierced = folded_quads(rest, x, turn, cage.quads), pierced_quads(cage.at_finer @ x, cage.finer) > 0
+        if not (folded | pierced).any() or repairs == REPAIRS:
+            return Fitted(x, turn, int(folded.sum()), int(pierced.sum()), repairs)
+        repairs += 1
+        hit = np.zeros(len(rest))
+        hit[cage.quads[folded | pierced]] = 1
+        calm = calm * np.where(near @ (near @ hit) > 0, CALMER, 1.0)
+
+
+def _steps(
+    cage: Cage,
+    rest: F64,
+    x: F64,
+    scan: Scan,
+    guides: Guides,
+    calm: F64,
+    unit: float,
+    steps: Steps,
+    check: Callable[[], None],
+) -> tuple[F64, F64]:
+    """x (V, 3) after the steps, and the rotations there (V, 3, 3). calm (V,) >= 1: how much less the data count there,
+    and how much stiffer it is."""
+    around, edges = _around(cage), cage.difference @ rest
+    size = abs(guides.stencil)
+    less = (size @ np.ones(len(x))) / np.maximum(size @ calm, 1e-30)
+    trust = 1 / (cage.stencil @ calm)
+    cage = replace(cage, stiffness=cage.stiffness * 0.5 * (abs(cage.difference) @ calm))
+    fixed = csr_array(eye_array(len(x), format="csr"))
+    springs = csr_array(cage.difference.T @ diags_array(cage.stiffness) @ cage.difference)
+    for c, reach in steps:
+        pull = csr_array(guides.stencil.T @ diags_array(less * np.maximum(LANDMARK * c, guides.least)))
+        alike = csr_array(c * springs + c * FIXED * fixed + pull @ guides.stencil)
+        for _ in range(ROUNDS):
+            check()
+            turn = rotations(cage, edges, cage.difference @ x, around)
+            found = _data(cage, x, scan, trust, reach * unit, unit)
+            right = c * (_rigid_right(cage, edges, turn) + FIXED * x) + pull @ guides.where
+            stencil = csr_array(cage.stencil[found.rows])
+            right = right + stencil.T @ ((found.weight * found.offset)[:, None] * found.normals)
+            x, _ = solved(alike, stencil, found.normals, found.weight, np.ascontiguousarray(right), x, TOLERANCE, MOST)
+    return x, rotations(cage, edges, cage.difference @ x, around)
+
+
+@dataclass(frozen=True, slots=True)
+class _Data:
+    """Of the points that have a pair: weight (N,), normals (N, 3) and offset (N,) of the planes, rows (N,)."""
+
+    weight: F64
+    normals: F64
+    offset: F64
+    rows: Indices
+
+
+def _data(cage: Cage, x: F64, scan: Scan, trust: F64, reach: float, unit: float) -> _Data:
+    pairs = scan.pairs(cage.points(x), cage.normals(x), reach)
+    limit = np.where(cage.loose, min(LOOSE_REACH * unit, reach), reach)
+    weight = trust * pairs.weight / (1 + (pairs.distance / (SOFT * limit)) ** 2)
+    weight[~cage.shown | (pairs.distance > limit)] = 0.0
+    rows = np.flatnonzero(weight > 1e-5)
+    normals = pairs.normals[rows]
+    return _Data(weight[rows], normals, (normals * pairs.where[rows]).sum(1), rows)
+
+
+def rotations(cage: Cage, rest: F64, now: F64, around: csr_array) -> F64:
+    """(V, 3, 3) rotations that take the edges rest (E, 3) around each vertex and its neighbours nearest to now."""
+    moments = (cage.stiffness[:, None, None] * now[:, :, None] * rest[:, None, :]).reshape(-1, 9)
+    total = around @ (abs(cage.difference).T @ moments)
+    u, _, v = np.linalg.svd(total.reshape(-1, 3, 3))
+    flip = np.linalg.det(u) * np.linalg.det(v) < 0
+    u[flip, :, 2] *= -1
+    return np.asarray(u @ v, np.float64)
+
+
+def _around(cage: Cage) -> csr_array:
+    """(V, V) 1 for a vertex itself and its neighbours."""
+    ends = abs(cage.difference)
+    joined = csr_array(ends.T @ ends)
+    joined.data[:] = 1.0
+    return joined
+
+
+def _rigid_right(cage: Cage, edges: F64, turn: F64) -> F64:
+    """(V, 3) right side of the last term for c = 1."""
+    mean = 0.5 * (abs(cage.difference) @ turn.reshape(-1, 9)).reshape(-1, 3, 3)
+    wanted = np.einsum("eij,ej->ei", mean, edges)
+    return np.asarray(cage.difference.T @ (cage.stiffness[:, None] * wanted))

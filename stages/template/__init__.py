@@ -1,0 +1,1 @@
+"""Template stage: the head template, registered to the fitted surface."""

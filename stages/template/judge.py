@@ -1,0 +1,66 @@
+"""The checks of the registration: measured figures are compared with limits.
+
+Source of the limits: a scanned bald head in a studio and rendered persons (docs/stages/template.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pipeline.verdict import Finding, Limits, judged
+
+DISTANCE = Limits(0.3, 1.0, lower=False)
+MOST = Limits(1.0, 3.0, lower=False)
+LANDMARKS = Limits(4.0, 8.0, lower=False)  # the network's own scatter is 2 to 3 mm
+FOLDED = Limits(0, 40, lower=False)
+PIERCED = Limits(0, 200, lower=False)
+
+SHAPE = "look at the surface in the report; better masks and cameras make it smoother"
+
+
+def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
+    """All findings of a registered template, including the good ones. figures: of the artifact."""
+    f = figures
+    return (
+        judged("distance_mm", f["distance_mm"], DISTANCE,
+               f"half of the seen skin lies within {f['distance_mm']:.2g} mm of the fitted surface before displacement",
+               SHAPE, unit="mm"),
+        judged("distance_95_mm", f["distance_95_mm"], MOST,
+               f"95 % of the seen skin lies within {f['distance_95_mm']:.2g} mm of the fitted surface before "
+               "displacement", SHAPE, unit="mm"),
+        judged("landmarks_mm", f["landmarks_mm"], LANDMARKS,
+               f"the face's landmarks lie {f['landmarks_mm']:.2g} mm (median) from the template's",
+               "take sharper photos of the face from the front and both sides", unit="mm"),
+        judged("folded", f["folded"], FOLDED, f"{f['folded']:g} quads of the head are folded", SHAPE),
+        judged("pierced", f["pierced"], PIERCED,
+               f"{f['pierced']:g} edges of the face pass through another part of it", SHAPE),
+    )  # fmt: skip
+
+
+MAX_RESIDUAL = 6.0  # mm: landmarks further off are not those of a face
+SCALES = (0.75, 1.75)  # metres per metre of the template: a child's head to the largest of adults
+MAX_WEIGHT = 3.0  # root mean square of the identity weights: persons have 1
+MAX_DISTANCE = 3.0  # mm, median: the template is not on this head
+MIN_SEEN = 0.03  # of the skin
+
+
+def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:
+    """Why the landmarks do not place the template; "" if they do. scale: metres per metre of the template."""
+    if residual_mm > MAX_RESIDUAL:
+        return f"the template's landmarks are {residual_mm:.2g} mm off (median), more than {MAX_RESIDUAL:g}"
+    if metric and not SCALES[0] <= scale <= SCALES[1]:
+        return f"the head would be {scale:.2g} times the template's size, outside of {SCALES[0]:g} to {SCALES[1]:g}"
+    return ""
+
+
+def refused_fit(figures: Mapping[str, float]) -> str:
+    """Why the finished registration does not hold; "" if it does."""
+    checks = (
+        (
+            figures["identity_rms"] <= MAX_WEIGHT,
+            f"identity weights of {figures['identity_rms']:.2g} (root mean square)",
+        ),
+        (figures["distance_mm"] <= MAX_DISTANCE, f"{figures['distance_mm']:.2g} mm (median) from the fitted surface"),
+        (figures["seen"] >= MIN_SEEN, f"the photos show {figures['seen']:.1%} of its skin"),
+    )
+    return next((f"the template does not fit this head: {why}" for ok, why in checks if not ok), "")

@@ -1,0 +1,130 @@
+"""From the fitted surface and the face's landmarks to the registered template, with its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array, vstack
+
+from pipeline.meshes import F64, Indices, Mesh
+from pipeline.registration.cage import Cage, cage_of
+from pipeline.registration.displacement import displacement
+from pipeline.registration.followers import followed
+from pipeline.registration.head import Head, limit_surface
+from pipeline.registration.identity_fit import PlacedHead, landmark_data, place
+from pipeline.registration.lids import REST, closing, lids_closed, with_lids
+from pipeline.registration.nonrigid import Fitted, Guides, fitted
+from pipeline.registration.quality import outer_quads
+from pipeline.registration.refine_identity import LANDMARK_SIGMA, refined
+from pipeline.registration.scan import Scan
+from pipeline.registration.subdivision import limit, subdivided
+from pipeline.template.model import Template
+from pipeline.visibility import FittedPhoto, Occluder, seen_weight
+
+AROUND = 0.25  # metres of the template: the surface further from the head's middle is not looked at
+ASKED = 30_000  # vertices of the surface whose visibility is computed; the others take that of the nearest
+LANDMARK_REACH = 0.006  # metres of the template: a landmark further from the surface does not guide
+CLOSED_LIDS = 2.0  # weight of what pulls closed lids together, in that of a point on the surface
+
+Step = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """placed: similarity and identity. fitted: the cage's skin; cage: its operators. head: the result; landmarks_mm:
+    median distance of the face's landmarks from the template's, metres of the template times 1000; closed: whether the
+    eyes are."""
+
+    placed: PlacedHead
+    cage: Cage
+    fitted: Fitted
+    head: Head
+    landmarks_mm: float
+    closed: bool
+
+
+def placed_on(template: Template, landmarks: F64) -> PlacedHead | None:
+    """The template on landmarks (468, 3); None if too few are known."""
+    data = landmark_data(template, landmarks, LANDMARK_SIGMA)
+    return place(template, (data,)) if len(data.where) >= len(template.landmarks.names) // 2 else None
+
+
+def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> Scan:
+    """The part of the fitted surface around the head, and how well the photos see it."""
+    middle = head.world_from_template[:3, 3]
+    near = np.linalg.norm(mesh.vertices - middle, axis=1) < AROUND * head.scale
+    faces = mesh.faces[near[mesh.faces].all(1)]
+    used, flat = np.unique(faces, return_inverse=True)
+    part = Mesh(mesh.vertices[used], mesh.normals[used], flat.reshape(-1, 3).astype(np.int32))
+    return Scan(part, _seen(part, views, Occluder(mesh)))
+
+
+def _seen(part: Mesh, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
+    """(V,) sum of cosines, exact at every few vertices."""
+    from scipy.spatial import cKDTree
+
+    points, normals = part.vertices.astype(np.float64), part.normals.astype(np.float64)
+    asked = np.arange(0, len(points), max(1, len(points) // ASKED))
+    seen = seen_weight(points[asked], normals[asked], views, occluder)
+    _, nearest = cKDTree(points[asked]).query(points)
+    return np.asarray(seen[nearest], np.float64)
+
+
+def register(
+    template: Template, landmarks: F64, placed: PlacedHead, scan: Scan, levels: int, step: Step
+) -> Registration:
+    """The template on the scan, from where the landmarks (468, 3) place it."""
+    step(0, 4, "identity")
+    placed = refined(template, landmarks, placed, scan)
+    cage = cage_of(template)
+    closed = lids_closed(template, placed, cage, scan)
+    start = with_lids(template, placed, REST if closed else 0.0)
+    step(1, 4, "deformation")
+    rest, guides = start[cage.of_template], guides_for(template, placed, cage, scan, landmarks, closed)
+    found = fitted(cage, rest, scan, guides, placed.scale, lambda: step(1, 4, "deformation"))
+    vertices = followed(template, start, cage.of_template, found.vertices, found.rotations, placed.scale)
+    step(2, 4, "displacement")
+    level = subdivided(template.quads, len(vertices), levels)
+    regions, parts = (index_of(x, len(template.quads)) for x in (template.regions, template.parts))
+    free = np.repeat(outer_quads(regions, tuple(template.regions)), 4**levels)
+    moved, seen = displacement(*limit_surface(vertices, level), free, scan, placed.scale)
+    known = np.isfinite(landmarks[template.landmarks.network]).all(1)
+    away = np.linalg.norm(template.landmark_points(vertices) - landmarks[template.landmarks.network], axis=1)[known]
+    step(3, 4, "figures")
+    head = Head(
+        vertices, template.quads, template.uvs, template.uv_quads, regions, parts,
+        moved.astype(np.float32), seen.astype(np.float32), levels,
+    )  # fmt: skip
+    return Registration(placed, cage, found, head, 1000 * float(np.median(away)) / placed.scale, closed)
+
+
+def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, landmarks: F64, closed: bool) -> Guides:
+    """The landmarks, laid on the scan (their depth is less certain than the surface's), and closed lids."""
+    points = template.landmarks
+    where = landmarks[points.network]
+    known = np.isfinite(where).all(1)
+    on, away = scan.nearest(np.nan_to_num(where))
+    use = np.flatnonzero(known & (away < LANDMARK_REACH * placed.scale))
+    row = np.full(len(template.vertices), -1, np.int64)
+    row[cage.of_template] = np.arange(len(cage.of_template))
+    flat = csr_array(
+        (points.weights[use].ravel(), (np.repeat(np.arange(len(use)), 3), row[points.corners[use]].ravel())),
+        shape=(len(use), len(cage.of_template)),
+    )
+    stencil, place_at = csr_array(flat @ limit(cage.quads, len(cage.of_template)).point), on[use]
+    least = np.zeros(len(use))
+    if closed:
+        more, there = closing(template, placed, cage)
+        stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
+        least = np.concatenate([least, np.full(len(there), CLOSED_LIDS)])
+    return Guides(stencil, place_at, least)
+
+
+def index_of(named: Mapping[str, Indices], count: int) -> Indices:
+    """(Q,) index of the entry that holds each quad, -1 for none. named: name -> quads."""
+    out = np.full(count, -1, np.int64)
+    for i, rows in enumerate(named.values()):
+        out[rows] = i
+    return out

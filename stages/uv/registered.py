@@ -1,0 +1,116 @@
+"""The textured mesh from the registered template: its subdivided quads on the fitted surface, with its own texture
+layout. Each quad is two triangles, rows 2 q and 2 q + 1, cut from its first to its third corner.
+
+Lashes are left out: they need a material with opacity.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline import meshes, tiles
+from pipeline.meshes import F64, Charts, Indices, Mask, Mesh
+from pipeline.registration.head import Head, limit_surface
+from pipeline.registration.quality import face_quads, outer_quads, triangles
+from pipeline.registration.subdivision import subdivided
+from stages.uv import decimate
+from stages.uv.build import Built, Step, crumpled
+from stages.uv.chart_quality import Quality, measure
+from stages.uv.config import Config
+from stages.uv.decimate import Deviation
+from stages.uv.density import face_share
+from stages.uv.judge import judge
+from stages.uv.remainder import left_over, together
+from stages.uv.unwrap import unwrap
+
+LEFT_OUT = ("lashes",)
+SAMPLES = 20_000
+REST = 2  # share of uv.target_faces for what is beside the head
+NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
+
+
+def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step) -> Built:
+    """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to."""
+    step(0, 3, "subdividing")
+    kept = np.array([n not in LEFT_OUT for n in regions])[head.region]
+    fine = np.repeat(kept, 4**head.levels)
+    mesh, rows = compacted(*_displaced(head), head.fine().quads[fine])
+    uvs, uv_quads = head.fine_uvs()
+    charts = _charts(uvs, uv_quads[fine])
+    points, normals, _ = limit_surface(head.vertices, subdivided(head.quads, len(head.vertices), 0))
+    proxy, _ = compacted(points, normals, head.quads[kept])
+    face = np.repeat(face_quads(head, regions)[fine], 2)
+    shown = _shown(head, regions, fine)
+    whole, laid = _with_rest(mesh, charts, shown, dense, config) if config.rest else (mesh, charts)
+    face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
+    with ThreadPoolExecutor(1) as beside:
+        away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
+        step(1, 3, "measuring charts")
+        quality = _skin_share(measure(whole, laid, face), laid, face)
+        step(2, 3, "measuring distances")
+        deviation, rough, against = away.result()
+    step(3, 3, "done")
+    span = float(np.ptp(whole.vertices, axis=0).max())
+    findings = judge(quality, deviation, span, against, 0.0, crumpled(whole))
+    return Built(whole, laid, proxy, quality, deviation, rough, (), findings)
+
+
+def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Config) -> tuple[Mesh, Charts]:
+    """The head, and what the scan shows beside it on the next tile."""
+    vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
+    rest = left_over(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
+    if rest is None:
+        return mesh, charts
+    rest = decimate.decimated(rest, config.target_faces // REST)
+    own = unwrap(rest, config.changed(tiles=1))
+    moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
+    return together([(mesh, charts), (rest, moved)])
+
+
+def _displaced(head: Head) -> tuple[F64, F64]:
+    """(n, 3) points on the fitted surface where it was seen, and their normals."""
+    points, normals, quads = head.surface()
+    moved = points + head.displacement[:, None].astype(np.float64) * normals
+    return moved, meshes.vertex_normals(moved, triangles(quads)).astype(np.float64)
+
+
+def compacted(points: F64, normals: F64, quads: Indices) -> tuple[Mesh, Indices]:
+    """A mesh of the vertices that quads (Q, 4) use, and their rows (n',)."""
+    used, flat = np.unique(quads, return_inverse=True)
+    faces = triangles(flat.reshape(-1, 4))
+    return Mesh(points[used].astype(np.float32), normals[used].astype(np.float32), faces), np.asarray(used, np.int64)
+
+
+def _charts(uvs: F64, quads: Indices) -> Charts:
+    used, flat = np.unique(quads, return_inverse=True)
+    return Charts(np.asarray(uvs[used], np.float32), triangles(flat.reshape(-1, 4)))
+
+
+def _shown(head: Head, regions: tuple[str, ...], fine: Mask) -> Mask:
+    """(F,) triangles of the skin's outside."""
+    return np.asarray(np.repeat(np.repeat(outer_quads(head.region, regions), 4**head.levels)[fine], 2), np.bool_)
+
+
+def _skin_share(quality: Quality, charts: Charts, face: Mask) -> Quality:
+    """The face's share of its own tile: eyes, teeth and the inside of the mouth have another one."""
+    tile = tiles.of_face(charts)
+    own = tile == np.bincount(tile[face]).argmax()
+    return replace(quality, face_share=face_share(Charts(charts.uvs, charts.faces[own]), face[own]))
+
+
+def _away(dense: Mesh, mesh: Mesh, proxy: Mesh, seen: Mask) -> tuple[Deviation, Deviation, float]:
+    """Distances of the seen skin (F,) and of the proxy near the surface from the dense mesh, and the share of the seen
+    skin that faces against it."""
+    part = Mesh(mesh.vertices, mesh.normals, mesh.faces[seen])
+    if not len(part.faces):
+        return Deviation(0.0, 0.0), Deviation(0.0, 0.0), 0.0
+    return _near(part, dense), _near(proxy, dense), decimate.flipped_share(dense, part)
+
+
+def _near(mesh: Mesh, dense: Mesh) -> Deviation:
+    d = decimate.one_way(mesh, dense, SAMPLES)
+    d = d[d < NEAR]
+    return Deviation(float(d.mean()), float(np.sqrt((d * d).mean()))) if len(d) else Deviation(0.0, 0.0)

@@ -1,0 +1,92 @@
+"""What the scan shows beside the registered template: hair, clothes, shoulders. It becomes a mesh of its own, with
+charts on a tile of its own.
+
+Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with normal n. p is left over if it lies outside
+(n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end) and |p - q| > JOINT.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline import meshes
+from pipeline.meshes import F64, Charts, Mask, Mesh
+
+AWAY = 0.003  # metres: nearer, the head's skin stands for it
+JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
+OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not left over
+SMALL = 0.01  # of the dense mesh's area: smaller pieces are dropped
+
+
+def left_over(dense: Mesh, skin: Mesh) -> Mesh | None:
+    """The part of the dense mesh that the head's skin does not stand for; None if there is none."""
+    beside = _beside(dense, skin)
+    keep = np.asarray(beside[dense.faces].any(1), np.bool_)
+    faces = _large(dense, keep)
+    if not len(faces):
+        return None
+    vertices, compact, rows = meshes.compact(dense.vertices, faces)
+    parted, own = meshes.split_apart(np.asarray(vertices, np.float64), compact)
+    normals = meshes.vertex_normals(parted, own)
+    if len(parted) == len(rows):
+        normals = dense.normals[rows]
+    return Mesh(parted.astype(np.float32), normals, own)
+
+
+def together(parts: Sequence[tuple[Mesh, Charts]]) -> tuple[Mesh, Charts]:
+    """One mesh; their charts keep their tiles."""
+    moved, laid, at, uv_at = [], [], 0, 0
+    for mesh, charts in parts:
+        moved.append(mesh.faces + at)
+        laid.append(charts.faces + uv_at)
+        at, uv_at = at + len(mesh.vertices), uv_at + len(charts.uvs)
+    meshes_, charts_ = zip(*parts, strict=True)
+    whole = Mesh(
+        np.concatenate([m.vertices for m in meshes_]),
+        np.concatenate([m.normals for m in meshes_]),
+        np.concatenate(moved).astype(np.int32),
+    )
+    return whole, Charts(np.concatenate([c.uvs for c in charts_]), np.concatenate(laid).astype(np.int32))
+
+
+def _beside(dense: Mesh, skin: Mesh) -> Mask:
+    """(V,) vertices that are left over."""
+    from scipy.spatial import cKDTree
+
+    points: F64 = dense.vertices.astype(np.float64)
+    away, nearest = cKDTree(skin.vertices.astype(np.float64)).query(points)
+    out = ((points - skin.vertices[nearest]) * skin.normals[nearest]).sum(1)
+    at_border = _border(skin)[nearest]
+    return np.asarray(np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away)))
+
+
+def _border(mesh: Mesh) -> Mask:
+    """(V,) vertices of the longest border: the neck's end, not those of eyes and mouth."""
+    e = meshes.edges(mesh.faces)
+    count = len(mesh.vertices)
+    open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
+    out = np.zeros(count, np.bool_)
+    if not len(open_edges):
+        return out
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(open_edges), np.int8), tuple(open_edges.T)), shape=(count, count))
+    label = connected_components(graph, directed=False)[1]
+    length = np.linalg.norm(mesh.vertices[open_edges[:, 1]] - mesh.vertices[open_edges[:, 0]], axis=1)
+    longest = np.bincount(label[open_edges[:, 0]], length).argmax()
+    out[open_edges[label[open_edges[:, 0]] == longest].ravel()] = True
+    return out
+
+
+def _large(dense: Mesh, keep: Mask) -> meshes.Faces:
+    """(F', 3) faces of the connected pieces that are large enough."""
+    faces = dense.faces[keep]
+    if not len(faces):
+        return faces
+    piece = meshes.component_of_face(faces, len(dense.vertices))
+    area = np.bincount(piece, meshes.areas(dense.vertices, faces))
+    whole = float(meshes.areas(dense.vertices, dense.faces).sum())
+    return np.asarray(faces[area[piece] > SMALL * whole], np.int32)

@@ -1,0 +1,44 @@
+"""Pairs with a ball whose surface is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from support.ball_head import ball_quads, ball_scan
+
+from pipeline.registration.scan import Scan
+
+
+def scan(radius: float = 0.1, seen: float = 1.0) -> Scan:
+    mesh = ball_scan(radius)
+    return Scan(mesh, np.full(len(mesh.vertices), seen))
+
+
+def test_distance_along_the_normal_is_signed_and_that_of_the_ball() -> None:
+    out = ball_quads(3)[0]
+    for offset in (-0.004, 0.0, 0.003):
+        away, seen = scan().along((0.1 - offset) * out, out, 0.01)
+        assert np.allclose(away, offset, atol=6e-5) and np.allclose(seen, 1)
+
+
+def test_nothing_beyond_the_reach_and_nothing_that_faces_away() -> None:
+    out = ball_quads(3)[0]
+    away, seen = scan().along(0.08 * out, out, 0.01)
+    assert np.isnan(away).all() and not seen.any()
+    away, _ = scan().along(0.099 * out, -out, 0.01)
+    assert np.isnan(away).all()
+    assert not scan().pairs(0.099 * out, -out, 0.01).weight.any()
+
+
+def test_pairs_have_the_plane_s_distance_and_the_weight_of_what_is_seen() -> None:
+    out = ball_quads(3)[0]
+    pairs = scan(seen=0.4).pairs(0.102 * out, out, 0.01)
+    assert np.allclose(pairs.distance, 0.002, atol=1e-4) and np.allclose(pairs.weight, 0.4)
+    assert np.allclose(pairs.normals @ np.eye(3), pairs.where / 0.1, atol=1e-4)
+    assert not scan(seen=0.0).pairs(0.102 * out, out, 0.01).weight.any()
+    far = scan().pairs(0.15 * out, out, 0.01)
+    assert not far.weight.any() and np.isinf(far.distance).all()
+
+
+def test_nearest_vertex() -> None:
+    where, away = scan().nearest(np.array([[0.0, 0.0, 0.2]]))
+    assert np.allclose(where, [[0, 0, 0.1]], atol=1e-6) and np.isclose(away[0], 0.1, atol=1e-6)
