@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.artifacts import CameraSet, Capture, FittedFace, Located, MaskSet, RegisteredHead, Surface
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, RegisteredHead, Surface
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
 from stages.template.config import Config as Config
