@@ -32,13 +32,14 @@ CHUNK = 131_072
 @dataclass(frozen=True, slots=True)
 class Shaded:
     """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
-    calibration."""
+    calibration. along_normal: (N,) rho c . B(n, n), the reflectance along the normal; 0 for models without bases."""
 
     total: Tensor
     diffuse: Tensor
     specular: Tensor
     albedo: Tensor
     inv_kappa: Tensor
+    along_normal: Tensor
 
 
 class FaceModel(nn.Module):
@@ -71,12 +72,20 @@ class FaceModel(nn.Module):
             albedo = albedo.detach().median(0).values.expand_as(albedo)
         if not self.spec.specular:
             diffuse = self._diffuse(albedo, x, n)
-            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa)
+            return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa, torch.zeros_like(rho))
         skin = Skin(albedo, rho, c, inv_kappa)
         base = self.shading.diffuse_albedo(skin)
         diffuse = self._diffuse(base, x, n)
         specular = self.shading.specular(skin, x, n, wo)
-        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa)
+        straight = torch.zeros_like(rho)
+        if self.has_bases:  # B depends on n . wo only, which is 1 for all points
+            straight = rho * (c * self.shading.bases(n[:1], n[:1])).sum(-1)
+        return Shaded(diffuse + specular, diffuse, specular, base, inv_kappa, straight)
+
+    @property
+    def has_bases(self) -> bool:
+        """Whether the specular term has bases of the angles only, so that it has an F0."""
+        return (self.spec.shading, self.spec.integral, self.spec.basis_inputs) == ("neural", "low_rank", "cosine")
 
     def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
         """L_d (N, 3), including shadows if they are modelled."""

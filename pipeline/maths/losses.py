@@ -20,6 +20,27 @@ def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
 
 
 @full_precision
+def rgb_bounded(predicted: Tensor, target_srgb: Tensor, bound: Tensor) -> Tensor:
+    """`rgb_l1` with clipped values as inequalities: (N, 3) linear, (N, 3) encoded, (N, 3) -> (N,). Not in the paper.
+
+        |r| where bound = 0,  max(-r, 0) where bound > 0,  max(r, 0) where bound < 0;  r = I - I_bar, mean over channels
+
+    A sensor's largest value only says that the radiance is at least this value (bound > 0), its smallest that it is at
+    most this value (bound < 0).
+    """
+    r = srgb_from_linear(predicted) - target_srgb
+    allowed = ((bound > 0) & (r > 0)) | ((bound < 0) & (r < 0))
+    return torch.where(allowed, torch.zeros_like(r), r.abs()).mean(-1)
+
+
+@full_precision
+def above(value: Tensor, limit: float) -> Tensor:
+    """max(v / limit - 1, 0): (N,) -> (N,). A penalty for values that are larger than physically possible. Not in the
+    paper."""
+    return (value / limit - 1).clamp(min=0)
+
+
+@full_precision
 def white_light(coefficients: Tensor) -> Tensor:
     """|L_i - mean over RGB of L_i|, on the SH coefficients: (K, 3) -> (K,). [NeuFace eq. 22]
 

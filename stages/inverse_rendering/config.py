@@ -135,6 +135,11 @@ class Config(StageConfig):
         description="initial geometry; hull: of the masks; template: the hull, cut by the head template on the face "
         "landmarks; auto: template where the hull hides the face",
     )
+    # trust in the photos
+    robust: bool = Field(
+        default=True,
+        description="weights of pixels and photos, learned with the fit: what only some photos show gets a low weight",
+    )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")
     mask: float = Field(default=0.1, ge=0, description="weight of the mask loss (cross-entropy of the opacity)")
@@ -142,6 +147,10 @@ class Config(StageConfig):
     specular_energy: float = Field(
         default=0.02, ge=0, description="weight of the specular-energy loss, lambda 3 [NeuFace eq. 23]"
     )
+    f0_limit: float = Field(
+        default=0.17, gt=0, le=1, description="largest F0 without penalty; diamond has .17, skin .02 to .045"
+    )
+    f0_excess: float = Field(default=0.1, ge=0, description="weight of the penalty on F0 above f0_limit")
     shininess_prior: float = Field(
         default=1e-3, ge=0, description="weight of the prior on 1 / kappa (skin's typical value)"
     )

@@ -179,10 +179,11 @@ class Trainer(TrainingLoop):
             return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
 
     def weights(self) -> Config:
-        """The settings. If the light is known, without the sparse-albedo prior, which would move albedo into the
-        lobe."""
-        light_known = self.choices is not None and self.choices.light_known
-        return self.settings.changed(albedo_sparsity=0.0) if light_known else self.settings
+        """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
+        later, there is no sparse-albedo prior, which would move albedo into the lobe."""
+        if self.choices is None:
+            return self.settings.changed(f0_excess=0.0)
+        return self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""

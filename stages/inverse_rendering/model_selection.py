@@ -27,7 +27,7 @@ from stages.inverse_rendering.cross_validation import NEGLIGIBLE, ValidationSamp
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lobe, reflectance
 from stages.inverse_rendering.observations import observe, pictures, surface_points
-from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, Rays
 
 SELECTION_AT = 0.3  # share of the steps: the surface is accurate to a millimetre, and most steps are still to come
 RAYS = 1500
@@ -119,7 +119,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
     if not fit.validation and not wanted:
         return out, None
     shots = pictures(fit.views)
-    rays = _table(fit).draw(RAYS, 0.0, SEED + s.seed).rays
+    rays = _exact_rays(fit, SEED + s.seed)
     seen = observe(model.geometry, shots, *surface_points(model.geometry, rays))
     found = cross_validation.validation_samples(seen, fit.validation, model) if fit.validation else None
     gain = np.ones((len(fit.views), 3))
@@ -178,6 +178,13 @@ def _table(fit: Fit) -> PixelTable:
     return fit.table
 
 
+def _exact_rays(fit: Fit, seed: int) -> Rays:
+    """Rays of random subject pixels that are not clipped: points in highlights would be over-represented."""
+    batch = _table(fit).draw(RAYS, 0.0, seed)
+    exact = ~(batch.bound > 0).any(-1)
+    return Rays(batch.rays.o[exact], batch.rays.d[exact])
+
+
 def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceModel) -> Choices:
     """Select lobe, calibration, order and rank, in an order in which each uses the previous results."""
     full, facts = model.spec.light_order, _facts(given, s, "not tested")
@@ -227,7 +234,7 @@ def _best_order(t: ValidationSamples, full: int) -> int:
 def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[Any]) -> Choices:
     """Whether the fitted surface explains the validation views better than the prior."""
     prior = prior_surface(fit)
-    seen = observe(prior, shots, *surface_points(prior, _table(fit).draw(RAYS, 0.0, SEED + 1).rays))
+    seen = observe(prior, shots, *surface_points(prior, _exact_rays(fit, SEED + 1)))
     before = cross_validation.validation_samples(seen, fit.validation, fit.model)
     own, theirs = (silhouette_error(fit, g) for g in (fit.model.geometry, prior))
     moved = theirs > own + SILHOUETTE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -11,7 +12,7 @@ from pipeline.colour import srgb_from_linear
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import grid_of
-from pipeline.maths import density, losses
+from pipeline.maths import density, losses, microfacet
 from pipeline.maths.sdf import unit
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.ray_sampling import WHOLE, Batch
@@ -68,7 +69,7 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     colour, target = shaded.total, batch.target[rays]
     if model.spec.calibrated:
         colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
-    rgb = losses.rgb_l1(colour, target)
+    rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
     out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, rays)
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     energy = losses.specular_energy(shaded.specular)
@@ -78,10 +79,15 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     if model.spec.specular:
         shininess = losses.shininess_prior(shaded.inv_kappa, TYPICAL_INV_KAPPA)
         out.add("shininess_prior", settings.shininess_prior * shininess.mean(), shininess, rays)
+        if model.has_bases:
+            high = losses.above(f0_of(shaded.along_normal, shaded.inv_kappa), settings.f0_limit)
+            out.add("f0_excess", settings.f0_excess * high.mean(), high, rays)
     if grid_of(model.geometry).values.requires_grad:  # not for a frozen surface
         out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
     with torch.no_grad():
-        out.error = float(((srgb_from_linear(colour.clamp(0, 1)) - target) ** 2).mean())
+        exact = batch.bound[rays] == 0
+        square = (srgb_from_linear(colour.clamp(0, 1)) - target) ** 2
+        out.error = float((square * exact).sum() / exact.sum().clamp(min=1))
     return out
 
 
@@ -93,6 +99,15 @@ def calibrated_colours(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor
     """
     chosen = torch.nn.functional.one_hot(view, len(matrices)).to(colour) @ matrices.reshape(-1, 9)
     return torch.einsum("nij,nj->ni", chosen.reshape(-1, 3, 3), colour)
+
+
+def f0_of(along_normal: Tensor, inv_kappa: Tensor) -> Tensor:
+    """F0 (N,) of the GGX lobe with this reflectance along the normal (N,) (pipeline.maths.microfacet.f0_from_lobe).
+
+    The width 1 / kappa (N,) has no gradient: a lobe that reflects too much must become weaker, not narrower.
+    """
+    ratio = microfacet.f0_from_lobe(np.ones(len(inv_kappa)), inv_kappa.detach().float().cpu().numpy())
+    return along_normal * torch.from_numpy(ratio).to(along_normal)
 
 
 def _smoothness(model: FaceModel, x: Tensor, generator: torch.Generator) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,10 +23,12 @@ from pipeline.images import shrink_whole
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
+Int8 = npt.NDArray[np.int8]
 NEAR_BAND = 0.05  # of the image side: all background pixels within this distance of the subject are used
 FAR_EVERY = 16  # of the other background pixels one in so many is used, against floating artefacts
 DARKEST = 1e-4  # smallest mean radiance for the initial light
 WHOLE = 0.99  # alpha of a fully covered pixel
+BELOW_LIMIT = 0.8  # of the largest clipped value: a channel below it is not clipped, if another channel is
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +70,8 @@ class Batch:
     """Rays with their pixels: target (N, 3) sRGB-encoded, alpha (N,), view (N,) position in the fit.
 
     share: (N,) weight of a ray in the mask term, mean 1: inverse to the probability of its pixel. Without it the side
-    that is drawn more often would shift the silhouette by beta ln(ratio).
+    that is drawn more often would shift the silhouette by beta ln(ratio). bound: (N, 3) int8, 1 where the target is
+    only a lower limit, -1 where it is only an upper limit, else 0.
     """
 
     rays: Rays
@@ -75,6 +79,7 @@ class Batch:
     alpha: Tensor
     view: Tensor
     share: Tensor
+    bound: Tensor
 
 
 def factor_for(size: tuple[int, int], side: int, *, exact: bool = False) -> int:
@@ -100,10 +105,9 @@ class PixelTable:
     """The pixels of all fitted views at one resolution, for random batches."""
 
     def __init__(self, views: list[PhotoView], side: int, device: str) -> None:
-        parts: list[tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]] = []
-        for n, view in enumerate(views):
-            parts.append(_pixels_of(view, n, factor_for(view.size, side)))
-        xy, target, alpha, which, kind = (np.concatenate(p) for p in zip(*parts, strict=True))
+        parts = [_pixels_of(view, n, factor_for(view.size, side)) for n, view in enumerate(views)]
+        xy, target, alpha, which, kind, bound = (np.concatenate(p) for p in zip(*parts, strict=True))
+        self.bound = torch.from_numpy(bound).to(device)
         self.xy, self.target = torch.from_numpy(xy).to(device), torch.from_numpy(target).to(device)
         self.alpha, self.view = torch.from_numpy(alpha).to(device), torch.from_numpy(which).to(device)
         self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
@@ -150,7 +154,8 @@ class PixelTable:
         """The batch of the pixels i (N,) of the table. share: see Batch; 1 if None."""
         view = self.view[i].long()
         share = torch.ones_like(self.alpha[i]) if share is None else share
-        return Batch(self._rays(self.xy[i], view), self.target[i].float(), self.alpha[i], view, share)
+        rays, target = self._rays(self.xy[i], view), self.target[i].float()
+        return Batch(rays, target, self.alpha[i], view, share, self.bound[i])
 
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
@@ -158,12 +163,10 @@ class PixelTable:
         return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True))
 
 
-def _pixels_of(
-    view: PhotoView, n: int, factor: int
-) -> tuple[F32, npt.NDArray[np.float16], F32, npt.NDArray[np.int16], npt.NDArray[np.int8]]:
-    """Candidate pixels of one view: (x, y), encoded target, alpha, view number, 1 inside or 0 outside."""
-    alpha = shrink_whole(view.alpha, factor)
-    encoded = srgb_from_linear(shrink_whole(view.rgb, factor)).astype(np.float16)
+def _pixels_of(view: PhotoView, n: int, factor: int) -> tuple[npt.NDArray[Any], ...]:
+    """Candidate pixels of one view: (x, y), encoded target, alpha, view number, 1 inside or 0 outside, bound."""
+    alpha, rgb = shrink_whole(view.alpha, factor), shrink_whole(view.rgb, factor)
+    encoded = srgb_from_linear(rgb).astype(np.float16)
     xy = normalised_positions(view, factor)
     reach = 2 * max(int(max(alpha.shape) * NEAR_BAND), 2) + 1
     near = cv2.dilate((alpha > 0.01).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
@@ -171,13 +174,30 @@ def _pixels_of(
     far = np.zeros_like(near)
     far.reshape(-1)[n % FAR_EVERY :: FAR_EVERY] = True
     take = inside | near | far
-    if view.clipped is not None:  # a clipped value is only a lower bound; clipped background is still background
-        take &= ~(inside & (shrink_whole(view.clipped, factor) > 0))
     if view.doubtful is not None:
         take &= shrink_whole(view.doubtful.astype(np.float32), factor) == 0
     if view.asked is not None:
         take &= shrink_whole(view.asked, factor) > WHOLE
-    return (xy[take], encoded[take], alpha[take], np.full(int(take.sum()), n, np.int16), inside[take].astype(np.int8))
+    bound = bounds_of(rgb, None if view.clipped is None else shrink_whole(view.clipped, factor))
+    count = int(take.sum())
+    number, kind = np.full(count, n, np.int16), inside[take].astype(np.int8)
+    return xy[take], encoded[take], alpha[take], number, kind, bound[take]
+
+
+def bounds_of(rgb: F32, clipped: F32 | None) -> Int8:
+    """(H, W, 3) 1 where a block's mean rgb (H, W, 3) is only a lower limit, -1 where it is only an upper limit, else 0.
+
+    clipped: (H, W) clipped share of each block. The mean of values of which some are clipped is a lower limit of the
+    true mean. A channel of a wholly clipped block that is far below the photo's limit is not clipped itself. A mean of
+    0 is that of values below the sensor's smallest.
+    """
+    bound = np.where(rgb <= 0, -1, 0).astype(np.int8)
+    if clipped is None or not (clipped > 0).any():
+        return bound
+    limit = float(rgb[clipped > 0].max())
+    known = (clipped >= WHOLE)[..., None] & (rgb < BELOW_LIMIT * limit)
+    bound[(clipped > 0)[..., None] & ~known] = 1
+    return bound
 
 
 def image_rays(view: PhotoView, factor: int, device: str) -> Rays:

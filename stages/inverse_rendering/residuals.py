@@ -83,7 +83,7 @@ def view_errors(
     codes of each view at any size, or None; names: of the codes."""
     most = min(max(PIXELS // max(len(views), 1), MIN_PIXELS), MAX_PIXELS)
     inside = _sample(table, table.inside, len(views), most, SEED)
-    inside = [pool[table.alpha[pool] > WHOLE] for pool in inside]
+    inside = [pool[(table.alpha[pool] > WHOLE) & (table.bound[pool] == 0).all(-1)] for pool in inside]
     outside = _sample(table, table.outside, len(views), most // 4, SEED + 1)
     outside = [pool[table.alpha[pool] < 1 - WHOLE] for pool in outside]
     if not any(len(pool) for pool in inside):

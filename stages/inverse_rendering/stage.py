@@ -115,7 +115,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=10,
+    version=11,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -79,7 +79,7 @@ def test_a_bad_gradient_of_the_geometry_is_dropped() -> None:
 def test_without_the_guard_the_run_would_be_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """The derivative of |x - NaN| happens to be 0; that of a square is NaN and reaches every parameter."""
     monkeypatch.setattr(Trainer, "_is_finite", lambda self, loss: True)
-    monkeypatch.setattr(objective.losses, "rgb_l1", lambda p, t: ((p - t) ** 2).mean(-1))
+    monkeypatch.setattr(objective.losses, "rgb_bounded", lambda p, t, bound: ((p - t) ** 2).mean(-1))
     plain = trainer()
     t = Poisoned(plain.views, plain.settings, "cpu", plain.model)
     while t.step < t.settings.steps:
@@ -170,7 +170,8 @@ def test_an_empty_batch_costs_nothing() -> None:
 
     t = trainer()
     none = torch.zeros(0, 3)
-    batch = Batch(Rays(none, none), none, none[:, 0], torch.zeros(0, dtype=torch.int64), none[:, 0])
+    index = torch.zeros(0, dtype=torch.int64)
+    batch = Batch(Rays(none, none), none, none[:, 0], index, none[:, 0], none, index)
     found = objective.terms(t.model, batch, t.settings, torch.Generator(), 1.0)
     assert float(found.total.detach()) == 0 and np.isnan(found.error)
 

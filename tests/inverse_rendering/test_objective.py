@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.maths.microfacet import alpha_from_kappa, energy
 from stages.inverse_rendering.fit import Trainer
-from stages.inverse_rendering.objective import calibrated_colours, terms
+from stages.inverse_rendering.objective import Terms, calibrated_colours, terms
 from tests.support.small_ball import SMALL, trainer
 
 
@@ -39,15 +40,23 @@ def test_calibration_applies_each_views_matrix() -> None:
 
 
 WEIGHTS = {
-    "mask": 2.0, "eikonal": 3.0, "rgb": 5.0, "white": 7.0, "specular_energy": 11.0, "albedo_sparsity": 13.0,
-    "shininess_prior": 17.0, "smooth": 19.0,
-}  # fmt: skip
+    "mask": 2.0,
+    "eikonal": 3.0,
+    "rgb": 5.0,
+    "white": 7.0,
+    "specular_energy": 11.0,
+    "albedo_sparsity": 13.0,
+    "shininess_prior": 17.0,
+    "f0_excess": 23.0,
+    "smooth": 19.0,
+}
+F0_LIMIT = 0.01  # lower than that of the weighed ball, so that there is an excess  # fmt: skip
 
 
 def weighed_ball() -> Trainer:
     """A fit whose terms all differ and all have another weight: its skin is patchy, its light not white, and its
     matrices are not the identity."""
-    t = trainer(SMALL.changed(**WEIGHTS), calibrated=True)
+    t = trainer(SMALL.changed(f0_limit=F0_LIMIT, **WEIGHTS), calibrated=True)
     t.enter_level()
     t.set_rates()
     torch.manual_seed(0)
@@ -82,6 +91,9 @@ def test_the_objective_is_eq_20_by_hand() -> None:
         x = shell.x[torch.from_numpy(pick)]
         moved = x + t.model.geometry.cell * torch.randn(x.shape, generator=generator)
         n, near = (t.model.geometry(p)[1].double().numpy() for p in (x, moved))
+        _, rho, c, width = (v.double().numpy() for v in t.model.spatial(x))
+        up = torch.tensor([[0.0, 1.0, 0.0]])
+        f0 = rho * (c @ t.model.basis(up, up)[0].double().numpy()) / energy(alpha_from_kappa(1 / width))
         A, light = t.model.calibration().double().numpy(), t.model.light().double().numpy()
     kept, rays = shell.kept.numpy(), shell.kept.numpy()[pick]
     assert 0 < len(pick) < len(kept) < 512, "rays of all three kinds"
@@ -103,6 +115,7 @@ def test_the_objective_is_eq_20_by_hand() -> None:
         "specular_energy": shaded.specular.double().numpy().mean(),
         "albedo_sparsity": np.abs(log - middle).mean(),
         "shininess_prior": (np.log(shaded.inv_kappa.double().numpy() / 0.1) ** 2).mean(),
+        "f0_excess": np.maximum(f0 / F0_LIMIT - 1, 0).mean(),
         "smooth": 0.5 * (1 - (n * near).sum(1)).mean(),
     }
     assert list(found.scalars) == list(parts)
@@ -128,10 +141,10 @@ def test_background_alone_asks_for_nothing_but_a_mask_and_a_distance() -> None:
     "name", ["light.coefficients", "spatial.net.4.bias", "basis.net.4.bias", "calibration.net.2.weight"]
 )
 def test_the_objectives_gradient_is_that_of_differences(name: str) -> None:
-    """Along a random direction of one part of the model. The median that albedo_sparsity holds fixed is left out,
-    and so is what depends on the shape alone."""
+    """Along a random direction of one part of the model. The median that albedo_sparsity holds fixed is left out, the
+    width that f0_excess holds fixed, and what depends on the shape alone."""
     t = weighed_ball()
-    settings = t.settings.changed(albedo_sparsity=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
+    settings = t.settings.changed(albedo_sparsity=0.0, f0_excess=0.0, mask=0.0, eikonal=0.0, smooth=0.0)
     batch = t.pixels.draw(512, 0.25, 0)
     p = dict(t.model.named_parameters())[name]
     way = torch.randn(p.shape, generator=torch.Generator().manual_seed(1))

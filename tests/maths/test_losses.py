@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,53 @@ def test_rgb_is_zero_for_the_right_colour_and_keeps_its_gradient_above_one() -> 
     x = torch.tensor([[0.0, 2.0, -0.1]], requires_grad=True)
     losses.rgb_l1(x, target).sum().backward()
     assert torch.isfinite(x.grad).all() and (x.grad != 0).all()
+
+
+def test_a_clipped_value_is_a_limit() -> None:
+    """Per channel in float64: at a lower limit only what is below it costs, at an upper limit only what is above it."""
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand(200, 3, generator=generator, dtype=torch.float64)
+    colour = (1.5 * torch.rand(200, 3, generator=generator, dtype=torch.float64) - 0.2).requires_grad_()
+    bound = torch.randint(-1, 2, (200, 3), generator=generator, dtype=torch.int8)
+
+    def by_hand(linear: np.ndarray) -> np.ndarray:
+        srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.003) ** (1 / 2.4) - 0.055)
+        r, b = srgb - target.numpy(), bound.numpy()
+        cost = np.where(b == 0, np.abs(r), np.where(b > 0, np.maximum(-r, 0), np.maximum(r, 0)))
+        return np.asarray(cost.mean(1))
+
+    found = losses.rgb_bounded(colour, target, bound)
+    values = colour.detach().numpy()
+    assert np.allclose(found.detach().numpy(), by_hand(values), rtol=1e-6, atol=1e-7)
+    found.sum().backward()
+    assert colour.grad is not None
+    h = 1e-6
+    for c in range(3):
+        step = np.zeros((200, 3))
+        step[:, c] = h
+        slope = (by_hand(values + step) - by_hand(values - step)) / (2 * h)
+        assert np.allclose(colour.grad[:, c].numpy(), slope, rtol=1e-3, atol=1e-6)
+
+
+def test_clipped_values_at_the_extremes() -> None:
+    target = torch.tensor([[1.0, 1.0, 1.0]] * 3)
+    bright = torch.tensor([[1e6] * 3, [1.0] * 3, [0.0] * 3], requires_grad=True)
+    cost = losses.rgb_bounded(bright, target, torch.ones(3, 3, dtype=torch.int8))
+    assert cost.tolist() == pytest.approx([0, 0, 1], abs=1e-6)
+    cost.sum().backward()
+    assert bright.grad is not None and torch.isfinite(bright.grad).all()
+    assert not bright.grad[0].any() and (bright.grad[2] < 0).all()
+    free = torch.zeros(3, 3, dtype=torch.int8)
+    assert torch.equal(losses.rgb_bounded(bright, target, free), losses.rgb_l1(bright, target))
+
+
+def test_what_is_above_its_limit_costs() -> None:
+    f = torch.tensor([-1.0, 0.0, 0.17, 0.34, 17.0], requires_grad=True)
+    cost = losses.above(f, 0.17)
+    assert cost.tolist() == pytest.approx([0, 0, 0, 1, 99], rel=1e-5)
+    cost.sum().backward()
+    assert f.grad is not None and f.grad[[0, 1]].tolist() == [0, 0]
+    assert f.grad[[3, 4]].tolist() == pytest.approx([1 / 0.17] * 2)
 
 
 def test_white_light_counts_colour_alone() -> None:
