@@ -10,7 +10,7 @@ import torch
 
 from pipeline.maths.microfacet import alpha_from_kappa, energy
 from stages.inverse_rendering.fit import Trainer
-from stages.inverse_rendering.objective import Terms, calibrated_colours, terms
+from stages.inverse_rendering.objective import calibrated_colours, terms
 from tests.support.small_ball import SMALL, trainer
 
 
