@@ -37,11 +37,19 @@ def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
     )  # fmt: skip
 
 
+MIN_FACES = 0.1  # of the photos: persons have 0.25 or more also if photographed all around, a statue had 0.06
 MAX_RESIDUAL = 6.0  # mm: landmarks further off are not those of a face
 SCALES = (0.75, 1.75)  # metres per metre of the template: a child's head to the largest of adults
 MAX_WEIGHT = 3.0  # root mean square of the identity weights: persons have 1
 MAX_DISTANCE = 3.0  # mm, median: the template is not on this head
 MIN_SEEN = 0.03  # of the skin
+
+
+def refused_faces(agree: int, photos: int) -> str:
+    """Why so few photos with a face are not a person's; "" if they are enough. agree: of `photos`."""
+    if agree < MIN_FACES * photos:
+        return f"only {agree} of {photos} photos agree on a face: a statue, or photos of something else"
+    return ""
 
 
 def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:

@@ -36,10 +36,10 @@ class Inputs:
 def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     """Register the template. StageError only if it is required and does not hold, or if its folder is damaged."""
     from pipeline import meshes
-    from pipeline.faces.landmarks3d import load_landmarks
+    from pipeline.faces.landmarks3d import load_landmarks, photos_that_agree
     from pipeline.template.load import load_template
     from pipeline.visibility import seen_by
-    from stages.template.judge import refused_placing
+    from stages.template.judge import refused_faces, refused_placing
     from stages.template.register import placed_on, register, scan_of
 
     def step(done: int, total: int, message: str) -> None:
@@ -49,6 +49,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     ref = inputs.masks.artifact.landmarks
     if ref is None:
         return _refused(config, "no face was found in three photos or more")
+    why = refused_faces(photos_that_agree(inputs.masks.path(ref)), len(inputs.masks.artifact.masks))
+    if why:
+        return _refused(config, why)
     template = load_template(Path(config.folder) if config.folder else None)
     landmarks = load_landmarks(inputs.masks.path(ref))
     placed = placed_on(template, landmarks)

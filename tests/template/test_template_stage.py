@@ -15,7 +15,7 @@ from pipeline.registration.head import Head
 from pipeline.registration.subdivision import subdivided
 from pipeline.template.load import OWN, load_template
 from stages.template.config import folder_digest
-from stages.template.judge import judge, refused_fit, refused_placing
+from stages.template.judge import judge, refused_faces, refused_fit, refused_placing
 from stages.template.stage import Config, Inputs, run
 from stages.uv import stage as uv_stage
 from stages.uv.config import Config as UvConfig
@@ -27,7 +27,7 @@ GOOD = {"distance_mm": 0.1, "distance_95_mm": 0.5, "landmarks_mm": 2.0, "folded"
 def inputs(tmp_path: Path, landmarks: np.ndarray | None = None) -> Inputs:
     ref = None
     if landmarks is not None:
-        np.savez(tmp_path / "landmarks.npz", xyz=landmarks)
+        np.savez(tmp_path / "landmarks.npz", xyz=landmarks, kept=np.ones(3, np.bool_))
         ref = FileRef.of(tmp_path, "landmarks.npz")
     masks = Located(MaskSet(masks=(), landmarks=ref), tmp_path)
     poses = CameraSet(source="given", metric=True, capture_from_asset=((1.0,),), roi_radius=1.0, cameras=())
@@ -83,6 +83,7 @@ def test_checks_and_reasons() -> None:
         assert levels.pop(name) == "unusable" and set(levels.values()) == {"good"}
     assert not refused_placing(2.0, 1.1, metric=True) and not refused_placing(2.0, 9.0, metric=False)
     assert refused_placing(2.0, 0.5, metric=True) and refused_placing(7.0, 1.1, metric=True)
+    assert refused_faces(4, 67) and not refused_faces(7, 67) and not refused_faces(3, 0)
     fit = {"identity_rms": 0.6, "distance_mm": 0.1, "seen": 0.9}
     assert not refused_fit(fit)
     for name, bad in (("identity_rms", 4.0), ("distance_mm", 4.0), ("seen", 0.01)):
