@@ -17,7 +17,7 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.start_choice import Facts, stereo_start
 from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
-from stages.inverse_rendering.template_start import FAR, carved_by_template, landmarks_off
+from stages.inverse_rendering.template_start import FAR, HOPELESS, carved_by_template, landmarks_off
 
 NAMES = {
     "hull": "visual hull",
@@ -65,14 +65,16 @@ def choose_start(
         )  # fmt: skip
         start, stereo = _after_stereo(hull, views, settings, device, check)
         return ChosenStart(start, hull, _facts("hull", why, stereo=stereo))
+    before = landmarks_off(hull, landmarks, head.scale)
     known: Facts = {
         "template_residual_mm": round(1e3 * float(np.median(head.residual)), 3),
         "template_scale": round(head.scale, 4),
+        "landmarks_off_hull_mm": round(1e3 * before, 3),
     }
-    if settings.prior == AUTO:
+    if settings.prior == AUTO and before <= HOPELESS:
         start, stereo = _after_stereo(hull, views, settings, device, check)
         off = landmarks_off(start, landmarks, head.scale)
-        known["landmarks_off_hull_mm"] = round(1e3 * off, 3)
+        known["landmarks_off_mm"] = round(1e3 * off, 3)
         if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
             return ChosenStart(start, hull, _facts("hull", why, known, stereo))

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.maths.microfacet import alpha_from_kappa, energy
+from pipeline.maths.ggx_width import best_fit_alpha
+from pipeline.maths.microfacet import energy
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.objective import calibrated_colours, terms
 from tests.support.small_ball import SMALL, trainer
@@ -93,7 +94,7 @@ def test_the_objective_is_eq_20_by_hand() -> None:
         n, near = (t.model.geometry(p)[1].double().numpy() for p in (x, moved))
         _, rho, c, width = (v.double().numpy() for v in t.model.spatial(x))
         up = torch.tensor([[0.0, 1.0, 0.0]])
-        f0 = rho * (c @ t.model.basis(up, up)[0].double().numpy()) / energy(alpha_from_kappa(1 / width))
+        f0 = rho * (c @ t.model.basis(up, up)[0].double().numpy()) / energy(best_fit_alpha(1 / width))
         A, light = t.model.calibration().double().numpy(), t.model.light().double().numpy()
     kept, rays = shell.kept.numpy(), shell.kept.numpy()[pick]
     assert 0 < len(pick) < len(kept) < 512, "rays of all three kinds"

@@ -55,6 +55,11 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "density.crossing_weights": (density.crossing_weights, (draw(3, 5, low=-0.9), BETA)),
     "density.opacity_cross_entropy": (density.opacity_cross_entropy, (draw(6, high=3.0), draw(6, seed=1))),
     "losses.rgb_l1": (lambda p: losses.rgb_l1(p, torch.full((4, 3), 0.05, dtype=torch.float64)), (draw(4, 3),)),
+    "losses.rgb_bounded": (  # predictions are .1 and more, the targets smaller, so that no residual is 0
+        lambda p: losses.rgb_bounded(p, torch.full((4, 3), 0.05, dtype=torch.float64), torch.tensor([[0, 1, -1]] * 4)),
+        (draw(4, 3),),
+    ),
+    "losses.above": (lambda v: losses.above(v, 0.05), (draw(4),)),
     "losses.white_light": (losses.white_light, (draw(9, 3),)),
     "losses.specular_energy": (losses.specular_energy, (draw(4, 3),)),
     "losses.shininess_prior": (lambda s: losses.shininess_prior(s, 0.1), (draw(4, low=0.2),)),

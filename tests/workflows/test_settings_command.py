@@ -44,7 +44,7 @@ def test_those_of_the_papers_model_are_listed_apart(capsys: pytest.CaptureFixtur
     title = "inverse_rendering, only with inverse_rendering.preset = paper or comparison"
     ours, papers = lines[: lines.index(title)], lines[lines.index(title) :]
     assert "  shading = neural   (neural, phong or disney)" in papers
-    assert not any(line.startswith(("  shading", "  prior", "  method")) for line in ours)
+    assert not any(line.startswith(("  shading", "  prior_file", "  method")) for line in ours)
     assert any(line.startswith("  batch = ") for line in ours) and not any(x.startswith("  batch") for x in papers)
     assert "  only with inverse_rendering.preset = paper or comparison" in shown(capsys, "inverse_rendering.shading")
 
