@@ -16,7 +16,7 @@ from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.start_choice import Facts, stereo_start
-from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
+from stages.inverse_rendering.stereo import SWEEPS, Sweep
 from stages.inverse_rendering.template_start import FAR, HOPELESS, carved_by_template, landmarks_off
 
 NAMES = {
@@ -80,10 +80,10 @@ def choose_start(
             return ChosenStart(start, hull, _facts("hull", why, known, stereo))
     cut = carved_by_template(hull, load_template(), head, np.stack([v.world_from_cam[:3, 3] for v in views]))
     # on smooth skin, longer sweeps find depths at random, and eat hair away
-    start = start_from_photos(cut, views, device, check, SWEEPS[-1:]) if settings.stereo != "off" else cut
+    start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])
     known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)
     why = "setting" if settings.prior == "template" else "the hull's surface does not have the face"
-    return ChosenStart(start, cut, _facts("template", why, known, {"start": "short sweep", "why": "head template"}))
+    return ChosenStart(start, cut, _facts("template", why, known, stereo))
 
 
 def _placed(landmarks: F64 | None) -> PlacedHead | None:
@@ -91,11 +91,16 @@ def _placed(landmarks: F64 | None) -> PlacedHead | None:
 
 
 def _after_stereo(
-    hull: Start, views: list[PhotoView], settings: Config, device: str, check: Callable[[], None]
+    hull: Start,
+    views: list[PhotoView],
+    settings: Config,
+    device: str,
+    check: Callable[[], None],
+    sweeps: tuple[Sweep, ...] = SWEEPS,
 ) -> tuple[Start, Facts]:
     if settings.stereo == "off":
         return hull, {"start": "visual hull", "why": "setting"}
-    return stereo_start(hull, views, settings.stereo, device, check)
+    return stereo_start(hull, views, settings.stereo, device, check, sweeps)
 
 
 def _facts(prior: str, why: str, more: Facts | None = None, stereo: Facts | None = None) -> dict[str, Facts]:

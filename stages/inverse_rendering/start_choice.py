@@ -31,7 +31,7 @@ from stages.inverse_rendering.dense_stereo import (
 from stages.inverse_rendering.depth_fusion import fused
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.stereo import SWEEPS, start_from_photos
+from stages.inverse_rendering.stereo import SWEEPS, Sweep, start_from_photos
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -49,15 +49,20 @@ GAIN = (
 
 
 def stereo_start(
-    hull: Start, views: list[PhotoView], kind: str, device: str, check: Callable[[], None] = lambda: None
+    hull: Start,
+    views: list[PhotoView],
+    kind: str,
+    device: str,
+    check: Callable[[], None] = lambda: None,
+    sweeps: tuple[Sweep, ...] = SWEEPS,
 ) -> tuple[Start, Facts]:
-    """The start from stereo, and the figures of the choice. kind: auto, sweep or dense.
+    """The start from stereo, and the figures of the choice. kind: auto, sweep or dense. sweeps: those of the sweep.
 
     The sweep has read the validation views, too, so that the comparison favours it a little.
     """
     if kind == "sweep" or (kind == "auto" and len(views) < MIN_VIEWS):
         why = "setting" if kind == "sweep" else f"fewer than {MIN_VIEWS} views"
-        return start_from_photos(hull, views, device, check), {"start": "sweep", "why": why}
+        return start_from_photos(hull, views, device, check, sweeps), {"start": "sweep", "why": why}
 
     def dense_start(maps: DepthMaps, seen: list[PhotoView]) -> Start:
         """The fused surface; the short sweeps along its normals, which are right by now, add what fusion smoothed."""
@@ -67,7 +72,7 @@ def stereo_start(
         return dense_start(depth_maps(hull, views, check), views), {"start": "dense", "why": "setting"}
     waiting = validation_views(len(views))
     maps = depth_maps(hull, views, check, waiting)
-    swept = start_from_photos(hull, views, device, check)
+    swept = start_from_photos(hull, views, device, check, sweeps)
     dense = dense_start(without(maps, waiting), [v for n, v in enumerate(views) if n not in waiting])
     known = pictures_of(views, None, SIDE)
     neighbours = neighbours_of(hull, views, waiting)
