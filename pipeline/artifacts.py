@@ -252,7 +252,8 @@ class RegisteredHead(Artifact):
     file's indices refer to. levels: subdivisions of the displacement. quads: of the control cage. world_from_template:
     4x4 similarity to asset coordinates; identity: weights in standard deviations. figures: by name, see
     docs/stages/template.md. distances_mm: by region (median and 95 % of the subdivided head's distance from the fitted
-    surface, then both with displacement), over skin that the photos show.
+    surface, then both with displacement), over skin that the photos show. quality: the checks; they count for the stage
+    uv where the asset is made from this head, and for no verdict else.
     """
 
     registered: bool
@@ -268,6 +269,7 @@ class RegisteredHead(Artifact):
     identity: tuple[float, ...] = ()
     figures: dict[str, float] = {}
     distances_mm: dict[str, tuple[float, float, float, float]] = {}
+    quality: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -99,6 +99,7 @@ def configs_for(
                 known(key, names, what=f"unknown setting of {stage}", where=f"{origin} {stage}.{key}")
             merged[stage].update(current)
     _tile_size(merged)
+    _template(merged)
     return {name: _checked(name, classes[name], values) for name, values in merged.items()}
 
 
@@ -128,6 +129,13 @@ def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
     uv, bake = merged.get("uv", {}), merged.get("bake", {})
     if uv.get("tiles") == "auto" and "tile_size" not in uv and "size" in bake:
         uv["tile_size"] = bake["size"]
+
+
+def _template(merged: dict[str, dict[str, Any]]) -> None:
+    """The head template is registered only where the asset is made from it, or where that is asked for."""
+    uv, template = merged.get("uv", {}), merged.get("template", {})
+    if uv.get("mesh") == "template" and "template" in merged:
+        template.setdefault("enabled", True)
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:

@@ -15,6 +15,7 @@ from pipeline.units import ContentHash
 class Config(StageConfig):
     """Settings of the template stage."""
 
+    enabled: bool = Field(False, description="register the head template; default: only with uv.mesh=template")
     levels: int = Field(2, ge=1, le=3, description="subdivisions of the registered head's quads")
     require: bool = Field(False, description="fail if the template does not fit the head, or the capture shows no face")
     folder: str = Field(

@@ -46,6 +46,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         context.check()
         context.progress(done, total, message)
 
+    if not (config.enabled or config.require):
+        return RegisteredHead(registered=False, reason="not asked for (template.enabled)")
     ref = inputs.masks.artifact.landmarks
     if ref is None:
         return _refused(config, "no face was found in three photos or more")
@@ -96,7 +98,7 @@ def _registered(
         identity=tuple(round(float(w), 6) for w in found.placed.weights),
         figures=figures,
         distances_mm={n: (d.median, d.most, d.displaced_median, d.displaced_most) for n, d in by_region.items()},
-        findings=judge(figures),
+        quality=judge(figures),
     )
 
 
@@ -112,4 +114,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=1, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=2, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, RegisteredHead, Surface, UvMesh
 from pipeline.contract import Context, Stage
+from pipeline.verdict import Finding
 from stages.uv.config import Config as Config
 
 if TYPE_CHECKING:
@@ -39,20 +40,20 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.check()
         context.progress(done, total, message)
 
-    head, notes = inputs.template, list[str]()
+    head, notes, quality = inputs.template, list[str](), tuple[Finding, ...]()
     if config.mesh == "template" and head.artifact.head is not None:
         from pipeline.registration.head import load_head
         from stages.uv.registered import build_registered
 
         registered = load_head(head.path(head.artifact.head))
-        built = build_registered(registered, head.artifact.regions, dense, config, step)
+        built, quality = build_registered(registered, head.artifact.regions, dense, config, step), head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
         if config.mesh == "template":
             notes.append(f"the mesh is the scan's: {head.artifact.reason}")
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
-    return _artifact(built, tuple(notes), context)
+    return _artifact(built, tuple(notes), quality, context)
 
 
 def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
@@ -70,7 +71,7 @@ def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
     return build(dense, config, step, texel=texel, landmarks=landmarks)
 
 
-def _artifact(built: Built, notes: tuple[str, ...], context: Context) -> UvMesh:
+def _artifact(built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...], context: Context) -> UvMesh:
     return UvMesh(
         mesh=context.file(MESH),
         proxy=context.file(PROXY),
@@ -89,7 +90,7 @@ def _artifact(built: Built, notes: tuple[str, ...], context: Context) -> UvMesh:
         proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
         face_share=None if built.quality.face_share is None else round(built.quality.face_share, 5),
         warnings=(*notes, *built.warnings),
-        findings=built.findings,
+        findings=(*quality, *built.findings),
     )
 
 

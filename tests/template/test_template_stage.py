@@ -14,6 +14,7 @@ from pipeline.errors import StageError
 from pipeline.registration.head import Head
 from pipeline.registration.subdivision import subdivided
 from pipeline.template.load import OWN, load_template
+from stages.presets import configs_for
 from stages.template.config import folder_digest
 from stages.template.judge import judge, refused_faces, refused_fit, refused_placing
 from stages.template.stage import Config, Inputs, run
@@ -43,8 +44,8 @@ def network_points(scale: float, noise: float) -> np.ndarray:
 
 def test_without_a_face_nothing_is_registered_and_nothing_is_written(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    found = run(inputs(tmp_path), Config(), Context(tmp_path / "out", tmp_path))
-    assert not found.registered and "no face" in found.reason and found.head is None and found.findings == ()
+    found = run(inputs(tmp_path), Config(enabled=True), Context(tmp_path / "out", tmp_path))
+    assert not found.registered and "no face" in found.reason and found.head is None and found.quality == ()
     assert not list((tmp_path / "out").iterdir())
 
 
@@ -57,7 +58,7 @@ def test_without_a_face_nothing_is_registered_and_nothing_is_written(tmp_path: P
     ],
 )
 def test_landmarks_that_are_not_a_head_s_are_refused(points: np.ndarray, why: str, tmp_path: Path) -> None:
-    found = run(inputs(tmp_path, points), Config(), Context(tmp_path, tmp_path))
+    found = run(inputs(tmp_path, points), Config(enabled=True), Context(tmp_path, tmp_path))
     assert not found.registered and why in found.reason
 
 
@@ -166,3 +167,14 @@ def test_the_scan_is_used_where_the_template_does_not_hold(tmp_path: Path) -> No
     config = UvConfig(mesh="template", target_faces=2000, proxy_faces=300)
     uv = uv_stage.run(files, config, Context(tmp_path, tmp_path))
     assert any("no face" in w for w in uv.warnings) and uv.tiles == 1
+
+
+def test_it_is_registered_only_where_the_asset_is_made_from_it() -> None:
+    assert not configs_for("draft", {})["template"].enabled
+    assert configs_for("draft", {"uv": {"mesh": "template"}})["template"].enabled
+    assert not configs_for("draft", {"uv": {"mesh": "template"}, "template": {"enabled": False}})["template"].enabled
+
+
+def test_nothing_is_read_where_it_is_not_asked_for(tmp_path: Path) -> None:
+    found = run(None, Config(), Context(tmp_path, tmp_path))  # type: ignore[arg-type]
+    assert not found.registered and "template.enabled" in found.reason
