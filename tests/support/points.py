@@ -48,11 +48,11 @@ def reach(name: str, stopped: Callable[[], bool] = lambda: False) -> None:
 def instrument() -> None:
     """Let the real stages and the fit's checkpoints reach their points."""
     from pipeline.store import Store
-    from stages.inverse_rendering import fit
+    from stages.inverse_rendering import training_loop
     from stages.inverse_rendering.fit import Trainer
 
     if os.environ.get("NEUFACE_TEST_POINT", "").startswith("fit.checkpoint"):
-        fit.CHECKPOINT_SHARE = 1e9  # after each step: how often one is due goes by the clock otherwise
+        training_loop.CHECKPOINT_SHARE = 1e9  # after each step: how often one is due goes by the clock otherwise
     begin, finish, save = Store.begin, Store.finish, Trainer.save
 
     def begun(self: Store, stage: str, *rest: Any) -> Any:
