@@ -61,7 +61,7 @@ def leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def everything(t: Trainer) -> dict[str, Any]:
     """All that the rest of a fit depends on, what a checkpoint leaves out among it, and what is reported of it."""
     grid = t.grid
-    counted = {name: getattr(t, name) for name in fit.COUNTED if name != "spent"}
+    counted = {name: getattr(t, name) for name in t.counted if name != "spent"}
     band = {"m": grid.m, "v": grid.v, "sink": grid.sink.view(-1)[grid.active], "moves": grid.values.requires_grad}
     rates = [group["lr"] for group in t.optimiser.param_groups]
     found = {"parts": t.parts(), "counted": counted, "band": band, "rates": rates, "history": t.history}
