@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import Cancelled
-from stages.inverse_rendering import fit, time_budget
+from stages.inverse_rendering import time_budget, training_loop
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.paper.config import PaperConfig
 from stages.inverse_rendering.stage import Config
@@ -28,7 +28,7 @@ STEPS = 60
 def ticking(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A step takes one tick, whatever the machine does."""
     ticks = count()
-    monkeypatch.setattr(fit, "time", SimpleNamespace(monotonic=lambda: TICK * next(ticks)))
+    monkeypatch.setattr(training_loop, "time", SimpleNamespace(monotonic=lambda: TICK * next(ticks)))
     yield
 
 
