@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -99,8 +100,9 @@ def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
     check()
     renderer = Renderer(load_exported(root))
     view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
-    write_rgba_png(path.resolve(), renderer.render(view))
-    return path.resolve()
+    path = Path(os.path.normpath(path))  # symbolic links stay: the store's folder may be one
+    write_rgba_png(path, renderer.render(view))
+    return path
 
 
 def framing(renderer: Renderer, azimuth: float, size: int) -> PinholeCamera:
