@@ -23,8 +23,8 @@ from pipeline.artifacts import Located
 from pipeline.store import Store
 from stages.inverse_rendering.initial_geometry import Start, hull_start
 from stages.inverse_rendering.load_views import read_views
-from stages.inverse_rendering.start_choice import stereo_start
 from stages.inverse_rendering.stereo import start_from_photos, surface_points
+from stages.inverse_rendering.stereo_choice import stereo_start
 from stages.registry import REGISTRY
 
 CHIN, CHEST = -0.06, -0.17  # heights in the truth's world, m

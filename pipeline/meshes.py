@@ -113,6 +113,11 @@ def unit(v: npt.NDArray[np.floating]) -> F64:
     return out
 
 
+def triangles_of(quads: Indices) -> Faces:
+    """(2 Q, 3): quad q (Q, 4) is triangles 2 q and 2 q + 1, cut from its first to its third corner."""
+    return np.asarray(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
+
+
 def edges(faces: Faces) -> Indices:
     """(3 F, 2) directed edges, in the order of the faces' sides 0-1, 1-2, 2-0 (all first sides first)."""
     f = np.asarray(faces, np.int64)

@@ -79,26 +79,27 @@ def _inverse_blocks(  # type: ignore[no-untyped-def]
 
 
 @njit(error_model="numpy", cache=True)
+def _row_times(start, column, value, i, x):  # type: ignore[no-untyped-def]
+    """Row i of a sparse matrix times x (V, 3)."""
+    a = b = c = 0.0
+    for k in range(start[i], start[i + 1]):
+        j, v = column[k], value[k]
+        a += v * x[j, 0]
+        b += v * x[j, 1]
+        c += v * x[j, 2]
+    return a, b, c
+
+
+@njit(error_model="numpy", cache=True)
 def _applied(  # type: ignore[no-untyped-def]
     l_start, l_column, l_value, s_start, s_column, s_value, t_start, t_column, t_value, normals, weights, x, out
 ):
     """out (V, 3) = the matrix times x (V, 3)."""
     for i in range(len(out)):
-        a = b = c = 0.0
-        for k in range(l_start[i], l_start[i + 1]):
-            j, v = l_column[k], l_value[k]
-            a += v * x[j, 0]
-            b += v * x[j, 1]
-            c += v * x[j, 2]
-        out[i, 0], out[i, 1], out[i, 2] = a, b, c
+        out[i, 0], out[i, 1], out[i, 2] = _row_times(l_start, l_column, l_value, i, x)
     along = np.empty(len(normals))
     for m in range(len(normals)):
-        a = b = c = 0.0
-        for k in range(s_start[m], s_start[m + 1]):
-            j, v = s_column[k], s_value[k]
-            a += v * x[j, 0]
-            b += v * x[j, 1]
-            c += v * x[j, 2]
+        a, b, c = _row_times(s_start, s_column, s_value, m, x)
         along[m] = weights[m] * (a * normals[m, 0] + b * normals[m, 1] + c * normals[m, 2])
     for i in range(len(out)):
         for k in range(t_start[i], t_start[i + 1]):

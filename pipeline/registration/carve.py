@@ -24,12 +24,10 @@ from scipy.spatial import cKDTree
 
 from pipeline.hull import BAND_CELLS, Hull
 from pipeline.meshes import F32, F64, Mask, vertex_normals
-from pipeline.registration.identity_fit import PlacedHead, landmark_data, place
+from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.shell import outer_shell, shell_distance
 from pipeline.template.model import SKIN, Template
 
-SIGMA = 0.003  # metres: scatter of the network's landmarks around the template's, on rendered persons and head scans
-MAX_RESIDUAL = 0.006  # metres: a template whose own landmarks are further off does not fit this face
 # Metres, by region. Everywhere a little: stereo finds a surface inside of its start more easily than one outside.
 FACED: Mapping[str, float] = {"scalp": 0.045, "ears": 0.012, "neck": 0.015}
 ELSEWHERE, SIDE, HIDDEN = 0.002, 0.08, 0.02
@@ -41,15 +39,6 @@ BELOW = 0.01  # metres below the lowest landmark at which that begins
 CHEST, BACK = 0.02, 0.06  # metres that anything may lie in front of the nose, and behind the back of the head
 SMOOTH_STEPS = 12  # of averaging over neighbours: a changes over about two centimetres
 BLUR = 0.006  # metres: so that a has no steps where the nearest place of the template changes
-
-
-def placed_on_face(template: Template, landmarks: F64) -> PlacedHead | None:
-    """The template on landmarks (468, 3), in any unit; None if they do not look like a face's."""
-    data = landmark_data(template, landmarks, SIGMA)
-    if len(data.where) < len(template.landmarks.names) // 2:
-        return None
-    head = place(template, (data,))
-    return head if float(np.median(head.residual)) <= MAX_RESIDUAL else None
 
 
 def possible_space(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Indices, Mask
+from pipeline.meshes import F64, Indices, Mask, triangles_of
 from pipeline.registration.folds import piercing_edges
 from pipeline.registration.scan import Scan
 
@@ -30,7 +30,7 @@ def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Sc
     blocked[quads[~free]] = True
     use = agrees & (seen > 0) & ~blocked
     moved = np.where(use, np.nan_to_num(signed), 0.0) * _faded(use, quads)
-    faces = np.asarray(quads[free][:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
+    faces = triangles_of(quads[free])
     before = np.unique(piercing_edges(points, faces))
     for _ in range(TAKEN_BACK):
         hit = np.setdiff1d(piercing_edges(points + moved[:, None] * normals, faces), before)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, unit
+from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, triangles_of, unit
 from pipeline.ray_casting import RayCaster
 
 LEAST = 0.1  # cosine between the corner's normal and that of the turned rest
@@ -68,6 +68,6 @@ def piercing_edges(vertices: F64, faces: Faces) -> Indices:
 def pierced_quads(points: F64, fine: Indices) -> Indices:
     """(Q,) number of piercing edges at each quad of the cage. points (M, 3), fine (16 Q, 4): of the second
     subdivision."""
-    edges = piercing_edges(points, np.asarray(fine[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32))
+    edges = piercing_edges(points, triangles_of(fine))
     hits = np.bincount(edges.ravel(), minlength=len(points))
     return np.asarray(hits[fine].reshape(-1, 64).sum(1), np.int64)

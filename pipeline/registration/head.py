@@ -8,6 +8,7 @@ seen (n,): 0 to 1, how well the photos show that place.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pipeline.meshes import F32, F64, Indices
 from pipeline.registration.subdivision import Level, limit, subdivided
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # no slots: the surface is kept
 class Head:
     """vertices (V, 3) asset coordinates; quads (Q, 4); uvs (U, 2), uv_quads (Q, 4): UDIM tiles in one row; region, part
     (Q,): index into the names of the artifact; displacement, seen (n,); levels ()."""
@@ -37,6 +38,10 @@ class Head:
 
     def surface(self) -> tuple[F64, F64, Indices]:
         """Limit points (n, 3), unit normals (n, 3) and quads (Q 4^levels, 4), without displacement."""
+        return self._surface
+
+    @cached_property
+    def _surface(self) -> tuple[F64, F64, Indices]:
         return limit_surface(self.vertices, self.fine())
 
     def fine_uvs(self) -> tuple[F64, Indices]:

@@ -25,6 +25,8 @@ from pipeline.meshes import F64, Indices
 from pipeline.template.model import Template
 from pipeline.transforms import apply, similarity, umeyama
 
+LANDMARK_SIGMA = 0.003  # metres: scatter of the network's landmarks around the template's, on persons and scans
+MAX_RESIDUAL = 0.006  # metres, median: a template whose landmarks are further off does not fit this face
 ROUNDS = 12  # Gauss-Newton steps; 6 are enough on all captures
 SOFT = 2.0  # sigmas at which a datum has half of its weight
 MIN_DATA = 8  # landmarks: fewer do not determine a similarity well
@@ -62,12 +64,24 @@ class PlacedHead:
         return float(np.cbrt(np.linalg.det(self.world_from_template[:3, :3])))
 
 
-def landmark_data(template: Template, landmarks: F64, sigma: float) -> Data:
+def landmark_data(template: Template, landmarks: F64, sigma: float = LANDMARK_SIGMA) -> Data:
     """The template's landmarks that the network's points landmarks (468, 3) show; sigma: metres."""
     points = template.landmarks
     where = landmarks[points.network]
     known = np.isfinite(where).all(1)
     return Data(points.corners[known], points.weights[known], where[known], np.full(int(known.sum()), sigma))
+
+
+def placed_on_landmarks(template: Template, landmarks: F64) -> PlacedHead | None:
+    """The template on landmarks (468, 3), in any unit; None if fewer than half of its own are known."""
+    data = landmark_data(template, landmarks)
+    return place(template, (data,)) if len(data.where) >= len(template.landmarks.names) // 2 else None
+
+
+def placed_on_face(template: Template, landmarks: F64) -> PlacedHead | None:
+    """The same; None also if the landmarks do not look like a face's."""
+    head = placed_on_landmarks(template, landmarks)
+    return head if head is not None and float(np.median(head.residual)) <= MAX_RESIDUAL else None
 
 
 def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None = None) -> PlacedHead:

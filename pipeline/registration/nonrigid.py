@@ -38,7 +38,7 @@ LOOSE_REACH = 0.004  # metres: on scalp and neck a surface further away is hair 
 LANDMARK = 1.0  # h_l over c of the same step: landmarks guide, and let go with the stiffness
 FIXED = 1e-6  # of c: keeps the system positive definite where nothing else does
 TOLERANCE, MOST = 0.01, 200  # of the solver: of the residual at its start, which the last round left; steps
-REPAIRS, CALMER = 5, 4.0  # rounds of repair, and how much calmer the surroundings of a fault become in each
+REPAIRS, DAMPING = 5, 4.0  # rounds of repair, and factor of the damping around a fault in each
 
 
 Steps = tuple[tuple[float, float], ...]
@@ -68,19 +68,19 @@ class Fitted:
 
 def fitted(cage: Cage, rest: F64, scan: Scan, guides: Guides, unit: float, check: Callable[[], None]) -> Fitted:
     """The cage with rest (V, 3) on the scan. unit: world units per metre of the template."""
-    calm = np.ones(len(rest))
+    damping = np.ones(len(rest))
     near = _around(cage)
-    start, _ = _steps(cage, rest, rest, scan, guides, calm, unit, STEPS[:AGAIN], check)
+    start, _ = _steps(cage, rest, rest, scan, guides, damping, unit, STEPS[:AGAIN], check)
     repairs = 0
     while True:
-        x, turn = _steps(cage, rest, start, scan, guides, calm, unit, STEPS[AGAIN:], check)
+        x, turn = _steps(cage, rest, start, scan, guides, damping, unit, STEPS[AGAIN:], check)
         folded, pierced = folded_quads(rest, x, turn, cage.quads), pierced_quads(cage.at_finer @ x, cage.finer) > 0
         if not (folded | pierced).any() or repairs == REPAIRS:
             return Fitted(x, turn, int(folded.sum()), int(pierced.sum()), repairs)
         repairs += 1
         hit = np.zeros(len(rest))
         hit[cage.quads[folded | pierced]] = 1
-        calm = calm * np.where(near @ (near @ hit) > 0, CALMER, 1.0)
+        damping = damping * np.where(near @ (near @ hit) > 0, DAMPING, 1.0)
 
 
 def _steps(
@@ -89,18 +89,18 @@ def _steps(
     x: F64,
     scan: Scan,
     guides: Guides,
-    calm: F64,
+    damping: F64,
     unit: float,
     steps: Steps,
     check: Callable[[], None],
 ) -> tuple[F64, F64]:
-    """x (V, 3) after the steps, and the rotations there (V, 3, 3). calm (V,) >= 1: how much less the data count there,
-    and how much stiffer it is."""
+    """x (V, 3) after the steps, and the rotations there (V, 3, 3). damping (V,) >= 1: how much less the data
+    count there, and how much stiffer it is."""
     around, edges = _around(cage), cage.difference @ rest
     size = abs(guides.stencil)
-    less = (size @ np.ones(len(x))) / np.maximum(size @ calm, 1e-30)
-    trust = 1 / (cage.stencil @ calm)
-    cage = replace(cage, stiffness=cage.stiffness * 0.5 * (abs(cage.difference) @ calm))
+    less = (size @ np.ones(len(x))) / np.maximum(size @ damping, 1e-30)
+    trust = 1 / (cage.stencil @ damping)
+    cage = replace(cage, stiffness=cage.stiffness * 0.5 * (abs(cage.difference) @ damping))
     fixed = csr_array(eye_array(len(x), format="csr"))
     springs = csr_array(cage.difference.T @ diags_array(cage.stiffness) @ cage.difference)
     for c, reach in steps:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.meshes import F64, Faces, Indices, Mask
+from pipeline.meshes import F64, Indices, Mask, triangles_of
 from pipeline.registration.cage import HIDDEN, LOOSE
 from pipeline.registration.folds import piercing_edges
 from pipeline.registration.head import Head
@@ -46,11 +46,6 @@ class Quads:
     aspect: float
 
 
-def triangles(quads: Indices) -> Faces:
-    """(2 Q, 3): each quad cut from its first to its third corner."""
-    return np.asarray(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
-
-
 def distances(head: Head, names: tuple[str, ...], scan: Scan, unit: float) -> Mapping[str, Distances]:
     """By region, and of all skin that can be shown under the name "skin". unit: world units per metre of the template;
     distances are in metres of the world times 1000."""
@@ -65,8 +60,9 @@ def distances(head: Head, names: tuple[str, ...], scan: Scan, unit: float) -> Ma
     out, before = {}, np.abs(off[quads])
     ok = (seen[quads] > 0) & ~(loose[:, None] & (before > LOOSE_REACH * unit)) & np.isfinite(before)
     fine = (after_seen > 0) & ok.all(1) & np.isfinite(after)
-    shown = np.array([n not in HIDDEN and n not in NOT_SKIN for n in names])
-    for name, rows in {**{n: region == i for i, n in enumerate(names) if shown[i]}, "skin": shown[region]}.items():
+    shown = outer_quads(region, names)
+    regions = {n: region == i for i, n in enumerate(names) if n not in HIDDEN and n not in NOT_SKIN}
+    for name, rows in {**regions, "skin": shown}.items():
         a, b = before[rows][ok[rows]], np.abs(after[rows & fine])
         if len(a) and len(b):
             (m, p), (dm, dp) = np.quantile(a, [0.5, 0.95]), np.quantile(b, [0.5, 0.95])
@@ -78,7 +74,7 @@ def seen_share(head: Head, names: tuple[str, ...]) -> float:
     """Share of the area of the skin's outside that the photos show."""
     points, _, quads = head.surface()
     region = np.repeat(head.region, 4**head.levels)
-    outside = np.array([n not in HIDDEN and n not in NOT_SKIN for n in names])[region]
+    outside = outer_quads(region, names)
     at = points[quads[outside]]
     area = 0.5 * np.linalg.norm(np.cross(at[:, 2] - at[:, 0], at[:, 3] - at[:, 1]), axis=1)
     return float((area * (head.seen[quads[outside]] > 0).mean(1)).sum() / max(area.sum(), 1e-30))
@@ -102,7 +98,7 @@ def face_piercings(head: Head, names: tuple[str, ...]) -> int:
     """Edges of the displaced face (with lids, lips and nose) that pass through another part of it."""
     points, normals, quads = head.surface()
     moved = points + head.displacement[:, None].astype(np.float64) * normals
-    return len(piercing_edges(moved, triangles(quads[face_quads(head, names)])))
+    return len(piercing_edges(moved, triangles_of(quads[face_quads(head, names)])))
 
 
 def face_quads(head: Head, names: tuple[str, ...]) -> Mask:

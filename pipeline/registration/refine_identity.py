@@ -14,7 +14,6 @@ from pipeline.registration.identity_fit import Data, PlacedHead, landmark_data, 
 from pipeline.registration.scan import Scan
 from pipeline.template.model import SKIN, Template
 
-LANDMARK_SIGMA = 0.003  # metres: scatter of the network's landmarks around the template's
 REACHES = (0.025, 0.015, 0.010)  # metres of the template, one round each
 SIGMA = 0.0115  # metres: eight neighbouring pairs with an error of 4 mm count like one that is independent
 LOOSE_REACH = 0.008  # metres, on scalp and neck
@@ -23,7 +22,7 @@ MOST = 1000  # pairs of a round: more change nothing
 
 def refined(template: Template, landmarks: F64, head: PlacedHead, scan: Scan) -> PlacedHead:
     """The head on landmarks (468, 3) and the scan, from the head that lies on the landmarks alone."""
-    own = landmark_data(template, landmarks, LANDMARK_SIGMA)
+    own = landmark_data(template, landmarks)
     for reach in REACHES:
         pairs = surface_data(template, head, scan, reach)
         if len(pairs.where):

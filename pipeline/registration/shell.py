@@ -13,7 +13,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from pipeline.meshes import F32, F64, Faces, Indices, Mask, area_vectors, unit
+from pipeline.meshes import F32, F64, Faces, Indices, Mask, area_vectors, triangles_of, unit
 from pipeline.ray_casting import RayCaster
 from pipeline.template.model import SKIN, Template
 
@@ -43,12 +43,11 @@ def outer_shell(template: Template) -> Shell:
     left_out = [template.regions[name] for name in INSIDE if name in template.regions]
     keep = np.setdiff1d(template.parts[SKIN], np.concatenate(left_out) if left_out else np.zeros(0, np.int64))
     quads = template.quads[keep]
-    triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     loops = border_loops(quads)
     middle = len(template.vertices) + np.arange(len(loops))
     caps = [np.stack([np.roll(b, -1), b, np.full(len(b), m)], 1) for b, m in zip(loops, middle, strict=True)]
     quad = np.concatenate([np.repeat(keep, 2), np.full(sum(map(len, caps)), -1)])
-    return Shell(np.concatenate([triangles, *caps]).astype(np.int32), quad.astype(np.int64), tuple(loops))
+    return Shell(np.concatenate([triangles_of(quads), *caps]).astype(np.int32), quad.astype(np.int64), tuple(loops))
 
 
 def border_loops(quads: Indices) -> list[Indices]:

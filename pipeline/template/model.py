@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import UsageError
-from pipeline.meshes import F64, Faces, Indices, Mask
+from pipeline.meshes import F64, Faces, Indices, Mask, triangles_of
 
 SKIN = "skin"  # the part that every template has
 
@@ -114,7 +114,7 @@ class Template:
 
     def triangles(self) -> Faces:
         """(2 Q, 3): quad q is triangles 2 q and 2 q + 1, cut from its first to its third corner."""
-        return np.asarray(self.quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
+        return triangles_of(self.quads)
 
     def region_weights(self, name: str) -> F64:
         """(V,) share of each vertex's quads that belong to a region: soft at its border."""

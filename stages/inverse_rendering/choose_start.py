@@ -9,22 +9,14 @@ import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.meshes import F64
-from pipeline.registration.carve import placed_on_face
-from pipeline.registration.identity_fit import PlacedHead
+from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
-from stages.inverse_rendering.config import AUTO, Config
+from stages.inverse_rendering.config import AUTO, PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.start_choice import Facts, stereo_start
 from stages.inverse_rendering.stereo import SWEEPS, Sweep
-from stages.inverse_rendering.template_start import FAR, HOPELESS, carved_by_template, landmarks_off
-
-NAMES = {
-    "hull": "visual hull",
-    "template": "visual hull cut by the head template",
-    "sphere": "sphere",
-    "imface": "ImFace",
-}
+from stages.inverse_rendering.stereo_choice import Facts, stereo_start
+from stages.inverse_rendering.template_start import BEYOND_STEREO, FAR, carved_by_template, landmarks_off
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +46,9 @@ def choose_start(
     """
     if settings.prior not in (AUTO, "hull", "template"):  # a preset of the paper's
         return ChosenStart(hull, hull, _facts(settings.prior, "setting"))
-    head = _placed(landmarks) if settings.prior != "hull" else None
-    if head is None or landmarks is None:
+    template = None if settings.prior == "hull" or landmarks is None else load_template()
+    head = None if template is None or landmarks is None else placed_on_face(template, landmarks)
+    if head is None or template is None or landmarks is None:
         if settings.prior == "template":
             raise _no_face(landmarks is not None)
         why = (
@@ -71,23 +64,19 @@ def choose_start(
         "template_scale": round(head.scale, 4),
         "landmarks_off_hull_mm": round(1e3 * before, 3),
     }
-    if settings.prior == AUTO and before <= HOPELESS:
+    if settings.prior == AUTO and before <= BEYOND_STEREO:
         start, stereo = _after_stereo(hull, views, settings, device, check)
         off = landmarks_off(start, landmarks, head.scale)
         known["landmarks_off_mm"] = round(1e3 * off, 3)
         if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
             return ChosenStart(start, hull, _facts("hull", why, known, stereo))
-    cut = carved_by_template(hull, load_template(), head, np.stack([v.world_from_cam[:3, 3] for v in views]))
-    # on smooth skin, longer sweeps find depths at random, and eat hair away
+    cut = carved_by_template(hull, template, head, np.stack([v.world_from_cam[:3, 3] for v in views]))
+    # on smooth skin, longer sweeps find depths at random, and remove hair
     start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])
     known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)
     why = "setting" if settings.prior == "template" else "the hull's surface does not have the face"
     return ChosenStart(start, cut, _facts("template", why, known, stereo))
-
-
-def _placed(landmarks: F64 | None) -> PlacedHead | None:
-    return None if landmarks is None else placed_on_face(load_template(), landmarks)
 
 
 def _after_stereo(
@@ -104,7 +93,7 @@ def _after_stereo(
 
 
 def _facts(prior: str, why: str, more: Facts | None = None, stereo: Facts | None = None) -> dict[str, Facts]:
-    geometry: Facts = {"prior": NAMES[prior], "why": why, **(more or {})}
+    geometry: Facts = {"prior": PRIORS[prior], "why": why, **(more or {})}
     return {"geometry": geometry} | ({} if stereo is None else {"stereo": stereo})
 
 

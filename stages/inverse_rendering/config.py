@@ -18,6 +18,12 @@ MAX_RANK, MAX_ORDER = 3, 10  # values until the model selection: the paper's
 
 Preset = Literal["draft", "studio", "film"]
 Decision = Literal["auto", "on", "off"]
+PRIORS = {  # names of the initial geometries in the report
+    "hull": "visual hull",
+    "template": "visual hull cut by the head template",
+    "sphere": "sphere",
+    "imface": "ImFace",
+}
 
 
 # Presets: the settings that differ from the defaults of Config.

@@ -12,6 +12,7 @@ from pipeline.artifacts import MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
+from stages.inverse_rendering.config import PRIORS
 from stages.inverse_rendering.cross_validation import more
 from stages.inverse_rendering.model_selection import MIN_SPECULAR, Facts
 from stages.inverse_rendering.residuals import ViewError, decibels
@@ -44,7 +45,6 @@ AGREE = Limits(0.12, 0.35, lower=False)
 SPECULAR = Limits(MIN_SPECULAR, 0.0)
 ALWAYS = Limits(0.0, 0.0)
 MAX_NAMED = 12
-HULL = "visual hull"  # choose_start.py; other initial geometries need not have the silhouettes
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +67,8 @@ def findings(f: Fitted) -> tuple[Finding, ...]:
 def start(f: Fitted) -> list[Finding]:
     """The check whether the initial hull has the masks' silhouettes."""
     error = _number(f.facts, "relief", "silhouette_error_of_prior")
-    if error is None or f.facts.get("geometry", {}).get("prior") != HULL:
-        return []
+    if error is None or f.facts.get("geometry", {}).get("prior") != PRIORS["hull"]:
+        return []  # other initial geometries need not have the silhouettes
     message = f"the initial geometry contradicts the masks of the validation views in {error:.1%} of the rays"
     remedy = (
         "check the masks in the report: a mask that lacks a part of the subject removes it from the model; correct or "

@@ -27,7 +27,7 @@ from stages.inverse_rendering.cross_validation import NEGLIGIBLE, ValidationSamp
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lobe, reflectance
 from stages.inverse_rendering.observations import observe, pictures, surface_points
-from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, Rays
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, Rays, evenly_spaced
 
 SELECTION_AT = 0.3  # share of the steps: the surface is accurate to a millimetre, and most steps are still to come
 RAYS = 1500
@@ -93,7 +93,7 @@ def validation_views(count: int, settings: Config) -> tuple[int, ...]:
     if count < MIN_VIEWS or not settings.has_open_parts:
         return ()
     n = min(max(round(VALIDATION_SHARE * count), 2), MAX_VALIDATION)
-    return tuple(int((i + 0.5) * count / n) for i in range(n))
+    return evenly_spaced(count, n)
 
 
 # ------------------------------------------------------------------ deciding

@@ -82,6 +82,11 @@ class Batch:
     bound: Tensor
 
 
+def evenly_spaced(count: int, n: int) -> tuple[int, ...]:
+    """n positions among `count` views; none for n = 0."""
+    return tuple(int((i + 0.5) * count / n) for i in range(n))
+
+
 def factor_for(size: tuple[int, int], side: int, *, exact: bool = False) -> int:
     """The smallest block size, in pixels, that reduces the longest side of (width, height) to at most `side`.
 

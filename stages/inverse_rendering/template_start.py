@@ -20,7 +20,7 @@ from stages.inverse_rendering.stereo import distances
 # Metres of the template: median distance of the landmarks from a surface that does not have the face. Measured: 1 to
 # 3 mm on surfaces that are right, 6 to 45 mm where the hull hides the face.
 FAR = 0.006
-HOPELESS = 0.015  # the same before stereo: no sweep goes so far. 24 mm on arcs of photos
+BEYOND_STEREO = 0.015  # the same before stereo: no sweep goes so far. 24 mm on arcs of photos
 
 
 def landmarks_off(start: Start, landmarks: F64, unit: float) -> float:

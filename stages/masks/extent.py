@@ -49,7 +49,8 @@ def whole_hull(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent)
 
 def cut_by_head(hull: Hull, cameras: Sequence[Camera], face: F64) -> Hull:
     """A hull that the photos leave open, without what no person with this face fills. face: (468, 3) landmarks."""
-    from pipeline.registration.carve import carved_hull, placed_on_face
+    from pipeline.registration.carve import carved_hull
+    from pipeline.registration.identity_fit import placed_on_face
     from pipeline.template.load import load_template
 
     template = load_template()

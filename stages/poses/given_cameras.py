@@ -10,6 +10,7 @@ from pipeline.artifacts import Camera, CameraSet, Located
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import StageError
+from pipeline.faces.landmarks3d import head_frame
 from pipeline.transforms import inverse_rigid, matrix
 from pipeline.verdict import Finding
 from stages.poses.config import Config
@@ -20,7 +21,7 @@ from stages.poses.normalise import Unit, nearest_point, normalise, viewing_rays
 from stages.poses.photos import photos_of
 from stages.poses.progress import progress_of
 from stages.poses.scale import by_world, eyes_of
-from stages.poses.scale_source import find_faces, head_of, known_scale, size_of_head, some_of
+from stages.poses.scale_source import find_faces, known_scale, landmarks_of, size_of_head, some_of
 from stages.poses.write_cameras import camera_of, camera_set
 
 if TYPE_CHECKING:
@@ -62,8 +63,10 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
     if world is not None and config.unit == "auto":
         published, axes = by_world(matrix(world))
         known = published if known is None and config.scale == "auto" else known
+    face = landmarks_of(faces)
+    head = None if face is None else head_frame(face)
     found = normalise(
-        cameras, given=True, unit=unit, known=known, axes=axes, head=head_of(faces), guess=lambda: size_of_head(faces)
+        cameras, given=True, unit=unit, known=known, axes=axes, head=head, guess=lambda: size_of_head(face)
     )
     all_warnings = (*warnings, *found.warnings)
     result = camera_set("given", cameras, found, model, [c.name for c in cameras], names, all_warnings, context)

@@ -10,8 +10,9 @@ from pipeline.artifacts import Camera, Located
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.errors import StageError
 from pipeline.faces.find import Face, find_face
-from pipeline.faces.landmarks3d import HeadFrame, head_frame, triangulate
+from pipeline.faces.landmarks3d import triangulate
 from pipeline.images import read_encoded
+from pipeline.transforms import F64
 from stages.poses.config import Config
 from stages.poses.features import U8, grey8
 from stages.poses.scale import Eyes, Scale, by_distance, by_markers, by_positions, by_pupils, find_markers
@@ -81,25 +82,23 @@ def find_faces(
     return out
 
 
-def size_of_head(faces: list[tuple[Camera, Face]]) -> Scale | None:
-    """A guess of the scale from the head template placed on the face, or None if no three photos agree on a face that
-    it fits."""
+def landmarks_of(faces: list[tuple[Camera, Face]]) -> F64 | None:
+    """(468, 3) the face's landmarks in the cameras' world, or None if no three photos agree on a face."""
     found = triangulate([c for c, _ in faces], np.stack([f.points for _, f in faces])) if faces else None
-    if found is None:
+    return None if found is None else found.xyz
+
+
+def size_of_head(landmarks: F64 | None) -> Scale | None:
+    """A guess of the scale from the head template placed on landmarks (468, 3); None if it does not fit them."""
+    if landmarks is None:
         return None
-    from pipeline.registration.carve import placed_on_face
+    from pipeline.registration.identity_fit import placed_on_face
     from pipeline.template.load import load_template
 
-    head = placed_on_face(load_template(), found.xyz)
+    head = placed_on_face(load_template(), landmarks)
     if head is None:
         return None
     return Scale(HEAD_SIZE / head.scale, f"guessed from the shape of the face, within about {HEAD_DEVIATION:.0%}")
-
-
-def head_of(faces: list[tuple[Camera, Face]]) -> HeadFrame | None:
-    """The head's axes in the cameras' world, or None if no three photos agree on a face."""
-    found = triangulate([c for c, _ in faces], np.stack([f.points for _, f in faces])) if faces else None
-    return None if found is None else head_frame(found.xyz)
 
 
 def some_of(capture: Located[Capture], cameras: list[Camera]) -> list[Camera]:

@@ -15,7 +15,7 @@ from stages.poses.normalise import normalise
 from stages.poses.photos import photos_of
 from stages.poses.progress import progress_of
 from stages.poses.scale import eyes_of
-from stages.poses.scale_source import find_faces, known_scale, size_of_head
+from stages.poses.scale_source import find_faces, known_scale, landmarks_of, size_of_head
 from stages.poses.sfm import solve
 from stages.poses.write_cameras import camera_of, camera_set
 
@@ -45,7 +45,9 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     faces = find_faces(capture, cameras, context.check)
     eyes = eyes_of([(c, face.pupils) for c, face in faces])
     known = known_scale(capture, cameras, config, eyes, warnings)
-    found = normalise(cameras, model.points, given=False, known=known, eyes=eyes, guess=lambda: size_of_head(faces))
+    found = normalise(
+        cameras, model.points, given=False, known=known, eyes=eyes, guess=lambda: size_of_head(landmarks_of(faces))
+    )
     warnings += found.warnings
     if missing:
         listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pipeline.registration.identity_fit import MAX_RESIDUAL
 from pipeline.verdict import Finding, Limits, judged
 
 DISTANCE = Limits(0.3, 1.0, lower=False)
@@ -38,7 +39,6 @@ def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
 
 
 MIN_FACES = 0.1  # of the photos: persons have 0.25 or more also if photographed all around, a statue had 0.06
-MAX_RESIDUAL = 6.0  # mm: landmarks further off are not those of a face
 SCALES = (0.75, 1.75)  # metres per metre of the template: a child's head to the largest of adults
 MAX_WEIGHT = 3.0  # root mean square of the identity weights: persons have 1
 MAX_DISTANCE = 3.0  # mm, median: the template is not on this head
@@ -54,8 +54,8 @@ def refused_faces(agree: int, photos: int) -> str:
 
 def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:
     """Why the landmarks do not place the template; "" if they do. scale: metres per metre of the template."""
-    if residual_mm > MAX_RESIDUAL:
-        return f"the template's landmarks are {residual_mm:.2g} mm off (median), more than {MAX_RESIDUAL:g}"
+    if residual_mm > 1000 * MAX_RESIDUAL:
+        return f"the template's landmarks are {residual_mm:.2g} mm off (median), more than {1000 * MAX_RESIDUAL:g}"
     if metric and not SCALES[0] <= scale <= SCALES[1]:
         return f"the head would be {scale:.2g} times the template's size, outside of {SCALES[0]:g} to {SCALES[1]:g}"
     return ""

@@ -13,11 +13,11 @@ from pipeline.registration.cage import Cage, cage_of
 from pipeline.registration.displacement import displacement
 from pipeline.registration.followers import followed
 from pipeline.registration.head import Head, limit_surface
-from pipeline.registration.identity_fit import PlacedHead, landmark_data, place
+from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.lids import REST, closing, lids_closed, with_lids
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
 from pipeline.registration.quality import outer_quads
-from pipeline.registration.refine_identity import LANDMARK_SIGMA, refined
+from pipeline.registration.refine_identity import refined
 from pipeline.registration.scan import Scan
 from pipeline.registration.subdivision import limit, subdivided
 from pipeline.template.model import Template
@@ -43,12 +43,6 @@ class Registration:
     head: Head
     landmarks_mm: float
     closed: bool
-
-
-def placed_on(template: Template, landmarks: F64) -> PlacedHead | None:
-    """The template on landmarks (468, 3); None if too few are known."""
-    data = landmark_data(template, landmarks, LANDMARK_SIGMA)
-    return place(template, (data,)) if len(data.where) >= len(template.landmarks.names) // 2 else None
 
 
 def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> Scan:

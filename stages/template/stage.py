@@ -35,19 +35,20 @@ class Inputs:
 
 def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     """Register the template. StageError only if it is required and does not hold, or if its folder is damaged."""
+    if not (config.enabled or config.require):
+        return RegisteredHead(registered=False, reason="not asked for (template.enabled)")
     from pipeline import meshes
     from pipeline.faces.landmarks3d import load_landmarks, photos_that_agree
+    from pipeline.registration.identity_fit import placed_on_landmarks
     from pipeline.template.load import load_template
     from pipeline.visibility import seen_by
     from stages.template.judge import refused_faces, refused_placing
-    from stages.template.register import placed_on, register, scan_of
+    from stages.template.register import register, scan_of
 
     def step(done: int, total: int, message: str) -> None:
         context.check()
         context.progress(done, total, message)
 
-    if not (config.enabled or config.require):
-        return RegisteredHead(registered=False, reason="not asked for (template.enabled)")
     ref = inputs.masks.artifact.landmarks
     if ref is None:
         return _refused(config, "no face was found in three photos or more")
@@ -56,7 +57,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         return _refused(config, why)
     template = load_template(Path(config.folder) if config.folder else None)
     landmarks = load_landmarks(inputs.masks.path(ref))
-    placed = placed_on(template, landmarks)
+    placed = placed_on_landmarks(template, landmarks)
     if placed is None:
         return _refused(config, "too few landmarks of the face are known")
     why = refused_placing(1000 * float(np.median(placed.residual)), placed.scale, metric=inputs.poses.artifact.metric)

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import meshes, tiles
-from pipeline.meshes import F64, Charts, Indices, Mask, Mesh
+from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, triangles_of
 from pipeline.registration.head import Head, limit_surface
-from pipeline.registration.quality import face_quads, outer_quads, triangles
+from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
 from stages.uv import decimate
 from stages.uv.build import Built, Step, crumpled
@@ -37,7 +37,7 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: 
     step(0, 3, "subdividing")
     kept = np.array([n not in LEFT_OUT for n in regions])[head.region]
     fine = np.repeat(kept, 4**head.levels)
-    mesh, rows = compacted(*_displaced(head), head.fine().quads[fine])
+    mesh, rows = compacted(*_displaced(head), head.surface()[2][fine])
     uvs, uv_quads = head.fine_uvs()
     charts = _charts(uvs, uv_quads[fine])
     points, normals, _ = limit_surface(head.vertices, subdivided(head.quads, len(head.vertices), 0))
@@ -74,19 +74,19 @@ def _displaced(head: Head) -> tuple[F64, F64]:
     """(n, 3) points on the fitted surface where it was seen, and their normals."""
     points, normals, quads = head.surface()
     moved = points + head.displacement[:, None].astype(np.float64) * normals
-    return moved, meshes.vertex_normals(moved, triangles(quads)).astype(np.float64)
+    return moved, meshes.vertex_normals(moved, triangles_of(quads)).astype(np.float64)
 
 
 def compacted(points: F64, normals: F64, quads: Indices) -> tuple[Mesh, Indices]:
     """A mesh of the vertices that quads (Q, 4) use, and their rows (n',)."""
     used, flat = np.unique(quads, return_inverse=True)
-    faces = triangles(flat.reshape(-1, 4))
+    faces = triangles_of(flat.reshape(-1, 4))
     return Mesh(points[used].astype(np.float32), normals[used].astype(np.float32), faces), np.asarray(used, np.int64)
 
 
 def _charts(uvs: F64, quads: Indices) -> Charts:
     used, flat = np.unique(quads, return_inverse=True)
-    return Charts(np.asarray(uvs[used], np.float32), triangles(flat.reshape(-1, 4)))
+    return Charts(np.asarray(uvs[used], np.float32), triangles_of(flat.reshape(-1, 4)))
 
 
 def _shown(head: Head, regions: tuple[str, ...], fine: Mask) -> Mask:

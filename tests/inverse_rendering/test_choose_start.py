@@ -10,8 +10,8 @@ from pipeline.errors import StageError
 from pipeline.meshes import F64
 from pipeline.registration.shell import outer_shell, shell_distance
 from pipeline.template.load import load_template
-from stages.inverse_rendering.choose_start import NAMES, ChosenStart, choose_start
-from stages.inverse_rendering.config import Config
+from stages.inverse_rendering.choose_start import ChosenStart, choose_start
+from stages.inverse_rendering.config import PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.template_start import FAR, landmarks_off
 
@@ -48,7 +48,7 @@ def chosen(hull: Start, landmarks: F64 | None, **changes: Any) -> ChosenStart:
 def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
     found = chosen(box(), marks())
     facts = found.facts["geometry"]
-    assert facts["prior"] == NAMES["template"] and float(facts["landmarks_off_hull_mm"]) > 1e3 * FAR
+    assert facts["prior"] == PRIORS["template"] and float(facts["landmarks_off_hull_mm"]) > 1e3 * FAR
     assert landmarks_off(found.start, marks(), 1.0) < 0.004
     assert box().values[found.start.values < 0].max() < CELL  # the hull stays the outer limit
     assert found.prior is not box() and np.array_equal(found.prior.values, found.start.values)
@@ -57,7 +57,7 @@ def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
 def test_a_hull_with_the_face_stays() -> None:
     hull = head()
     found = chosen(hull, marks())
-    assert found.start is hull and found.facts["geometry"]["prior"] == NAMES["hull"]
+    assert found.start is hull and found.facts["geometry"]["prior"] == PRIORS["hull"]
     assert float(found.facts["geometry"]["landmarks_off_hull_mm"]) < 1e3 * FAR
 
 
@@ -65,13 +65,13 @@ def test_without_a_face_the_hull_stays() -> None:
     hull = box()
     for landmarks in (None, np.random.default_rng(0).standard_normal((468, 3))):
         found = chosen(hull, landmarks)
-        assert found.start is hull and found.facts["geometry"]["prior"] == NAMES["hull"]
+        assert found.start is hull and found.facts["geometry"]["prior"] == PRIORS["hull"]
 
 
 def test_the_setting_decides() -> None:
     hull = box()
     assert chosen(hull, marks(), prior="hull").start is hull
-    assert chosen(head(), marks(), prior="template").facts["geometry"]["prior"] == NAMES["template"]
+    assert chosen(head(), marks(), prior="template").facts["geometry"]["prior"] == PRIORS["template"]
     for landmarks in (None, np.full((468, 3), np.nan)):
         with pytest.raises(StageError, match="template"):
             chosen(hull, landmarks, prior="template")

@@ -17,7 +17,7 @@ from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.depth_fusion import closed, fused
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.start_choice import stereo_start, validation_views, windowed
+from stages.inverse_rendering.stereo_choice import stereo_start, validation_views, windowed
 
 RADIUS, SIDE, DISTANCE = 0.1, 160, 0.5
 DENT, DENT_AT = 0.05, np.array([0.0, 0.0, 0.11])  # a ball of this radius is taken out of the front: a bowl

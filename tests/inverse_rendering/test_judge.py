@@ -14,7 +14,7 @@ from pipeline.artifacts import FileRef, MaskSet, ViewMask
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, worst
-from stages.inverse_rendering.choose_start import NAMES
+from stages.inverse_rendering.config import PRIORS
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.judge import Fitted, findings
@@ -35,7 +35,7 @@ FACTS: dict[str, dict[str, Any]] = {
         "silhouette_error_of_prior": 0.002,
         "silhouette_error": 0.004,
     },
-    "geometry": {"prior": NAMES["hull"]},
+    "geometry": {"prior": PRIORS["hull"]},
 }
 RISING = (19.3, 25.2, 32.0, 34.3, 33.6, 34.5, 35.2, 36.4, 37.2, 37.5)
 
@@ -146,7 +146,7 @@ def test_histories_too_short_to_judge() -> None:
 def test_a_start_that_the_masks_contradict(wrong: float, level: str) -> None:
     facts: Any = {"relief": {**FACTS["relief"], "silhouette_error_of_prior": wrong}}
     assert only(sound(facts=facts), "start_silhouette").level == level
-    sphere = sound(facts=facts | {"geometry": {"prior": NAMES["sphere"]}})  # which is never the subject's shape
+    sphere = sound(facts=facts | {"geometry": {"prior": PRIORS["sphere"]}})  # which is never the subject's shape
     assert "start_silhouette" not in [f.check for f in findings(sphere)]
 
 

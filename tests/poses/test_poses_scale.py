@@ -25,7 +25,7 @@ from stages.poses.scale import (
     eyes_of,
     find_markers,
 )
-from stages.poses.scale_source import HEAD_SIZE, size_of_head
+from stages.poses.scale_source import HEAD_SIZE, landmarks_of, size_of_head
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
 SIZE = (640, 480)
@@ -211,6 +211,6 @@ def test_the_size_of_a_head_is_guessed_from_its_landmarks() -> None:
     for c in cams:
         uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.zeros(5), world)
         faces.append((c, Face(uv, 1.0)))
-    found = size_of_head(faces)
+    found = size_of_head(landmarks_of(faces))
     assert found is not None and found.metres_per_unit == pytest.approx(HEAD_SIZE / unit, rel=0.02)
-    assert "guessed" in found.source and size_of_head([]) is None and size_of_head(faces[:2]) is None
+    assert "guessed" in found.source and size_of_head(landmarks_of([])) is None and landmarks_of(faces[:2]) is None

@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.hull import Hull
 from pipeline.meshes import F64
-from pipeline.registration.carve import CHEST, ELSEWHERE, carved_hull, placed_on_face, possible_space
+from pipeline.registration.carve import CHEST, ELSEWHERE, carved_hull, possible_space
+from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
 from pipeline.transforms import apply, similarity
 

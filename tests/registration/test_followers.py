@@ -75,8 +75,7 @@ def test_lids_meet_where_they_are_pulled() -> None:
 
 
 def test_open_and_closed_eyes_are_told_apart() -> None:
-    from pipeline.meshes import Mesh, vertex_normals
-    from pipeline.registration.quality import triangles
+    from pipeline.meshes import Mesh, triangles_of, vertex_normals
 
     template = load_template()
     cage = cage_of(template)
@@ -84,7 +83,7 @@ def test_open_and_closed_eyes_are_told_apart() -> None:
     skin = template.quads[template.parts["skin"]]
     for strength, closed in ((0.0, False), (0.5, True)):
         vertices = template.vertices + strength * blink(template)
-        mesh = Mesh(vertices.astype(np.float32), vertex_normals(vertices, triangles(skin)), triangles(skin))
+        mesh = Mesh(vertices.astype(np.float32), vertex_normals(vertices, triangles_of(skin)), triangles_of(skin))
         assert lids_closed(template, still, cage, Scan(mesh, np.ones(len(vertices)))) == closed
 
 
@@ -139,16 +138,15 @@ def test_displacement_is_taken_back_where_it_would_cross() -> None:
     both = np.concatenate([low, low + [0, 1e-3, 0]])
     normals = np.repeat([[0.0, 1, 0], [0, -1, 0]], n * n, axis=0)
     faces = np.concatenate([quads, quads[:, ::-1] + n * n])
-    from pipeline.meshes import Mesh
+    from pipeline.meshes import Mesh, triangles_of
     from pipeline.registration.folds import piercing_edges
-    from pipeline.registration.quality import triangles
 
     wave = 1.2e-3 * (1 + np.sin(400 * x.ravel())) / 2
     target = np.concatenate([low + np.c_[0 * wave, wave, 0 * wave], low + [0, 1.0e-3, 0]])
-    mesh = Mesh(target.astype(np.float32), normals.astype(np.float32), triangles(faces))
+    mesh = Mesh(target.astype(np.float32), normals.astype(np.float32), triangles_of(faces))
     moved, _ = displacement(both, normals, faces, np.ones(len(faces), np.bool_), Scan(mesh, np.ones(len(both))), 1.0)
     assert np.abs(moved).max() > 2e-4
-    assert not len(piercing_edges(both + moved[:, None] * normals, triangles(faces)))
+    assert not len(piercing_edges(both + moved[:, None] * normals, triangles_of(faces)))
 
 
 def test_figures_of_a_ball_beside_a_ball() -> None:

@@ -20,12 +20,17 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Artifact, Located
 from pipeline.capture_artifacts import Capture, CaptureView
+from stages.inverse_rendering.systems import paper_config
 from workflows.bench.rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.cli.console import Console
 
 F32 = npt.NDArray[np.float32]
 Looks = tuple[float, float, float, float]
 OURS = "SH + neural bases, k = 3"
+AS_IN_THE_PAPER = (  # settings of every row, with the values of preset paper
+    "basis_inputs", "calibration", "rank", "light_order", "specular", "refine_geometry", "resolution", "shadows",
+    "albedo_sparsity", "uniform_albedo_until", "stereo",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,24 +140,15 @@ def unique(tables: Iterable[Table]) -> list[Row]:
 
 def settings_of(row: Row, given: argparse.Namespace) -> tuple[str, ...]:
     """Settings as for `--set`: the budget, the paper's model where the fast one adds to it, the row's own."""
+    paper = paper_config().presets["paper"]
     base = {
         "preset": "comparison",
         "steps": given.steps,
         "image_side": given.side,
         "batch": given.batch,
         "grid_cells": 192,
-        "basis_inputs": "paper",
-        "calibration": "on",
-        "rank": 3,
-        "light_order": 10,
-        "specular": "on",
-        "refine_geometry": "on",
-        "resolution": "given",
-        "shadows": False,
-        "albedo_sparsity": 0.0,
-        "uniform_albedo_until": 0.0,
+        **{name: paper[name] for name in AS_IN_THE_PAPER},
         "light_from": "uniform_albedo",
-        "stereo": "off",
         "levels": 3,
     }
     values = {f"inverse_rendering.{k}": v for k, v in {**base, **row.settings}.items()}

@@ -25,11 +25,10 @@ from workflows.bench import captures_find as captures
 from workflows.bench.captures_against import compare
 from workflows.bench.captures_child import CHILD, Ended, run_child
 from workflows.bench.captures_figures import Run, figures_of, read_run, texture_of, verdict_of
-from workflows.bench.captures_find import Found
+from workflows.bench.captures_find import PROJECT, Found
 from workflows.bench.captures_table import FIGURES, markdown, shown
 from workflows.cli.console import Console
 
-PROJECT = Path(__file__).resolve().parents[2]
 TABLE = PROJECT / "docs" / "benchmarks" / "captures.json"
 FORMAT = 1
 LIMIT = 40.0  # minutes: a draft takes three to ten on two cores

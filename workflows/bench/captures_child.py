@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from workflows.bench.captures_find import PROJECT
+
 CHILD = (sys.executable, "-m", "workflows.cli")
 GRACE = 30.0  # seconds that a run has to stop at its next checkpoint before it is killed
 FINISHED = re.compile(r"^\[\d+/\d+\] (\w+): (?:(\d+(?:\.\d+)?) s|reused)\s*$")
@@ -81,7 +83,7 @@ def _signal(group: int, number: int) -> None:
 
 
 def _environment() -> dict[str, str]:
-    here = str(Path(__file__).resolve().parents[2])
+    here = str(PROJECT)
     paths = os.pathsep.join(p for p in (here, os.environ.get("PYTHONPATH", "")) if p)
     return {**os.environ, "PYTHONPATH": paths}
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from pipeline.errors import UsageError
 from workflows.batch.captures import natural
 
-DEFAULT_ROOT = Path(__file__).resolve().parents[3] / "shared" / "captures"  # beside the project
+PROJECT = Path(__file__).resolve().parents[2]
+DEFAULT_ROOT = PROJECT.parent / "shared" / "captures"  # beside the project
 PHOTOS = "images"
 LIGHT_STAGE = ("lights.json", "olat")  # photos with one light at a time: not a format of this version
 ALL_ON, CAMERAS = "full_on", "params.json"  # of a light stage: the photos with all lights on, and their cameras

@@ -30,7 +30,7 @@ from stages.inverse_rendering.dense_stereo import (
 )
 from stages.inverse_rendering.depth_fusion import fused
 from stages.inverse_rendering.initial_geometry import Start
-from stages.inverse_rendering.ray_sampling import PhotoView
+from stages.inverse_rendering.ray_sampling import PhotoView, evenly_spaced
 from stages.inverse_rendering.stereo import SWEEPS, Sweep, start_from_photos
 
 F32 = npt.NDArray[np.float32]
@@ -86,8 +86,7 @@ def stereo_start(
 
 def validation_views(views: int) -> tuple[int, ...]:
     """Positions of the validation views, evenly spaced."""
-    count = min(VALIDATION, views // 4)
-    return tuple(int((k + 0.5) * views / count) for k in range(count))
+    return evenly_spaced(views, min(VALIDATION, views // 4))
 
 
 def without(maps: DepthMaps, left_out: tuple[int, ...]) -> DepthMaps:
