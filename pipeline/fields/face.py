@@ -6,7 +6,6 @@ File: npz with `spec` (JSON, utf-8 bytes) and one array per parameter or buffer,
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from pipeline.errors import StageError
 from pipeline.fields import build
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.parts import Geometry, Skin
+from pipeline.fields.parts import Geometry, Shaded, Skin
 from pipeline.fields.protocol import F32, Material
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.fields.spec import FaceSpec
@@ -27,19 +26,6 @@ from pipeline.maths.sdf import unit
 
 FORMAT = 1
 CHUNK = 131_072
-
-
-@dataclass(frozen=True, slots=True)
-class Shaded:
-    """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
-    calibration. along_normal: (N,) rho c . B(n, n), the reflectance along the normal; 0 for models without bases."""
-
-    total: Tensor
-    diffuse: Tensor
-    specular: Tensor
-    albedo: Tensor
-    inv_kappa: Tensor
-    along_normal: Tensor
 
 
 class FaceModel(nn.Module):
@@ -60,6 +46,7 @@ class FaceModel(nn.Module):
         self.basis = system.integral(spec)
         self.light = system.light(spec)
         self.shading = system.shading(spec, self.basis, self.light)
+        self.rendering = system.rendering(spec)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
         self.uniform_albedo = False  # one albedo for all points, while the light is estimated

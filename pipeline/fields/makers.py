@@ -12,6 +12,7 @@ from pipeline.fields.encodings import HashEncoding
 from pipeline.fields.geometry import GridSdf
 from pipeline.fields.light import ShLight
 from pipeline.fields.parts import Integral, Light
+from pipeline.fields.rendering import ExpectedPoint
 from pipeline.fields.shading import BasisShading
 from pipeline.fields.spec import FaceSpec
 
@@ -47,3 +48,8 @@ def shading(spec: FaceSpec, integral: Integral, light: Light) -> BasisShading:
     """The specular term."""
     assert isinstance(integral, IntegratedBasis)
     return BasisShading(integral, light, spec.attenuation)
+
+
+def rendering(spec: FaceSpec) -> ExpectedPoint:
+    """Shading once per ray."""
+    return ExpectedPoint()

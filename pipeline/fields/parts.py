@@ -27,6 +27,19 @@ class Skin:
     inv_kappa: Tensor
 
 
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """Radiance at N surface points: total = diffuse + specular [NeuFace eq. 4], (N, 3) each, linear, before the
+    calibration. along_normal: (N,) rho c . B(n, n), the reflectance along the normal; 0 for models without bases."""
+
+    total: Tensor
+    diffuse: Tensor
+    specular: Tensor
+    albedo: Tensor
+    inv_kappa: Tensor
+    along_normal: Tensor
+
+
 class Part(Protocol):
     """A network module."""
 
@@ -118,6 +131,31 @@ class Shading(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class RayPoints:
+    """Where K rays are shaded: the expected point x, unit normal n and unit direction to the eye wo, (K, 3) each.
+    samples(): all S samples of each ray, as points (K, S, 3), unit normals (K, S, 3) and their shares of the ray's
+    weight (K, S)."""
+
+    x: Tensor
+    n: Tensor
+    wo: Tensor
+    samples: Callable[[], tuple[Tensor, Tensor, Tensor]]
+
+
+class RayRendering(Protocol):
+    """How the samples of a ray become its opacity and its radiance. [NeuFace eq. 18]"""
+
+    def weights(self, s: Tensor, half_width: Tensor, hit: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
+        """SDF (M, S) at samples spread evenly over +-half_width (M,), whether the ray hits (M,), width of the density
+        (): weights (M, S) and optical depth (M,)."""
+        ...
+
+    def shade(self, model: Callable[[Tensor, Tensor, Tensor], Shaded], at: RayPoints) -> Shaded:
+        """Radiance of K rays; model: (x, n, wo) -> radiance at surface points."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
 class System:
     """Constructors of a model's parts. geometry: from the arrays of a saved model, by name, and its cell."""
 
@@ -126,3 +164,4 @@ class System:
     integral: Callable[[FaceSpec], Integral]
     light: Callable[[FaceSpec], Light]
     shading: Callable[[FaceSpec, Integral, Light], Shading]
+    rendering: Callable[[FaceSpec], RayRendering]

@@ -3,20 +3,19 @@
 Symbols: t_0 hit or closest approach; samples at t_0 +- w, w wide enough that the shell crosses the soft surface at any
 angle; tau optical depth; x_s, n the point and normal averaged by the weights of [NeuFace eq. 18].
 
-Differs: shading is evaluated once per ray, at x_s, and not at every sample: over a shell of less than a millimetre the
-radiance is nearly linear, so the mean of the values is the value at the mean. `volumetric` shades every sample and
-averages, as the paper does; docs/benchmarks.md compares both.
+How the samples become opacity and radiance is a part of the model (pipeline.fields.parts.RayRendering).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from pipeline.fields.face import FaceModel, Shaded
-from pipeline.maths.density import OPAQUE, crossing_weights, laplace_density, ray_weights
+from pipeline.fields.face import FaceModel
+from pipeline.fields.parts import RayPoints, Shaded
+from pipeline.maths.density import OPAQUE
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.ray_sampling import Rays
@@ -63,20 +62,11 @@ def sample_shell(
     t = t0[:, None] + w[:, None] * (2 * u - 1)
     x = o[:, None] + t[..., None] * d[:, None]
     s, g = geometry(x.reshape(-1, 3))
-    weights, tau = _weigh(model, s.reshape(t.shape), w, hit)
+    weights, tau = model.rendering.weights(s.reshape(t.shape), w, hit, model.beta)
     share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-8)
     x_s = o + (share * t).sum(-1, keepdim=True) * d
     n = unit((share[..., None] * g.reshape(*t.shape, 3)).sum(1))
     return Shell(kept, tau, t0 + w, x_s, n, hit, g, t, share)
-
-
-def _weigh(model: FaceModel, s: Tensor, w: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (M, S) and optical depth (M,) of a shell's SDF samples."""
-    if model.spec.density == "crossing":
-        return crossing_weights(s, model.beta)
-    delta = (2 * w / s.shape[1])[:, None].expand_as(s).clone()
-    delta[:, -1] += torch.where(hit, 2 * w, torch.zeros_like(w))  # behind the shell of a hit lies the solid
-    return ray_weights(laplace_density(s, model.beta), delta)
 
 
 def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
@@ -89,20 +79,13 @@ def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
 def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Shaded:
     """Radiance (K, 3) of the rays `pick` (K,), indices into the shell."""
     wo = -rays.d[shell.kept[pick]]
-    if not model.spec.volumetric:
-        return model.shade(shell.x[pick], shell.n[pick], wo)
-    t, share = shell.t[pick], shell.share[pick]
-    samples = t.shape[1]
-    x = rays.o[shell.kept[pick]][:, None] - t[..., None] * wo[:, None]
-    n = unit(shell.gradient.reshape(-1, samples, 3)[pick])
-    every = model.shade(x.reshape(-1, 3), n.reshape(-1, 3), wo.repeat_interleave(samples, 0))
-    return Shaded(**{f.name: _mean(getattr(every, f.name), share) for f in fields(Shaded)})
 
+    def samples() -> tuple[Tensor, Tensor, Tensor]:
+        t, share = shell.t[pick], shell.share[pick]
+        x = rays.o[shell.kept[pick]][:, None] - t[..., None] * wo[:, None]
+        return x, unit(shell.gradient.reshape(-1, share.shape[1], 3)[pick]), share
 
-def _mean(values: Tensor, share: Tensor) -> Tensor:
-    """Weighted mean over the samples: (M * S, ...), (M, S) -> (M, ...)."""
-    every = values.reshape(*share.shape, *values.shape[1:])
-    return (share.reshape(*share.shape, *[1] * (values.dim() - 1)) * every).sum(1)
+    return model.rendering.shade(model.shade, RayPoints(shell.x[pick], shell.n[pick], wo, samples))
 
 
 def solid_behind(model: FaceModel, shell: Shell, rays: Rays) -> Tensor:

@@ -217,17 +217,18 @@ def test_what_lies_behind_an_edge_shows() -> None:
 
 def test_shading_every_sample_is_the_mean_of_the_samples(fitted: Trainer) -> None:
     """Against a plain loop over one ray's samples; and close to shading once, which the shell is thin enough for."""
+    from pipeline.fields.paper.rendering import EverySample
     from stages.inverse_rendering.render import sample_shell, shade_shell
 
     model, rays = fitted.model, image_rays(ball_view(5), 1, "cpu")
     shell = sample_shell(model, rays, 8, None, None)
     pick = torch.nonzero(shell.hit).squeeze(-1)[::97]
     once = shade_shell(model, shell, rays, pick)
-    model.spec = replace(model.spec, volumetric=True)
+    ours, model.rendering = model.rendering, EverySample(model.rendering)
     try:
         every = shade_shell(model, shell, rays, pick)
     finally:
-        model.spec = replace(model.spec, volumetric=False)
+        model.rendering = ours
     i = int(pick[3])
     d = rays.d[shell.kept[i]]
     by_hand = torch.zeros(3)

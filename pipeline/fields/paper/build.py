@@ -16,6 +16,7 @@ from pipeline.fields.paper.displaced import DisplacedSdf
 from pipeline.fields.paper.material import FEATURES, DirectIntegral, FeatureIntegral
 from pipeline.fields.paper.prior_imface import ImFacePrior, under
 from pipeline.fields.paper.priors import HullPrior, SpherePrior
+from pipeline.fields.paper.rendering import rendering
 from pipeline.fields.paper.shading import DisneyShading, IntegralShading, PhongShading
 from pipeline.fields.paper.sinusoidal import SinusoidalField
 from pipeline.fields.parts import Geometry, Integral, Light, Shading, Spatial, System
@@ -26,7 +27,7 @@ def compared(spec: FaceSpec) -> System:
     """A system that differs from ours in at least one part."""
     return System(
         GEOMETRIES[spec.geometry], SPATIALS[spec.appearance], INTEGRALS[spec.integral], LIGHTS[spec.light],
-        shading_of(spec),
+        shading_of(spec), rendering,
     )  # fmt: skip
 
 
