@@ -62,7 +62,11 @@ class SpatialField(nn.Module):
 
     Differs: a hash encoding and a small ReLU network replace the paper's sinusoidal MLP (about 10 times faster per
     sample on a CPU, docs/benchmarks.md). Heads as in the paper: sigmoid, sigmoid, (softplus), softplus.
+
+    level: factor of a and rho, 1 during the fit; it is changed together with the light, at the end.
     """
+
+    level: Tensor
 
     def __init__(
         self,
@@ -79,10 +83,12 @@ class SpatialField(nn.Module):
         last = self.net[-1]
         assert isinstance(last, nn.Linear)
         start_heads(last, albedo)
+        self.register_buffer("level", torch.ones(()))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Material at x (N, 3)."""
-        return heads(self.net(self.encoding(x)), self.positive)
+        albedo, rho, c, inv_kappa = heads(self.net(self.encoding(x)), self.positive)
+        return albedo * self.level, rho * self.level, c, inv_kappa
 
 
 class IntegratedBasis(nn.Module):

@@ -101,6 +101,11 @@ class Config(StageConfig):
         description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo",
     )
+    albedo_level: Annotated[float, Field(ge=0.01, le=0.95)] | Literal["auto", "fitted"] = Field(
+        default=AUTO,
+        description="luminance of the face's albedo, linear, if it was measured; auto: from the lobe and the whites of "
+        "the eyes; fitted: as it comes out of the fit",
+    )
     attenuation: Literal["exponential", "exact"] = Field(
         default="exponential", description="attenuation of the light's SH bands by the lobe [NeuFace eq. 11]"
     )

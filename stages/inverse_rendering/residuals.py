@@ -155,11 +155,16 @@ def _by_label(
     """Errors of a view's pixels by label name. xy: (N, 2) on the z = 1 plane; square: (N,) squared errors."""
     if codes is None:
         return {}
+    found, errors = codes_at(view, xy, codes), square.cpu().numpy()
+    here = (int(c) for c in np.unique(found) if 0 < c < len(names))
+    return {names[c]: LabelError(int((found == c).sum()), float(errors[found == c].mean())) for c in here}
+
+
+def codes_at(view: PhotoView, xy: Tensor, codes: U8) -> U8:
+    """(N,) label codes of a view's pixels. xy: (N, 2) on the z = 1 plane; codes: (H, W) at any size."""
     positions = np.asarray(xy.cpu().numpy(), np.float64)
     uv = transforms.distort(positions, view.distortion) @ view.K[:2, :2].T + view.K[:2, 2]
     height, width = codes.shape
     column = (uv[:, 0] * width / view.size[0]).astype(np.int64).clip(0, width - 1)
     row = (uv[:, 1] * height / view.size[1]).astype(np.int64).clip(0, height - 1)
-    found, errors = codes[row, column], square.cpu().numpy()
-    here = (int(c) for c in np.unique(found) if 0 < c < len(names))
-    return {names[c]: LabelError(int((found == c).sum()), float(errors[found == c].mean())) for c in here}
+    return np.asarray(codes[row, column], np.uint8)

@@ -28,6 +28,7 @@ class Inputs:
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
     from pipeline.faces.landmarks3d import load_landmarks
+    from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import exposures_differ
     from stages.inverse_rendering.footprint import footprint, supported
@@ -77,13 +78,15 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
         trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, MIN_TRAINING * settings.seconds)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
+    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
+    light = trainer.choices.facts.get("light", {}) if trainer.choices else {}
+    level = set_level(model, trainer.pixels, views, labels, names, config.albedo_level, light)
     model.save(context.workdir / "field.npz")
     write_light(model, context)
     held_out = predict_held_out(
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
-    facts = model_facts(trainer, looked, chosen.facts)
-    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
+    facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level}
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
     fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts)
     return FittedFace(
@@ -115,7 +118,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=11,
+    version=12,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

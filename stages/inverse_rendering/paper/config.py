@@ -19,6 +19,7 @@ PAPER_PRESETS: dict[str, dict[str, Any]] = {
     # Tested in short runs only: on a CPU it would take weeks.
     "paper": {
         "method": "paper",
+        "albedo_level": "fitted",
         "stereo": "off",
         "rank": 3,
         "light_order": 10,

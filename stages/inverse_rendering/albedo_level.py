@@ -1,0 +1,187 @@
+"""The level of the albedo: the one factor that photos under an unknown light do not tell.
+
+    albedo -> g albedo,  reflectance -> g reflectance,  light -> light / g        changes no photo, for every g > 0
+
+So g comes from what else is known. Each source gives ln g with a standard deviation; they are averaged by their
+weights 1 / sigma^2:
+
+lobe     g = 1. The light was estimated from view-dependent residuals for skin's F0 (light_estimate.py). Where they
+         explain the share e of the view-dependent variance, sigma = LOBE_STD ((1 - e) / e)^1.5. Truth: e = 0.47, error
+         1 % (head_a); e = 0.23, error 26 % (person_e).
+start    g = 1. Without that estimate the level is that of the initial albedo, a middle tone: it says next to nothing.
+eyes     g = SCLERA / (luminance of the whites of the eyes). Sclera is nearly the same for everyone, of any skin tone.
+         Left out for closed or hidden eyes.
+
+SCLERA is the value that the fit gives to open eyes if its level is right: 0.40 and 0.37 for two rendered persons with
+known albedo. It is below the sclera's own reflectance, because lids shade the eye by more than the fit models.
+
+Differs: not in the paper, whose level follows from the white-light loss and the initial values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from pipeline.colour import LUMA
+from pipeline.fields.appearance import SpatialField
+from pipeline.fields.face import FaceModel
+from pipeline.fields.light import ShLight
+from stages.inverse_rendering.config import AUTO
+from stages.inverse_rendering.observations import surface_points
+from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+from stages.inverse_rendering.residuals import U8, codes_at
+
+F64 = npt.NDArray[np.float64]
+Fact = dict[str, str | float | bool]
+
+FACE, EYES = "face", "eyes"  # names of the labels
+LOBE_STD, START_STD, EYES_STD = 0.06, 0.6, 0.2  # of ln g
+SCLERA = 0.39
+MIN_PIXELS = 200  # of the eyes, over all photos
+MOST_PIXELS = 20_000
+BRIGHTEST = 0.95  # quantile of the luminance between the lids: sclera
+DARKEST, CONTRAST = 0.05, 0.4  # quantile of pupil and iris, and its largest ratio to the sclera
+LESS_RED = 0.12  # least difference of ln(red / blue) between skin and sclera
+WHITEST, WHITE_QUANTILE = 0.98, 0.99  # g leaves this quantile of the face's albedo below that value
+SEED = 27_644_437
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledAlbedos:
+    """Albedo of surface points that photos show with the label face (N, 3) or eyes (M, 3), linear."""
+
+    face: F64
+    eyes: F64
+
+
+@dataclass(frozen=True, slots=True)
+class AlbedoLevel:
+    """gain: the factor g of the albedo. log_std: standard deviation of ln g, 0 if the level was given. facts: for the
+    report."""
+
+    gain: float
+    log_std: float
+    facts: Fact
+
+
+def set_level(
+    model: FaceModel,
+    table: PixelTable,
+    views: Sequence[PhotoView],
+    labels: Sequence[U8 | None],
+    names: Sequence[str],
+    wanted: float | str,
+    light: Fact,
+) -> Fact:
+    """Decide the level and apply it to the model; the facts for the report.
+
+    wanted: setting `albedo_level`. light: the facts of the light's selection. A model of other parts than ours, or the
+    setting `fitted`, keeps its level.
+    """
+    if not isinstance(model.spatial, SpatialField) or not isinstance(model.light, ShLight) or wanted == "fitted":
+        return {"gain": 1.0, "why": "setting"}
+    seen = labelled_albedos(model, table, views, labels, names)
+    explained = light.get("explained")
+    found = decide(seen, None if wanted == AUTO else float(wanted), None if explained is None else float(explained))
+    apply_gain(model.spatial, model.light, found.gain)
+    return found.facts
+
+
+def labelled_albedos(
+    model: FaceModel,
+    table: PixelTable,
+    views: Sequence[PhotoView],
+    labels: Sequence[U8 | None],
+    names: Sequence[str],
+) -> LabelledAlbedos:
+    """Albedo of the model at random labelled pixels of all views. labels, names: as in residuals.view_errors."""
+    generator = torch.Generator().manual_seed(SEED)
+    pools: dict[str, list[Tensor]] = {FACE: [], EYES: []}
+    for n, (view, codes) in enumerate(zip(views, labels, strict=True)):
+        own = table.inside[table.view[table.inside] == n]
+        if codes is None or not len(own):
+            continue
+        found = torch.from_numpy(codes_at(view, table.xy[own], codes).astype(np.int64)).to(own.device)
+        for name, pool in pools.items():
+            if name in names:
+                pool.append(own[found == list(names).index(name)])
+    return LabelledAlbedos(*(_albedos(model, table, pools[name], generator) for name in (FACE, EYES)))
+
+
+def _albedos(model: FaceModel, table: PixelTable, pools: list[Tensor], generator: torch.Generator) -> F64:
+    """(N, 3) where the rays of at most MOST_PIXELS of these pixels hit the surface."""
+    pixels = torch.cat(pools) if pools else table.inside[:0]
+    if not len(pixels):
+        return np.zeros((0, 3))
+    if len(pixels) > MOST_PIXELS:
+        pixels = pixels[torch.randint(len(pixels), (MOST_PIXELS,), generator=generator).to(pixels.device)]
+    x, _ = surface_points(model.geometry, table.at(pixels).rays)
+    with torch.no_grad():
+        return np.asarray(model.spatial(x)[0].cpu().numpy(), np.float64)
+
+
+def decide(seen: LabelledAlbedos, wanted: float | None, explained: float | None) -> AlbedoLevel:
+    """The level from all sources.
+
+    wanted: luminance of the face's albedo that was measured, None to decide. explained: share of the view-dependent
+    variance that the light's estimate explains, in (0, 1), None without an estimate.
+    """
+    skin = float(np.median(seen.face @ LUMA)) if len(seen.face) >= MIN_PIXELS else None
+    if wanted is not None:
+        if skin is None:
+            return AlbedoLevel(1.0, 0.0, {"gain": 1.0, "why": "setting, but no pixel has the label face"})
+        gain = wanted / max(skin, 1e-6)
+        return AlbedoLevel(gain, 0.0, {"gain": round(gain, 4), "face": round(wanted, 4), "why": "setting"})
+    source, std = ("lobe", lobe_std(explained)) if explained is not None else ("start", START_STD)
+    total, weight, facts = 0.0, std**-2, dict[str, str | float | bool]()
+    white = sclera(seen)
+    if white is not None:
+        total, weight = EYES_STD**-2 * math.log(SCLERA / white), weight + EYES_STD**-2
+        facts["whites_of_the_eyes"] = round(white, 4)
+        source += " and eyes"
+    gain = math.exp(total / weight)
+    if skin is not None:
+        brightest = float(np.quantile(seen.face.max(1), WHITE_QUANTILE))
+        gain = min(gain, max(WHITEST / max(brightest, 1e-6), 1.0))
+        facts["face"] = round(gain * skin, 4)
+    facts |= {"gain": round(gain, 4), "log_std": round(weight**-0.5, 3), "why": source}
+    return AlbedoLevel(gain, weight**-0.5, facts)
+
+
+def lobe_std(explained: float) -> float:
+    """Standard deviation of ln g of a light estimate that explains this share, clamped to [0.01, 0.99]; never more than
+    START_STD, the knowledge without an estimate."""
+    e = min(max(explained, 0.01), 0.99)
+    return min(LOBE_STD * math.pow((1 - e) / e, 1.5), START_STD)
+
+
+def sclera(seen: LabelledAlbedos) -> float | None:
+    """Luminance of the whites of the eyes; None for closed or hidden eyes, which are as red as skin and have no dark
+    pupil."""
+    if len(seen.eyes) < MIN_PIXELS or len(seen.face) < MIN_PIXELS:
+        return None
+    light = seen.eyes @ LUMA
+    dark, white = np.quantile(light, (DARKEST, BRIGHTEST))
+    if not white > 0 or dark > CONTRAST * white:
+        return None
+    top, skin = np.median(seen.eyes[light >= white], 0), np.median(seen.face, 0)
+    return float(white) if _redness(skin) - _redness(top) > LESS_RED else None
+
+
+def _redness(colour: F64) -> float:
+    return math.log(max(float(colour[0]), 1e-6) / max(float(colour[2]), 1e-6))
+
+
+def apply_gain(spatial: SpatialField, light: ShLight, gain: float) -> None:
+    """Multiply albedo and reflectance by g > 0 and divide the light by it. Every photo stays as it is, except for light
+    that skin reflects onto itself, which keeps the factor of the former level (a few percent in concave parts)."""
+    with torch.no_grad():
+        spatial.level.mul_(gain)
+        light.coefficients.div_(gain)
