@@ -281,11 +281,13 @@ class UvMesh(Artifact):
     Linf of [Sander 2001]. seam_front_mm: length of seams where the surface faces the front. deviation: of the mesh and
     of the proxy from the dense mesh. tiles: number of UDIM tiles (pipeline.tiles); tile_utilisation: share of each tile
     under charts, if there are several; utilisation: their mean. face_share: share of the area under charts that belongs
-    to the face; None if the face is unknown.
+    to the face; None if the face is unknown. of_template: the mesh is the subdivided and displaced cage of the
+    RegisteredHead, without the regions that the asset leaves out (pipeline.registration.head), then what lies beside.
     """
 
     mesh: FileRef
     proxy: FileRef | None = None
+    of_template: bool = False
     vertices: int
     faces: int
     charts: int

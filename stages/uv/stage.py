@@ -41,11 +41,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.progress(done, total, message)
 
     head, notes, quality = inputs.template, list[str](), tuple[Finding, ...]()
-    if config.mesh == "template" and head.artifact.head is not None:
+    ref = head.artifact.head if config.mesh == "template" else None
+    if ref is not None:
         from pipeline.registration.head import load_head
         from stages.uv.registered import build_registered
 
-        registered = load_head(head.path(head.artifact.head))
+        registered = load_head(head.path(ref))
         built, quality = build_registered(registered, head.artifact.regions, dense, config, step), head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
@@ -53,7 +54,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
             notes.append(f"the mesh is the scan's: {head.artifact.reason}")
     meshes.save(context.workdir / MESH, built.mesh, built.charts)
     meshes.save(context.workdir / PROXY, built.proxy)
-    return _artifact(built, tuple(notes), quality, context)
+    return _artifact(built, tuple(notes), quality, context, of_template=ref is not None)
 
 
 def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
@@ -71,8 +72,11 @@ def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
     return build(dense, config, step, texel=texel, landmarks=landmarks)
 
 
-def _artifact(built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...], context: Context) -> UvMesh:
+def _artifact(
+    built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...], context: Context, *, of_template: bool
+) -> UvMesh:
     return UvMesh(
+        of_template=of_template,
         mesh=context.file(MESH),
         proxy=context.file(PROXY),
         vertices=len(built.mesh.vertices),
@@ -94,4 +98,4 @@ def _artifact(built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...]
     )
 
 
-STAGE = Stage(name="uv", version=8, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=9, inputs=Inputs, config=Config, output=UvMesh, run=run)

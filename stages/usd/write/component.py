@@ -14,12 +14,14 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
 
 from pipeline import tiles
+from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, on_tile, tile_count
-from stages.usd.write.shading import MATERIAL, Look, preview_networks
+from stages.usd.write.shading import HEIGHT, MATERIAL, Look, preview_networks
 
 STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
 HIGH, RENDER, PROXY = "high", "render", "proxy"
+REST = "rest"  # beside the template: hair, clothes
 HIGH_FILE = "high.usdc"
 
 
@@ -73,7 +75,14 @@ def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
 
 
 def root_layer(
-    who: Identity, extents: list[Gf.Vec3f], look: Look, *, high: bool, proxy: bool, thumbnail: str | None
+    who: Identity,
+    extents: list[Gf.Vec3f],
+    look: Look,
+    *,
+    high: bool,
+    proxy: bool,
+    thumbnail: str | None,
+    rest: bool = False,
 ) -> Sdf.Layer:
     """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded."""
     stage = new_stage(
@@ -87,7 +96,9 @@ def root_layer(
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
     _looks(stage, prim, look)
-    _levels(stage, prim, high=high, proxy=proxy)
+    _levels(stage, prim, rest=rest, high=high, proxy=proxy)
+    if look.displacement:
+        _smooth_levels(stage, prim, look)
     return detached(stage)
 
 
@@ -112,7 +123,7 @@ def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
     looks.SetVariantSelection(STANDARD)
 
 
-def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> None:
+def _levels(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool, high: bool, proxy: bool) -> None:
     """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
     path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
@@ -124,7 +135,8 @@ def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> Non
         if variant == RENDER:
             continue
         with lods.GetVariantEditContext():
-            stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
+            for hidden in (RENDER, REST) if rest else (RENDER,):
+                stage.OverridePrim(path.AppendPath(f"geo/{hidden}")).SetActive(False)
             if variant == HIGH:
                 if proxy:
                     stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
@@ -139,7 +151,27 @@ def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> Non
     lods.SetVariantSelection(RENDER)
 
 
-def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
+def _smooth_levels(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
+    """The dense mesh and the proxy are no cages: without displacement, which is taken out of the material there."""
+    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
+    outputs = [f"outputs:{HEIGHT}", *([f"outputs:mtlx:{HEIGHT}"] if look.f0 and look.roughness else [])]
+    surfaces = ["preview", *(["preview_specular"] if look.specular else [])]
+    lods = prim.GetVariantSets().GetVariantSet("lod")
+    for variant in lods.GetVariantNames():
+        if variant == RENDER:
+            continue
+        lods.SetVariantSelection(variant)
+        with lods.GetVariantEditContext():
+            for output in outputs:
+                over = stage.OverridePrim(material)
+                over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False).SetConnections([])
+            for surface in surfaces:
+                over = stage.OverridePrim(material.AppendPath(surface))
+                over.CreateAttribute(f"inputs:{HEIGHT}", Sdf.ValueTypeNames.Float, custom=False).SetConnections([])
+    lods.SetVariantSelection(RENDER)
+
+
+def payload_layer(name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
     """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look)
@@ -177,20 +209,31 @@ def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
     return detached(stage)
 
 
-def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> None:
+def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
     UsdGeom.Scope.Define(stage, f"/{name}/geo")
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
     material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
     preview_networks(stage, material, look)
     materialx_networks(stage, material, look)
-    render = _mesh(stage, f"/{name}/geo/render", mesh, material)
-    render.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
-    if proxy is not None:
-        stand_in = _mesh(stage, f"/{name}/geo/proxy", proxy, material)
-        stand_in.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    shown = _shown(stage, f"/{name}/geo", mesh, material)
+    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)
+    for one in shown if stand_in is None else [*shown, stand_in]:
+        one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    if stand_in is not None:
         stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
-        render.CreatePurposeAttr(UsdGeom.Tokens.render)
-        render.SetProxyPrim(stand_in)
+        for one in shown:
+            one.CreatePurposeAttr(UsdGeom.Tokens.render)
+        shown[0].SetProxyPrim(stand_in)
+
+
+def _shown(
+    stage: Usd.Stage, geo: str, mesh: UvSurface | TemplateMesh, material: UsdShade.Material
+) -> list[UsdGeom.Mesh]:
+    """The meshes of full detail: one of triangles, or the template's cage and what lies beside it."""
+    if isinstance(mesh, UvSurface):
+        return [_mesh(stage, f"{geo}/{RENDER}", mesh, material)]
+    out = [write_cage(stage, f"{geo}/{RENDER}", mesh.cage, material)]
+    return out if mesh.rest is None else [*out, _mesh(stage, f"{geo}/{REST}", mesh.rest, material)]
 
 
 def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:

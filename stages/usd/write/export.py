@@ -11,12 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, RegisteredHead, Surface, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd.config import Config
 from stages.usd.write import component
+from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.gltf import write_glb
 from stages.usd.write.light import environment, environment_figures, light_json, read_light
 from stages.usd.write.lookdev import lookdev_layer
@@ -47,6 +48,7 @@ def export(
     face: Located[FittedFace],
     poses: Located[CameraSet],
     capture: Located[Capture],
+    template: Located[RegisteredHead],
     config: Config,
     folder: Path,
     check: Callable[[], None],
@@ -54,12 +56,16 @@ def export(
     """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
+    head = template_mesh(template, mesh) if uv.artifact.of_template else None
     proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
     high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
     check()
     light = read_light(face.path(face.artifact.light))
-    maps = write_maps(bake, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    maps = write_maps(
+        bake, mesh, light, name, folder, check,
+        divide=config.divide_shadows, acescg=config.acescg, heights=None if head is None else head.heights,
+    )  # fmt: skip
     written, look = maps.written, maps.look
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
@@ -68,10 +74,18 @@ def export(
     cameras = tuple(sorted(poses.artifact.cameras, key=lambda c: c.index))
     layers = {
         f"{name}.usd": (
-            component.root_layer(who, hints, look, high=high is not None, proxy=proxy is not None, thumbnail=THUMBNAIL),
+            component.root_layer(
+                who,
+                hints,
+                look,
+                high=high is not None,
+                proxy=proxy is not None,
+                thumbnail=THUMBNAIL,
+                rest=head is not None and head.rest is not None,
+            ),
             "usda",
         ),
-        "payload.usdc": (component.payload_layer(name, mesh, proxy, look), "usdc"),
+        "payload.usdc": (component.payload_layer(name, mesh if head is None else head, proxy, look), "usdc"),
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
     }
     if high is not None:
@@ -84,14 +98,15 @@ def export(
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
+    light_mesh = mesh if head is None else with_rest(head)
     if config.usdz:
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
-        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
-        single = component.package_layer(who, mesh, plain)
+        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
+        single = component.package_layer(who, light_mesh, plain)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")
-        write_glb(written[-1], name, mesh, look, folder, who.stated())
+        write_glb(written[-1], name, light_mesh, look, folder, who.stated())
     if config.obj:
         written += write_obj(folder, name, mesh, look)
     check()

@@ -1,0 +1,87 @@
+"""A registered head for the usd stage: a cube of quads on the asset's ball, with charts on two tiles and a displacement
+that is known in closed form; a smaller ball above it as hair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from support.synthetic_asset import RADIUS, SyntheticInputs, texture_arrays, write_inputs, write_tiles
+
+from pipeline import meshes
+from pipeline.artifacts import FileRef, Located, MaskSet, RegisteredHead, Surface
+from pipeline.contract import Context
+from pipeline.registration.head import Head, limit_surface
+from pipeline.registration.subdivision import subdivided
+from stages.uv import stage as uv_stage
+from tests.support.ball_head import ball_quads, ball_scan
+
+SIDE, LEVELS = 6, 2  # quads along an edge of the cube; subdivisions
+REGIONS, PARTS = ("face", "eyes", "lashes"), ("skin", "eye_left", "lashes_left")
+HEIGHT = 0.002  # metres: largest displacement
+
+
+def cube_uvs() -> np.ndarray:
+    """(6 SIDE^2, 4, 2) sides 0 to 3 in the quarters of tile 1001, 4 and 5 on tile 1002."""
+    at = np.arange(SIDE)
+    x, y = np.meshgrid(at, at, indexing="ij")
+    low = np.stack([x.ravel(), y.ravel()], -1)[:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    place = np.array([[0, 0], [0.5, 0], [0, 0.5], [0.5, 0.5], [1, 0], [1.5, 0]])
+    return np.concatenate([0.05 + 0.4 * low / SIDE + p for p in place])
+
+
+def height_at(points: np.ndarray) -> np.ndarray:
+    """(N,) metres."""
+    return HEIGHT * np.sin(points[:, 0] / (0.3 * RADIUS)) * np.cos(points[:, 1] / (0.4 * RADIUS))
+
+
+def registered_head() -> Head:
+    """Sides 0 to 4 are skin, displaced; side 5 is an eye but for its last row, lashes, which the asset leaves out. The
+    parts share no vertices."""
+    directions, quads = ball_quads(SIDE)
+    corners = np.round(cube_uvs(), 9)
+    uvs, index = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+    region = np.zeros(len(quads), np.int64)
+    region[5 * SIDE**2 :], region[-SIDE:] = 1, 2
+    own, flat = np.unique(quads + len(directions) * region[:, None], return_inverse=True)
+    directions, quads = directions[own % len(directions)], flat.reshape(-1, 4)
+    level = subdivided(quads, len(directions), LEVELS)
+    vertices = RADIUS * directions
+    points, _, fine = limit_surface(vertices, level)
+    free = np.isin(np.arange(len(points)), fine[np.repeat(region == 0, 4**LEVELS)])
+    moved = np.where(free, height_at(points), 0.0).astype(np.float32)
+    return Head(vertices, quads, uvs, index.reshape(-1, 4), region, region, moved, free.astype(np.float32), LEVELS)
+
+
+def write_head(folder: Path) -> Located[RegisteredHead]:
+    """The template stage's artifact."""
+    folder.mkdir(parents=True, exist_ok=True)
+    registered_head().save(folder / "head.npz")
+    made = RegisteredHead(
+        registered=True, head=FileRef.of(folder, "head.npz"), regions=REGIONS, parts=PARTS, levels=LEVELS
+    )
+    return Located(made, folder)
+
+
+def template_inputs(folder: Path) -> SyntheticInputs:
+    """The inputs of the usd stage with uv.mesh=template."""
+    plain, template = write_inputs(folder / "plain"), write_head(folder / "head")
+    ball, hair = ball_scan(RADIUS), ball_scan(0.25 * RADIUS, 12, (0, 1.5 * RADIUS, 0))
+    dense = meshes.Mesh(
+        np.concatenate([ball.vertices, hair.vertices]), np.concatenate([ball.normals, hair.normals]),
+        np.concatenate([ball.faces, hair.faces + len(ball.vertices)]),
+    )  # fmt: skip
+    meshes.save(folder / "surface.npz", dense)
+    surface = Located(
+        Surface(
+            mesh=FileRef.of(folder, "surface.npz"), vertices=len(dense.vertices), faces=len(dense.faces),
+            watertight=True, components=2, removed_components=0, cell=0.001,
+        ),
+        folder,
+    )  # fmt: skip
+    (folder / "uv").mkdir()
+    files = uv_stage.Inputs(surface, None, None, Located(MaskSet(masks=()), folder), template)  # type: ignore[arg-type]
+    uv = uv_stage.run(files, uv_stage.Config(mesh="template"), Context(folder / "uv", folder / "scratch"))
+    bake = write_tiles(folder / "bake", [texture_arrays() for _ in range(uv.tiles)])
+    return replace(plain, surface=surface, template=template, uv=Located(uv, folder / "uv"), bake=bake)
