@@ -248,17 +248,19 @@ class Surface(Artifact):
 class RegisteredHead(Artifact):
     """The head template on the fitted surface; if it does not hold, registered is false and reason says why.
 
-    head: npz of pipeline.registration.head. template, licence: its name and licence. regions, parts: names that the
-    file's indices refer to. levels: subdivisions of the displacement. quads: of the control cage. world_from_template:
-    4x4 similarity to asset coordinates; identity: weights in standard deviations. figures: by name, see
-    docs/stages/template.md. distances_mm: by region (median and 95 % of the subdivided head's distance from the fitted
-    surface, then both with displacement), over skin that the photos show. quality: the checks; they count for the stage
-    uv where the asset is made from this head, and for no verdict else.
+    head: npz of pipeline.registration.head; rig: of pipeline.registration.rig, if the template has joints. template,
+    licence: its name and licence. regions, parts: names that the file's indices refer to. levels: subdivisions of the
+    displacement. quads: of the control cage. world_from_template: 4x4 similarity to asset coordinates; identity:
+    weights in standard deviations. figures: by name, see docs/stages/template.md. distances_mm: by region (median and
+    95 % of the subdivided head's distance from the fitted surface, then both with displacement), over skin that the
+    photos show. quality: the checks; they count for the stage uv where the asset is made from this head, and for no
+    verdict else.
     """
 
     registered: bool
     reason: str = ""
     head: FileRef | None = None
+    rig: FileRef | None = None
     template: str = ""
     licence: str = ""
     regions: tuple[str, ...] = ()

@@ -13,7 +13,9 @@ from pipeline import meshes
 from pipeline.artifacts import FileRef, Located, MaskSet, RegisteredHead, Surface
 from pipeline.contract import Context
 from pipeline.registration.head import Head, limit_surface
+from pipeline.registration.rig import Rig
 from pipeline.registration.subdivision import subdivided
+from pipeline.template.model import Expressions
 from stages.uv import stage as uv_stage
 from tests.support.ball_head import ball_quads, ball_scan
 
@@ -54,13 +56,31 @@ def registered_head() -> Head:
     return Head(vertices, quads, uvs, index.reshape(-1, 4), region, region, moved, free.astype(np.float32), LEVELS)
 
 
+def head_rig() -> Rig:
+    """Two expressions of the skin, and an eye joint; the jaw turns what lies below the middle in front."""
+    head = registered_head()
+    front = np.flatnonzero(
+        (head.vertices[:, 2] > 0.3 * RADIUS) & np.isin(np.arange(len(head.vertices)), head.quads[:72])
+    )
+    low = front[head.vertices[front, 1] < 0]
+    offsets = np.concatenate([np.full((len(low), 3), [0.0, -0.01, 0.002]), 0.004 * head.vertices[front] / RADIUS])
+    starts = np.array([0, len(low), len(low) + len(front)])
+    shapes = Expressions(("jawOpen", "cheekPuff"), starts, np.concatenate([low, front]), offsets)
+    eye = np.isin(np.arange(len(head.vertices)), head.quads[head.region == 1])
+    jaw = np.isin(np.arange(len(head.vertices)), low) * 0.75
+    places = np.array([[0, 0, 0], [0, -0.01, 0.02], [0, 0, 0.1]], np.float64)
+    return Rig(shapes, ("head", "jaw", "eye_left"), places, np.stack([1 - jaw - eye, jaw, eye], 1))
+
+
 def write_head(folder: Path) -> Located[RegisteredHead]:
     """The template stage's artifact."""
     folder.mkdir(parents=True, exist_ok=True)
     registered_head().save(folder / "head.npz")
+    head_rig().save(folder / "rig.npz")
     made = RegisteredHead(
-        registered=True, head=FileRef.of(folder, "head.npz"), regions=REGIONS, parts=PARTS, levels=LEVELS
-    )
+        registered=True, head=FileRef.of(folder, "head.npz"), rig=FileRef.of(folder, "rig.npz"),
+        regions=REGIONS, parts=PARTS, levels=LEVELS,
+    )  # fmt: skip
     return Located(made, folder)
 
 

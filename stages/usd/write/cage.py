@@ -7,17 +7,20 @@ follows is beside the head (hair, clothes) and stays triangles.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
+from scipy.sparse import csr_array
 
 from pipeline import meshes
 from pipeline.artifacts import Located, RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, triangles_of
 from pipeline.registration.head import Head, kept_quads, load_head
-from pipeline.registration.subdivision import subdivided
+from pipeline.registration.rig import load_rig
+from pipeline.registration.subdivision import limit, subdivided
 from stages.usd.write.mesh import UvSurface
+from stages.usd.write.rig import MeshRig, mesh_rig
 
 COARSE = 1  # subdivisions of the mesh for programs that do not subdivide
 LEVELS_KEY = "neufaceSubdivisions"  # customData of the cage: steps after which its vertices carry the displacement
@@ -39,16 +42,20 @@ class CageSurface:
 @dataclass(frozen=True, slots=True)
 class TemplateMesh:
     """cage: the control cage. coarse: triangles of its first subdivision, displaced. rest: what the scan shows beside
-    it. heights (n,): displacement in metres at the vertices of the textured mesh."""
+    it. heights (n,): displacement in metres at the vertices of the textured mesh. rig, coarse_rig: expressions and
+    joints of cage and coarse."""
 
     cage: CageSurface
     coarse: UvSurface
     rest: UvSurface | None
     heights: F32
+    rig: MeshRig | None = None
+    coarse_rig: MeshRig | None = None
 
 
-def template_mesh(registered: Located[RegisteredHead], textured: UvSurface) -> TemplateMesh:
-    """What the asset shows of the registered head, and the rest of the textured mesh."""
+def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool) -> TemplateMesh:
+    """What the asset shows of the registered head, and the rest of the textured mesh; with its rig if asked for and
+    there is one."""
     ref = registered.artifact.head
     assert ref is not None, "the uv stage made its mesh from the head"
     head = load_head(registered.path(ref))
@@ -57,7 +64,13 @@ def template_mesh(registered: Located[RegisteredHead], textured: UvSurface) -> T
     used = np.unique(quads)
     heights = np.zeros(len(textured.vertices), np.float32)
     heights[: len(used)] = head.displacement[used]
-    return TemplateMesh(_cage(head, kept), _coarse(head, kept), _rest(textured, 2 * len(quads)), heights)
+    cage, (coarse, points) = _cage(head, kept), _coarse(head, kept)
+    made = TemplateMesh(cage, coarse, _rest(textured, 2 * len(quads)), heights)
+    found = registered.artifact.rig
+    if found is None or not rigged:
+        return made
+    rig = load_rig(registered.path(found))
+    return replace(made, rig=mesh_rig(rig).of_vertices(cage.rows), coarse_rig=mesh_rig(rig, points))
 
 
 def _cage(head: Head, kept: meshes.Mask) -> CageSurface:
@@ -69,21 +82,23 @@ def _cage(head: Head, kept: meshes.Mask) -> CageSurface:
     )  # fmt: skip
 
 
-def _coarse(head: Head, kept: meshes.Mask) -> UvSurface:
-    """A step's vertex points come first in the next one, so the vertices of the first steps have the same rows in the
-    finest."""
+def _coarse(head: Head, kept: meshes.Mask) -> tuple[UvSurface, csr_array]:
+    """The mesh, and the stencil (n, V) of its limit points from the template's vertices. A step's vertex points come
+    first in the next one, so the vertices of the first steps have the same rows in the finest."""
     steps = min(COARSE, head.levels)
     keep = np.repeat(kept, 4**steps)
-    quads = subdivided(head.quads, len(head.vertices), steps).quads[keep]
+    level = subdivided(head.quads, len(head.vertices), steps)
+    quads = level.quads[keep]
     uv_quads = subdivided(head.uv_quads, len(head.uvs), steps, "sharp").quads[keep]
     points, fine = head.displaced(), head.surface()[2]
     normals = meshes.vertex_normals(points, triangles_of(fine))
     rows, faces = np.unique(quads, return_inverse=True)
     used, uv_faces = np.unique(uv_quads, return_inverse=True)
-    return UvSurface(
+    made = UvSurface(
         points[rows].astype(np.float32), normals[rows], triangles_of(faces.reshape(-1, 4)),
         head.fine_uvs()[0][used].astype(np.float32), triangles_of(uv_faces.reshape(-1, 4)),
     )  # fmt: skip
+    return made, csr_array((limit(level.quads, level.stencil.shape[0]).point @ level.stencil)[rows])
 
 
 def _rest(textured: UvSurface, first: int) -> UvSurface | None:
@@ -99,10 +114,8 @@ def _rest(textured: UvSurface, first: int) -> UvSurface | None:
 
 
 def with_rest(made: TemplateMesh) -> UvSurface:
-    """The coarse mesh and the rest as one."""
-    if made.rest is None:
-        return made.coarse
-    return joined([made.coarse, made.rest])
+    """The coarse mesh and the rest as one; the vertices of the coarse mesh come first."""
+    return made.coarse if made.rest is None else joined([made.coarse, made.rest])
 
 
 def joined(parts: list[UvSurface]) -> UvSurface:

@@ -11,12 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
 
 from pipeline import tiles
 from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, on_tile, tile_count
+from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
 from stages.usd.write.shading import HEIGHT, MATERIAL, Look, preview_networks
 
 STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
@@ -190,32 +191,41 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
     return detached(stage)
 
 
-def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
+def package_layer(who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
-    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>."""
+    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
+    of the mesh's first vertices."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
-    if count == 1:
+    if count == 1 and rig is None:
         _fill(stage, who.name, mesh, None, look)
     else:
-        for folder in ("geo", "mtl"):
-            UsdGeom.Scope.Define(stage, f"/{who.name}/{folder}")
+        UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
+        skeleton = _geo(stage, who.name, rig)
         for t in range(count):
             number = tiles.FIRST + t
             material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
             preview_networks(stage, material, look.on_tile(t))
-            _mesh(stage, f"/{who.name}/geo/render_{number}", on_tile(mesh, t, count), material)
+            part = on_tile(mesh, t, count)
+            made, used = (
+                _mesh(stage, f"/{who.name}/geo/render_{number}", part, material),
+                np.unique(part.faces).astype(np.int64),
+            )
+            if rig is not None and skeleton is not None and used[-1] < len(rig.weights):
+                bind(stage, made, rig.of_vertices(used), skeleton)
     return detached(stage)
 
 
 def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
-    UsdGeom.Scope.Define(stage, f"/{name}/geo")
+    skeleton = _geo(stage, name, mesh.rig if isinstance(mesh, TemplateMesh) else None)
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
     material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
     preview_networks(stage, material, look)
     materialx_networks(stage, material, look)
     shown = _shown(stage, f"/{name}/geo", mesh, material)
+    if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
+        bind(stage, shown[0], mesh.rig, skeleton)
     stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)
     for one in shown if stand_in is None else [*shown, stand_in]:
         one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
@@ -224,6 +234,15 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: Uv
         for one in shown:
             one.CreatePurposeAttr(UsdGeom.Tokens.render)
         shown[0].SetProxyPrim(stand_in)
+
+
+def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton | None:
+    """The parent of the meshes; with a rig a SkelRoot with its skeleton."""
+    if rig is None:
+        UsdGeom.Scope.Define(stage, f"/{name}/geo")
+        return None
+    UsdSkel.Root.Define(stage, f"/{name}/geo")
+    return write_skeleton(stage, f"/{name}/geo/{RIG}", rig)
 
 
 def _shown(

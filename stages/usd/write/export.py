@@ -56,7 +56,7 @@ def export(
     """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
-    head = template_mesh(template, mesh) if uv.artifact.of_template else None
+    head = template_mesh(template, mesh, rigged=config.expressions) if uv.artifact.of_template else None
     proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
     high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
@@ -98,15 +98,15 @@ def export(
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
-    light_mesh = mesh if head is None else with_rest(head)
+    light_mesh, light_rig = (mesh, None) if head is None else (with_rest(head), head.coarse_rig)
     if config.usdz:
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
         plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
-        single = component.package_layer(who, light_mesh, plain)
+        single = component.package_layer(who, light_mesh, plain, light_rig)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")
-        write_glb(written[-1], name, light_mesh, look, folder, who.stated())
+        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig)
     if config.obj:
         written += write_obj(folder, name, mesh, look)
     check()
