@@ -285,11 +285,13 @@ class UvMesh(Artifact):
     under charts, if there are several; utilisation: their mean. face_share: share of the area under charts that belongs
     to the face; None if the face is unknown. of_template: the mesh is the subdivided and displaced cage of the
     RegisteredHead, without the regions that the asset leaves out (pipeline.registration.head), then what lies beside.
+    scan: the decimated scan with its own charts, if the asset has both meshes.
     """
 
     mesh: FileRef
     proxy: FileRef | None = None
     of_template: bool = False
+    scan: UvMesh | None = None
     vertices: int
     faces: int
     charts: int
@@ -329,7 +331,7 @@ class TextureSet(Artifact):
     texels under charts. figures: shares of the covered texels that no photo shows (`unseen`), whose albedo was clamped
     (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a texel and median edge of the photos'
     finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of the surface's area by region name;
-    empty without labelled photos."""
+    empty without labelled photos. scan: those of the scan's mesh, if the asset has both meshes."""
 
     size: int
     tiles: int = 1
@@ -340,6 +342,7 @@ class TextureSet(Artifact):
     lod_rms_mm: dict[str, float] = {}
     figures: dict[str, float] = {}
     regions: dict[str, float] = {}
+    scan: TextureSet | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
-from support.synthetic_asset import RADIUS, SyntheticInputs, texture_arrays, write_inputs, write_tiles
+from support.synthetic_asset import RADIUS, SyntheticInputs, texture_arrays, write_inputs, write_textures, write_tiles
 
 from pipeline import meshes
 from pipeline.artifacts import FileRef, Located, MaskSet, RegisteredHead, Surface
@@ -84,8 +85,8 @@ def write_head(folder: Path) -> Located[RegisteredHead]:
     return Located(made, folder)
 
 
-def template_inputs(folder: Path) -> SyntheticInputs:
-    """The inputs of the usd stage with uv.mesh=template."""
+def template_inputs(folder: Path, mesh: Literal["template", "both"] = "template") -> SyntheticInputs:
+    """The inputs of the usd stage with uv.mesh=template or both."""
     plain, template = write_inputs(folder / "plain"), write_head(folder / "head")
     ball, hair = ball_scan(RADIUS), ball_scan(0.25 * RADIUS, 12, (0, 1.5 * RADIUS, 0))
     dense = meshes.Mesh(
@@ -102,6 +103,20 @@ def template_inputs(folder: Path) -> SyntheticInputs:
     )  # fmt: skip
     (folder / "uv").mkdir()
     files = uv_stage.Inputs(surface, None, None, Located(MaskSet(masks=()), folder), template)  # type: ignore[arg-type]
-    uv = uv_stage.run(files, uv_stage.Config(mesh="template"), Context(folder / "uv", folder / "scratch"))
+    uv = uv_stage.run(
+        files,
+        uv_stage.Config(mesh=mesh, target_faces=3000, proxy_faces=300),
+        Context(folder / "uv", folder / "scratch"),
+    )
     bake = write_tiles(folder / "bake", [texture_arrays() for _ in range(uv.tiles)])
+    if uv.scan is not None:
+        own = write_textures(folder / "bake/scan", texture_arrays()).artifact
+        maps = {
+            name: m.model_copy(
+                update={"files": {k: f.model_copy(update={"path": f"scan/{f.path}"}) for k, f in m.files.items()}}
+            )
+            for name, m in own.maps.items()
+        }
+        scan = own.model_copy(update={"maps": maps})
+        bake = Located(bake.artifact.model_copy(update={"scan": scan}), bake.folder)
     return replace(plain, surface=surface, template=template, uv=Located(uv, folder / "uv"), bake=bake)

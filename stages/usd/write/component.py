@@ -18,12 +18,17 @@ from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, on_tile, tile_count
 from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
-from stages.usd.write.shading import HEIGHT, MATERIAL, Look, preview_networks
-
-STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
-HIGH, RENDER, PROXY = "high", "render", "proxy"
-REST = "rest"  # beside the template: hair, clothes
-HIGH_FILE = "high.usdc"
+from stages.usd.write.shading import MATERIAL, Look, preview_networks
+from stages.usd.write.variants import (
+    RENDER,
+    REST,
+    SCAN,
+    SCAN_MATERIAL,
+    without_displacement,
+    write_levels,
+    write_looks,
+    write_meshes,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +89,10 @@ def root_layer(
     proxy: bool,
     thumbnail: str | None,
     rest: bool = False,
+    scan: Look | None = None,
 ) -> Sdf.Layer:
-    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded."""
+    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded. rest:
+    whether there is a mesh beside the template; scan: the look of the scan's mesh, if there is one beside it."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
@@ -96,86 +103,28 @@ def root_layer(
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    _looks(stage, prim, look)
-    _levels(stage, prim, rest=rest, high=high, proxy=proxy)
+    write_looks(stage, prim, look, scan)
+    write_levels(stage, prim, rest=rest, scan=scan is not None, high=high, proxy=proxy)
     if look.displacement:
-        _smooth_levels(stage, prim, look)
+        without_displacement(stage, prim, look)
+    if scan is not None:
+        write_meshes(stage, prim, rest=rest)
     return detached(stage)
 
 
-def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
-    """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
-    payload alone equals the first variant."""
-    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
-    outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
-    if not look.specular:
-        del outputs[SPECULAR]
-    if look.coefficients and look.inv_kappa and look.roughness:
-        outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
-    looks = prim.GetVariantSets().AddVariantSet("look")
-    for variant, connections in outputs.items():
-        looks.AddVariant(variant)
-        looks.SetVariantSelection(variant)
-        with looks.GetVariantEditContext():
-            for output, source in connections.items():
-                over = stage.OverridePrim(material)
-                attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
-                attribute.SetConnections([material.AppendPath(source)])
-    looks.SetVariantSelection(STANDARD)
-
-
-def _levels(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool, high: bool, proxy: bool) -> None:
-    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
-    path = prim.GetPath()
-    lods = prim.GetVariantSets().AddVariantSet("lod")
-    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
-        if not made:
-            continue
-        lods.AddVariant(variant)
-        lods.SetVariantSelection(variant)
-        if variant == RENDER:
-            continue
-        with lods.GetVariantEditContext():
-            for hidden in (RENDER, REST) if rest else (RENDER,):
-                stage.OverridePrim(path.AppendPath(f"geo/{hidden}")).SetActive(False)
-            if variant == HIGH:
-                if proxy:
-                    stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
-                dense = stage.OverridePrim(path.AppendPath("geo/high"))
-                dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
-                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
-                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
-            else:
-                shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
-                purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
-                purpose.Set(UsdGeom.Tokens.default_)
-    lods.SetVariantSelection(RENDER)
-
-
-def _smooth_levels(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
-    """The dense mesh and the proxy are no cages: without displacement, which is taken out of the material there."""
-    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
-    outputs = [f"outputs:{HEIGHT}", *([f"outputs:mtlx:{HEIGHT}"] if look.f0 and look.roughness else [])]
-    surfaces = ["preview", *(["preview_specular"] if look.specular else [])]
-    lods = prim.GetVariantSets().GetVariantSet("lod")
-    for variant in lods.GetVariantNames():
-        if variant == RENDER:
-            continue
-        lods.SetVariantSelection(variant)
-        with lods.GetVariantEditContext():
-            for output in outputs:
-                over = stage.OverridePrim(material)
-                over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False).SetConnections([])
-            for surface in surfaces:
-                over = stage.OverridePrim(material.AppendPath(surface))
-                over.CreateAttribute(f"inputs:{HEIGHT}", Sdf.ValueTypeNames.Float, custom=False).SetConnections([])
-    lods.SetVariantSelection(RENDER)
-
-
-def payload_layer(name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
-    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default."""
+def payload_layer(
+    name: str,
+    mesh: UvSurface | TemplateMesh,
+    proxy: UvSurface | None,
+    look: Look,
+    scan: tuple[UvSurface, Look] | None = None,
+) -> Sdf.Layer:
+    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default. scan:
+    the scan's mesh with its own maps, beside the template's."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look)
+    if scan is not None:
+        _scan(stage, name, *scan, purposes=proxy is not None)
     return detached(stage)
 
 
@@ -220,9 +169,7 @@ def package_layer(who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | Non
 def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
     skeleton = _geo(stage, name, mesh.rig if isinstance(mesh, TemplateMesh) else None)
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
-    material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
-    preview_networks(stage, material, look)
-    materialx_networks(stage, material, look)
+    material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
     shown = _shown(stage, f"/{name}/geo", mesh, material)
     if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
         bind(stage, shown[0], mesh.rig, skeleton)
@@ -234,6 +181,22 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: Uv
         for one in shown:
             one.CreatePurposeAttr(UsdGeom.Tokens.render)
         shown[0].SetProxyPrim(stand_in)
+
+
+def _scan(stage: Usd.Stage, name: str, mesh: UvSurface, look: Look, *, purposes: bool) -> None:
+    material = _material(stage, f"/{name}/mtl/{SCAN_MATERIAL}", look)
+    made = _mesh(stage, f"/{name}/geo/{SCAN}", mesh, material)
+    made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    if purposes:
+        made.CreatePurposeAttr(UsdGeom.Tokens.render)
+        made.SetProxyPrim(UsdGeom.Mesh.Get(stage, f"/{name}/geo/proxy"))
+
+
+def _material(stage: Usd.Stage, path: str, look: Look) -> UsdShade.Material:
+    material = UsdShade.Material.Define(stage, path)
+    preview_networks(stage, material, look)
+    materialx_networks(stage, material, look)
+    return material
 
 
 def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton | None:

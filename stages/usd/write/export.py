@@ -21,11 +21,12 @@ from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.gltf import write_glb
 from stages.usd.write.light import environment, environment_figures, light_json, read_light
 from stages.usd.write.lookdev import lookdev_layer
-from stages.usd.write.maps import write_maps
+from stages.usd.write.maps import Maps, write_maps
 from stages.usd.write.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap
 from stages.usd.write.obj import write_obj
 from stages.usd.write.package import bounded_png, write_package
 from stages.usd.write.shading import Look
+from stages.usd.write.variants import HIGH_FILE, SCAN
 
 NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
 THUMBNAIL = "./thumbnails/default.png"  # rendered by the stage after the export
@@ -67,6 +68,8 @@ def export(
         divide=config.divide_shadows, acescg=config.acescg, heights=None if head is None else head.heights,
     )  # fmt: skip
     written, look = maps.written, maps.look
+    scan = _scan(uv, bake, light, config, folder, check)
+    written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
     hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
@@ -82,14 +85,18 @@ def export(
                 proxy=proxy is not None,
                 thumbnail=THUMBNAIL,
                 rest=head is not None and head.rest is not None,
+                scan=None if scan is None else scan[1].look,
             ),
             "usda",
         ),
-        "payload.usdc": (component.payload_layer(name, mesh if head is None else head, proxy, look), "usdc"),
+        "payload.usdc": (
+            component.payload_layer(name, head or mesh, proxy, look, None if scan is None else (scan[0], scan[1].look)),
+            "usdc",
+        ),
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
     }
     if high is not None:
-        layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
+        layers[HIGH_FILE] = (component.high_layer(high, look), "usdc")
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
     dome = environment(light, config.environment_width)
@@ -140,6 +147,23 @@ def _hints(boxes: list[npt.NDArray[np.float64]]) -> list[npt.NDArray[np.float64]
     """Boxes for extentsHint: one per purpose, in the order default, render, proxy; an unused one is empty."""
     empty = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
     return [row for box in (empty, *boxes) for row in box]
+
+
+def _scan(
+    uv: Located[UvMesh],
+    bake: Located[TextureSet],
+    light: npt.NDArray[np.float32],
+    config: Config,
+    folder: Path,
+    check: Callable[[], None],
+) -> tuple[UvSurface, Maps] | None:
+    """The scan's mesh beside the template's, and its maps NAME_scan_*; None if there is none."""
+    if uv.artifact.scan is None or bake.artifact.scan is None:
+        return None
+    mesh = read_mesh(uv.path(uv.artifact.scan.mesh))
+    baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
+    made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    return mesh, made
 
 
 def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
