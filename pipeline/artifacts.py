@@ -248,17 +248,19 @@ class Surface(Artifact):
 class RegisteredHead(Artifact):
     """The head template on the fitted surface; if it does not hold, registered is false and reason says why.
 
-    head: npz of pipeline.registration.head. template, licence: its name and licence. regions, parts: names that the
-    file's indices refer to. levels: subdivisions of the displacement. quads: of the control cage. world_from_template:
-    4x4 similarity to asset coordinates; identity: weights in standard deviations. figures: by name, see
-    docs/stages/template.md. distances_mm: by region (median and 95 % of the subdivided head's distance from the fitted
-    surface, then both with displacement), over skin that the photos show. quality: the checks; they count for the stage
-    uv where the asset is made from this head, and for no verdict else.
+    head: npz of pipeline.registration.head; rig: of pipeline.registration.rig, if the template has joints. template,
+    licence: its name and licence. regions, parts: names that the file's indices refer to. levels: subdivisions of the
+    displacement. quads: of the control cage. world_from_template: 4x4 similarity to asset coordinates; identity:
+    weights in standard deviations. figures: by name, see docs/stages/template.md. distances_mm: by region (median and
+    95 % of the subdivided head's distance from the fitted surface, then both with displacement), over skin that the
+    photos show. quality: the checks; they count for the stage uv where the asset is made from this head, and for no
+    verdict else.
     """
 
     registered: bool
     reason: str = ""
     head: FileRef | None = None
+    rig: FileRef | None = None
     template: str = ""
     licence: str = ""
     regions: tuple[str, ...] = ()
@@ -281,11 +283,15 @@ class UvMesh(Artifact):
     Linf of [Sander 2001]. seam_front_mm: length of seams where the surface faces the front. deviation: of the mesh and
     of the proxy from the dense mesh. tiles: number of UDIM tiles (pipeline.tiles); tile_utilisation: share of each tile
     under charts, if there are several; utilisation: their mean. face_share: share of the area under charts that belongs
-    to the face; None if the face is unknown.
+    to the face; None if the face is unknown. of_template: the mesh is the subdivided and displaced cage of the
+    RegisteredHead, without the regions that the asset leaves out (pipeline.registration.head), then what lies beside.
+    scan: the decimated scan with its own charts, if the asset has both meshes.
     """
 
     mesh: FileRef
     proxy: FileRef | None = None
+    of_template: bool = False
+    scan: UvMesh | None = None
     vertices: int
     faces: int
     charts: int
@@ -325,7 +331,7 @@ class TextureSet(Artifact):
     texels under charts. figures: shares of the covered texels that no photo shows (`unseen`), whose albedo was clamped
     (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a texel and median edge of the photos'
     finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of the surface's area by region name;
-    empty without labelled photos."""
+    empty without labelled photos. scan: those of the scan's mesh, if the asset has both meshes."""
 
     size: int
     tiles: int = 1
@@ -336,6 +342,7 @@ class TextureSet(Artifact):
     lod_rms_mm: dict[str, float] = {}
     figures: dict[str, float] = {}
     regions: dict[str, float] = {}
+    scan: TextureSet | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

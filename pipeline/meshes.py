@@ -6,6 +6,7 @@ caller's unit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +78,22 @@ def load_charts(path: Path) -> Charts:
     """The texture coordinates of an npz written by `save`. Raises KeyError if it holds none."""
     with np.load(path, allow_pickle=False) as z:
         return Charts(z["uvs"], z["uv_faces"])
+
+
+def joined(parts: Sequence[tuple[Mesh, Charts]]) -> tuple[Mesh, Charts]:
+    """One mesh of several with their charts, which keep their tiles."""
+    moved, laid, at, uv_at = [], [], 0, 0
+    for mesh, charts in parts:
+        moved.append(mesh.faces + at)
+        laid.append(charts.faces + uv_at)
+        at, uv_at = at + len(mesh.vertices), uv_at + len(charts.uvs)
+    meshes_, charts_ = zip(*parts, strict=True)
+    whole = Mesh(
+        np.concatenate([m.vertices for m in meshes_]),
+        np.concatenate([m.normals for m in meshes_]),
+        np.concatenate(moved).astype(np.int32),
+    )
+    return whole, Charts(np.concatenate([c.uvs for c in charts_]), np.concatenate(laid).astype(np.int32))
 
 
 def area_vectors(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:

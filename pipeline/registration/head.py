@@ -13,8 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.meshes import F32, F64, Indices
+from pipeline.meshes import F32, F64, Indices, Mask
 from pipeline.registration.subdivision import Level, limit, subdivided
+
+LEFT_OUT = ("lashes",)  # regions that the asset leaves out: they need a material with opacity
 
 
 @dataclass(frozen=True)  # no slots: the surface is kept
@@ -44,6 +46,11 @@ class Head:
     def _surface(self) -> tuple[F64, F64, Indices]:
         return limit_surface(self.vertices, self.fine())
 
+    def displaced(self) -> F64:
+        """(n, 3) the limit points, moved along their normals by the displacement."""
+        points, normals, _ = self._surface
+        return np.asarray(points + self.displacement[:, None].astype(np.float64) * normals)
+
     def fine_uvs(self) -> tuple[F64, Indices]:
         """(U', 2) texture coordinates and quads (Q 4^levels, 4), linear along the borders of charts."""
         level = subdivided(self.uv_quads, len(self.uvs), self.levels, "sharp")
@@ -52,6 +59,11 @@ class Head:
     def save(self, path: Path) -> None:
         """Write the npz."""
         np.savez(path, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})  # type: ignore[arg-type]
+
+
+def kept_quads(head: Head, regions: tuple[str, ...]) -> Mask:
+    """(Q,) quads of the cage that the asset shows. regions: names that head.region refers to."""
+    return np.asarray(np.array([n not in LEFT_OUT for n in regions])[head.region], np.bool_)
 
 
 def load_head(path: Path) -> Head:

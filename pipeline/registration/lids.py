@@ -60,22 +60,28 @@ def with_lids(template: Template, head: PlacedHead, strength: float) -> F64:
 
 def closing(template: Template, head: PlacedHead, cage: Cage) -> tuple[csr_array, F64]:
     """Stencil (n, V) over the cage and the places (n, 3) of what joins the margins of the lids."""
-    row = np.full(len(template.vertices), -1, np.int64)
-    row[cage.of_template] = np.arange(len(cage.of_template))
+    stencil = csr_array(facing(template)[:, cage.of_template])
+    up = head.world_from_template[:3, 1]
+    return stencil, np.tile(GAP * up, (stencil.shape[0], 1))
+
+
+def facing(template: Template, side: float = 0.0) -> csr_array:
+    """Stencil (n, V) of the upper lids' margins minus the lower lids' below them; of one eye by the sign of its x, of
+    both with 0."""
     rows: list[tuple[int, int, float]] = []
     count = 0
     for upper, lower in _margins(template):
         at = template.vertices[lower, 0]
+        if at[0] * side < 0:
+            continue
         for u in upper:
             x = template.vertices[u, 0]
             k = int(np.clip(np.searchsorted(at, x), 1, len(at) - 1))
             a = float(np.clip((at[k] - x) / max(at[k] - at[k - 1], 1e-9), 0, 1))
-            rows += [(count, int(row[u]), 1.0), (count, int(row[lower[k - 1]]), -a), (count, int(row[lower[k]]), a - 1)]
+            rows += [(count, int(u), 1.0), (count, int(lower[k - 1]), -a), (count, int(lower[k]), a - 1)]
             count += 1
     i, j, value = (np.array(c) for c in zip(*rows, strict=True)) if rows else (np.zeros(0, int),) * 3
-    stencil = csr_array((value.astype(np.float64), (i, j)), shape=(count, len(cage.of_template)))
-    up = head.world_from_template[:3, 1]
-    return stencil, np.tile(GAP * up, (count, 1))
+    return csr_array((value.astype(np.float64), (i, j)), shape=(count, len(template.vertices)))
 
 
 def _margins(template: Template) -> list[tuple[Indices, Indices]]:

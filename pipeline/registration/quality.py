@@ -51,7 +51,7 @@ def distances(head: Head, names: tuple[str, ...], scan: Scan, unit: float) -> Ma
     distances are in metres of the world times 1000."""
     points, normals, quads = head.surface()
     region = np.repeat(head.region, 4**head.levels)
-    moved = points + head.displacement[:, None].astype(np.float64) * normals
+    moved = head.displaced()
     off, seen = scan.along(points, normals, FAR * unit)
     middle, way = moved[quads].mean(1), normals[quads].mean(1)
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-30)
@@ -96,9 +96,8 @@ def quad_quality(vertices: F64, quads: Indices) -> Quads:
 
 def face_piercings(head: Head, names: tuple[str, ...]) -> int:
     """Edges of the displaced face (with lids, lips and nose) that pass through another part of it."""
-    points, normals, quads = head.surface()
-    moved = points + head.displacement[:, None].astype(np.float64) * normals
-    return len(piercing_edges(moved, triangles_of(quads[face_quads(head, names)])))
+    quads = head.surface()[2]
+    return len(piercing_edges(head.displaced(), triangles_of(quads[face_quads(head, names)])))
 
 
 def face_quads(head: Head, names: tuple[str, ...]) -> Mask:

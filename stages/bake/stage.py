@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureMap, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
+SCAN = "scan"  # folder of the maps of the scan's mesh, if the asset has both meshes
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,27 @@ class Config(StageConfig):
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
-    """Bake every map. Raises StageError if the mesh has no charts or the field is not finite on it."""
+    """Bake every map; with two meshes, once for each. Raises StageError if a mesh has no charts or the field is not
+    finite on it."""
+    made, second = _baked(inputs, config, context), inputs.uv.artifact.scan
+    if second is None:
+        return made
+    inside = replace(context, workdir=context.workdir / SCAN)
+    inside.workdir.mkdir(parents=True)
+    own = _baked(replace(inputs, uv=Located(second, inputs.uv.folder)), config, inside)
+    return made.model_copy(update={"scan": own.model_copy(update={"maps": _within(own.maps, SCAN)})})
+
+
+def _within(maps: Mapping[str, TextureMap], folder: str) -> dict[str, TextureMap]:
+    """Maps whose files lie in a folder of the artifact's."""
+    out = {}
+    for name, one in maps.items():
+        files = {k: f.model_copy(update={"path": f"{folder}/{f.path}"}) for k, f in one.files.items()}
+        out[name] = one.model_copy(update={"files": files})
+    return out
+
+
+def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline import footprint, meshes
     from pipeline.fields.face import load_face
     from pipeline.people import shows_person
@@ -112,4 +133,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=7, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=8, inputs=Inputs, config=Config, output=TextureSet, run=run)

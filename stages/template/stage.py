@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pipeline.template.model import Template
     from stages.template.register import Registration
 
-HEAD = "head.npz"
+HEAD, RIG = "head.npz", "rig.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +73,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
 def _registered(
     found: Registration, template: Template, scan: Scan, config: Config, context: Context
 ) -> RegisteredHead:
+    from pipeline.registration.rig import rig_of
     from stages.template.figures import figures_of, region_figures
     from stages.template.judge import judge, refused_fit
 
@@ -85,10 +86,14 @@ def _registered(
     if why:
         return _refused(config, why)
     found.head.save(context.workdir / HEAD)
+    rig = rig_of(template, found.head.vertices, found.placed.world_from_template)
+    if rig is not None:
+        rig.save(context.workdir / RIG)
     context.log.info("template: %.3f mm from the surface, %d repairs", figures["distance_mm"], found.fitted.repairs)
     return RegisteredHead(
         registered=True,
         head=context.file(HEAD),
+        rig=None if rig is None else context.file(RIG),
         template=template.name,
         licence=template.licence,
         regions=regions,
@@ -115,4 +120,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=2, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=3, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

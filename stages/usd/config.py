@@ -19,6 +19,11 @@ class Config(StageConfig):
     usdz: bool = Field(True, description="also write a preview package NAME.usdz")
     glb: bool = Field(True, description="also write NAME.glb")
     obj: bool = Field(True, description="also write NAME.obj and NAME.mtl")
+    expressions: bool = Field(
+        True,
+        description="write the template's expressions (blend shapes, morph targets) and the joints of jaw and eyes, "
+        "where the mesh is the template's",
+    )
     divide_shadows: bool = Field(
         True, description="divide the shadows and interreflections of the captured light out of the albedo"
     )

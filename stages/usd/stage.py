@@ -16,6 +16,7 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
+    RegisteredHead,
     Surface,
     TextureSet,
     UsdAsset,
@@ -31,6 +32,7 @@ class Inputs:
     """The artifacts that are exported."""
 
     surface: Located[Surface]
+    template: Located[RegisteredHead]
     uv: Located[UvMesh]
     bake: Located[TextureSet]
     inverse_rendering: Located[FittedFace]
@@ -59,6 +61,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         inputs.inverse_rendering,
         inputs.poses,
         inputs.capture,
+        inputs.template,
         config,
         context.workdir / "asset",
         context.check,
@@ -130,4 +133,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=10, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=11, inputs=Inputs, config=Config, output=UsdAsset, run=run)

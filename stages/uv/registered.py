@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import meshes, tiles
-from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, triangles_of
-from pipeline.registration.head import Head, limit_surface
+from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
+from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
 from stages.uv import decimate
@@ -23,10 +23,9 @@ from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import face_share
 from stages.uv.judge import judge
-from stages.uv.remainder import left_over, together
+from stages.uv.remainder import left_over
 from stages.uv.unwrap import unwrap
 
-LEFT_OUT = ("lashes",)
 SAMPLES = 20_000
 REST = 2  # share of uv.target_faces for what is beside the head
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
@@ -35,7 +34,7 @@ NEAR = 0.004  # metres: parts of the head further from the fitted surface are ha
 def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step) -> Built:
     """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to."""
     step(0, 3, "subdividing")
-    kept = np.array([n not in LEFT_OUT for n in regions])[head.region]
+    kept = kept_quads(head, regions)
     fine = np.repeat(kept, 4**head.levels)
     mesh, rows = compacted(*_displaced(head), head.surface()[2][fine])
     uvs, uv_quads = head.fine_uvs()
@@ -67,13 +66,12 @@ def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Con
     rest = decimate.decimated(rest, config.target_faces // REST)
     own = unwrap(rest, config.changed(tiles=1))
     moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
-    return together([(mesh, charts), (rest, moved)])
+    return joined([(mesh, charts), (rest, moved)])
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:
     """(n, 3) points on the fitted surface where it was seen, and their normals."""
-    points, normals, quads = head.surface()
-    moved = points + head.displacement[:, None].astype(np.float64) * normals
+    moved, quads = head.displaced(), head.surface()[2]
     return moved, meshes.vertex_normals(moved, triangles_of(quads)).astype(np.float64)
 
 

@@ -7,12 +7,10 @@ Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from pipeline import meshes
-from pipeline.meshes import F64, Charts, Mask, Mesh
+from pipeline.meshes import F64, Mask, Mesh
 
 AWAY = 0.003  # metres: nearer, the head's skin stands for it
 JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
@@ -33,22 +31,6 @@ def left_over(dense: Mesh, skin: Mesh) -> Mesh | None:
     if len(parted) == len(rows):
         normals = dense.normals[rows]
     return Mesh(parted.astype(np.float32), normals, own)
-
-
-def together(parts: Sequence[tuple[Mesh, Charts]]) -> tuple[Mesh, Charts]:
-    """One mesh; their charts keep their tiles."""
-    moved, laid, at, uv_at = [], [], 0, 0
-    for mesh, charts in parts:
-        moved.append(mesh.faces + at)
-        laid.append(charts.faces + uv_at)
-        at, uv_at = at + len(mesh.vertices), uv_at + len(charts.uvs)
-    meshes_, charts_ = zip(*parts, strict=True)
-    whole = Mesh(
-        np.concatenate([m.vertices for m in meshes_]),
-        np.concatenate([m.normals for m in meshes_]),
-        np.concatenate(moved).astype(np.int32),
-    )
-    return whole, Charts(np.concatenate([c.uvs for c in charts_]), np.concatenate(laid).astype(np.int32))
 
 
 def _beside(dense: Mesh, skin: Mesh) -> Mask:

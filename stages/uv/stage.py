@@ -41,19 +41,27 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.progress(done, total, message)
 
     head, notes, quality = inputs.template, list[str](), tuple[Finding, ...]()
-    if config.mesh == "template" and head.artifact.head is not None:
+    ref = head.artifact.head if config.mesh != "scan" else None
+    if ref is not None:
         from pipeline.registration.head import load_head
         from stages.uv.registered import build_registered
 
-        registered = load_head(head.path(head.artifact.head))
+        registered = load_head(head.path(ref))
         built, quality = build_registered(registered, head.artifact.regions, dense, config, step), head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
-        if config.mesh == "template":
+        if config.mesh != "scan":
             notes.append(f"the mesh is the scan's: {head.artifact.reason}")
-    meshes.save(context.workdir / MESH, built.mesh, built.charts)
-    meshes.save(context.workdir / PROXY, built.proxy)
-    return _artifact(built, tuple(notes), quality, context)
+    made = _saved(built, "", context).model_copy(
+        update={
+            "of_template": ref is not None,
+            "warnings": (*notes, *built.warnings),
+            "findings": (*quality, *built.findings),
+        }
+    )
+    if ref is None or config.mesh != "both":
+        return made
+    return made.model_copy(update={"scan": _saved(_of_scan(dense, inputs, config, step), "scan_", context)})
 
 
 def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
@@ -71,10 +79,14 @@ def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
     return build(dense, config, step, texel=texel, landmarks=landmarks)
 
 
-def _artifact(built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...], context: Context) -> UvMesh:
+def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
+    from pipeline import meshes
+
+    meshes.save(context.workdir / f"{prefix}{MESH}", built.mesh, built.charts)
+    meshes.save(context.workdir / f"{prefix}{PROXY}", built.proxy)
     return UvMesh(
-        mesh=context.file(MESH),
-        proxy=context.file(PROXY),
+        mesh=context.file(f"{prefix}{MESH}"),
+        proxy=context.file(f"{prefix}{PROXY}"),
         vertices=len(built.mesh.vertices),
         faces=len(built.mesh.faces),
         charts=built.quality.charts,
@@ -89,9 +101,9 @@ def _artifact(built: Built, notes: tuple[str, ...], quality: tuple[Finding, ...]
         deviation_rms_mm=1000 * built.deviation.rms,
         proxy_deviation_rms_mm=1000 * built.proxy_deviation.rms,
         face_share=None if built.quality.face_share is None else round(built.quality.face_share, 5),
-        warnings=(*notes, *built.warnings),
-        findings=(*quality, *built.findings),
+        warnings=built.warnings,
+        findings=built.findings,
     )
 
 
-STAGE = Stage(name="uv", version=8, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=9, inputs=Inputs, config=Config, output=UvMesh, run=run)

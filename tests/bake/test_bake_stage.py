@@ -173,3 +173,18 @@ def test_an_exposure_is_no_detail(inputs: Inputs, tmp_path: Path) -> None:
     told = np.abs(one - plain).mean()
     assert told > 2e-4
     assert np.abs(one - half).mean() < 0.1 * told
+
+
+def test_two_meshes_are_baked_one_after_the_other(inputs: Inputs, tmp_path: Path) -> None:
+    from pipeline.store import file_refs
+
+    uv = inputs.uv.artifact
+    both = dataclasses.replace(inputs, uv=Located(uv.model_copy(update={"scan": uv}), inputs.uv.folder))
+    (tmp_path / "out").mkdir()
+    made = run(both, Config(size=256, detail=False), Context(tmp_path / "out", tmp_path))
+    assert made.scan is not None and made.scan.scan is None and set(made.scan.maps) == set(made.maps)
+    for name, one in made.maps.items():
+        for kind, file in one.files.items():
+            assert made.scan.maps[name].files[kind].path == f"scan/{file.path}"
+            assert made.scan.maps[name].files[kind].sha256 == file.sha256
+    assert all((tmp_path / "out" / f.path).is_file() for f in file_refs(made))

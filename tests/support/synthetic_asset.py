@@ -18,6 +18,7 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
+    RegisteredHead,
     Surface,
     TextureMap,
     TextureSet,
@@ -36,6 +37,7 @@ class SyntheticInputs:
     """The usd stage's inputs by name."""
 
     surface: Located[Surface]
+    template: Located[RegisteredHead]
     uv: Located[UvMesh]
     bake: Located[TextureSet]
     inverse_rendering: Located[FittedFace]
@@ -290,6 +292,7 @@ def write_inputs(
     )
     return SyntheticInputs(
         Located(surface, made["surface"]),
+        Located(RegisteredHead(registered=False, reason="not asked for"), folder),
         Located(uv, made["uv"]),
         write_tiles(made["bake"], [texture_arrays(tile=t) for t in (0, 1)])
         if tiled

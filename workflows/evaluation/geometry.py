@@ -40,22 +40,12 @@ def camera_of(view: CaptureView) -> PinholeCamera:
 def asset_mesh(path: Path, capture_from_asset: F64) -> tuple[Any, F64]:
     """The render mesh of a USD component as a trimesh in the capture's world, and st of each corner (F, 3, 2)."""
     import trimesh
-    from pxr import Usd, UsdGeom
 
-    stage = Usd.Stage.Open(str(path))
-    meshes = [
-        p
-        for p in stage.Traverse()
-        if p.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(p).ComputePurpose() in ("default", "render")
-    ]
-    prim = max(meshes, key=lambda p: len(UsdGeom.Mesh(p).GetPointsAttr().Get()))
-    mesh = UsdGeom.Mesh(prim)
-    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T  # USD multiplies row vectors
-    points = apply(capture_from_asset @ world, np.array(mesh.GetPointsAttr().Get(), np.float64))
-    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)
-    st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
-    corners = np.array(st.ComputeFlattened(), np.float64).reshape(-1, 3, 2)
-    return trimesh.Trimesh(points, faces, process=False), corners
+    from stages.usd.render.exported import read_usd_mesh
+
+    mesh = read_usd_mesh(path)
+    points = apply(capture_from_asset, mesh.vertices.astype(np.float64))
+    return trimesh.Trimesh(points, mesh.faces, process=False), mesh.uvs[mesh.uv_faces].astype(np.float64)
 
 
 def spread(mesh: Any, count: int = SURFACE_SAMPLES) -> tuple[F64, F64]:

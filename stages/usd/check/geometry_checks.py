@@ -32,8 +32,10 @@ def mesh_findings(mesh: UsdGeom.Mesh) -> list[Finding]:
         "uniform": len(counts),
         "constant": 1,
     }
-    out = [*_extent(mesh, points), *_subdivision(mesh), *_primvars(mesh, sizes)]
+    out = [*_extent(mesh, points), *_subdivision(mesh, counts), *_primvars(mesh, sizes)]
     normals, interpolation = _normals(mesh)
+    if normals is None and _scheme(mesh) == UsdGeom.Tokens.catmullClark:
+        return out  # its normals are those of the limit surface
     if normals is None:
         return [*out, Finding("warning", "normals", "no normals: programs will shade the mesh differently", where)]
     if len(normals) != sizes.get(interpolation):
@@ -66,12 +68,30 @@ def _extent(mesh: UsdGeom.Mesh, points: F64) -> list[Finding]:
     return []
 
 
-def _subdivision(mesh: UsdGeom.Mesh) -> list[Finding]:
+def _scheme(mesh: UsdGeom.Mesh) -> str | None:
     attribute = mesh.GetSubdivisionSchemeAttr()
-    if attribute.HasAuthoredValue() and attribute.Get() == "none":
+    return str(attribute.Get()) if attribute.HasAuthoredValue() else None
+
+
+def _subdivision(mesh: UsdGeom.Mesh, counts: I64) -> list[Finding]:
+    """Triangles are not subdivided. A cage has quads, no normals (programs would have to choose between them and those
+    of the limit surface), and says what happens at its borders."""
+    scheme, where = _scheme(mesh), str(mesh.GetPath())
+    if scheme == UsdGeom.Tokens.none:
         return []
-    found = attribute.Get() if attribute.HasAuthoredValue() else "not authored: clients smooth by default"
-    return [Finding("error", "subdivisionScheme", f"{found}, expected none", str(mesh.GetPath()))]
+    if scheme != UsdGeom.Tokens.catmullClark:
+        found = scheme or "not authored: clients smooth by default"
+        return [Finding("error", "subdivisionScheme", f"{found}, expected none or catmullClark", where)]
+    out = []
+    if (counts != 4).any():
+        text = f"{int((counts != 4).sum())} of {len(counts)} faces of a cage are not quads"
+        out.append(Finding("error", "subdivisionScheme", text, where))
+    if _normals(mesh)[0] is not None:
+        out.append(Finding("error", "normals", "a cage has normals", where))
+    for attribute in (mesh.GetInterpolateBoundaryAttr(), mesh.GetFaceVaryingLinearInterpolationAttr()):
+        if not attribute.HasAuthoredValue():
+            out.append(Finding("error", "subdivisionScheme", f"{attribute.GetName()} is not authored", where))
+    return out
 
 
 def _normals(mesh: UsdGeom.Mesh) -> tuple[F64 | None, str]:

@@ -6,8 +6,9 @@ The renderer uses these, so that it shows the written files and not data of an e
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -16,10 +17,16 @@ from pipeline import tiles
 from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
+from pipeline.meshes import vertex_normals
+from pipeline.transforms import apply
 from stages.usd.write.light import read_light
 from stages.usd.write.mesh import UvSurface, tile_count
 
+if TYPE_CHECKING:
+    from pxr import UsdGeom
+
 F32 = npt.NDArray[np.float32]
+CAGE_HEIGHT = "cage_displacement"  # name of the map of displacement from the cage's limit surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,20 +137,20 @@ def _normal(folder: Path, name: str, count: int) -> F32 | None:
 
 
 def read_usd_mesh(path: Path) -> UvSurface:
-    """The mesh that is rendered (purpose default or render)."""
+    """The meshes that are rendered (purpose default or render) as one of triangles. A cage is subdivided as often as
+    the asset says, and displaced by the map in textures/."""
     from pxr import Usd, UsdGeom
 
+    from stages.usd.write.cage import is_cage, joined
+
     stage = Usd.Stage.Open(str(path))
+    parts = []
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(prim).ComputePurpose() in ("default", "render"):
-            mesh, st = UsdGeom.Mesh(prim), UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
-            return UvSurface(
-                np.array(mesh.GetPointsAttr().Get(), np.float32),
-                np.array(mesh.GetNormalsAttr().Get(), np.float32),
-                np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32).reshape(-1, 3),
-                np.array(st.Get(), np.float32),
-                np.array(st.GetIndices(), np.int32).reshape(-1, 3),
-            )
+            mesh = UsdGeom.Mesh(prim)
+            parts.append(_displaced(mesh, path) if is_cage(mesh) else _triangles(mesh))
+    if parts:
+        return parts[0] if len(parts) == 1 else joined(parts)
     raise StageError(
         "the asset has no mesh to render",
         where=path.name,
@@ -151,6 +158,43 @@ def read_usd_mesh(path: Path) -> UvSurface:
         limit="one",
         remedy="run the usd stage again",
     )
+
+
+def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
+    """In the stage's world. Normals that are not authored, or of a moved mesh, are those of the triangles."""
+    from pxr import UsdGeom
+
+    st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32).reshape(-1, 3)
+    vertices, normals = np.array(mesh.GetPointsAttr().Get(), np.float32), mesh.GetNormalsAttr()
+    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim())).T  # USD multiplies row vectors
+    moved = not np.array_equal(world, np.eye(4))
+    vertices = apply(world, vertices.astype(np.float64)).astype(np.float32) if moved else vertices
+    own = normals.HasAuthoredValue() and not moved
+    return UvSurface(
+        vertices,
+        np.array(normals.Get(), np.float32) if own else vertex_normals(vertices, faces),
+        faces,
+        np.array(st.Get(), np.float32),
+        np.array(st.GetIndices(), np.int32).reshape(-1, 3)
+        if st.IsIndexed()
+        else np.arange(faces.size, dtype=np.int32).reshape(-1, 3),
+    )
+
+
+def _displaced(mesh: UsdGeom.Mesh, path: Path) -> UvSurface:
+    from stages.usd.render.render import bilinear
+    from stages.usd.write.cage import evaluated
+
+    smooth = evaluated(mesh)
+    count = tile_count(smooth)
+    if not _paths(path.parent, path.stem, CAGE_HEIGHT, "exr", count)[0].is_file():
+        return smooth
+    uv = np.zeros((len(smooth.vertices), 2), np.float32)
+    uv[smooth.faces] = smooth.uvs[smooth.uv_faces]
+    height = bilinear(_map(path.parent, path.stem, CAGE_HEIGHT, count)[..., :1], uv, count)
+    moved = np.asarray(smooth.vertices + height * smooth.normals, np.float32)
+    return replace(smooth, vertices=moved, normals=vertex_normals(moved, smooth.faces))
 
 
 def read_cameras(lookdev: Path) -> dict[int, tuple[PinholeCamera, bool]]:

@@ -11,16 +11,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
 
 from pipeline import tiles
+from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, on_tile, tile_count
+from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
-
-STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
-HIGH, RENDER, PROXY = "high", "render", "proxy"
-HIGH_FILE = "high.usdc"
+from stages.usd.write.variants import (
+    RENDER,
+    REST,
+    SCAN,
+    SCAN_MATERIAL,
+    without_displacement,
+    write_levels,
+    write_looks,
+    write_meshes,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +81,18 @@ def _as_component(stage: Usd.Stage, who: Identity) -> Usd.Prim:
 
 
 def root_layer(
-    who: Identity, extents: list[Gf.Vec3f], look: Look, *, high: bool, proxy: bool, thumbnail: str | None
+    who: Identity,
+    extents: list[Gf.Vec3f],
+    look: Look,
+    *,
+    high: bool,
+    proxy: bool,
+    thumbnail: str | None,
+    rest: bool = False,
+    scan: Look | None = None,
 ) -> Sdf.Layer:
-    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded."""
+    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded. rest:
+    whether there is a mesh beside the template; scan: the look of the scan's mesh, if there is one beside it."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
@@ -86,63 +103,28 @@ def root_layer(
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    _looks(stage, prim, look)
-    _levels(stage, prim, high=high, proxy=proxy)
+    write_looks(stage, prim, look, scan)
+    write_levels(stage, prim, rest=rest, scan=scan is not None, high=high, proxy=proxy)
+    if look.displacement:
+        without_displacement(stage, prim, look)
+    if scan is not None:
+        write_meshes(stage, prim, rest=rest)
     return detached(stage)
 
 
-def _looks(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
-    """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
-    payload alone equals the first variant."""
-    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
-    outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
-    if not look.specular:
-        del outputs[SPECULAR]
-    if look.coefficients and look.inv_kappa and look.roughness:
-        outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
-    looks = prim.GetVariantSets().AddVariantSet("look")
-    for variant, connections in outputs.items():
-        looks.AddVariant(variant)
-        looks.SetVariantSelection(variant)
-        with looks.GetVariantEditContext():
-            for output, source in connections.items():
-                over = stage.OverridePrim(material)
-                attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
-                attribute.SetConnections([material.AppendPath(source)])
-    looks.SetVariantSelection(STANDARD)
-
-
-def _levels(stage: Usd.Stage, prim: Usd.Prim, *, high: bool, proxy: bool) -> None:
-    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
-    path = prim.GetPath()
-    lods = prim.GetVariantSets().AddVariantSet("lod")
-    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
-        if not made:
-            continue
-        lods.AddVariant(variant)
-        lods.SetVariantSelection(variant)
-        if variant == RENDER:
-            continue
-        with lods.GetVariantEditContext():
-            stage.OverridePrim(path.AppendPath("geo/render")).SetActive(False)
-            if variant == HIGH:
-                if proxy:
-                    stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
-                dense = stage.OverridePrim(path.AppendPath("geo/high"))
-                dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
-                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
-                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
-            else:
-                shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
-                purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
-                purpose.Set(UsdGeom.Tokens.default_)
-    lods.SetVariantSelection(RENDER)
-
-
-def payload_layer(name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> Sdf.Layer:
-    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default."""
+def payload_layer(
+    name: str,
+    mesh: UvSurface | TemplateMesh,
+    proxy: UvSurface | None,
+    look: Look,
+    scan: tuple[UvSurface, Look] | None = None,
+) -> Sdf.Layer:
+    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default. scan:
+    the scan's mesh with its own maps, beside the template's."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look)
+    if scan is not None:
+        _scan(stage, name, *scan, purposes=proxy is not None)
     return detached(stage)
 
 
@@ -158,39 +140,82 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
     return detached(stage)
 
 
-def package_layer(who: Identity, mesh: UvSurface, look: Look) -> Sdf.Layer:
+def package_layer(who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
-    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>."""
+    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
+    of the mesh's first vertices."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
-    if count == 1:
+    if count == 1 and rig is None:
         _fill(stage, who.name, mesh, None, look)
     else:
-        for folder in ("geo", "mtl"):
-            UsdGeom.Scope.Define(stage, f"/{who.name}/{folder}")
+        UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
+        skeleton = _geo(stage, who.name, rig)
         for t in range(count):
             number = tiles.FIRST + t
             material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
             preview_networks(stage, material, look.on_tile(t))
-            _mesh(stage, f"/{who.name}/geo/render_{number}", on_tile(mesh, t, count), material)
+            part = on_tile(mesh, t, count)
+            made, used = (
+                _mesh(stage, f"/{who.name}/geo/render_{number}", part, material),
+                np.unique(part.faces).astype(np.int64),
+            )
+            if rig is not None and skeleton is not None and used[-1] < len(rig.weights):
+                bind(stage, made, rig.of_vertices(used), skeleton)
     return detached(stage)
 
 
-def _fill(stage: Usd.Stage, name: str, mesh: UvSurface, proxy: UvSurface | None, look: Look) -> None:
-    UsdGeom.Scope.Define(stage, f"/{name}/geo")
+def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
+    skeleton = _geo(stage, name, mesh.rig if isinstance(mesh, TemplateMesh) else None)
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
-    material = UsdShade.Material.Define(stage, f"/{name}/mtl/{MATERIAL}")
+    material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
+    shown = _shown(stage, f"/{name}/geo", mesh, material)
+    if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
+        bind(stage, shown[0], mesh.rig, skeleton)
+    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)
+    for one in shown if stand_in is None else [*shown, stand_in]:
+        one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    if stand_in is not None:
+        stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
+        for one in shown:
+            one.CreatePurposeAttr(UsdGeom.Tokens.render)
+        shown[0].SetProxyPrim(stand_in)
+
+
+def _scan(stage: Usd.Stage, name: str, mesh: UvSurface, look: Look, *, purposes: bool) -> None:
+    material = _material(stage, f"/{name}/mtl/{SCAN_MATERIAL}", look)
+    made = _mesh(stage, f"/{name}/geo/{SCAN}", mesh, material)
+    made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
+    if purposes:
+        made.CreatePurposeAttr(UsdGeom.Tokens.render)
+        made.SetProxyPrim(UsdGeom.Mesh.Get(stage, f"/{name}/geo/proxy"))
+
+
+def _material(stage: Usd.Stage, path: str, look: Look) -> UsdShade.Material:
+    material = UsdShade.Material.Define(stage, path)
     preview_networks(stage, material, look)
     materialx_networks(stage, material, look)
-    render = _mesh(stage, f"/{name}/geo/render", mesh, material)
-    render.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
-    if proxy is not None:
-        stand_in = _mesh(stage, f"/{name}/geo/proxy", proxy, material)
-        stand_in.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
-        stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
-        render.CreatePurposeAttr(UsdGeom.Tokens.render)
-        render.SetProxyPrim(stand_in)
+    return material
+
+
+def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton | None:
+    """The parent of the meshes; with a rig a SkelRoot with its skeleton."""
+    if rig is None:
+        UsdGeom.Scope.Define(stage, f"/{name}/geo")
+        return None
+    UsdSkel.Root.Define(stage, f"/{name}/geo")
+    return write_skeleton(stage, f"/{name}/geo/{RIG}", rig)
+
+
+def _shown(
+    stage: Usd.Stage, geo: str, mesh: UvSurface | TemplateMesh, material: UsdShade.Material
+) -> list[UsdGeom.Mesh]:
+    """The meshes of full detail: one of triangles, or the template's cage and what lies beside it."""
+    if isinstance(mesh, UvSurface):
+        return [_mesh(stage, f"{geo}/{RENDER}", mesh, material)]
+    out = [write_cage(stage, f"{geo}/{RENDER}", mesh.cage, material)]
+    return out if mesh.rest is None else [*out, _mesh(stage, f"{geo}/{REST}", mesh.rest, material)]
 
 
 def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:

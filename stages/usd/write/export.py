@@ -11,20 +11,22 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, RegisteredHead, Surface, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
 from pipeline.images import write_exr
 from stages.usd.config import Config
 from stages.usd.write import component
+from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.gltf import write_glb
 from stages.usd.write.light import environment, environment_figures, light_json, read_light
 from stages.usd.write.lookdev import lookdev_layer
-from stages.usd.write.maps import write_maps
+from stages.usd.write.maps import Maps, write_maps
 from stages.usd.write.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap
 from stages.usd.write.obj import write_obj
 from stages.usd.write.package import bounded_png, write_package
 from stages.usd.write.shading import Look
+from stages.usd.write.variants import HIGH_FILE, SCAN
 
 NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
 THUMBNAIL = "./thumbnails/default.png"  # rendered by the stage after the export
@@ -47,6 +49,7 @@ def export(
     face: Located[FittedFace],
     poses: Located[CameraSet],
     capture: Located[Capture],
+    template: Located[RegisteredHead],
     config: Config,
     folder: Path,
     check: Callable[[], None],
@@ -54,13 +57,19 @@ def export(
     """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh))
+    head = template_mesh(template, mesh, rigged=config.expressions) if uv.artifact.of_template else None
     proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
     high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
     check()
     light = read_light(face.path(face.artifact.light))
-    maps = write_maps(bake, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    maps = write_maps(
+        bake, mesh, light, name, folder, check,
+        divide=config.divide_shadows, acescg=config.acescg, heights=None if head is None else head.heights,
+    )  # fmt: skip
     written, look = maps.written, maps.look
+    scan = _scan(uv, bake, light, config, folder, check)
+    written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
     hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
@@ -68,14 +77,26 @@ def export(
     cameras = tuple(sorted(poses.artifact.cameras, key=lambda c: c.index))
     layers = {
         f"{name}.usd": (
-            component.root_layer(who, hints, look, high=high is not None, proxy=proxy is not None, thumbnail=THUMBNAIL),
+            component.root_layer(
+                who,
+                hints,
+                look,
+                high=high is not None,
+                proxy=proxy is not None,
+                thumbnail=THUMBNAIL,
+                rest=head is not None and head.rest is not None,
+                scan=None if scan is None else scan[1].look,
+            ),
             "usda",
         ),
-        "payload.usdc": (component.payload_layer(name, mesh, proxy, look), "usdc"),
+        "payload.usdc": (
+            component.payload_layer(name, head or mesh, proxy, look, None if scan is None else (scan[0], scan[1].look)),
+            "usdc",
+        ),
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
     }
     if high is not None:
-        layers[component.HIGH_FILE] = (component.high_layer(high, look), "usdc")
+        layers[HIGH_FILE] = (component.high_layer(high, look), "usdc")
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
     dome = environment(light, config.environment_width)
@@ -84,14 +105,15 @@ def export(
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
+    light_mesh, light_rig = (mesh, None) if head is None else (with_rest(head), head.coarse_rig)
     if config.usdz:
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
-        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=())
-        single = component.package_layer(who, mesh, plain)
+        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
+        single = component.package_layer(who, light_mesh, plain, light_rig)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")
-        write_glb(written[-1], name, mesh, look, folder, who.stated())
+        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig)
     if config.obj:
         written += write_obj(folder, name, mesh, look)
     check()
@@ -125,6 +147,23 @@ def _hints(boxes: list[npt.NDArray[np.float64]]) -> list[npt.NDArray[np.float64]
     """Boxes for extentsHint: one per purpose, in the order default, render, proxy; an unused one is empty."""
     empty = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
     return [row for box in (empty, *boxes) for row in box]
+
+
+def _scan(
+    uv: Located[UvMesh],
+    bake: Located[TextureSet],
+    light: npt.NDArray[np.float32],
+    config: Config,
+    folder: Path,
+    check: Callable[[], None],
+) -> tuple[UvSurface, Maps] | None:
+    """The scan's mesh beside the template's, and its maps NAME_scan_*; None if there is none."""
+    if uv.artifact.scan is None or bake.artifact.scan is None:
+        return None
+    mesh = read_mesh(uv.path(uv.artifact.scan.mesh))
+    baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
+    made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    return mesh, made
 
 
 def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:

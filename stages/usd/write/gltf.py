@@ -7,6 +7,10 @@ Core metallic-roughness material with metallic 0, and KHR_materials_specular: re
 whose texture is sRGB-encoded F0 over its largest value, so that eight bits are enough. The origin of texture
 coordinates is top left in glTF, so v becomes 1 - v. glTF has no UDIM tiles: each tile becomes a primitive with its own
 material and coordinates in the unit square. The same content gives the same bytes.
+
+Expressions are morph targets of the primitives that they move, as sparse accessors: offsets of positions and normals
+at the moved vertices only. Primitives of one mesh must have the same targets, so what no expression moves is a second
+mesh.
 """
 
 from __future__ import annotations
@@ -22,11 +26,13 @@ import numpy.typing as npt
 from pipeline import tiles
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_encoded, read_exr
+from pipeline.meshes import F32, Indices, vertex_normals
 from stages.usd.write.mesh import UvSurface, on_tile, tile_count
 from stages.usd.write.package import bounded_png
+from stages.usd.write.rig import MeshRig
 from stages.usd.write.shading import Look
 
-FLOAT, UINT, ARRAY_BUFFER, ELEMENT_BUFFER = 5126, 5125, 34962, 34963
+FLOAT, UINT, USHORT, ARRAY_BUFFER, ELEMENT_BUFFER = 5126, 5125, 5123, 34962, 34963
 LINEAR, LINEAR_MIPMAPS, CLAMP = 9729, 9987, 33071
 DIELECTRIC_F0 = 0.04
 MIN_TOP, LARGEST_TOP = 0.02, 0.16  # range of F0's largest value: outliers of a fit must not use up the eight bits
@@ -39,6 +45,7 @@ class _Binary:
         self.data = bytearray()
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
+        self.last: tuple[bytes, int] | None = None  # the rows of the latest sparse accessor
 
     def view(self, content: bytes, target: int | None = None) -> int:
         self.data += bytes(-len(self.data) % 4)
@@ -60,6 +67,28 @@ class _Binary:
         self.accessors.append(found)
         return len(self.accessors) - 1
 
+    def sparse(self, rows: npt.NDArray[np.integer], values: F32, count: int) -> int:
+        """`count` vectors that are 0 but for rows (n,) ascending, where they are values (n, 3). The rows are stored
+        once for accessors that follow each other."""
+        full = np.concatenate([values, np.zeros((int(len(rows) < count), 3), np.float32)])
+        found: dict[str, Any] = {"componentType": FLOAT, "count": count, "type": "VEC3"}
+        found |= {"min": full.min(0).tolist(), "max": full.max(0).tolist()}
+        if len(rows):
+            short = count <= np.iinfo(np.uint16).max
+            index = np.ascontiguousarray(rows, np.uint16 if short else np.uint32)
+            found["sparse"] = {
+                "count": len(rows),
+                "indices": {"bufferView": self._rows(index.tobytes()), "componentType": USHORT if short else UINT},
+                "values": {"bufferView": self.view(np.ascontiguousarray(values, np.float32).tobytes())},
+            }
+        self.accessors.append(found)
+        return len(self.accessors) - 1
+
+    def _rows(self, content: bytes) -> int:
+        if self.last is None or self.last[0] != content:
+            self.last = (content, self.view(content))
+        return self.last[1]
+
 
 def corners(mesh: UvSurface) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
     """Vertices split at seams: (N,) indices into the vertices and into the uvs, and faces (F, 3) into these."""
@@ -68,11 +97,36 @@ def corners(mesh: UvSurface) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int6
     return unique[:, 0], unique[:, 1], inverse.reshape(-1, 3).astype(np.uint32)
 
 
-def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, metadata: dict[str, str]) -> None:
-    """Write the file. `folder`: base of the look's paths. `metadata`: from the user."""
+def write_glb(
+    path: Path,
+    name: str,
+    mesh: UvSurface,
+    look: Look,
+    folder: Path,
+    metadata: dict[str, str],
+    rig: MeshRig | None = None,
+) -> None:
+    """Write the file. `folder`: base of the look's paths. `metadata`: from the user. rig: of the mesh's first
+    vertices."""
     binary, count = _Binary(), tile_count(mesh)
     looks = [look.on_tile(t) for t in range(count)]
-    primitives = [_primitive(on_tile(mesh, t, count), t, binary) for t in range(count)]
+    bent = [] if rig is None else bent_normals(mesh, rig)
+    meshes: list[dict[str, Any]] = []
+    moving: list[dict[str, Any]] = []
+    still: list[dict[str, Any]] = []
+    for t in range(count):
+        part = on_tile(mesh, t, count)
+        made = _primitive(part, t, binary)
+        if rig is not None and part.faces.max() < len(rig.weights):
+            made["targets"] = _targets(corners(part)[0], rig, bent, binary)
+        (moving if "targets" in made else still).append(made)
+    if moving and rig is not None:
+        names = [s.name for s in rig.shapes]
+        meshes.append(
+            {"name": name, "primitives": moving, "weights": [0.0] * len(names), "extras": {"targetNames": names}}
+        )
+    if still:
+        meshes.append({"name": f"{name}_rest" if moving else name, "primitives": still})
     images: list[dict[str, Any]] = []
     names = [name] if count == 1 else [f"{name}_{tiles.FIRST + t}" for t in range(count)]
     top = max((_top(folder / x.f0) for x in looks if x.f0), default=0.0)
@@ -86,9 +140,9 @@ def write_glb(path: Path, name: str, mesh: UvSurface, look: Look, folder: Path, 
         "asset": asset,
         "extensionsUsed": sorted(materials[0].get("extensions", {})),
         "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": name}],
-        "meshes": [{"name": name, "primitives": primitives}],
+        "scenes": [{"nodes": list(range(len(meshes)))}],
+        "nodes": [{"mesh": i, "name": m["name"]} for i, m in enumerate(meshes)],
+        "meshes": meshes,
         "materials": materials,
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR_MIPMAPS, "wrapS": CLAMP, "wrapT": CLAMP}],
         "textures": [{"sampler": 0, "source": i} for i in range(len(images))],
@@ -121,6 +175,35 @@ def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any
         "indices": binary.accessor(faces.ravel(), "SCALAR", ELEMENT_BUFFER),
         "material": material,
     }
+
+
+def bent_normals(mesh: UvSurface, rig: MeshRig) -> list[F32]:
+    """For each expression the change (n, 3) of the triangles' normals at the vertices that it moves."""
+    own = np.asarray(mesh.faces[(mesh.faces < len(rig.weights)).all(1)])
+    vertices = mesh.vertices[: len(rig.weights)].astype(np.float64)
+    smooth, out = vertex_normals(vertices, own), []
+    for shape in rig.shapes:
+        moved = vertices.copy()
+        moved[shape.rows] += shape.offsets
+        out.append((vertex_normals(moved, own) - smooth)[shape.rows])
+    return out
+
+
+def _targets(vertex: Indices, rig: MeshRig, bent: list[F32], binary: _Binary) -> list[dict[str, int]]:
+    """The morph targets of a primitive whose corners have the mesh's vertices `vertex` (n,)."""
+    out = []
+    for shape, turned in zip(rig.shapes, bent, strict=True):
+        row = np.full(len(rig.weights), -1, np.int64)
+        row[shape.rows] = np.arange(len(shape.rows))
+        corner = np.flatnonzero(row[vertex] >= 0)
+        at = row[vertex[corner]]
+        out.append(
+            {
+                "POSITION": binary.sparse(corner, shape.offsets[at].astype(np.float32), len(vertex)),
+                "NORMAL": binary.sparse(corner, turned[at].astype(np.float32), len(vertex)),
+            }
+        )
+    return out
 
 
 def _top(f0: Path) -> float:

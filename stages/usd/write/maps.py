@@ -19,7 +19,7 @@ from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_pn
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
-from stages.usd.render.exported import numbered
+from stages.usd.render.exported import CAGE_HEIGHT, numbered
 from stages.usd.render.median_cut import lamps
 from stages.usd.render.render import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
@@ -58,11 +58,14 @@ def write_maps(
     *,
     divide: bool,
     acescg: bool = False,
+    heights: F32 | None = None,
 ) -> Maps:
     """Write textures/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also write that
-    albedo in ACEScg."""
+    albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it."""
     folder = asset / "textures"
     written = copy_maps(bake, name, folder)
+    if heights is not None:
+        written += write_heights(bake, mesh, heights, name, folder)
     figures: dict[str, float] = {}
     if divide and not shadows_fitted(bake):
         shown, found = divided_albedo(bake, mesh, light, name, folder, check)
@@ -193,6 +196,17 @@ def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F64, check: Callable[[
     return occlusion(transport, lit, unblocked, albedo, check)
 
 
+def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name: str, folder: Path) -> list[Path]:
+    """NAME_cage_displacement.exr: metres along the cage's limit normal. heights (V,) at the vertices of the textured
+    mesh. (NAME_displacement.exr is the bake's: from the textured mesh to the zero set.)"""
+    count, written = bake.artifact.tiles, []
+    for tile in range(count):
+        written.append(folder / f"{name}_{CAGE_HEIGHT}.{tiles.form('exr', tile, count)}")
+        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.size)
+        write_exr(written[-1], image, primaries=None, units="m")
+    return written
+
+
 def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
     """(size, size, C) texture of vertex values (V, C); texels between charts are filled from the nearest one."""
     charts = Charts(mesh.uvs, mesh.uv_faces)
@@ -240,6 +254,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
         inv_kappa=found("inv_kappa", "exr"),
         coefficients=counted("coefficients", count),
         basis=counted("basis", 1),
+        displacement=found(CAGE_HEIGHT, "exr"),
     )
 
 

@@ -16,9 +16,9 @@ from pxr import Sdf, Usd, UsdShade
 
 from pipeline import tiles
 from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0, REFERENCE_IOR
-from stages.usd.write.shading import Look, T, connect, shader
+from stages.usd.write.shading import HEIGHT, Look, T, connect, shader
 
-SURFACE = "ND_open_pbr_surface_surfaceshader"
+SURFACE, DISPLACEMENT = "ND_open_pbr_surface_surfaceshader", "ND_displacement_float"
 CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
 SRGB, DATA = "srgb_texture", "raw"
 LARGEST_F0 = 0.16  # `specular_weight` = 4: limits the reflectance of a failed fit
@@ -78,7 +78,21 @@ def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look
         prim.CreateAttribute("config:mtlx:version", T.String, False, Sdf.VariabilityUniform).Set(VERSION)
         output = UsdShade.Shader.Get(stage, f"{path}/{made[0]}/surface").ConnectableAPI()
         material.CreateSurfaceOutput("mtlx").ConnectToSource(output, "out")
+        if look.displacement:
+            height = _displacement(stage, f"{path}/{made[0]}", look.displacement)
+            material.CreateDisplacementOutput("mtlx").ConnectToSource(height.ConnectableAPI(), "out")
     return made
+
+
+def _displacement(stage: Usd.Stage, path: str, file: str) -> UsdShade.Shader:
+    """Displacement in metres, which are the units of the scene. It is the same in all networks."""
+    nodes = _Nodes(stage, path)
+    height = nodes.image("height", "float", T.Float, file, DATA)
+    out = shader(stage, f"{path}/{HEIGHT}", DISPLACEMENT)
+    connect(out.CreateInput("displacement", T.Float), height)
+    out.CreateInput("scale", T.Float).Set(1.0)
+    out.CreateOutput("out", T.Token)
+    return out
 
 
 def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:

@@ -12,6 +12,7 @@ from pipeline import tiles
 
 T = Sdf.ValueTypeNames
 MATERIAL = "captured"
+HEIGHT = "displacement"  # reader of the displacement map, and the output of both kinds of network
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +21,7 @@ class Look:
     there are several tiles; None leaves a map out.
 
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
+    displacement: metres along the normal, of a mesh that is subdivided.
     """
 
     albedo: str
@@ -32,6 +34,7 @@ class Look:
     inv_kappa: str | None = None
     coefficients: tuple[str, ...] = ()
     basis: tuple[str, ...] = ()
+    displacement: str | None = None
 
     def on_tile(self, tile: int) -> Look:
         """The same look with the files of one tile."""
@@ -76,6 +79,7 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
     albedo = _texture(stage, st, f"{path}/albedo", look.albedo, "sRGB")
     roughness = _texture(stage, st, f"{path}/roughness", look.roughness, "raw", "r") if look.roughness else None
     normal = _normal_texture(stage, st, f"{path}/normal", look.normal) if look.normal else None
+    height = _texture(stage, st, f"{path}/{HEIGHT}", look.displacement, "raw", "r") if look.displacement else None
     for which in ("preview", "preview_specular") if look.specular else ("preview",):
         surface = shader(stage, f"{path}/{which}", "UsdPreviewSurface")
         surface.CreateInput("useSpecularWorkflow", T.Int).Set(int(which != "preview"))
@@ -93,9 +97,13 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
         if normal is not None:
             connect(surface.CreateInput("normal", T.Normal3f), normal)
         surface.CreateOutput("surface", T.Token)
-    material.CreateSurfaceOutput().ConnectToSource(
-        UsdShade.Shader.Get(stage, f"{path}/preview").ConnectableAPI(), "surface"
-    )
+        if height is not None:
+            connect(surface.CreateInput("displacement", T.Float), height)
+            surface.CreateOutput("displacement", T.Token)
+    preview = UsdShade.Shader.Get(stage, f"{path}/preview").ConnectableAPI()
+    material.CreateSurfaceOutput().ConnectToSource(preview, "surface")
+    if height is not None:
+        material.CreateDisplacementOutput().ConnectToSource(preview, "displacement")
 
 
 def _texture(

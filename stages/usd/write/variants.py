@@ -1,0 +1,101 @@
+"""The component's variant sets: `look` (which network is the material's surface), `lod` (which mesh), and `mesh`
+(template or scan), if the asset has both.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+from pxr import Sdf, Usd, UsdGeom, UsdShade
+
+from stages.usd.write.shading import HEIGHT, MATERIAL, Look
+
+STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
+HIGH, RENDER, PROXY = "high", "render", "proxy"
+REST = "rest"  # beside the template: hair, clothes
+TEMPLATE, SCAN = "template", "scan"
+SCAN_MATERIAL = f"{MATERIAL}_{SCAN}"
+HIGH_FILE = "high.usdc"
+
+
+def write_looks(stage: Usd.Stage, prim: Usd.Prim, look: Look, scan: Look | None = None) -> None:
+    """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
+    payload alone equals the first variant. scan: of the scan's own material, which follows."""
+    names = (MATERIAL, SCAN_MATERIAL) if scan is not None else (MATERIAL,)
+    materials = [prim.GetPath().AppendPath(f"mtl/{n}") for n in names]
+    outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
+    if not look.specular:
+        del outputs[SPECULAR]
+    if look.coefficients and look.inv_kappa and look.roughness:
+        outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
+    looks = prim.GetVariantSets().AddVariantSet("look")
+    for variant, connections in outputs.items():
+        looks.AddVariant(variant)
+        looks.SetVariantSelection(variant)
+        with looks.GetVariantEditContext():
+            for material, (output, source) in product(materials, connections.items()):
+                over = stage.OverridePrim(material)
+                attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
+                attribute.SetConnections([material.AppendPath(source)])
+    looks.SetVariantSelection(STANDARD)
+
+
+def write_levels(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool, scan: bool, high: bool, proxy: bool) -> None:
+    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
+    path = prim.GetPath()
+    lods = prim.GetVariantSets().AddVariantSet("lod")
+    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
+        if not made:
+            continue
+        lods.AddVariant(variant)
+        lods.SetVariantSelection(variant)
+        if variant == RENDER:
+            continue
+        with lods.GetVariantEditContext():
+            for hidden in (RENDER, *([REST] if rest else []), *([SCAN] if scan else [])):
+                stage.OverridePrim(path.AppendPath(f"geo/{hidden}")).SetActive(False)
+            if variant == HIGH:
+                if proxy:
+                    stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
+                dense = stage.OverridePrim(path.AppendPath("geo/high"))
+                dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
+                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
+                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
+            else:
+                shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
+                purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
+                purpose.Set(UsdGeom.Tokens.default_)
+    lods.SetVariantSelection(RENDER)
+
+
+def without_displacement(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
+    """Take the displacement out of the material where the mesh is no cage: the dense mesh, the proxy."""
+    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
+    outputs = [f"outputs:{HEIGHT}", *([f"outputs:mtlx:{HEIGHT}"] if look.f0 and look.roughness else [])]
+    surfaces = ["preview", *(["preview_specular"] if look.specular else [])]
+    lods = prim.GetVariantSets().GetVariantSet("lod")
+    for variant in lods.GetVariantNames():
+        if variant == RENDER:
+            continue
+        lods.SetVariantSelection(variant)
+        with lods.GetVariantEditContext():
+            for output in outputs:
+                over = stage.OverridePrim(material)
+                over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False).SetConnections([])
+            for surface in surfaces:
+                over = stage.OverridePrim(material.AppendPath(surface))
+                over.CreateAttribute(f"inputs:{HEIGHT}", Sdf.ValueTypeNames.Float, custom=False).SetConnections([])
+    lods.SetVariantSelection(RENDER)
+
+
+def write_meshes(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool) -> None:
+    """Variant set `mesh`: the template's cage with what lies beside it, or the scan's triangles."""
+    shown = {TEMPLATE: [RENDER, *([REST] if rest else [])], SCAN: [SCAN]}
+    meshes = prim.GetVariantSets().AddVariantSet("mesh")
+    for variant, other in ((TEMPLATE, SCAN), (SCAN, TEMPLATE)):
+        meshes.AddVariant(variant)
+        meshes.SetVariantSelection(variant)
+        with meshes.GetVariantEditContext():
+            for hidden in shown[other]:
+                stage.OverridePrim(prim.GetPath().AppendPath(f"geo/{hidden}")).SetActive(False)
+    meshes.SetVariantSelection(TEMPLATE)
