@@ -16,7 +16,7 @@ from pipeline import tiles
 from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
-from stages.usd.write.light import read_light
+from pipeline.lighting.dome import read_light
 from stages.usd.write.mesh import UvSurface, tile_count
 
 F32 = npt.NDArray[np.float32]

@@ -16,17 +16,17 @@ from pipeline.artifacts import Located, TextureSet
 from pipeline.colour import ACESCG, acescg_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
+from pipeline.lighting.dome import environment
+from pipeline.lighting.median_cut import lamps
+from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
 from stages.usd.render.exported import numbered
-from stages.usd.render.median_cut import lamps
 from stages.usd.render.render import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
-from stages.usd.write.light import environment
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
-from stages.usd.write.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
