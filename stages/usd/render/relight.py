@@ -17,7 +17,7 @@ from pipeline.lighting.median_cut import Lamps, checked_environment, lamps
 from pipeline.lighting.transport import Transport
 from pipeline.maths.ggx_width import KAPPA_RANGE
 from stages.usd.render import kernels
-from stages.usd.render.render import Points, Renderer
+from stages.usd.render.render import Points, Renderer, vertex_values
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -55,11 +55,3 @@ class Environment:
 def table_of(lit: Lamps) -> F32:
     """(7, N) direction, flux and spread of the lamps, as input of the kernel."""
     return np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
-
-
-def vertex_values(image: F32, renderer: Renderer) -> F64:
-    """(V, C) values of a map (H, W, C) at the vertices; at a seam, from one of its sides."""
-    mesh = renderer.asset.mesh
-    uv = np.zeros((len(mesh.vertices), 2), np.float32)
-    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
-    return renderer.at(image, uv).astype(np.float64)

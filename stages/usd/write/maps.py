@@ -64,7 +64,7 @@ def write_maps(
     folder = asset / "textures"
     written = copy_maps(bake, name, folder)
     figures: dict[str, float] = {}
-    if divide and not shadows_fitted(bake):
+    if divide and not shadows_fitted(bake) and not standard_fitted(bake):
         shown, found = divided_albedo(bake, mesh, light, name, folder, check)
         written += shown
         figures |= found
@@ -114,6 +114,11 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
     return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
+def standard_fitted(bake: Located[TextureSet]) -> bool:
+    """Whether the standard material was fitted: its base colour is then free of the photos' shadows."""
+    return any(name.startswith("gloss_") for name in bake.artifact.figures)
+
+
 def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     """Copy every file of every map as NAME_map.format."""
     count = bake.artifact.tiles
@@ -130,6 +135,8 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for which, texture in sorted(bake.artifact.maps.items()):
+        if which == "neuface_albedo" and not standard_fitted(bake):
+            continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = folder / f"{name}_{which}.{form}"
             shutil.copyfile(bake.path(ref), target)
@@ -240,6 +247,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
         inv_kappa=found("inv_kappa", "exr"),
         coefficients=counted("coefficients", count),
         basis=counted("basis", 1),
+        neuface_albedo=found("neuface_albedo", "png"),
     )
 
 

@@ -20,6 +20,7 @@ class Look:
     there are several tiles; None leaves a map out.
 
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
+    neuface_albedo: the field's own albedo, if `albedo` is the base colour of a fitted standard material.
     """
 
     albedo: str
@@ -32,6 +33,7 @@ class Look:
     inv_kappa: str | None = None
     coefficients: tuple[str, ...] = ()
     basis: tuple[str, ...] = ()
+    neuface_albedo: str | None = None
 
     def on_tile(self, tile: int) -> Look:
         """The same look with the files of one tile."""
