@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.regions import Votes, areas
 from stages.bake.smooth import continued
+from stages.bake.standard_observe import standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
 
@@ -85,8 +86,11 @@ class Baker:
         step: Step,
         photos: Photos | None = None,
         scratch: Path | None = None,
+        skin_code: int = -1,
+        fit_standard: bool = True,
     ) -> None:
-        """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory."""
+        """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
+        `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
@@ -97,6 +101,14 @@ class Baker:
         )
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
+        self.material_figures: dict[str, float] = {}
+        if fit_standard and self._found is not None:
+            step(0, 1, "standard material")
+            seen = self._known.unseen < 0.5
+            fitted = standard_material(
+                field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material")
+            )
+            self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
 
     def tile(self, number: int) -> Baked:
         """Bake all texels that a chart of this tile touches.

@@ -89,6 +89,21 @@ def _colour(camera, pixels, column, row, out):
         out[i] = camera[30 + 3 * i] * r0 + camera[31 + 3 * i] * r1 + camera[32 + 3 * i] * r2
 
 
+@njit(parallel=True, error_model="numpy", cache=True)
+def observed(cameras, pixels, depth, clipped, x, n, colour, cosines):
+    """Linear colour (views, N, 3) of every point (N, 3) in every photo, and the cosines (views, N), 0 where a photo
+    does not see the point."""
+    for v in prange(len(cameras)):
+        found = np.empty(3)
+        for i in range(len(x)):
+            cosine, _, column, row = _look(cameras[v], depth, clipped, x[i], n[i])
+            cosines[v, i] = cosine
+            if cosine > 0:
+                _colour(cameras[v], pixels, column, row, found)
+                for k in range(3):
+                    colour[v, i, k] = found[k]
+
+
 @njit(error_model="numpy", cache=True)
 def residual(camera, pixels, depth, clipped, x, n, corner, weights, gloss, albedo, shade, out, cosines):
     """One photo's albedo minus the field's at N points (N, 3), clamped to OUTLIER, and the cosines (N,), 0 where it

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.colour import LUMA
-from pipeline.maths import microfacet
 from pipeline.meshes import F32, Indices
 from pipeline.verdict import Finding, Limits, judged
 from stages.bake.regions import Votes
@@ -50,8 +49,8 @@ def chosen(s: Samples, texel: Indices, size: int, votes: Votes | None, names: Se
     skin = np.zeros(len(rows), np.bool_) if votes is None else votes.winners(texel[rows], size) == face
     return Texels(
         s.f0[rows],
-        np.asarray(microfacet.roughness_from_inv_kappa(s.inv_kappa[rows]), np.float32),
-        np.asarray(s.albedo[rows] @ np.array(LUMA), np.float32),
+        s.roughness[rows],
+        np.asarray(s.base_color[rows] @ np.array(LUMA), np.float32),
         skin,
     )
 

@@ -75,6 +75,10 @@ class Poll:
                 mine = label == code
                 self._votes.setdefault(int(code), np.zeros(self._count))[seen[mine]] += cosine[seen[mine]]
 
+    def votes(self) -> dict[int, F64]:
+        """(count,) votes by code."""
+        return self._votes
+
     def result(self, spread: Callable[[F64], F32]) -> Votes | None:
         """The votes as a picture, which `spread` makes from (N, L); None if there are none."""
         if not self._votes:

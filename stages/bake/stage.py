@@ -37,6 +37,11 @@ class Config(StageConfig):
 
     size: Texels = Field(1024, ge=256, le=16384, description="width and height of the maps in texels")
     detail: bool = Field(True, description="add the fine detail of the fitted photos to the albedo")
+    fit_standard: bool = Field(
+        True,
+        description="fit base colour, F0 and roughness of standard shaders to the photos; off, or without detail: "
+        "convert NeuFace's lobe",
+    )
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
@@ -85,9 +90,10 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         context.progress(done, total, message)
 
     mesh, charts = meshes.load(path), meshes.load_charts(path)
-    baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch)
-    parts, counted, judged, areas = [], [], [], Counter[int]()
     labels = inputs.masks.artifact.label_names
+    skin = labels.index("face") if "face" in labels else -1
+    baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard)
+    parts, counted, judged, areas = [], [], [], Counter[int]()
     for number in range(baker.tiles):
         baked = baker.tile(number)
         parts.append(write_maps(baked, context, number, baker.tiles))
@@ -98,7 +104,8 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     maps, all_tiles = joined(parts, [s.texels for s in counted], context), together(counted)
     pixel = footprint.pixel(mesh, (v.camera for v in views))
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
-    figures = all_tiles.figures(detail=baker.detailed) | {k: round(1000 * v, 5) for k, v in sizes.items() if v}
+    figures = all_tiles.figures(detail=baker.detailed) | baker.material_figures
+    figures |= {k: round(1000 * v, 5) for k, v in sizes.items() if v}
     levels = {"render": mesh, "high": meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))}
     if uv.artifact.proxy is not None:
         levels["proxy"] = meshes.load(uv.path(uv.artifact.proxy))

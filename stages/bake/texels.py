@@ -22,6 +22,7 @@ from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.raster import Hits
 from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
+from stages.bake.standard_fit import Fitted
 
 NEWTON_STEPS = 3
 MIN_SLOPE = 0.3  # of d along N: lower limit of the slope in Newton's step
@@ -37,19 +38,21 @@ ALBEDO_RANGE = (0.005, 0.95)  # soot and fresh snow: nothing on a head is darker
 class Samples:
     """One row per texel, in the order of its Hits. All float32, but `landed` is bool.
 
-    albedo (N, 3), including photo detail; rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,);
-    irradiance_ratio (N, 3); f0 (N,); normal (N, 3) in tangent space, unit; displacement (N,) metres; ambient (N,):
-    ambient occlusion. landed (N,): False where no zero set is near the mesh (the cap). support (N,): weight of the
-    photos in the detail. unseen (N,): 1 where no photo shows the point. clamped (N,): largest change of an albedo
-    channel by clamping to ALBEDO_RANGE.
+    albedo (N, 3) of the field, including photo detail; base_color (N, 3), f0 and roughness (N,) of standard shaders;
+    rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); irradiance_ratio (N, 3); normal (N, 3) in
+    tangent space, unit; displacement (N,) metres; ambient (N,): ambient occlusion. landed (N,): False where no zero set
+    is near the mesh (the cap). support (N,): weight of the photos in the detail. unseen (N,): 1 where no photo shows
+    the point. clamped (N,): largest change of an albedo channel by clamping to ALBEDO_RANGE.
     """
 
     albedo: F32
+    base_color: F32
     rho: F32
     coefficients: F32
     inv_kappa: F32
     irradiance_ratio: F32
     f0: F32
+    roughness: F32
     normal: F32
     displacement: F32
     ambient: F32
@@ -62,11 +65,13 @@ class Samples:
 @dataclass(frozen=True, slots=True)
 class Known:
     """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; albedo (V, 3), where
-    unseen continued from the surroundings."""
+    unseen continued from the surroundings. standard: the fitted material of standard shaders; None: it is converted
+    from NeuFace's."""
 
     ambient: F32
     unseen: F32
     albedo: F32
+    standard: Fitted | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +114,7 @@ def sample(
     ratio = np.asarray(field.irradiance_ratio(x), np.float32)
     strength = material.rho * tangents.dot(material.coefficients, field.basis(straight, straight))
     f0 = microfacet.f0_from_lobe(strength, material.inv_kappa)
+    roughness = microfacet.roughness_from_inv_kappa(material.inv_kappa)
     albedo, support = np.asarray(material.albedo, np.float32), np.zeros(len(x), np.float32)
     _check("albedo", albedo)
     if detail is not None:
@@ -121,14 +127,20 @@ def sample(
         unseen = tangents.dot(known.unseen[corner], hits.weights)
         nearby = tangents.mixed(known.albedo[corner], hits.weights)
         albedo = np.asarray(albedo + unseen[:, None] * (nearby - albedo), np.float32)
-    physical = albedo.clip(*ALBEDO_RANGE)
+    physical = base = albedo.clip(*ALBEDO_RANGE)
+    if known is not None and known.standard is not None:
+        fitted, corner = known.standard, mesh.faces[hits.face]
+        f0, roughness = (tangents.dot(values[corner], hits.weights) for values in (fitted.f0, fitted.roughness))
+        base = (albedo * tangents.mixed(fitted.correction[corner], hits.weights)).clip(*ALBEDO_RANGE)
     found = Samples(
         albedo=physical,
+        base_color=np.asarray(base, np.float32),
         rho=np.asarray(material.rho, np.float32),
         coefficients=np.asarray(material.coefficients, np.float32),
         inv_kappa=np.asarray(material.inv_kappa, np.float32),
         irradiance_ratio=ratio,
-        f0=f0.astype(np.float32),
+        f0=np.asarray(f0, np.float32),
+        roughness=np.asarray(roughness, np.float32),
         normal=in_frame(at.world, at.t, at.b, at.n),
         displacement=at.moved.astype(np.float32),
         ambient=around,

@@ -19,7 +19,6 @@ from pipeline.artifacts import FileRef, TextureMap
 from pipeline.colour import REC709
 from pipeline.contract import Context
 from pipeline.images import write_exr, write_png, write_png_from_linear
-from pipeline.maths import microfacet
 from pipeline.meshes import F32
 from stages.bake.build import Baked, bands
 from stages.bake.memmap_buffer import blank
@@ -59,13 +58,14 @@ class MapKind:
 
 
 KINDS: dict[str, MapKind] = {
-    "albedo": MapKind(("albedo",), png=8, space="srgb_png", colour=True),
+    "albedo": MapKind(("base_color",), png=8, space="srgb_png", colour=True),
+    "neuface_albedo": MapKind(("albedo",), png=8, space="srgb_png", colour=True),
     "specular_coefficients": MapKind(("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True),
     "lobe_coefficients": MapKind(("coefficients",), numbered=True),
     "specular_intensity": MapKind(("rho",), png=8),
     "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, MIN_INV_KAPPA)),
     "inv_kappa": MapKind(("inv_kappa",)),
-    "roughness": MapKind(("inv_kappa",), microfacet.roughness_from_inv_kappa, png=8),
+    "roughness": MapKind(("roughness",), png=8),
     "f0": MapKind(("f0",), png=16),  # about 0.03: 8 bits would leave 8 steps
     "normal": MapKind(("normal",), png=8, encoded=True),
     "irradiance_ratio": MapKind(("irradiance_ratio",), png=8, colour=True),

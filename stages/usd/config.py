@@ -30,7 +30,7 @@ class Config(StageConfig):
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     high: bool = Field(True, description="write the dense mesh as high.usdc, for the variant lod=high")
-    environment_width: Pixels = Field(512, ge=64, le=8192, multiple_of=2, description="width of environment.exr")
+    environment_width: Pixels = Field(1024, ge=64, le=8192, multiple_of=2, description="width of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
     samples: int = Field(
         0, ge=0, le=8, description="rays along each side of a pixel in these renders; 0: one ray, 64 on silhouettes"

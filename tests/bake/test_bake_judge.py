@@ -100,8 +100,8 @@ def samples(n: int, unseen: Any) -> Samples:
     columns = {f.name: np.zeros(n, np.float32) for f in fields(Samples)}
     columns |= {"unseen": np.asarray(unseen, np.float32), "f0": np.arange(n, dtype=np.float32)}
     columns |= {
-        "albedo": np.tile(np.array([1.0, 0.5, 0.25], np.float32), (n, 1)),
-        "inv_kappa": np.full(n, 0.1, np.float32),
+        "base_color": np.tile(np.array([1.0, 0.5, 0.25], np.float32), (n, 1)),
+        "roughness": np.full(n, 0.4371, np.float32),
     }
     return Samples(**columns)  # type: ignore[arg-type]
 
@@ -114,7 +114,7 @@ def test_only_what_was_seen_is_chosen() -> None:
     t = chosen(samples(16, np.arange(16) >= 8), np.arange(16), 4, votes, names)
     assert t.f0.tolist() == list(range(8)) and t.skin.tolist() == [True] * 4 + [False] * 4
     assert t.luma == pytest.approx(0.2126 + 0.5 * 0.7152 + 0.25 * 0.0722)
-    assert 0.4 < t.roughness[0] < 0.5  # of 1 / kappa = 0.1, by the report's own map
+    np.testing.assert_allclose(t.roughness, 0.4371)
     assert not chosen(samples(16, np.zeros(16)), np.arange(16), 4, None, ()).skin.any()
 
 

@@ -29,6 +29,7 @@ from tests.support.field_artifacts import fitted, poses
 
 PNG = {
     "albedo",
+    "neuface_albedo",
     "irradiance_ratio",
     "specular_intensity",
     "roughness",

@@ -11,8 +11,7 @@ from scipy.special import sph_harm_y
 from support.synthetic_asset import smooth_light
 
 from pipeline.errors import StageError
-from pipeline.maths.sh import sh_basis
-from stages.usd.write.light import (
+from pipeline.lighting.dome import (
     environment,
     latlong_directions,
     latlong_weights,
@@ -20,6 +19,7 @@ from stages.usd.write.light import (
     light_json,
     read_light,
 )
+from pipeline.maths.sh import sh_basis
 
 AXES = {  # direction: (column, row) of the pixel just right of and below it, as shares of the picture
     (0, 1, 0): (0.5, 0.0),

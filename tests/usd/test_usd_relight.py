@@ -8,14 +8,14 @@ from support.render_stand_ins import asset, fine_ball, sphere_points
 from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
+from pipeline.lighting.dome import latlong_directions, latlong_weights
+from pipeline.lighting.median_cut import Lamps, checked_environment, lamps
+from pipeline.lighting.transport import DARKEST, Transport, occlusion
 from pipeline.maths.ggx_width import KAPPA_RANGE
 from stages.usd.render.camera import orbit_camera
-from stages.usd.render.median_cut import Lamps, checked_environment, lamps
 from stages.usd.render.relight import Environment, table_of
 from stages.usd.render.render import Renderer, kernels
-from stages.usd.write.light import latlong_directions, latlong_weights
 from stages.usd.write.maps import vertex_image
-from stages.usd.write.transport import DARKEST, Transport, occlusion
 
 
 def sky(width: int = 64) -> np.ndarray:
@@ -120,7 +120,7 @@ def test_compiled_lamps_are_the_formula() -> None:
     seen = rng.integers(0, 2, (9, 30)).astype(np.uint8)
     d, flux, spread = unit(rng.normal(size=(30, 3))), rng.uniform(0, 1, (30, 3)), rng.uniform(0, 0.02, 30)
     diffuse, specular = np.empty((50, 3), np.float32), np.empty((50, 3), np.float32)
-    lit = Lamps(d, flux.astype(np.float32), spread.astype(np.float32))
+    lit = Lamps(d, flux.astype(np.float32), spread.astype(np.float32), np.zeros(30, np.float32))
     kernels.under_lamps(n, m, s, corner, w, seen, table_of(lit), diffuse, specular)
     share = (w[:, :, None] * seen[corner]).sum(1)
     np.testing.assert_allclose(diffuse, (share * np.maximum(n @ d.T, 0)) @ flux, rtol=1e-3, atol=1e-5)

@@ -50,7 +50,7 @@ def render_pictures(request: RenderRequest) -> Iterator[tuple[Path, float]]:
     root = component_in(request.folder)
     renderer = Renderer(load_exported(root))
     views = _views(request, root, renderer)
-    light = _light(request.light, renderer)
+    light = _light(request.light, renderer, root)
     for name, view in views.items():
         start = time.perf_counter()
         shown = view.scaled(request.width) if request.width else view
@@ -78,12 +78,14 @@ def component_in(folder: Path) -> Path:
     )
 
 
-def _light(name: str, renderer: Renderer) -> Light | None:
+def _light(name: str, renderer: Renderer, root: Path) -> Light | None:
     from pipeline.images import read_linear
+    from stages.usd.render.previews import captured
     from stages.usd.render.relight import Environment
+    from stages.usd.render.standard_light import StandardLight
 
     if name == CAPTURED:
-        return None
+        return captured(renderer, root)
     path = Path(name)
     if path.suffix.lower() not in ENVIRONMENTS or not path.is_file():
         raise StageError(
@@ -93,7 +95,8 @@ def _light(name: str, renderer: Renderer) -> Light | None:
             limit=f"{CAPTURED}, or a file {' or '.join(ENVIRONMENTS)}",
             remedy="give --env an equirectangular picture",
         )
-    return Environment(renderer, read_linear(path), path.name)
+    kind = Environment if renderer.asset.f0 is None else StandardLight
+    return kind(renderer, read_linear(path), path.name)
 
 
 def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, PinholeCamera]:

@@ -17,9 +17,9 @@ from pipeline import tiles
 from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
+from pipeline.lighting.dome import read_light
 from pipeline.meshes import vertex_normals
 from pipeline.transforms import apply
-from stages.usd.write.light import read_light
 from stages.usd.write.mesh import UvSurface, tile_count
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ class ExportedAsset:
     albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) share of the captured light that arrives, with
     albedo * occlusion = fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
     normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
-    light ((L + 1)^2, 3).
+    light ((L + 1)^2, 3). neuface_albedo (H, W, 3), f0, roughness (H, W, 1): None in an asset whose standard material
+    was not fitted; albedo is then NeuFace's.
     """
 
     mesh: UvSurface
@@ -49,6 +50,9 @@ class ExportedAsset:
     attenuation: str
     occlusion: F32 | None = None
     tiles: int = 1
+    neuface_albedo: F32 | None = None
+    f0: F32 | None = None
+    roughness: F32 | None = None
 
 
 def load_exported(root: Path) -> ExportedAsset:
@@ -83,7 +87,17 @@ def load_exported(root: Path) -> ExportedAsset:
         attenuation,
         _occlusion(folder, name, count),
         count,
+        *_fitted(folder, name, count),
     )
+
+
+def _fitted(folder: Path, name: str, count: int) -> tuple[F32 | None, F32 | None, F32 | None]:
+    """NeuFace's own albedo, F0 and roughness, if the standard material was fitted."""
+    kinds = (("neuface_albedo", 3), ("f0", 1), ("roughness", 1))
+    if not all(p.is_file() for k, _ in kinds for p in _paths(folder, name, k, "exr", count)):
+        return None, None, None
+    albedo, f0, roughness = (_map(folder, name, k, count)[..., :channels] for k, channels in kinds)
+    return albedo, f0, roughness
 
 
 def _map(folder: Path, name: str, which: str, count: int) -> F32:

@@ -13,11 +13,12 @@ from pipeline.artifacts import UNCHANGED, Camera, CameraSet, FittedFace, HeldOut
 from pipeline.camera import PinholeCamera
 from pipeline.colour import as_photographed, srgb_from_linear
 from pipeline.contract import Context
-from pipeline.images import write_exr, write_png
+from pipeline.images import read_linear, write_exr, write_png
 from pipeline.transforms import matrix
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
-from stages.usd.render.render import Renderer
+from stages.usd.render.render import Light, Renderer
+from stages.usd.render.standard_light import StandardLight
 
 F32 = npt.NDArray[np.float32]
 FITTED_SHOWN, FITTED_SIDE = 3, 640  # fitted views rendered if none is held out, and their largest side
@@ -51,18 +52,30 @@ def render_held_out(
     if not wanted:
         return ()
     renderer = Renderer(load_exported(root))
+    light = captured(renderer, root, context.check)
     responses, out = {v.index: v.response for v in face.held_out}, []
     for number, (index, scale) in enumerate(wanted):
         context.check()
         context.progress(number, len(wanted), f"asset view {index}")
         response = responses.get(index, UNCHANGED)
-        rgba = as_photographed(renderer.render(view_of(by_index[index]), factor=scale, samples=samples), response)
+        rgba = as_photographed(
+            renderer.render(view_of(by_index[index]), factor=scale, samples=samples, light=light), response
+        )
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
         write_exr(exr, rgba)
         write_rgba_png(png, rgba)
         files = {"exr": context.file(exr), "png": context.file(png)}
         out.append(HeldOutView(index=index, **files, scale=scale, response=response))
     return tuple(out)
+
+
+def captured(renderer: Renderer, root: Path, check: Callable[[], None] = lambda: None) -> Light | None:
+    """The captured light as other programs see it, the exported dome on the standard material; None, the model's closed
+    form, for an asset whose standard material was not fitted."""
+    if renderer.asset.f0 is None:
+        return None
+    dome = root.parent / "environment.exr"
+    return StandardLight(renderer, read_linear(dome), dome.name, check=check)
 
 
 def spread(items: tuple[int, ...], count: int) -> list[int]:
@@ -85,13 +98,14 @@ def factor_for(camera: Camera) -> int:
 def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
     """Write SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
     renderer = Renderer(load_exported(root))
+    light = captured(renderer, root, check)
     written = []
     for side, degrees in SIDES.items():
         view = framing(renderer, np.radians(degrees), size)
-        for name, options in ((side, {}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
+        for name, options in ((side, {"light": light}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
             check()
             written.append(folder / f"{name}.png")
-            write_rgba_png(written[-1], renderer.render(view, **options))  # type: ignore[arg-type]
+            write_rgba_png(written[-1], renderer.render(view, **options))
     return written
 
 
@@ -99,9 +113,10 @@ def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
     """Write a picture of the head, slightly from one side, under the captured light."""
     check()
     renderer = Renderer(load_exported(root))
+    light = captured(renderer, root, check)
     view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
     path = Path(os.path.normpath(path))  # symbolic links stay: the store's folder may be one
-    write_rgba_png(path, renderer.render(view))
+    write_rgba_png(path, renderer.render(view, light=light))
     return path
 
 

@@ -3,7 +3,7 @@
     L(wo) = a / pi (D + I) + (sum_j rho c_j B_j(n.wo)) sum_k V_k E_k vMF(w_k; w_r, kappa)
 
 The lobe is the model's own; the light is the picture itself, not its spherical harmonics. Symbols:
-write/transport.py.
+pipeline/lighting/transport.py.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.lighting.median_cut import Lamps, checked_environment, lamps
+from pipeline.lighting.transport import Transport
 from pipeline.maths.ggx_width import KAPPA_RANGE
 from stages.usd.render import kernels
-from stages.usd.render.median_cut import Lamps, checked_environment, lamps
-from stages.usd.render.render import Points, Renderer
-from stages.usd.write.transport import Transport
+from stages.usd.render.render import Points, Renderer, vertex_values
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -55,11 +55,3 @@ class Environment:
 def table_of(lit: Lamps) -> F32:
     """(7, N) direction, flux and spread of the lamps, as input of the kernel."""
     return np.concatenate([lit.directions.T, lit.flux.T, lit.spread[None]]).astype(np.float32)
-
-
-def vertex_values(image: F32, renderer: Renderer) -> F64:
-    """(V, C) values of a map (H, W, C) at the vertices; at a seam, from one of its sides."""
-    mesh = renderer.asset.mesh
-    uv = np.zeros((len(mesh.vertices), 2), np.float32)
-    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
-    return renderer.at(image, uv).astype(np.float64)

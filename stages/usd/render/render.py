@@ -102,7 +102,8 @@ class Renderer:
         self._tangents = tangents(asset).astype(np.float32)
         self._normals = mesh.normals[mesh.faces].astype(np.float32)
         self._uvs = mesh.uvs[mesh.uv_faces].astype(np.float32)
-        self.fitted_albedo = asset.albedo if asset.occlusion is None else asset.albedo * asset.occlusion
+        own = asset.albedo if asset.neuface_albedo is None else asset.neuface_albedo
+        self.fitted_albedo = own if asset.occlusion is None else own * asset.occlusion
 
     def render(
         self,
@@ -196,6 +197,14 @@ class Renderer:
         t = _unit(tangent[:, :3] - normal * (normal * tangent[:, :3]).sum(1, keepdims=True))
         b = np.cross(normal, t) * sign
         return _unit(local[:, :1] * t + local[:, 1:2] * b + local[:, 2:] * normal)
+
+
+def vertex_values(image: F32, renderer: Renderer) -> F64:
+    """(V, C) values of a map (H, W, C) at the vertices; at a seam, from one of its sides."""
+    mesh = renderer.asset.mesh
+    uv = np.zeros((len(mesh.vertices), 2), np.float32)
+    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
+    return renderer.at(image, uv).astype(np.float64)
 
 
 def _borders(alpha: F32) -> npt.NDArray[np.bool_]:

@@ -15,11 +15,11 @@ from pipeline.artifacts import CameraSet, FittedFace, Located, RegisteredHead, S
 from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
 from pipeline.images import write_exr
+from pipeline.lighting.dome import environment, environment_figures, light_json, read_light
 from stages.usd.config import Config
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.gltf import write_glb
-from stages.usd.write.light import environment, environment_figures, light_json, read_light
 from stages.usd.write.lookdev import lookdev_layer
 from stages.usd.write.maps import Maps, write_maps
 from stages.usd.write.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap

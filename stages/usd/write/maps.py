@@ -16,17 +16,17 @@ from pipeline.artifacts import Located, TextureSet
 from pipeline.colour import ACESCG, acescg_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
+from pipeline.lighting.dome import environment
+from pipeline.lighting.median_cut import lamps
+from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
-from stages.usd.render.median_cut import lamps
 from stages.usd.render.render import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
-from stages.usd.write.light import environment
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
-from stages.usd.write.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -67,7 +67,7 @@ def write_maps(
     if heights is not None:
         written += write_heights(bake, mesh, heights, name, folder)
     figures: dict[str, float] = {}
-    if divide and not shadows_fitted(bake):
+    if divide and not shadows_fitted(bake) and not standard_fitted(bake):
         shown, found = divided_albedo(bake, mesh, light, name, folder, check)
         written += shown
         figures |= found
@@ -117,6 +117,11 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
     return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
+def standard_fitted(bake: Located[TextureSet]) -> bool:
+    """Whether the standard material was fitted: its base colour is then free of the photos' shadows."""
+    return any(name.startswith("gloss_") for name in bake.artifact.figures)
+
+
 def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     """Copy every file of every map as NAME_map.format."""
     count = bake.artifact.tiles
@@ -133,6 +138,8 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for which, texture in sorted(bake.artifact.maps.items()):
+        if which == "neuface_albedo" and not standard_fitted(bake):
+            continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = folder / f"{name}_{which}.{form}"
             shutil.copyfile(bake.path(ref), target)
@@ -255,6 +262,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
         coefficients=counted("coefficients", count),
         basis=counted("basis", 1),
         displacement=found(CAGE_HEIGHT, "exr"),
+        neuface_albedo=found("neuface_albedo", "png"),
     )
 
 

@@ -99,7 +99,8 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
     nodes = _Nodes(stage, path)
     surface = shader(stage, f"{path}/surface", SURFACE)
     surface.CreateInput("base_weight", T.Float).Set(1.0)
-    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, look.albedo, SRGB))
+    colour = look.neuface_albedo if basis and look.neuface_albedo else look.albedo
+    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, colour, SRGB))
     roughness = nodes.image("roughness", "float", T.Float, str(look.roughness), DATA)
     connect(surface.CreateInput("specular_roughness", T.Float), roughness)
     surface.CreateInput("specular_ior", T.Float).Set(REFERENCE_IOR)

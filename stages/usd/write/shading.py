@@ -22,6 +22,7 @@ class Look:
 
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     displacement: metres along the normal, of a mesh that is subdivided.
+    neuface_albedo: the field's own albedo, if `albedo` is the base colour of a fitted standard material.
     """
 
     albedo: str
@@ -35,6 +36,7 @@ class Look:
     coefficients: tuple[str, ...] = ()
     basis: tuple[str, ...] = ()
     displacement: str | None = None
+    neuface_albedo: str | None = None
 
     def on_tile(self, tile: int) -> Look:
         """The same look with the files of one tile."""

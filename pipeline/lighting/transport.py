@@ -18,8 +18,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.lighting.median_cut import Lamps
 from pipeline.ray_casting import RayCaster
-from stages.usd.render.median_cut import Lamps
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.colour import LUMA
 from pipeline.errors import StageError
-from stages.usd.write.light import latlong_directions, latlong_weights
+from pipeline.lighting.dome import latlong_directions, latlong_weights
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -49,11 +49,13 @@ def checked_environment(image: F32, name: str) -> F32:
 @dataclass(frozen=True, slots=True)
 class Lamps:
     """directions (N, 3) towards the lamps, unit; flux (N, 3) irradiance on a facing surface; spread (N,) approximate
-    variance (rad^2) along one axis of each lamp's area, comparable to 1 / kappa of a vMF lobe."""
+    variance (rad^2) along one axis of each lamp's area, comparable to 1 / kappa of a vMF lobe; solid (N,) its solid
+    angle."""
 
     directions: F32
     flux: F32
     spread: F32
+    solid: F32
 
 
 def lamps(image: F32, count: int) -> Lamps:
@@ -68,7 +70,7 @@ def lamps(image: F32, count: int) -> Lamps:
     sums[1:, 1:] = measure.cumsum(0).cumsum(1)
     pieces = _cut((0, height, 0, width), sums, count)
     directions = latlong_directions(width, height)
-    where, flux, spread = [], [], []
+    where, flux, spread, solid = [], [], [], []
     for y0, y1, x0, x1 in pieces:
         inside = np.s_[y0:y1, x0:x1]
         centre = (directions[inside] * measure[inside][..., None]).sum((0, 1)) / measure[inside].sum()
@@ -76,7 +78,8 @@ def lamps(image: F32, count: int) -> Lamps:
         where.append(centre / length)
         spread.append(1 - length)
         flux.append((image[inside].astype(np.float64) * weights[inside][..., None]).sum((0, 1)))
-    return Lamps(*(np.array(x, np.float32) for x in (where, flux, spread)))
+        solid.append(weights[inside].sum())
+    return Lamps(*(np.array(x, np.float32) for x in (where, flux, spread, solid)))
 
 
 def _shrunk(image: F32) -> F32:

@@ -1,0 +1,98 @@
+"""Compiled loops of the standard material under lamps: a GGX layer over a diffuse base.
+
+    f_s   = D(n.h) V(n.l, n.v) F(h.v),   D = q / (pi ((n.h)^2 (q - 1) + 1)^2),   q = alpha^2 + s / (2 (h.v)^2)
+    V     = 1 / (2 (n.l sqrt((n.v)^2 (1 - a2) + a2) + n.v sqrt((n.l)^2 (1 - a2) + a2))),   a2 = alpha^2
+    F     = F0 (1 - c) + c,   c = (1 - h.v)^5
+
+D is Trowbridge and Reitz' (GGX), V the height-correlated masking of Smith, F Schlick's. s is a lamp's spread: a lamp is
+an area of the sky, whose variance widens the lobe; a half vector turns by half of what the light turns, over h.v.
+[Walter 2007; Heitz 2014; Schlick 1994] The loops over lamps are in two parts: the first has no sums, so that it
+vectorises under strict arithmetic.
+"""
+
+# mypy: disable-error-code=no-untyped-def
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+ONE, ZERO, HALF, TWO = np.float32(1), np.float32(0), np.float32(0.5), np.float32(2)
+PI = np.float32(np.pi)
+LEAST_COSINE = np.float32(1e-3)  # of n.v: the masking's limit at 0 is finite, its terms are not
+
+
+@njit(error_model="numpy", cache=True)
+def _reflected(nl, nv, lv, a2, spread):
+    """D V n.l and Schlick's c of one lamp. lv: l.v."""
+    h2 = max(TWO + TWO * lv, np.float32(1e-6))
+    length = np.sqrt(h2)
+    nh, hv = min((nl + nv) / length, ONE), HALF * length
+    q = a2 + spread / (TWO * hv * hv)
+    t = nh * nh * (q - ONE) + ONE
+    masked = nl * np.sqrt(nv * nv * (ONE - a2) + a2) + nv * np.sqrt(nl * nl * (ONE - a2) + a2)
+    c = max(ONE - hv, ZERO)
+    c2 = c * c
+    return q / (PI * t * t) * HALF / masked * nl, c2 * c2 * c
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def lobes(vertex, normal, wo, arriving, lamp, alphas, out):
+    """Write the specular radiance of each of M observations for K widths, in two parts: out (M, K, 2, 3), such that the
+    layer of F0 reflects F0 out[:, :, 0] + out[:, :, 1].
+
+    vertex (M,); normal, wo (M, 3) unit; arriving (V, N, 3) flux of each lamp at the vertices; lamp (4, N): direction
+    and spread; alphas (K,). All float32.
+    """
+    count = lamp.shape[1]
+    for m in prange(len(vertex)):
+        own = arriving[vertex[m]]
+        nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
+        vx, vy, vz = wo[m, 0], wo[m, 1], wo[m, 2]
+        nv = max(nx * vx + ny * vy + nz * vz, LEAST_COSINE)
+        plain, rim = np.empty(count, np.float32), np.empty(count, np.float32)
+        for k in range(len(alphas)):
+            a2 = alphas[k] * alphas[k]
+            for i in range(count):
+                x, y, z = lamp[0, i], lamp[1, i], lamp[2, i]
+                nl = max(nx * x + ny * y + nz * z, ZERO)
+                w, c = _reflected(nl, nv, vx * x + vy * y + vz * z, a2, lamp[3, i])
+                plain[i], rim[i] = w * (ONE - c), w * c
+            p0, p1, p2, c0, c1, c2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+            for i in range(count):
+                e0, e1, e2 = own[i, 0], own[i, 1], own[i, 2]
+                p0, p1, p2 = p0 + plain[i] * e0, p1 + plain[i] * e1, p2 + plain[i] * e2
+                c0, c1, c2 = c0 + rim[i] * e0, c1 + rim[i] * e1, c2 + rim[i] * e2
+            out[m, k, 0, 0], out[m, k, 0, 1], out[m, k, 0, 2] = p0, p1, p2
+            out[m, k, 1, 0], out[m, k, 1, 1], out[m, k, 1, 2] = c0, c1, c2
+
+
+@njit(parallel=True, error_model="numpy", cache=True)
+def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, diffuse, specular):
+    """Write irradiance and specular radiance (M, 3) of M points inside triangles.
+
+    corner (M, 3) vertices of each point's triangle, weights (M, 3) barycentric; f0, alpha (M,); the others as in
+    `lobes`.
+    """
+    count = lamp.shape[1]
+    for m in prange(len(normal)):
+        pa, pb, pc = arriving[corner[m, 0]], arriving[corner[m, 1]], arriving[corner[m, 2]]
+        wa, wb, wc = weights[m, 0], weights[m, 1], weights[m, 2]
+        nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
+        vx, vy, vz = wo[m, 0], wo[m, 1], wo[m, 2]
+        nv = max(nx * vx + ny * vy + nz * vz, LEAST_COSINE)
+        a2 = alpha[m] * alpha[m]
+        glossy, cosine = np.empty(count, np.float32), np.empty(count, np.float32)
+        for i in range(count):
+            x, y, z = lamp[0, i], lamp[1, i], lamp[2, i]
+            nl = max(nx * x + ny * y + nz * z, ZERO)
+            w, c = _reflected(nl, nv, vx * x + vy * y + vz * z, a2, lamp[3, i])
+            cosine[i], glossy[i] = nl, w * (f0[m] * (ONE - c) + c)
+        d0, d1, d2, s0, s1, s2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        for i in range(count):
+            e0 = wa * pa[i, 0] + wb * pb[i, 0] + wc * pc[i, 0]
+            e1 = wa * pa[i, 1] + wb * pb[i, 1] + wc * pc[i, 1]
+            e2 = wa * pa[i, 2] + wb * pb[i, 2] + wc * pc[i, 2]
+            d0, d1, d2 = d0 + cosine[i] * e0, d1 + cosine[i] * e1, d2 + cosine[i] * e2
+            s0, s1, s2 = s0 + glossy[i] * e0, s1 + glossy[i] * e1, s2 + glossy[i] * e2
+        diffuse[m, 0], diffuse[m, 1], diffuse[m, 2] = d0, d1, d2
+        specular[m, 0], specular[m, 1], specular[m, 2] = s0, s1, s2

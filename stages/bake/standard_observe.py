@@ -1,0 +1,75 @@
+"""What the fit of standard shaders starts from: the mesh's vertices in all photos, and the exported light on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pipeline.fields.protocol import Field
+from pipeline.lighting.dome import environment
+from pipeline.lighting.median_cut import lamps
+from pipeline.lighting.standard import COUNT, arrivals
+from pipeline.meshes import F64, Indices, Mask, Mesh, unit
+from pipeline.transforms import inverse_rigid, matrix, project
+from pipeline.visibility import FittedPhoto
+from stages.bake import detail_kernels as kernels
+from stages.bake import standard_fit
+from stages.bake.detail import Detail, shade
+from stages.bake.regions import FEW_VOTES, Poll
+from stages.bake.smooth import continued
+
+DOME_WIDTH = 256  # columns of the picture that is cut into lamps
+MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradient
+
+
+def standard_material(
+    field: Field, mesh: Mesh, views: Sequence[FittedPhoto], skin_code: int, seen: Mask, found: Detail,
+    check: Callable[[], None],
+) -> standard_fit.Fitted:  # fmt: skip
+    """The fitted material at the vertices. skin_code: label of skin in the photos, -1 for none; seen (V,)."""
+    normals = field_normals(field, mesh)
+    albedo = field.material(mesh.vertices).albedo.astype(np.float64)
+    lit = lamps(environment(field.light, DOME_WIDTH), COUNT)
+    at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
+    observations, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
+    out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check)
+    correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
+    return standard_fit.Fitted(correction, out.f0, out.roughness, out.figures)
+
+
+def field_normals(field: Field, mesh: Mesh) -> F64:
+    """(V, 3) unit normals of the field at the vertices; the mesh's own where they do not agree (the neck's cut)."""
+    n = unit(field.sdf_and_gradient(mesh.vertices)[1])
+    own = unit(mesh.normals)
+    return np.where((n * own).sum(1, keepdims=True) > MIN_FACING, n, own)
+
+
+def _observed(
+    field: Field, mesh: Mesh, normals: F64, albedo: F64, views: Sequence[FittedPhoto], skin_code: int, found: Detail
+) -> tuple[standard_fit.Seen, Mask]:
+    photos, x = found.photos, mesh.vertices.astype(np.float64)
+    colour, cosines = np.zeros((len(views), len(x), 3)), np.zeros((len(views), len(x)))
+    kernels.observed(photos.cameras, photos.pixels, photos.depth, photos.clipped, x, normals, colour, cosines)
+    base = albedo * shade(field.light, normals, np.asarray(field.irradiance_ratio(mesh.vertices), np.float32))
+    view, vertex = np.nonzero(cosines > 0)
+    away = photos.cameras[view, 27:30] - x[vertex]
+    wo = away / np.linalg.norm(away, axis=1, keepdims=True)
+    predicted = base[vertex] + found.gloss[view, vertex]
+    return standard_fit.Seen(vertex, wo, colour[view, vertex], predicted), _skin(views, x, cosines, skin_code)
+
+
+def _skin(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask:
+    """(V,) where the photos' labels vote for skin."""
+    poll = Poll(len(x))
+    for view, cosine in zip(views, cosines, strict=True):
+        pose = inverse_rigid(matrix(view.camera.world_from_cam))
+        uv = project(matrix(view.camera.K), pose, np.array(view.camera.distortion), x)[0]
+        poll.ask(view, cosine, uv)
+    votes: dict[int, F64] = poll.votes()
+    best = max(votes, default=0)
+    if code < 0 or not best:
+        return np.zeros(len(x), np.bool_)
+    total = np.stack([votes.get(c, np.zeros(len(x))) for c in range(best + 1)], 1)
+    winner: Indices = total.argmax(1)
+    return np.asarray((total.max(1) > FEW_VOTES) & (winner == code))

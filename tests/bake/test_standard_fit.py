@@ -1,0 +1,75 @@
+"""The fit of base colour, F0 and roughness on a ball whose photos are rendered with known ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.synthetic_asset import ball
+
+from pipeline.lighting import standard
+from pipeline.lighting.dome import latlong_directions
+from pipeline.lighting.median_cut import lamps
+from pipeline.meshes import Mesh
+from stages.bake import standard_fit as fits
+
+RADIUS = 0.1
+
+
+def scene(f0: float, roughness: float, scale: float = 1.0) -> tuple[Mesh, standard.Arrivals, np.ndarray, fits.Seen]:
+    """A ball under a light with soft lamps, seen by 24 cameras. scale: true base colour over the field's albedo."""
+    made = ball(40, 20, height=1.0)
+    x = made["vertices"] / np.linalg.norm(made["vertices"], axis=1).max() * RADIUS
+    n = (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float64)
+    mesh = Mesh(x.astype(np.float32), n.astype(np.float32), made["faces"])
+    w = latlong_directions(64, 32)
+    image = 0.1 + sum(np.exp(8 * (w @ (d / np.linalg.norm(d)) - 1)) for d in np.array([[1, 1, 1.0], [-1, 0.3, 0.6]]))
+    lit = lamps(np.repeat(image[..., None], 3, -1).astype(np.float32), 128)
+    albedo = np.full((len(n), 3), [0.4, 0.3, 0.2]) * (1 + 0.3 * np.sin(60 * x[:, :1]))
+    at = standard.arrivals(mesh.vertices, mesh.normals, mesh.faces, lit, albedo)
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    eyes = np.stack([np.sin(turn), 0.4 * np.sin(3 * turn), np.cos(turn)], 1)
+    vertex, eye = np.nonzero(n @ (eyes / np.linalg.norm(eyes, axis=1, keepdims=True)).T > 0.25)
+    wo = eyes[eye] - x[vertex]
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    one = np.zeros((len(vertex), 3), np.int32) + vertex[:, None].astype(np.int32)
+    third = np.full((len(vertex), 3), 1 / 3, np.float32)
+    values = [np.full(len(vertex), v, np.float32) for v in (f0, roughness)]
+    base = (scale * albedo[vertex]).astype(np.float32)
+    diffuse, specular = standard.radiance(at, one, third, n[vertex], wo, base, *values)
+    return mesh, at, albedo, fits.Seen(vertex, wo, diffuse + specular, diffuse + specular)
+
+
+def fitted(f0: float, roughness: float, *, skin: bool, scale: float = 1.0) -> fits.Fitted:
+    mesh, at, albedo, seen = scene(f0, roughness, scale)
+    return fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, np.full(len(albedo), skin))
+
+
+@pytest.mark.parametrize(("f0", "roughness"), [(0.03, 0.45), (0.09, 0.45), (0.05, 0.6)])
+def test_an_objects_material_is_found(f0: float, roughness: float) -> None:
+    found = fitted(f0, roughness, skin=False, scale=1.1)
+    assert np.median(found.f0) == pytest.approx(f0, rel=0.15)
+    assert np.median(found.roughness) == pytest.approx(roughness, abs=0.06)
+    assert np.median(found.correction) == pytest.approx(1.1, rel=0.03)
+
+
+def test_skin_stays_skin() -> None:
+    """Metal labelled as skin is at the range's upper end; within the range the photos decide."""
+    assert fitted(0.5, 0.45, skin=True).figures["gloss_skin_f0"] < 2 * fits.SKIN_RANGE[1]
+    assert np.median(fitted(0.036, 0.45, skin=True).f0) == pytest.approx(0.036, rel=0.15)
+
+
+def test_a_dull_object_gets_no_layer_and_dull_skin_the_least() -> None:
+    dull = fitted(0.0, 0.5, skin=False)
+    assert (dull.f0 == 0).all()
+    np.testing.assert_allclose(np.median(dull.correction), 1, rtol=0.01)
+    assert 0 < np.median(fitted(0.0, 0.5, skin=True).f0) <= fits.SKIN_RANGE[0] + 1e-6
+
+
+def test_without_photos_the_prior_is_all() -> None:
+    mesh, at, albedo, seen = scene(0.04, 0.45)
+    none = fits.Seen(seen.vertex[:0], seen.wo[:0], seen.colour[:0], seen.predicted[:0])
+    n = mesh.normals.astype(np.float64)
+    for skin, wanted in ((True, fits.SKIN_F0), (False, 0.0)):
+        found = fits.fit(mesh, n, at, albedo, none, np.full(len(albedo), skin))
+        np.testing.assert_allclose(found.f0, wanted, rtol=1e-3)
+        np.testing.assert_allclose(found.correction, 1, rtol=1e-3)

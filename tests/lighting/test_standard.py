@@ -1,0 +1,132 @@
+"""The reference renderer of the standard material against quadrature in float64, and closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.synthetic_asset import ball
+
+from pipeline.lighting import standard
+from pipeline.lighting.dome import latlong_directions, latlong_weights
+from pipeline.lighting.median_cut import Lamps, lamps
+from pipeline.maths import microfacet
+
+F64 = np.ndarray
+
+
+def sky(width: int = 256) -> np.ndarray:
+    """A smooth light with colour: what spherical harmonics of a low order look like."""
+    w = latlong_directions(width, width // 2)
+    return np.exp(w @ np.array([0.4, 1.1, 0.7]))[..., None].astype(np.float32) * np.array([1.0, 0.8, 0.6], np.float32)
+
+
+def free(count: int, lit: Lamps) -> standard.Arrivals:
+    """The lamps without anything in their way, at `count` vertices."""
+    flux = np.broadcast_to(lit.flux, (count, *lit.flux.shape)).astype(np.float32)
+    lamp = np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32)
+    return standard.Arrivals(np.ascontiguousarray(flux), lamp, np.ones((count, 3), np.float32))
+
+
+def ggx(n: F64, v: F64, w: F64, f0: float, alpha: float) -> np.ndarray:
+    """f_s n.l of directions w (..., 3), written down again from the definitions."""
+    nl, nv = np.maximum(w @ n, 0), n @ v
+    h = (w + v) / np.linalg.norm(w + v, axis=-1, keepdims=True)
+    nh, hv = h @ n, h @ v
+    d = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+
+    def shadow(c: np.ndarray) -> np.ndarray:
+        c = np.maximum(c, 1e-9)
+        return 0.5 * (np.sqrt(1 + alpha**2 * (1 - c**2) / c**2) - 1)
+
+    g = 1 / (1 + shadow(nl) + shadow(np.asarray(nv)))
+    fresnel = f0 + (1 - f0) * (1 - hv) ** 5
+    return np.where(nl > 0, d * g * fresnel / (4 * nv), 0)
+
+
+def tilted(cosine: float) -> tuple[np.ndarray, np.ndarray]:
+    n = np.array([0.2, 0.3, np.sqrt(1 - 0.13)])
+    across = np.cross(n, [0.0, 1.0, 0.0])
+    return n, cosine * n + np.sqrt(1 - cosine**2) * across / np.linalg.norm(across)
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.7, 0.35])
+@pytest.mark.parametrize(("roughness", "limit"), [(0.35, 0.05), (0.5, 0.03), (0.7, 0.03)])
+def test_lamps_reflect_as_quadrature_does(cosine: float, roughness: float, limit: float) -> None:
+    image = sky()
+    n, v = tilted(cosine)
+    f0 = 0.04
+    values = ggx(n, v, latlong_directions(256, 128), f0, roughness**2)
+    wanted = (image.astype(np.float64) * (values * latlong_weights(256, 128))[..., None]).sum((0, 1))
+    at = free(1, lamps(image, standard.COUNT))
+    parts = standard.lobes(at, np.zeros(1, np.int64), n[None], v[None], np.array([roughness**2], np.float32))[0, 0]
+    np.testing.assert_allclose(f0 * parts[0] + parts[1], wanted, rtol=limit)
+    corner, weights = np.zeros((1, 3), np.int32), np.full((1, 3), 1 / 3, np.float32)
+    base = np.full((1, 3), 0.5, np.float32)
+    diffuse, specular = standard.radiance(
+        at, corner, weights, n[None], v[None], base, np.array([f0], np.float32), np.array([roughness], np.float32)
+    )
+    np.testing.assert_allclose(specular[0], wanted, rtol=limit)
+    irradiance = (image * (np.maximum(latlong_directions(256, 128) @ n, 0) * latlong_weights(256, 128))[..., None]).sum(
+        (0, 1)
+    )
+    a, b = microfacet.split_albedo(cosine, roughness**2)
+    np.testing.assert_allclose(diffuse[0], (1 - f0 * a - b) * 0.5 / np.pi * irradiance, rtol=0.01)
+
+
+def test_without_a_layer_there_is_no_rim() -> None:
+    n, v = tilted(0.1)
+    at = free(1, lamps(sky(64), 64))
+    corner, weights = np.zeros((1, 3), np.int32), np.full((1, 3), 1 / 3, np.float32)
+    base, none = np.ones((1, 3), np.float32), np.zeros(1, np.float32)
+    diffuse, specular = standard.radiance(at, corner, weights, n[None], v[None], base, none, none + 0.5)
+    assert (specular == 0).all()
+    whole = (np.maximum(at.lamp[:3].T @ n, 0)[:, None] * at.flux[0]).sum(0) / np.pi
+    np.testing.assert_allclose(diffuse[0], whole, rtol=1e-4)
+
+
+def test_everything_is_finite_at_the_ends() -> None:
+    at = free(4, lamps(sky(64), 64))
+    n = np.array([[0.0, 0, 1]] * 4)
+    v = np.array([[0.0, 0, 1], [1, 0, 1e-9], [1, 0, 0], [0, 1, -1e-3]])
+    corner, weights = np.zeros((4, 3), np.int32), np.full((4, 3), 1 / 3, np.float32)
+    base = np.ones((4, 3), np.float32)
+    for f0 in (0.0, 1e-6, 1.0):
+        for roughness in (0.0, 1e-3, 1.0):
+            values = (np.full(4, f0, np.float32), np.full(4, roughness, np.float32))
+            found = standard.radiance(at, corner, weights, n, v, base, *values)
+            assert all(np.isfinite(x).all() and (x >= 0).all() for x in found)
+
+
+def test_a_layer_keeps_what_microfacets_reflect() -> None:
+    cosine, alpha = np.array([0.05, 0.3, 0.9, 1.0]), np.array([0.05, 0.2, 0.36, 0.8])
+    a, b = microfacet.split_albedo(cosine, alpha)
+    np.testing.assert_allclose(standard.layer(cosine, np.full(4, 0.03), alpha), 0.03 * a + b, rtol=0.05)
+
+
+def test_light_arrives_on_a_convex_body_without_loss() -> None:
+    mesh = ball(48, 24, height=1.0)
+    lit = lamps(sky(64), 96)
+    albedo = np.full((len(mesh["vertices"]), 3), 0.5)
+    at = standard.arrivals(mesh["vertices"], mesh["normals"], mesh["faces"], lit, albedo)
+    wanted = np.maximum(mesh["normals"] @ lit.directions.T, 0) @ lit.flux
+    np.testing.assert_allclose(at.irradiance, wanted, rtol=0.02, atol=0.02 * wanted.max())
+
+
+def test_blocked_lamps_send_what_leaves_the_wall() -> None:
+    """A floor below a large black, then grey wall that faces it: a black wall takes its half of the sky away."""
+    x = np.array(
+        [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1], [-90, 1, -90], [90, 1, -90], [90, 1, 90], [-90, 1, 90]]
+    )
+    faces = np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]], np.int32)
+    n = np.array([[0, 1, 0]] * 4 + [[0, -1, 0]] * 4, np.float32)
+    lit = lamps(np.ones((32, 64, 3), np.float32), 128)
+    dark = standard.arrivals(x.astype(np.float32), n, faces, lit, np.zeros((8, 3)))
+    grey = standard.arrivals(x.astype(np.float32), n, faces, lit, np.full((8, 3), 0.5))
+    up = lit.directions[:, 1] > 0.2  # steep enough to meet the wall
+    assert (dark.flux[:4][:, up] == 0).all()
+    leaving = 0.5 / np.pi * grey.irradiance[4:].mean(0)
+    np.testing.assert_allclose(grey.flux[0][up], lit.solid[up, None] * leaving, rtol=1e-3)
+
+
+def test_solid_angles_of_the_lamps_fill_the_sphere() -> None:
+    assert lamps(sky(64), 50).solid.sum() == pytest.approx(4 * np.pi, rel=1e-5)
