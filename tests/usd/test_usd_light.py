@@ -11,11 +11,10 @@ from scipy.special import sph_harm_y
 from support.synthetic_asset import smooth_light
 
 from pipeline.errors import StageError
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 from pipeline.maths.sh import sh_basis
 from stages.usd.write.light import (
     environment,
-    latlong_directions,
-    latlong_weights,
     light_from_environment,
     light_json,
     read_light,

@@ -9,11 +9,11 @@ from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
 from pipeline.maths.ggx_width import KAPPA_RANGE
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.median_cut import Lamps, checked_environment, lamps
 from stages.usd.render.relight import Environment, table_of
 from stages.usd.render.render import Renderer, kernels
-from stages.usd.write.light import latlong_directions, latlong_weights
 from stages.usd.write.maps import vertex_image
 from stages.usd.write.transport import DARKEST, Transport, occlusion
 
