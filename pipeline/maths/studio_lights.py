@@ -70,7 +70,7 @@ def sunset(directions: F64) -> F64:
     height = np.sqrt(up.clip(0))
     sky = (1 - height) * np.array(HORIZON) + height * np.array(ZENITH)
     warm = GLOW.radiance(directions) + SUN.radiance(directions)
-    return np.where(up >= 0, sky + warm, np.array(EARTH) * np.ones_like(sky))
+    return np.asarray(np.where(up >= 0, sky + warm, np.array(EARTH) * np.ones_like(sky)), np.float64)
 
 
 LIGHTS = {"key": key_light, "overcast": overcast, "sunset": sunset}

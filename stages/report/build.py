@@ -27,6 +27,7 @@ from stages.report.pictures import (
     to_bytes,
 )
 from stages.report.verdict import verdict_shown
+from stages.report.viewer import viewer
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
@@ -95,9 +96,16 @@ def _both(row: JudgedRow) -> dict[str, float | None]:
 
 
 def build_page(
-    metrics: Mapping[str, Any], verdict: Verdict, rows: list[JudgedRow], r: Results, side: int, outlines: int
+    metrics: Mapping[str, Any],
+    verdict: Verdict,
+    rows: list[JudgedRow],
+    r: Results,
+    side: int,
+    outlines: int,
+    *,
+    view: bool,
 ) -> str:
-    """The HTML page with its pictures."""
+    """The HTML page with its pictures; `view`: with the 3D view."""
     return render_page(
         metrics,
         Pictures(
@@ -109,6 +117,7 @@ def build_page(
             scale_top=ERROR_RANGE,
             captured=captured(r, side // 2, outlines),
             verdict=verdict_shown(verdict, r, side // 2),
+            viewer=viewer(r) if view else None,
         ),
     )
 

@@ -50,6 +50,20 @@ def heat(values: F32) -> U8:
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
+def scale_colours() -> U8:
+    """(256, 3) RGB of a scale for maps, from dark blue to yellow, that is even for every kind of colour vision."""
+    level = np.arange(256, dtype=np.uint8)[None]
+    return np.ascontiguousarray(cv2.applyColorMap(level, cv2.COLORMAP_CIVIDIS)[0, :, ::-1])
+
+
+def png_uri(image: U8) -> str:
+    """Address of a picture (H, W, 1 or 3) as PNG, every pixel as it is."""
+    done, buffer = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise RuntimeError(f"a picture of {image.shape} can't be encoded")
+    return f"data:image/png;base64,{base64.b64encode(buffer.tobytes()).decode()}"
+
+
 def scale_bar() -> U8:
     """The heat map's colours from 0 to ERROR_RANGE, for the legend."""
     return heat(np.repeat(np.linspace(0, 1, 256, dtype=np.float32)[None], 12, 0))

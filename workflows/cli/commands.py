@@ -12,7 +12,7 @@ from typing import Any
 
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
-from workflows.cli.options import request_from, with_provenance
+from workflows.cli.options import request_from, with_provenance, with_viewer
 from workflows.run import output_dirs
 from workflows.run.interrupt import interruptible
 from workflows.run.plan import make_plan, preview
@@ -53,7 +53,7 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """neuface run"""
     request = request_from(options, RunRequest)
-    request = request.model_copy(update={"config": with_provenance(options, request.config)})
+    request = request.model_copy(update={"config": with_viewer(options, with_provenance(options, request.config))})
     if options.dry_run:
         for step in preview(make_plan(request)):
             print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")

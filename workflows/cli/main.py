@@ -83,6 +83,7 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--author", help="who made the capture; recorded in the asset")
     run.add_argument("--license", help="licence of the capture; recorded in the asset")
     run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
+    run.add_argument("--no-viewer", action="store_true", help="no 3D view in the report")
     run.add_argument("--dry-run", action="store_true", help="print what would be run and what reused, then stop")
     run.set_defaults(run=commands.run_command)
 
