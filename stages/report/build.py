@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -74,6 +74,18 @@ def _noted(scores: Scores | None, own_colours: bool) -> str:
     if scores is None:
         return ""
     return f", {scores.psnr:.1f} dB" + (f", {scores.psnr_matched:.1f} in the photo's colours" if own_colours else "")
+
+
+def best_median_worst(rows: list[JudgedRow], count: int) -> list[JudgedRow]:
+    """At most `count` rows for the page: the views with the best, the median and the worst PSNR, named so, before the
+    others in their order. Fewer than three scored views stay as they are."""
+    scored = sorted((r for r in rows if r.asset or r.model), key=lambda r: -(r.asset or r.model).psnr)  # type: ignore[union-attr]
+    if len(scored) < 3:
+        return rows[:count]
+    picked = (scored[0], "best"), (scored[len(scored) // 2], "median"), (scored[-1], "worst")
+    named = [replace(r, row=replace(r.row, title=f"{what.capitalize()}: view {r.index}")) for r, what in picked]
+    indices = {r.index for r in named}
+    return [*named, *(r for r in rows if r.index not in indices)][:count]
 
 
 def summary(rows: list[JudgedRow]) -> dict[str, Any]:
