@@ -24,12 +24,17 @@ from stages.report.pictures import (
     light_picture,
     map_picture,
     scale_bar,
+    scaled_picture,
     to_bytes,
 )
 from stages.report.verdict import verdict_shown
 from stages.report.viewer import viewer
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
+FIXED_RANGES = {  # the same in every report, so that assets can be compared
+    "f0": (0.0, 0.06), "roughness": (0.0, 1.0), "ambient_occlusion": (0.0, 1.0), "confidence": (0.0, 1.0),
+    "inv_kappa": (0.0, 0.5), "specular_intensity": (0.0, 0.2), "displacement": (-2.0, 2.0),
+}  # fmt: skip
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
 
 
@@ -166,8 +171,10 @@ def _maps(r: Results, side: int) -> list[Picture]:
     for name, texture in sorted(r.bake.artifact.maps.items()):
         if name not in SKIPPED_MAPS and set(kinds) <= texture.files.keys():
             values = np.concatenate([_thinned(read_exr(r.bake.path(texture.files[k]))[0], side) for k in kinds], 1)
-            picture = map_picture(values, texture.space)
-            out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}"))
+            limits = FIXED_RANGES.get(name)
+            picture = scaled_picture(values, *limits) if limits else map_picture(values, texture.space)
+            scale = f"; scale {limits[0]:g} to {limits[1]:g}" if limits else ""
+            out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}{scale}"))
     return out + _lobe_fit(r, side)
 
 

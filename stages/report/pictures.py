@@ -82,6 +82,16 @@ def map_picture(values: F32, space: str) -> U8:
     return to_bytes((grey - low) / (high - low))
 
 
+def scaled_picture(values: F32, low: float, high: float) -> U8:
+    """A map (H, W, C) of one number on the scale for maps from `low` to `high`, with the scale along its lower edge."""
+    share = ((values[..., 0] - low) / (high - low)).clip(0, 1)
+    shown = scale_colours()[np.round(np.nan_to_num(share) * 255).astype(np.uint8)]
+    width = shown.shape[1]
+    bar = scale_colours()[np.linspace(0, 255, width).round().astype(np.uint8)]
+    gap = np.full((max(1, width // 60), width, 3), 255, np.uint8)
+    return np.concatenate([shown, gap, np.repeat(bar[None], max(2, width // 25), 0)])
+
+
 def light_picture(values: F32) -> U8:
     """An environment map (H, W, 3), scaled so that its 99th percentile is just below white."""
     top = float(np.percentile(values, 99))

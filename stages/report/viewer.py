@@ -96,7 +96,7 @@ def _channels(r: Results, maps: dict[str, list[str]]) -> Iterator[dict[str, Any]
     yield {"name": "look", "label": "full look", "kind": "look"}
     yield {"name": "albedo", "label": "albedo", "kind": "colour"}
     if "f0" in r.bake.artifact.maps:
-        yield _value("f0", "F0 (reflectance at normal incidence)", high=0.1, of="specularColorMap")
+        yield _value("f0", "F0 (reflectance at normal incidence)", high=0.06, of="specularColorMap")
     if "roughness" in r.bake.artifact.maps:
         yield _value("roughness", "roughness", of="roughnessMap")
     yield {"name": "normal", "label": "normal, seen from the camera", "kind": "normal"}
