@@ -92,7 +92,7 @@ MUTATIONS = (
     Mutation("pipeline/ray_casting.py", 'found["primID"] >= 0', 'found["primID"] > 0',
              "tests/bake/test_bake_sight.py::test_distances_to_a_mesh_by_hand"),
     # ---------------------------------------------------------------- USD and report
-    Mutation("pipeline/lighting/dome.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
+    Mutation("pipeline/maths/latlong.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
              "np.pi * (2 * (np.arange(width) + 0.5) / width - 1)", "tests/usd/test_usd_light.py"),
     Mutation("stages/usd/write/ggx_conversion.py", "REFERENCE_F0 * a + b", "REFERENCE_F0 * a",
              "tests/usd/test_usd_ggx_conversion.py"),

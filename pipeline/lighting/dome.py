@@ -1,7 +1,6 @@
 """The captured light: conversion between spherical harmonics and a lat-long picture, and its file.
 
-Lat-long (USD's dome): rows from +Y (top) to -Y; the image's centre looks along +Z, its left edge is longitude +pi,
-and columns grow towards -X. Longitude 0 is +Z and grows towards +X.
+The picture's directions: pipeline/maths/latlong.py.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import torch
 
 from pipeline.errors import StageError
 from pipeline.maths import sh
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -29,28 +29,6 @@ CONVENTION = (
     "Y up, metres). d is a unit vector from the surface towards the light. The raw sum may be slightly negative; "
     "environment.exr is the positive picture with the same harmonics up to order 4."
 )
-
-
-def latlong_directions(width: int, height: int) -> F64:
-    """(height, width, 3) unit directions through the pixel centres."""
-    longitude = np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)
-    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
-    ring = np.cos(latitude)[:, None]
-    return np.stack(
-        [
-            ring * np.sin(longitude),
-            np.broadcast_to(np.sin(latitude)[:, None], (height, width)),
-            ring * np.cos(longitude),
-        ],
-        -1,
-    )
-
-
-def latlong_weights(width: int, height: int) -> F64:
-    """(height, 1) solid angle of one pixel in each row; the sum over all pixels is 4 pi."""
-    edge = np.sin(np.pi * (0.5 - np.arange(height + 1) / height))
-    weights: F64 = ((edge[:-1] - edge[1:]) * 2 * np.pi / width)[:, None]
-    return weights
 
 
 def environment(light: F32, width: int) -> F32:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.colour import LUMA
 from pipeline.errors import StageError
-from pipeline.lighting.dome import latlong_directions, latlong_weights
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +24,17 @@ from stages.report.pictures import (
     light_picture,
     map_picture,
     scale_bar,
+    scaled_picture,
     to_bytes,
 )
 from stages.report.verdict import verdict_shown
+from stages.report.viewer import viewer
 
 SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
+FIXED_RANGES = {  # the same in every report, so that assets can be compared
+    "f0": (0.0, 0.06), "roughness": (0.0, 1.0), "ambient_occlusion": (0.0, 1.0), "confidence": (0.0, 1.0),
+    "inv_kappa": (0.0, 0.5), "specular_intensity": (0.0, 0.2), "displacement": (-2.0, 2.0),
+}  # fmt: skip
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
 
 
@@ -75,6 +81,18 @@ def _noted(scores: Scores | None, own_colours: bool) -> str:
     return f", {scores.psnr:.1f} dB" + (f", {scores.psnr_matched:.1f} in the photo's colours" if own_colours else "")
 
 
+def best_median_worst(rows: list[JudgedRow], count: int) -> list[JudgedRow]:
+    """At most `count` rows for the page: the views with the best, the median and the worst PSNR, named so, before the
+    others in their order. Fewer than three scored views stay as they are."""
+    scored = sorted((r for r in rows if r.asset or r.model), key=lambda r: -(r.asset or r.model).psnr)  # type: ignore[union-attr]
+    if len(scored) < 3:
+        return rows[:count]
+    picked = (scored[0], "best"), (scored[len(scored) // 2], "median"), (scored[-1], "worst")
+    named = [replace(r, row=replace(r.row, title=f"{what.capitalize()}: view {r.index}")) for r, what in picked]
+    indices = {r.index for r in named}
+    return [*named, *(r for r in rows if r.index not in indices)][:count]
+
+
 def summary(rows: list[JudgedRow]) -> dict[str, Any]:
     """`holdout` of metrics.json: means over views, the worst view, and the scores of every view."""
     model, asset = [r.model for r in rows if r.model], [r.asset for r in rows if r.asset]
@@ -95,9 +113,16 @@ def _both(row: JudgedRow) -> dict[str, float | None]:
 
 
 def build_page(
-    metrics: Mapping[str, Any], verdict: Verdict, rows: list[JudgedRow], r: Results, side: int, outlines: int
+    metrics: Mapping[str, Any],
+    verdict: Verdict,
+    rows: list[JudgedRow],
+    r: Results,
+    side: int,
+    outlines: int,
+    *,
+    view: bool,
 ) -> str:
-    """The HTML page with its pictures."""
+    """The HTML page with its pictures; `view`: with the 3D view."""
     return render_page(
         metrics,
         Pictures(
@@ -109,6 +134,7 @@ def build_page(
             scale_top=ERROR_RANGE,
             captured=captured(r, side // 2, outlines),
             verdict=verdict_shown(verdict, r, side // 2),
+            viewer=viewer(r) if view else None,
         ),
     )
 
@@ -145,8 +171,10 @@ def _maps(r: Results, side: int) -> list[Picture]:
     for name, texture in sorted(r.bake.artifact.maps.items()):
         if name not in SKIPPED_MAPS and set(kinds) <= texture.files.keys():
             values = np.concatenate([_thinned(read_exr(r.bake.path(texture.files[k]))[0], side) for k in kinds], 1)
-            picture = map_picture(values, texture.space)
-            out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}"))
+            limits = FIXED_RANGES.get(name)
+            picture = scaled_picture(values, *limits) if limits else map_picture(values, texture.space)
+            scale = f"; scale {limits[0]:g} to {limits[1]:g}" if limits else ""
+            out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}{scale}"))
     return out + _lobe_fit(r, side)
 
 

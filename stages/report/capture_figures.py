@@ -60,7 +60,7 @@ class Captured:
 
 def captured(r: Started, side: int, shown: int) -> Captured:
     """The drawing, the table and the outlines of the `shown` worst masks."""
-    kinds = _kinds(r)
+    kinds = camera_kinds(r)
     rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
     why = r.poses.artifact.left_out
     lost = [
@@ -73,7 +73,8 @@ def captured(r: Started, side: int, shown: int) -> Captured:
                     lost, outlines, len(r.masks.artifact.masks) - len(outlines))  # fmt: skip
 
 
-def _kinds(r: Started) -> dict[int, str]:
+def camera_kinds(r: Started) -> dict[int, str]:
+    """What each camera's photo was used for, by its index."""
     held = {v.index for v in r.capture.artifact.views if v.holdout}
     dropped = set(r.masks.artifact.dropped)
     return {c.index: "mask dropped" if c.index in dropped else "held out" if c.index in held else "fitted"
@@ -194,6 +195,15 @@ def outlined(
     image: npt.NDArray[np.generic], alpha: npt.NDArray[np.float32], side: int
 ) -> npt.NDArray[np.uint8]:  # fmt: skip
     """(h, w, 3) 8-bit sRGB picture of a decoded photo, no larger than `side`, with the contour alpha = 0.5 drawn."""
+    out = reduced(image, side)
+    inside = (np.asarray(cv2.resize(alpha, out.shape[1::-1], interpolation=cv2.INTER_AREA)) >= 0.5).astype(np.uint8)
+    contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(out, contours, -1, OUTLINE, 1)
+    return out
+
+
+def reduced(image: npt.NDArray[np.generic], side: int) -> npt.NDArray[np.uint8]:
+    """(h, w, 3) 8-bit sRGB picture of a decoded photo (H, W, C), no larger than `side`."""
     shrink = min(1.0, side / max(image.shape[:2]))
     size = (max(1, round(image.shape[1] * shrink)), max(1, round(image.shape[0] * shrink)))
     plane = np.asarray(image[..., :3], np.float32)
@@ -202,8 +212,4 @@ def outlined(
     else:
         plane = np.asarray(encoded(plane / max(float(np.quantile(plane, 0.99)), 1e-6)), np.float32)
     small = np.asarray(cv2.resize(plane, size, interpolation=cv2.INTER_AREA), np.float32)
-    out = to_bytes(small)
-    inside = (np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA)) >= 0.5).astype(np.uint8)
-    contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(out, contours, -1, OUTLINE, 1)
-    return out
+    return to_bytes(small)

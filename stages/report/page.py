@@ -1,4 +1,4 @@
-"""The HTML page: one self-contained file, without scripts that run and without network access."""
+"""The HTML page: one self-contained file without network access. Only the 3D view's script may run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined, Template
+from jinja2 import DictLoader, Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from stages.report.collect import own_colours
@@ -48,6 +48,7 @@ class Pictures:
     scale_top: float = 0.0
     captured: object | None = None  # stages.report.capture_figures.Captured
     verdict: object | None = None  # stages.report.verdict.VerdictShown
+    viewer: object | None = None  # stages.report.viewer.Viewer
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:
@@ -120,8 +121,10 @@ def _template() -> Template:
     environment.filters["value"] = _value
     environment.filters["sentence"] = lambda text: f"{text.rstrip('.')}."
     environment.filters["island"] = lambda x: Markup(json.dumps(x).replace("<", "\\u003c"))
-    source = files("stages.report").joinpath("templates/page.html.j2").read_text(encoding="utf-8")
-    return environment.from_string(source)
+    folder = files("stages.report").joinpath("templates")
+    names = ("page.html.j2", "viewer.html.j2")
+    environment.loader = DictLoader({n: folder.joinpath(n).read_text(encoding="utf-8") for n in names})
+    return environment.get_template("page.html.j2")
 
 
 def _words(key: object) -> str:

@@ -50,6 +50,20 @@ def heat(values: F32) -> U8:
     return np.asarray(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO)[..., ::-1], np.uint8)
 
 
+def scale_colours() -> U8:
+    """(256, 3) RGB of a scale for maps, from dark blue to yellow, that is even for every kind of colour vision."""
+    level = np.arange(256, dtype=np.uint8)[None]
+    return np.ascontiguousarray(cv2.applyColorMap(level, cv2.COLORMAP_CIVIDIS)[0, :, ::-1])
+
+
+def png_uri(image: U8) -> str:
+    """Address of a picture (H, W, 1 or 3) as PNG, every pixel as it is."""
+    done, buffer = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    if not done:
+        raise RuntimeError(f"a picture of {image.shape} can't be encoded")
+    return f"data:image/png;base64,{base64.b64encode(buffer.tobytes()).decode()}"
+
+
 def scale_bar() -> U8:
     """The heat map's colours from 0 to ERROR_RANGE, for the legend."""
     return heat(np.repeat(np.linspace(0, 1, 256, dtype=np.float32)[None], 12, 0))
@@ -66,6 +80,16 @@ def map_picture(values: F32, space: str) -> U8:
     if high - low < 1e-3 * max(abs(low), abs(high), 1e-6):  # constant
         return to_bytes(grey if 0 <= low <= 1 else np.full_like(grey, 0.5))
     return to_bytes((grey - low) / (high - low))
+
+
+def scaled_picture(values: F32, low: float, high: float) -> U8:
+    """A map (H, W, C) of one number on the scale for maps from `low` to `high`, with the scale along its lower edge."""
+    share = ((values[..., 0] - low) / (high - low)).clip(0, 1)
+    shown = scale_colours()[np.round(np.nan_to_num(share) * 255).astype(np.uint8)]
+    width = shown.shape[1]
+    bar = scale_colours()[np.linspace(0, 255, width).round().astype(np.uint8)]
+    gap = np.full((max(1, width // 60), width, 3), 255, np.uint8)
+    return np.concatenate([shown, gap, np.repeat(bar[None], max(2, width // 25), 0)])
 
 
 def light_picture(values: F32) -> U8:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pydantic import Field
+
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Report, Surface, TextureSet, UsdAsset, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
@@ -28,7 +30,9 @@ class Inputs:
 
 
 class Config(StageConfig):
-    """The report has no settings."""
+    """Settings of the report."""
+
+    viewer: bool = Field(True, description="put a 3D view of the asset into the page (needs usd.glb)")
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> Report:
@@ -36,7 +40,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     import json
 
     from pipeline.verdict import verdict_of_inputs
-    from stages.report.build import build_page, build_rows, summary
+    from stages.report.build import best_median_worst, build_page, build_rows, summary
     from stages.report.collect import figures
     from stages.report.compare import judged_views, unjudged
     from stages.report.judge import judge
@@ -51,11 +55,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     metrics = {"verdict": verdict.record(every=True), "holdout": summary(rows), "timing": {}, **figures(inputs)}
     metrics["warnings"] = [*metrics["warnings"], *unjudged(inputs)]
     (context.workdir / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
-    page = build_page(metrics, verdict, rows[:VIEWS_SHOWN], inputs, PICTURE_SIDE, MASKS_SHOWN)
+    page = build_page(
+        metrics, verdict, best_median_worst(rows, VIEWS_SHOWN), inputs, PICTURE_SIDE, MASKS_SHOWN, view=config.viewer
+    )
     (context.workdir / "index.html").write_text(page, encoding="utf-8")
     context.progress(total + 1, total + 1, "done")
     files = context.file("index.html"), context.file("metrics.json")
     return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
-STAGE = Stage(name="report", version=6, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=9, inputs=Inputs, config=Config, output=Report, run=run)

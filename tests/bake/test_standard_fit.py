@@ -7,8 +7,8 @@ import pytest
 from support.synthetic_asset import ball
 
 from pipeline.lighting import standard
-from pipeline.lighting.dome import latlong_directions
 from pipeline.lighting.median_cut import lamps
+from pipeline.maths.latlong import latlong_directions
 from pipeline.meshes import Mesh
 from stages.bake import standard_fit as fits
 

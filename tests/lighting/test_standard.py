@@ -7,9 +7,9 @@ import pytest
 from support.synthetic_asset import ball
 
 from pipeline.lighting import standard
-from pipeline.lighting.dome import latlong_directions, latlong_weights
 from pipeline.lighting.median_cut import Lamps, lamps
 from pipeline.maths import microfacet
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 
 F64 = np.ndarray
 

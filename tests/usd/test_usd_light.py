@@ -13,12 +13,11 @@ from support.synthetic_asset import smooth_light
 from pipeline.errors import StageError
 from pipeline.lighting.dome import (
     environment,
-    latlong_directions,
-    latlong_weights,
     light_from_environment,
     light_json,
     read_light,
 )
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 from pipeline.maths.sh import sh_basis
 
 AXES = {  # direction: (column, row) of the pixel just right of and below it, as shares of the picture

@@ -8,10 +8,10 @@ from support.render_stand_ins import asset, fine_ball, sphere_points
 from support.synthetic_asset import RADIUS, ball
 
 from pipeline.errors import StageError
-from pipeline.lighting.dome import latlong_directions, latlong_weights
 from pipeline.lighting.median_cut import Lamps, checked_environment, lamps
 from pipeline.lighting.transport import DARKEST, Transport, occlusion
 from pipeline.maths.ggx_width import KAPPA_RANGE
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.relight import Environment, table_of
 from stages.usd.render.render import Renderer, kernels

@@ -149,3 +149,12 @@ def test_bad_config_files(tmp_path: Path, name: str, content: str | None) -> Non
 def test_a_stage_that_is_no_table() -> None:
     with pytest.raises(UsageError, match="must be a table"):
         configs_for("draft", {}, {"first": 3}, registry=TOYS)  # type: ignore[dict-item]
+
+
+def test_no_viewer_is_a_setting_of_the_report() -> None:
+    from workflows.cli.main import parser
+    from workflows.cli.options import with_viewer
+
+    for flags, wanted in (([], {"report": {}}), (["--no-viewer"], {"report": {"viewer": False}})):
+        options = parser().parse_args(["run", "photos", "--out", "out", *flags])
+        assert with_viewer(options, {"report": {}}) == wanted

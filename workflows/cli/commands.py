@@ -12,7 +12,8 @@ from typing import Any
 
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
-from workflows.cli.options import request_from, with_provenance
+from workflows.cli.options import request_from, with_provenance, with_viewer
+from workflows.cli.view import server_of
 from workflows.run import output_dirs
 from workflows.run.interrupt import interruptible
 from workflows.run.plan import make_plan, preview
@@ -53,7 +54,7 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """neuface run"""
     request = request_from(options, RunRequest)
-    request = request.model_copy(update={"config": with_provenance(options, request.config)})
+    request = request.model_copy(update={"config": with_viewer(options, with_provenance(options, request.config))})
     if options.dry_run:
         for step in preview(make_plan(request)):
             print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
@@ -202,8 +203,20 @@ def view_command(options: argparse.Namespace, console: Console) -> int:
             limit="a finished run",
             remedy=f"make it with: neuface report {options.folder}",
         )
-    print(page)
-    webbrowser.open(page.as_uri())
+    server, address = server_of(Path(options.folder))
+    print(f"{address}\nfor this machine only, until Ctrl-C; the page also opens without a server: {page}", flush=True)
+    webbrowser.open(address)
+    with server:
+        server.serve_forever()
+    return 0
+
+
+def turntable_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface turntable"""
+    from workflows.cli.turntable import TurntableRequest, write_turntable
+
+    request = TurntableRequest(Path(options.folder), Path(options.out), options.env, options.frames, options.size)
+    print(write_turntable(request))
     return 0
 
 

@@ -36,6 +36,8 @@ EXAMPLES = """examples:
   neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
 """
 
+ENV_HELP = "captured, key, overcast, sunset, or a lat-long .hdr or .exr"
+
 
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
@@ -60,9 +62,10 @@ def parser() -> argparse.ArgumentParser:
     validate.add_argument("--json", metavar="FILE", help="write every finding as JSON; - for standard output")
     validate.set_defaults(run=commands.validate_command)
     _render_options(commands_of.add_parser("render", help="render the exported asset: photos' views, or a turntable"))
+    _turntable_options(commands_of.add_parser("turntable", help="a film of one turn around the exported asset"))
     for name, text, run in (
         ("report", "(re)build the report of a run", commands.report_command),
-        ("view", "open the report of a run in a browser", commands.view_command),
+        ("view", "serve the report of a run to this machine's browser", commands.view_command),
     ):
         sub = commands_of.add_parser(name, help=text)
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
@@ -83,6 +86,7 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--author", help="who made the capture; recorded in the asset")
     run.add_argument("--license", help="licence of the capture; recorded in the asset")
     run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
+    run.add_argument("--no-viewer", action="store_true", help="no 3D view in the report")
     run.add_argument("--dry-run", action="store_true", help="print what would be run and what reused, then stop")
     run.set_defaults(run=commands.run_command)
 
@@ -90,13 +94,22 @@ def _run_options(run: argparse.ArgumentParser) -> None:
 def _render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
     render.add_argument("--out", required=True, metavar="OUT", help="folder for the pictures")
-    render.add_argument("--env", default="captured", help="captured, or a lat-long .hdr or .exr (%(default)s)")
+    render.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
     render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
     render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
     render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
     render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
     render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
     render.set_defaults(run=commands.render_command)
+
+
+def _turntable_options(turntable: argparse.ArgumentParser) -> None:
+    turntable.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
+    turntable.add_argument("--out", required=True, metavar="FILE", help="film.mp4 or film.webp")
+    turntable.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
+    turntable.add_argument("--frames", type=_at_least(1), default=120, help="pictures of the turn (%(default)s)")
+    turntable.add_argument("--size", type=_at_least(16), default=1080, help="pixels along each side (%(default)s)")
+    turntable.set_defaults(run=commands.turntable_command)
 
 
 def _unicode(options: argparse.Namespace) -> None:

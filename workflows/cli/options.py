@@ -134,3 +134,8 @@ def with_provenance(options: argparse.Namespace, config: Mapping[str, Mapping[st
     given = {n: getattr(options, n) for n in ("author", "license", "subject_consent")}
     stated = {k: v for k, v in given.items() if v is not None}
     return {**config, "usd": {**config.get("usd", {}), **stated}} if stated else dict(config)
+
+
+def with_viewer(options: argparse.Namespace, config: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Settings without the report's 3D view, where --no-viewer asks for that."""
+    return {**config, "report": {**config.get("report", {}), "viewer": False}} if options.no_viewer else dict(config)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 CAPTURED = "captured"
 TURNTABLE_SIDE = 1024  # pixels
 ENVIRONMENTS = (".exr", ".hdr")
+MADE_WIDTH = 256  # columns of the picture of a made light
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ def render_pictures(request: RenderRequest) -> Iterator[tuple[Path, float]]:
     root = component_in(request.folder)
     renderer = Renderer(load_exported(root))
     views = _views(request, root, renderer)
-    light = _light(request.light, renderer, root)
+    light = light_named(request.light, renderer, root)
     for name, view in views.items():
         start = time.perf_counter()
         shown = view.scaled(request.width) if request.width else view
@@ -78,24 +79,32 @@ def component_in(folder: Path) -> Path:
     )
 
 
-def _light(name: str, renderer: Renderer, root: Path) -> Light | None:
+def light_named(name: str, renderer: Renderer, root: Path) -> Light | None:
+    """The light of --env for one asset in the folder root: None for the captured light, a made one, or a file's.
+
+    Raises:
+        StageError: the file can't be read, or holds no light.
+    """
     from pipeline.images import read_linear
+    from pipeline.maths import studio_lights
     from stages.usd.render.previews import captured
     from stages.usd.render.relight import Environment
     from stages.usd.render.standard_light import StandardLight
 
     if name == CAPTURED:
         return captured(renderer, root)
+    kind = Environment if renderer.asset.f0 is None else StandardLight
+    if name in studio_lights.LIGHTS:
+        return kind(renderer, studio_lights.picture(name, MADE_WIDTH), name)
     path = Path(name)
     if path.suffix.lower() not in ENVIRONMENTS or not path.is_file():
         raise StageError(
             "this light can't be read",
             where=name,
             value="no such file" if not path.is_file() else f"a {path.suffix or 'nameless'} file",
-            limit=f"{CAPTURED}, or a file {' or '.join(ENVIRONMENTS)}",
+            limit=f"{CAPTURED}, {', '.join(studio_lights.LIGHTS)}, or a file {' or '.join(ENVIRONMENTS)}",
             remedy="give --env an equirectangular picture",
         )
-    kind = Environment if renderer.asset.f0 is None else StandardLight
     return kind(renderer, read_linear(path), path.name)
 
 

@@ -1,0 +1,262 @@
+"""The 3D view: what the page carries, and how it behaves in a browser (left out where none is installed)."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import struct
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.browser import Tab, installed, tab
+from support.synthetic_results import SyntheticResults, write_results
+
+from pipeline.artifacts import FileRef, Located
+from pipeline.contract import Context
+from pipeline.maths.latlong import latlong_directions
+from pipeline.transforms import project, rows
+from stages.report.stage import STAGE, Config, Inputs
+from stages.report.viewer import MODULES, light_data
+from stages.report.viewer_cameras import chosen, straightened
+from stages.usd.write.gltf import write_glb
+from stages.usd.write.mesh import read_mesh
+from stages.usd.write.shading import Look
+
+SHOWN = ["look", "albedo", "f0", "roughness", "normal", "confidence", "coverage", "checker", "density", "wireframe"]
+
+
+def with_glb(results: SyntheticResults) -> SyntheticResults:
+    """The results with a glb that has one expression: the head grows by half."""
+    usd, mesh = results.usd, read_mesh(results.uv.path(results.uv.artifact.mesh))
+    look = Look("albedo.png", "roughness.png", "normal.png", 1.4, (0.5, 0.4, 0.3), f0="f0.exr")
+    path = usd.folder / "asset/head.glb"
+    write_glb(path, "head", mesh, look, results.bake.folder, {})
+    path.write_bytes(with_expression(path.read_bytes()))
+    files = (*usd.artifact.files, FileRef.of(usd.folder, "asset/head.glb"))
+    return replace(results, usd=Located(usd.artifact.model_copy(update={"files": files}), usd.folder))
+
+
+def with_expression(glb: bytes) -> bytes:
+    """A morph target "jawOpen" whose offsets are half of the positions."""
+    size = struct.unpack("<I", glb[12:16])[0]
+    document, binary = json.loads(glb[20 : 20 + size]), bytearray(glb[28 + size :])
+    mesh = document["meshes"][0]
+    accessor = document["accessors"][mesh["primitives"][0]["attributes"]["POSITION"]]
+    view = document["bufferViews"][accessor["bufferView"]]
+    start = view["byteOffset"]
+    points = np.frombuffer(bytes(binary[start : start + view["byteLength"]]), np.float32) * np.float32(0.5)
+    document["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": points.nbytes})
+    bounds = {k: [0.5 * x for x in accessor[k]] for k in ("min", "max")}
+    document["accessors"].append({**accessor, **bounds, "bufferView": len(document["bufferViews"]) - 1})
+    mesh["primitives"][0]["targets"] = [{"POSITION": len(document["accessors"]) - 1}]
+    mesh["extras"], mesh["weights"] = {"targetNames": ["jawOpen"]}, [0]
+    binary += points.tobytes()
+    document["buffers"] = [{"byteLength": len(binary)}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON")
+    return head + text + struct.pack("<I4s", len(binary), b"BIN\0") + bytes(binary)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> SyntheticResults:
+    return with_glb(write_results(tmp_path_factory.mktemp("results")))
+
+
+def page_of(results: SyntheticResults, folder: Path, **settings: bool) -> Path:
+    named = {n: getattr(results, n) for n in Inputs.__slots__}
+    folder.mkdir(parents=True)
+    STAGE.run(Inputs(**named), Config(**settings), Context(folder, folder / "scratch"))
+    return folder / "index.html"
+
+
+@pytest.fixture(scope="module")
+def page(results: SyntheticResults, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page_of(results, tmp_path_factory.mktemp("page") / "report")
+
+
+def island(text: str, name: str) -> str:
+    found = re.search(rf'id="viewer-{name}">(.*?)</script>', text, re.S)
+    assert found is not None
+    return found[1]
+
+
+def test_the_page_holds_the_asset_and_only_its_own_script_may_run(page: Path, results: SyntheticResults) -> None:
+    text = page.read_text()
+    assert base64.b64decode(island(text, "glb")) == (results.usd.folder / "asset/head.glb").read_bytes()
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.S)
+    assert len(scripts) == 1
+    allowed = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+    assert f"script-src 'sha256-{allowed}' blob:" in unescape(text) and "default-src 'none'" in text
+    data = json.loads(island(text, "data"))
+    assert [c["name"] for c in data["channels"]] == SHOWN
+    assert [x["name"] for x in data["lights"]] == ["captured", "key", "overcast", "sunset"]
+    assert {c["name"] for c in data["cameras"] if c["photo"]} >= {c["name"] for c in data["cameras"]
+                                                                   if c["kind"] == "held out"}  # fmt: skip
+
+
+def test_without_the_setting_or_a_glb_nothing_runs(results: SyntheticResults, tmp_path: Path) -> None:
+    plain = write_results(tmp_path / "in")
+    for made in (page_of(results, tmp_path / "off", viewer=False), page_of(plain, tmp_path / "none")):
+        text = made.read_text()
+        assert "<script>" not in text and "script-src" not in text
+
+
+def test_every_module_imports_only_modules_before_it() -> None:
+    known: set[str] = set()
+    for name, path in MODULES:
+        source = (Path("stages/report") / path).read_text()
+        wanted = set(re.findall(r"^(?:import|export)\b[^;]*? from '([^']+)'", source, re.M))
+        assert wanted <= known, path
+        known.add(name)
+
+
+def test_three_js_is_unchanged() -> None:
+    folder = Path("stages/report/three")
+    notice = (folder / "NOTICE").read_text()
+    for file in sorted(folder.glob("*.js")):
+        assert hashlib.sha256(file.read_bytes()).hexdigest() in notice, file.name
+
+
+def test_the_light_points_where_three_js_looks() -> None:
+    """three.js samples at u = atan2(z, x) / 2 pi + 1/2, v = asin(y) / pi + 1/2, from the lowest row up."""
+    directions = latlong_directions(64, 32)
+    sent = light_data(directions.astype(np.float32) + 2)
+    image = np.frombuffer(base64.b64decode(sent["rgb"]), np.float16).reshape(32, 64, 3).astype(float) - 2
+    v, u = (np.indices((32, 64)) + 0.5) / np.array([32, 64])[:, None, None]
+    longitude, latitude = 2 * np.pi * (u - 0.5), np.pi * (v - 0.5)
+    wanted = [np.cos(latitude) * np.cos(longitude), np.sin(latitude), np.cos(latitude) * np.sin(longitude)]
+    assert np.abs(image - np.stack(wanted, -1)).max() < 3e-3
+    top = light_data(np.full((2, 4, 3), 1e9, np.float32))
+    assert np.isfinite(np.frombuffer(base64.b64decode(top["rgb"]), np.float16)).all()
+
+
+def test_photos_are_straightened_as_the_cameras_project(results: SyntheticResults) -> None:
+    """A dot drawn where the distorted camera sees a point comes to where the plain camera sees it."""
+    camera = results.poses.artifact.cameras[0].model_copy(update={"distortion": (-0.2, 0.05, 0.002, -0.001, 0.0)})
+    w, h = camera.width, camera.height
+    K, pose = np.array(camera.K), np.eye(4)
+    point = np.array([[0.25 * w / K[0, 0], 0.3 * h / K[1, 1], 1.0]])
+    seen, _ = project(K, pose, np.array(camera.distortion), point)
+    plain, _ = project(K, pose, np.zeros(5), point)
+    y, x = np.indices((h, w)) + 0.5
+    dot = np.exp(-((x - seen[0, 0]) ** 2 + (y - seen[0, 1]) ** 2) / 18)
+    found = straightened(np.repeat((255 * dot).astype(np.uint8)[..., None], 3, 2), camera)[..., 0].astype(float)
+    centre = np.array([(found * x).sum(), (found * y).sum()]) / found.sum()
+    assert np.abs(centre - plain[0]).max() < 0.3 < np.abs(seen - plain).max()
+    untouched = camera.model_copy(update={"distortion": (0.0,) * 5, "K": rows(K)})
+    assert (straightened(np.full((h, w, 3), 7, np.uint8), untouched) == 7).all()
+
+
+def test_held_out_photos_come_first_and_few_others(results: SyntheticResults) -> None:
+    picked = chosen(results)
+    assert picked[:2] == [3, 9] and len(picked) == len(set(picked)) <= 12
+
+
+# ------------------------------------------------------------------ in a browser
+@pytest.fixture(scope="module")
+def opened(page: Path, tmp_path_factory: pytest.TempPathFactory):
+    if installed() is None:
+        pytest.skip("no Chromium is installed")
+    with tab(tmp_path_factory.mktemp("profile")) as found:
+        found.size(1280, 720)
+        found.call("Page.navigate", url=page.as_uri())
+        found.until("document.documentElement && document.documentElement.dataset.viewer")
+        found.run("document.getElementById('viewer').scrollIntoView()")
+        yield found
+        assert found.troubles == []
+        assert [r for r in found.requests if not r.startswith(("file:", "data:", "blob:"))] == []
+
+
+def choose(page: Tab, control: str, value: object, event: str = "change") -> None:
+    page.run(f"(() => {{ const e = document.getElementById('viewer-{control}'); e.value = '{value}';"
+             f" e.dispatchEvent(new Event('{event}')); }})()")  # fmt: skip
+
+
+def drawn(page: Tab) -> np.ndarray:
+    """The canvas with what lies over it, (H, W, 3)."""
+    page.run("new Promise(r => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(r)), 100))")
+    box = page.run("(({x, y, width, height}) => ({x, y: y + scrollY, width, height}))"
+                   "(document.getElementById('viewer-canvas').getBoundingClientRect())")  # fmt: skip
+    return cv2.imdecode(np.frombuffer(page.picture(**box), np.uint8), cv2.IMREAD_COLOR).astype(float)
+
+
+def changed(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of pixels that differ visibly."""
+    return float((np.abs(a - b).max(-1) > 8).mean())
+
+
+@pytest.mark.slow
+def test_it_starts_and_turns(opened: Tab) -> None:
+    assert opened.run("document.documentElement.dataset.viewer") == "ready"
+    first = drawn(opened)
+    assert changed(first, np.broadcast_to(first[2, 2], first.shape)) > 0.05  # a head on an even background
+    opened.drag((500, 300), (700, 320))
+    by_mouse = drawn(opened)
+    assert changed(first, by_mouse) > 0.02
+    opened.run("document.getElementById('viewer-canvas').dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowUp'}))")
+    assert changed(by_mouse, drawn(opened)) > 0.005
+    opened.run("document.getElementById('viewer-home').click()")
+    assert changed(first, drawn(opened)) < 0.001
+
+
+@pytest.mark.slow
+def test_every_channel_and_light_shows_something_else(opened: Tab) -> None:
+    names = opened.run("[...document.getElementById('viewer-channel').options].map(o => o.value)")
+    assert names == SHOWN
+    pictures = []
+    for name in [*names[1:], "look"]:
+        choose(opened, "channel", name)
+        opened.until(f"document.getElementById('viewer-channel').dataset.shown === '{name}'")
+        pictures.append(drawn(opened))
+    for light in ("key", "overcast", "sunset"):
+        choose(opened, "light", light, "input")
+        pictures.append(drawn(opened))
+    choose(opened, "turn", 90, "input")
+    pictures.append(drawn(opened))
+    choose(opened, "exposure", 2, "input")
+    pictures.append(drawn(opened))
+    for i, a in enumerate(pictures):
+        assert all(changed(a, b) > 0.01 for b in pictures[:i]), i
+    for control, value in (("light", "captured"), ("turn", 0), ("exposure", 0)):
+        choose(opened, control, value, "input")
+
+
+@pytest.mark.slow
+def test_the_slider_shows_photo_or_render(opened: Tab, results: SyntheticResults) -> None:
+    number = opened.run(
+        "[...document.getElementById('viewer-camera').options].findIndex(o => o.text.includes('held out'))"
+    )
+    choose(opened, "camera", number - 1)
+    opened.run("document.getElementById('viewer-photo').decode()")
+    shown = {}
+    for share in (0, 50, 100):
+        choose(opened, "split", share, "input")
+        shown[share] = drawn(opened)
+    middle = shown[0].shape[1] // 2
+    assert changed(shown[0][:, : middle - 3], shown[50][:, : middle - 3]) > 0.1
+    assert changed(shown[0][:, middle + 3 :], shown[50][:, middle + 3 :]) < 0.02
+    assert changed(shown[50][:, middle + 3 :], shown[100][:, middle + 3 :]) > 0.1
+    choose(opened, "camera", "")
+
+
+@pytest.mark.slow
+def test_expressions_move_the_surface(opened: Tab) -> None:
+    before = drawn(opened)
+    opened.run("(() => { const e = document.querySelector('#viewer-expressions input'); e.value = 1;"
+               " e.dispatchEvent(new Event('input')); })()")  # fmt: skip
+    assert opened.run("document.querySelector('#viewer-expressions label').textContent") == "jawOpen"
+    assert changed(before, drawn(opened)) > 0.05
+
+
+@pytest.mark.slow
+def test_the_page_is_no_wider_than_a_phone(opened: Tab) -> None:
+    opened.size(390, 844, phone=True)
+    opened.until("document.documentElement.scrollWidth <= 390")
+    opened.size(1280, 720)
