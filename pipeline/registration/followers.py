@@ -4,6 +4,9 @@ A part keeps its own shape: it makes the rigid motion that the nearest skin make
 least squares with weights that fall with the distance. Lashes lie on the lids, whose shape changes: each of their
 vertices moves with the skin nearest to it.
 
+An eye is made smaller until the skin lies outside. The lids' inner edges count only where they lie outside of the
+template's own eye: most are sunk into it, which closes the slit between lid and eye.
+
 Source: Horn, Hilden and Negahdaripour 1988, for the rigid motion (by the singular value decomposition).
 """
 
@@ -18,7 +21,7 @@ from pipeline.template.model import SKIN, Template
 BENDING = "lashes"  # parts whose name begins so bend with the skin
 ROUND = "eye"  # parts whose name begins so stay behind the skin
 GAP = 2e-4  # metres of the template between an eye and its lids
-SMALLEST = 0.7  # least scale of an eye: MakeHuman's are a fifth too large
+SMALLEST = 0.7  # least scale of an eye
 NEAR = 150  # vertices of skin that move a part
 FALL = 0.006  # metres of the template: distance at which a vertex of skin has half of its weight
 
@@ -45,7 +48,8 @@ def followed(template: Template, rest: F64, cage: Indices, skin: F64, rotations:
         turn, shift = rigid_motion(rest[cage][near], skin[near], weight)
         out[own] = rest[own] @ turn.T + shift
         if name.startswith(ROUND):
-            out[own] = behind(out[own], skin[near], GAP * unit)
+            seen = near[room(rest[own], rest[cage][near]) >= 1]
+            out[own] = behind(out[own], skin[seen], GAP * unit)
     return out
 
 
@@ -53,11 +57,18 @@ def behind(ball: F64, skin: F64, gap: float) -> F64:
     """A ball's vertices (N, 3) scaled about its middle so far that the skin (M, 3) lies outside: lids that close press
     on an eye that is drawn too large."""
     middle = 0.5 * (ball.min(0) + ball.max(0))
+    least = room(ball, skin, gap).min(initial=1.0)
+    return np.asarray(middle + (ball - middle) * float(np.clip(least, SMALLEST, 1.0)))
+
+
+def room(ball: F64, skin: F64, gap: float = 0.0) -> F64:
+    """(M,) how far the skin (M, 3) lies from a ball's middle, less the gap, over the ball's radius in that direction: 1
+    or more outside of the ball (N, 3)."""
+    middle = 0.5 * (ball.min(0) + ball.max(0))
     own, there = ball - middle, skin - middle
     radius, away = np.linalg.norm(own, axis=1), np.linalg.norm(there, axis=1)
     _, nearest = cKDTree(own / np.maximum(radius, 1e-30)[:, None]).query(there / np.maximum(away, 1e-30)[:, None])
-    room = (away - gap) / np.maximum(radius[nearest], 1e-30)
-    return np.asarray(middle + own * float(np.clip(room.min(initial=1.0), SMALLEST, 1.0)))
+    return np.asarray((away - gap) / np.maximum(radius[nearest], 1e-30))
 
 
 def rigid_motion(start: F64, goal: F64, weights: F64) -> tuple[F64, F64]:

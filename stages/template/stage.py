@@ -120,4 +120,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=3, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=4, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

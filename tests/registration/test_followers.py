@@ -12,7 +12,7 @@ from support.ball_head import RADIUS, ball_quads, ball_scan, ball_template
 
 from pipeline.registration.cage import cage_of
 from pipeline.registration.displacement import displacement
-from pipeline.registration.followers import behind, followed, rigid_motion
+from pipeline.registration.followers import behind, followed, rigid_motion, room
 from pipeline.registration.head import Head, limit_surface, load_head
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.lids import BLINK, blink, closing, lids_closed, with_lids
@@ -61,6 +61,27 @@ def test_an_eye_that_is_too_large_becomes_smaller_and_no_other() -> None:
     assert np.allclose(np.linalg.norm(behind(ball, 0.9 * ball, 0.05), axis=1), 0.85)
     assert np.allclose(behind(ball, 1.5 * ball, 0.05), ball)
     assert np.allclose(np.linalg.norm(behind(ball, 0.1 * ball, 0.05), axis=1), 0.7)  # never less
+
+
+def test_the_template_s_own_eyes_keep_their_size() -> None:
+    """Its lids' inner edges are sunk into the eyes; that is no reason to make these smaller."""
+    template = load_template()
+    rest = template.vertices
+    rows = template.part_vertices("skin")
+    turns = np.tile(np.eye(3), (len(rows), 1, 1))
+    found = followed(template, rest, rows, rest[rows], turns, 1.0)
+    for eye in ("eye_left", "eye_right"):
+        own = template.part_vertices(eye)
+        size = np.ptp(found[own], axis=0) / np.ptp(rest[own], axis=0)
+        assert (size > 0.95).all() and (size <= 1).all()
+        assert (room(rest[own], rest[rows]) < 0.9).any()
+
+
+def test_room_is_the_share_of_a_ball_s_radius() -> None:
+    ball = ball_scan(0.012, 8).vertices.astype(np.float64) + [0.0, 0.01, 0.0]
+    at = np.array([[0.0, 0.01, 0.018], [0.006, 0.01, 0.0]])
+    np.testing.assert_allclose(room(ball, at), [1.5, 0.5], rtol=0.02)
+    np.testing.assert_allclose(room(ball, at, 0.006), [1.0, 0.0], atol=0.02)
 
 
 def test_lids_meet_where_they_are_pulled() -> None:
