@@ -17,8 +17,9 @@ For each alpha of a list the error Q - 2 F0 G + F0^2 H is one parabola in F0. Ov
 pooled (WIDTH), because F0 varies slowly; towards the mean of its group a prior pulls where there is little evidence.
 alpha is one number a group: one still light of low order does not determine it from place to place.
 
-The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS. Objects have neither: a layer is kept only if it
-explains MIN_EXPLAINED of what changes with the view. Then r follows by linear least squares, pooled over EDGES edges.
+The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and SKIN_F0 where a layer does not explain
+MIN_EXPLAINED of what changes with the view. Everything else has no prior for F0, and then no layer. At last r follows
+by linear least squares, pooled over EDGES edges.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ F0_SPREAD, TRUST = 0.01, 3.0  # standard deviation of F0 inside a group; observa
 SKIN_ROUGHNESS, ROUGHNESS_SPREAD = 0.45, 0.05
 OBJECT_SPREAD = 0.15  # of roughness, about the same mean
 INDEPENDENT = 30  # observations that a group's roughness counts as: errors of light and shape are common to all others
-MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must explain on an object
+MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must explain to be measured
+CERTAIN = 1e3  # weight of a prior that no evidence changes, in the evidence of the whole group
 MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
 OUTLIER = 2.5  # robust standard deviations of the field's residual from which the weight falls
@@ -176,8 +178,8 @@ def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
     k = int(cost.argmin())
     explained = 1 - float(error[k]) / max(float(sums.bare[own].sum()), 1e-30)
     variance = float(error[k]) / max(3 * float(sums.weight[own].sum()), 1e-30)
-    if not is_skin and explained < MIN_EXPLAINED:
-        return _Group(0.0, k, SKIN_ROUGHNESS, 1.0, explained)
+    if explained < MIN_EXPLAINED:  # the photos say nothing: skin is as usual, everything else has no layer
+        return _Group(SKIN_F0 if is_skin else 0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained)
     rough = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost)
     return _Group(float(mean[k]), k, rough, max(TRUST * variance / F0_SPREAD**2, 1e-12), explained)
 
