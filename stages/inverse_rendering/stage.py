@@ -115,7 +115,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=11,
+    version=12,
     inputs=Inputs,
     config=Config,
     output=FittedFace,
