@@ -212,20 +212,22 @@ def hull_bounds(
     min_views: int = 3,
     max_outside: int = 0,
     keep: Callable[[Hull], Hull] = lambda hull: hull,
+    reach: tuple[F64, F64] | None = None,
 ) -> tuple[F64, F64]:
     """(3,) lower and upper corner of the subject's bounding box in the cube of half-edge 1.6 * roi_radius. keep:
-    selects the part of the hull that counts (pipeline.extent).
+    selects the part of the hull that counts (pipeline.extent). reach: (3,) corners of a box that is searched as well,
+    asset units, because an extent can be larger than the cube.
 
-    `margin` is added on every side, as a fraction of the longest edge; the box stays inside the cube.
+    `margin` is added on every side, as a fraction of the longest edge; the box stays inside the searched space.
 
     Raises:
         StageError: the visual hull is empty.
     """
-    edge = 1.6 * roi_radius
-    whole = visual_hull(
-        cameras, alphas, [-edge] * 3, [edge] * 3, 2 * edge / cells, min_views=min_views, max_outside=max_outside
-    )
-    hull = keep(whole)
+    low, high = np.full(3, -1.6 * roi_radius), np.full(3, 1.6 * roi_radius)
+    if reach is not None:
+        low, high = np.minimum(low, reach[0]), np.maximum(high, reach[1])
+    cell = float((high - low).max()) / cells
+    hull = keep(visual_hull(cameras, alphas, low, high, cell, min_views=min_views, max_outside=max_outside))
     body = subject_pieces(hull.occupied, hull.lo + 0.5 * hull.cell, hull.cell)
     if not body.any():
         raise StageError(
@@ -238,7 +240,7 @@ def hull_bounds(
     index = np.argwhere(body)
     lo, hi = hull.lo + index.min(0) * hull.cell, hull.lo + (index.max(0) + 1) * hull.cell
     room = margin * float((hi - lo).max())
-    return np.maximum(lo - room, -edge), np.minimum(hi + room, edge)
+    return np.maximum(lo - room, low), np.minimum(hi + room, high)
 
 
 def hull_sdf(hull: Hull) -> F32:

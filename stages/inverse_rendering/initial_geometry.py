@@ -16,7 +16,7 @@ import torch
 
 from pipeline.artifacts import Camera, Extent
 from pipeline.errors import StageError
-from pipeline.extent import GROWN, within
+from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, visual_hull
 from pipeline.transforms import inverse_rigid, matrix
@@ -125,7 +125,8 @@ def hull_start(
     def kept(hull: Hull) -> Hull:
         return hull if extent is None else within(hull, extent, GROWN * extent.head)
 
-    lo, hi = hull_bounds(cameras, alphas, roi_radius, keep=kept)
+    reach = None if extent is None else bounds(extent, GROWN * extent.head)
+    lo, hi = hull_bounds(cameras, alphas, roi_radius, keep=kept, reach=reach)
     cell = float((hi - lo).max()) / cells * 2 ** (levels - 1)
     lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
     hull = kept(visual_hull(cameras, alphas, lo, hi, cell))

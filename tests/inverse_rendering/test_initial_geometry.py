@@ -122,6 +122,16 @@ def test_the_start_ends_a_little_beyond_the_extent() -> None:
     assert start.cell < whole.cell  # the same cells for less space
 
 
+def test_an_extent_larger_than_the_region_of_interest_is_fitted_as_a_whole() -> None:
+    """All pixels inside the extent count, so the start must not end before it does."""
+    ball = Extent(centre=(0, 0, 0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1)), radii=(0.15,) * 3, cuts=(), head=0.1)
+    start = hull_start(CAMERAS, ALPHAS, 0.04, 32, 1, ball)
+    y = (start.lo + start.cell * np.argwhere(start.values < 0))[:, 1]
+    (_, middle, _), radius = HEAD
+    assert y.max() == pytest.approx(middle + radius, abs=2 * start.cell)
+    assert y.min() == pytest.approx(-0.15 - GROWN * 0.1, abs=2 * start.cell)
+
+
 def test_pixels_beyond_the_extent_are_not_drawn() -> None:
     """Neither as subject nor as background."""
     camera, alpha = CAMERAS[0], ALPHAS[0]

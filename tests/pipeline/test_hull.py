@@ -144,6 +144,21 @@ def test_box_volume_with_axes_and_bounds() -> None:
     assert np.allclose(wide[1] - hi, 0.05 * (hi - lo).max())
 
 
+def test_bounds_search_a_reach_beyond_the_region_of_interest() -> None:
+    """A cube of 1.6 * 0.04 cuts the box at 0.064 of its 0.09; a reach that holds the box finds all of it."""
+    half = np.array([0.06, 0.09, 0.03])
+    cameras = around(12, distance=3.0, focal=900.0)
+    cameras += [looking_at(p, 50, focal=900.0) for p in ([3.0, 0, 0], [0, 3.0, 0], [0, 0, 3.0])]
+    alphas = [box_alpha(c, half) for c in cameras]
+    short = hull_bounds(cameras, alphas, 0.04, margin=0.05)
+    assert short[1][1] == pytest.approx(0.064) and short[0][1] == pytest.approx(-0.064)
+    reach = np.array([-0.01, -0.02, -0.01]), np.array([0.01, 0.15, 0.01])  # smaller than the cube in some directions
+    lo, hi = hull_bounds(cameras, alphas, 0.04, margin=0.0, reach=reach)
+    cell = (0.15 + 0.064) / 64
+    assert hi[1] == pytest.approx(half[1], abs=1.6 * cell)
+    assert lo[1] == pytest.approx(-0.064, abs=cell) and abs(hi[0] - half[0]) < 1.6 * cell  # the cube still counts
+
+
 def test_distortion_is_respected() -> None:
     cameras = around(24, distance=0.5, distortion=LENS, focal=120.0)
     centre = (0.05, 0.03, -0.04)  # off the axis, where the lens matters
