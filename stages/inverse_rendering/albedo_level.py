@@ -29,13 +29,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from pipeline.colour import LUMA
+from pipeline.colour import LUMA, linear_from_srgb
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from stages.inverse_rendering.config import AUTO
-from stages.inverse_rendering.observations import surface_points
-from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+from stages.inverse_rendering.observations import surface_hits
+from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, PixelTable
 from stages.inverse_rendering.residuals import U8, codes_at
 
 F64 = npt.NDArray[np.float64]
@@ -55,7 +55,8 @@ SEED = 27_644_437
 
 @dataclass(frozen=True, slots=True)
 class LabelledAlbedos:
-    """Albedo of surface points that photos show with the label face (N, 3) or eyes (M, 3), linear."""
+    """Albedo of surface points that photos show with the label face (N, 3), of the model, or eyes (M, 3), as the photos
+    show it; linear."""
 
     face: F64
     eyes: F64
@@ -101,7 +102,7 @@ def labelled_albedos(
     labels: Sequence[U8 | None],
     names: Sequence[str],
 ) -> LabelledAlbedos:
-    """Albedo of the model at random labelled pixels of all views. labels, names: as in residuals.view_errors."""
+    """Albedos at random labelled pixels of all views. labels, names: as in residuals.view_errors."""
     generator = torch.Generator().manual_seed(SEED)
     pools: dict[str, list[Tensor]] = {FACE: [], EYES: []}
     for n, (view, codes) in enumerate(zip(views, labels, strict=True)):
@@ -112,19 +113,38 @@ def labelled_albedos(
         for name, pool in pools.items():
             if name in names:
                 pool.append(own[found == list(names).index(name)])
-    return LabelledAlbedos(*(_albedos(model, table, pools[name], generator) for name in (FACE, EYES)))
+    x, _, _ = _hits(model, table, pools[FACE], generator)
+    with torch.no_grad():
+        face = model.spatial(x)[0]
+    return LabelledAlbedos(_array(face), _array(_shown(model, table, *_hits(model, table, pools[EYES], generator))))
 
 
-def _albedos(model: FaceModel, table: PixelTable, pools: list[Tensor], generator: torch.Generator) -> F64:
-    """(N, 3) where the rays of at most MOST_PIXELS of these pixels hit the surface."""
+def _hits(
+    model: FaceModel, table: PixelTable, pools: list[Tensor], generator: torch.Generator
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points and unit normals (N, 3) at at most MOST_PIXELS of these pixels, and the pixels (N,)."""
     pixels = torch.cat(pools) if pools else table.inside[:0]
-    if not len(pixels):
-        return np.zeros((0, 3))
     if len(pixels) > MOST_PIXELS:
         pixels = pixels[torch.randint(len(pixels), (MOST_PIXELS,), generator=generator).to(pixels.device)]
-    x, _ = surface_points(model.geometry, table.at(pixels).rays)
+    return surface_hits(model.geometry, table.at(pixels).rays, pixels)
+
+
+def _shown(model: FaceModel, table: PixelTable, x: Tensor, n: Tensor, pixels: Tensor) -> Tensor:
+    """(N, 3) albedo that the photos themselves show under the fitted light, without the fitted reflection: the field's
+    own albedo can't exceed 1, and blurs what is as small as an eye. Clipped pixels and the subject's rim are left
+    out."""
     with torch.no_grad():
-        return np.asarray(model.spatial(x)[0].cpu().numpy(), np.float64)
+        batch = table.at(pixels)
+        shaded = model.shade(x, n, -batch.rays.d)
+        colour = linear_from_srgb(batch.target)
+        if model.spec.calibrated:
+            colour = torch.linalg.solve(model.calibration()[batch.view], colour)
+        albedo = (colour - shaded.specular) * shaded.albedo / shaded.diffuse.clamp(min=1e-6)
+        return albedo[(batch.bound == 0).all(-1) & (batch.alpha > WHOLE) & albedo.isfinite().all(-1)]
+
+
+def _array(colour: Tensor) -> F64:
+    return np.asarray(colour.cpu().numpy(), np.float64)
 
 
 def decide(seen: LabelledAlbedos, wanted: float | None, explained: float | None) -> AlbedoLevel:

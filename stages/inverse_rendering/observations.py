@@ -92,11 +92,18 @@ def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
 
 def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
     """x and unit n (P, 3) where rays hit the surface, without the rays that miss it."""
+    x, n, _ = surface_hits(geometry, rays, torch.zeros(len(rays.d), device=rays.d.device))
+    return x, n
+
+
+def surface_hits(geometry: Geometry, rays: Rays, names: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The same, with the names (N,) of the rays that hit."""
     with torch.no_grad():
         near, far = box_interval(rays.o, rays.d, *geometry.box())
         t, hit, _ = geometry.trace(rays.o, rays.d, near, far)
-        x = (rays.o + t[:, None] * rays.d)[hit & (far > near)]
-        return x, unit(geometry(x)[1])
+        found = hit & (far > near)
+        x = (rays.o + t[:, None] * rays.d)[found]
+        return x, unit(geometry(x)[1]), names[found]
 
 
 def observe(geometry: Geometry, shots: list[Picture], x: Tensor, n: Tensor) -> Observations:
