@@ -10,7 +10,8 @@ from support.synthetic_asset import RADIUS, smooth_light, texture_arrays, write_
 from pipeline.camera import PinholeCamera
 from pipeline.transforms import inverse_rigid, project
 from stages.usd.render.camera import orbit_camera
-from stages.usd.render.render import Renderer, bilinear, lookup, tangents
+from stages.usd.render.map_lookup import bilinear, lookup
+from stages.usd.render.render import Renderer, tangents
 from stages.usd.write.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
 
 SIZE = 64

@@ -20,8 +20,9 @@ from pipeline.images import read_encoded, write_png
 from stages.usd.check.validate import validate
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
+from stages.usd.render.map_lookup import bilinear
 from stages.usd.render.relight import vertex_values
-from stages.usd.render.render import Renderer, bilinear
+from stages.usd.render.render import Renderer
 from stages.usd.write.mesh import UvSurface, half_gap, on_tile, tile_count, with_uvs_from, without_overlap
 
 NUMBERS = ("1001", "1002")

@@ -20,6 +20,7 @@ from pipeline.images import read_encoded, read_exr
 from pipeline.lighting.dome import read_light
 from pipeline.meshes import vertex_normals
 from pipeline.transforms import apply
+from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.mesh import UvSurface, tile_count
 
 if TYPE_CHECKING:
@@ -197,7 +198,6 @@ def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
 
 
 def _displaced(mesh: UsdGeom.Mesh, path: Path) -> UvSurface:
-    from stages.usd.render.render import bilinear
     from stages.usd.write.cage import evaluated
 
     smooth = evaluated(mesh)

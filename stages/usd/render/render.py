@@ -22,6 +22,7 @@ from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
 from stages.usd.render.exported import ExportedAsset
+from stages.usd.render.map_lookup import bilinear, lookup
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -228,24 +229,6 @@ def tangents(asset: ExportedAsset) -> F64:
         np.add.at(total, mesh.uv_faces[:, corner], along_u)
     sign = np.broadcast_to(np.where(area < 0, -1.0, 1.0)[:, None, None], (len(area), 3, 1))
     return np.concatenate([_unit(total)[mesh.uv_faces], sign], -1)
-
-
-def bilinear(image: F32, uv: npt.NDArray[np.floating], tiles: int = 1) -> F32:
-    """(N, C) values of (H, W, C) at uv (N, 2): texel centres at +0.5, v up, clamped at the border. `tiles`: the image
-    consists of that many squares side by side, tile t for t <= u < t + 1, each clamped at its own border."""
-    out = np.empty((len(uv), image.shape[2]), np.float32)
-    kernels.bilinear(np.ascontiguousarray(image, np.float32), tiles, uv, out)
-    return out
-
-
-def lookup(table: F32, cosine: F64) -> F32:
-    """(N, k) rows of the (W, k) table for cosines (N,). Row i is n.v = (i + 0.5) / W; linear between rows, constant
-    beyond the ends."""
-    width = len(table)
-    x = (cosine * width - 0.5).clip(0, width - 1)
-    low = np.floor(x).astype(np.int64)
-    f = (x - low)[:, None].astype(np.float32)
-    return np.asarray(table[low] * (1 - f) + table[np.minimum(low + 1, width - 1)] * f, np.float32)
 
 
 def _square(samples: int) -> Filter:

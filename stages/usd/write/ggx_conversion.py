@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.maths import ggx_width, microfacet
-from stages.usd.render.render import lookup
+from stages.usd.render.map_lookup import lookup
 
 F32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

@@ -23,7 +23,7 @@ from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
-from stages.usd.render.render import bilinear
+from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
