@@ -108,7 +108,10 @@ class Baker:
             fitted = standard_material(
                 field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material")
             )
-            self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
+            if fitted.plausible:
+                self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
+            else:
+                self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
 
     def tile(self, number: int) -> Baked:
         """Bake all texels that a chart of this tile touches.

@@ -18,8 +18,10 @@ pooled (WIDTH), because F0 varies slowly; towards the mean of its group a prior 
 alpha is one number a group: one still light of low order does not determine it from place to place.
 
 The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and SKIN_F0 where a layer does not explain
-MIN_EXPLAINED of what changes with the view. Everything else has no prior for F0, and then no layer. At last r follows
-by linear least squares, pooled over EDGES edges.
+MIN_EXPLAINED of what changes with the view. Everything else has no prior for F0, and then no layer; nor one where
+F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos are clipped. An object without any
+other material keeps the one that is read off NeuFace's lobe. At last r follows by linear least squares, pooled over
+EDGES edges.
 """
 
 from __future__ import annotations
@@ -48,6 +50,7 @@ MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
 OUTLIER = 2.5  # robust standard deviations of the field's residual from which the weight falls
 CORRECTION = (0.4, 2.5)  # limits of r
+DIELECTRIC = 0.17  # F0 of diamond, the largest of a dielectric that is common
 TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the base
 
 
@@ -64,12 +67,14 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,). figures: for the report."""
+    """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,). figures: for the report. plausible:
+    false if the only material is none that exists."""
 
     correction: F32
     f0: F32
     roughness: F32
     figures: dict[str, float]
+    plausible: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +112,15 @@ def fit(
         rough[group], layered[group] = found.roughness, found.f0 > 0
         figures |= {f"gloss_{name}_f0": float(f0[group].mean()), f"gloss_{name}_roughness": found.roughness}
         figures[f"gloss_{name}_explained"] = found.explained
+        if found.refused:
+            figures[f"gloss_{name}_refused_f0"] = found.refused
     # groups meet without a step
     f0, roughness = near(np.stack([f0, rough], 1)).T
     f0 = np.where(near(layered[:, None])[:, 0] > 0.01, f0, 0.0).clip(0, 1)
     correction = _correction(mesh, normals, at, albedo, seen, w, lit, f0, roughness, edge)
     return Fitted(
         correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
-        {k: round(v, 5) for k, v in figures.items()},
+        {k: round(v, 5) for k, v in figures.items()}, bool(skin.any()) or "gloss_rest_refused_f0" not in figures,
     )  # fmt: skip
 
 
@@ -155,13 +162,14 @@ def _sums(normals: F64, seen: Seen, w: F64, lit: F32, count: int) -> _Sums:
 @dataclass(frozen=True, slots=True)
 class _Group:
     """A group's mean F0 (0: no layer), index of its alpha, roughness, weight of the prior in H's unit, and the share
-    of the view-dependent variance that its layer explains."""
+    of the view-dependent variance that its layer explains. refused: F0 above DIELECTRIC that was found, else 0."""
 
     f0: float
     k: int
     roughness: float
     pull: float
     explained: float
+    refused: float = 0.0
 
 
 def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
@@ -180,6 +188,8 @@ def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
     variance = float(error[k]) / max(3 * float(sums.weight[own].sum()), 1e-30)
     if explained < MIN_EXPLAINED:  # the photos say nothing: skin is as usual, everything else has no layer
         return _Group(SKIN_F0 if is_skin else 0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained)
+    if not is_skin and mean[k] > DIELECTRIC:
+        return _Group(0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained, float(mean[k]))
     rough = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost)
     return _Group(float(mean[k]), k, rough, max(TRUST * variance / F0_SPREAD**2, 1e-12), explained)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def standard_material(
     observations, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
     out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check)
     correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
-    return standard_fit.Fitted(correction, out.f0, out.roughness, out.figures)
+    return replace(out, correction=correction)
 
 
 def field_normals(field: Field, mesh: Mesh) -> F64:

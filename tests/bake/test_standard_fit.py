@@ -65,6 +65,16 @@ def test_where_nothing_shines_objects_have_no_layer_and_skin_is_as_usual() -> No
     np.testing.assert_allclose(fitted(0.0, 0.5, skin=True).f0, fits.SKIN_F0, rtol=1e-2)
 
 
+def test_an_object_of_no_dielectric_is_refused() -> None:
+    """As a flash on the camera makes one: the lobe's material is kept then. Beside skin, the rest only has no layer."""
+    found = fitted(0.4, 0.45, skin=False)
+    assert not found.plausible and found.figures["gloss_rest_refused_f0"] == pytest.approx(0.4, rel=0.15)
+    mesh, at, albedo, seen = scene(0.4, 0.45)
+    half = mesh.vertices[:, 0] > 0
+    mixed = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, half)
+    assert mixed.plausible and (mixed.f0[mesh.vertices[:, 0] < -0.05] == 0).all()
+
+
 def test_without_photos_the_prior_is_all() -> None:
     mesh, at, albedo, seen = scene(0.04, 0.45)
     none = fits.Seen(seen.vertex[:0], seen.wo[:0], seen.colour[:0], seen.predicted[:0])
