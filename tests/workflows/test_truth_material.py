@@ -103,3 +103,21 @@ def test_figures_and_lines() -> None:
     assert figures.specular_share == pytest.approx(figures.true_specular_share)
     text = "\n".join(figures.lines())
     assert "albedo: correlation 1.000" in text and "specular share" in text and "gain 1.250" in text
+
+
+def test_exported_maps_are_read_at_the_nearest_vertex() -> None:
+    """Maps whose value is their own u and v, against the vertices' texture coordinates."""
+    from tests.support.render_stand_ins import asset
+    from workflows.evaluation.demo_maps import at_points
+
+    u, v = np.meshgrid((np.arange(256) + 0.5) / 256, 1 - (np.arange(256) + 0.5) / 256)
+    maps = {"f0": u[..., None].astype(np.float32), "roughness": v[..., None].astype(np.float32)}
+    shown = asset(**maps)
+    mesh = shown.mesh
+    uv = np.zeros((len(mesh.vertices), 2))
+    uv[mesh.faces] = mesh.uvs[mesh.uv_faces]
+    near = mesh.vertices.astype(np.float64) * (1 + 1e-6)
+    f0, roughness = at_points(shown, near)
+    inside = ((uv > 0.01) & (uv < 0.99)).all(1)
+    assert inside.any() and np.allclose(f0[inside], uv[inside, 0], atol=1e-3)
+    assert np.allclose(roughness[inside], uv[inside, 1], atol=1e-3)

@@ -130,6 +130,8 @@ def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], cap
     from pipeline.artifacts import FittedFace
     from pipeline.store import Store
     from pipeline.transforms import matrix
+    from workflows.cli.render import component_in
+    from workflows.evaluation.demo_maps import compare_maps
     from workflows.evaluation.demo_material import compare
 
     store = Store(Path(record["store"]))
@@ -137,7 +139,8 @@ def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], cap
     if fitted is None:
         return []
     place = matrix(record["capture_from_asset"])
-    return compare(fitted.path(fitted.artifact.field), folder, capture, place, out / "truth").lines()
+    lines = compare(fitted.path(fitted.artifact.field), folder, capture, place, out / "truth").lines()
+    return [*lines, *compare_maps(component_in(out), folder, capture, place)]
 
 
 def validate_command(options: argparse.Namespace, console: Console) -> int:

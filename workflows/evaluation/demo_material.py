@@ -48,6 +48,13 @@ class Agreement:
     found_mean: float
     true_mean: float
 
+    def line(self, name: str) -> str:
+        """For people."""
+        return (
+            f"{name}: correlation {self.correlation:.3f}, median error {self.error:.4f}, mean {self.found_mean:.4f} "
+            f"(true {self.true_mean:.4f})"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class MaterialFigures:
@@ -70,12 +77,11 @@ class MaterialFigures:
     def lines(self) -> list[str]:
         """For people."""
         rows = [
-            f"{name}: correlation {a.correlation:.3f}, median error {a.error:.4f}, mean {a.found_mean:.4f} "
-            f"(true {a.true_mean:.4f})"
+            a.line(name)
             for name, a in (
                 ("albedo", self.albedo),
-                ("F0", self.f0),
-                ("roughness", self.roughness),
+                ("F0 of the fitted lobe", self.f0),
+                ("roughness of the fitted lobe", self.roughness),
                 ("diffuse radiance", self.diffuse),
                 ("specular radiance", self.specular),
             )
@@ -96,7 +102,7 @@ def compare(field: Path, capture_folder: Path, capture: Capture, capture_from_as
     found, true = [], []
     held = [v for v in capture.views if v.holdout]
     for number, view in enumerate(held):
-        seen = _seen_points(view, capture_folder)
+        seen = seen_points(view, capture_folder)
         mine = fitted_looks(model, seen.points, seen.to_eye, capture_from_asset)
         really = true_looks(capture_folder, seen.points, seen.normals, seen.to_eye)
         found.append(mine)
@@ -123,7 +129,8 @@ class _Seen:
     size: tuple[int, int]
 
 
-def _seen_points(view: CaptureView, folder: Path) -> _Seen:
+def seen_points(view: CaptureView, folder: Path) -> _Seen:
+    """The true surface points that the pixels of a view show."""
     import trimesh
 
     from pipeline.demo import head
@@ -145,6 +152,11 @@ def _seen_points(view: CaptureView, folder: Path) -> _Seen:
     return _Seen(points[facing], normals[facing], to_eye[facing], inner[ray][facing], size)
 
 
+def seed_of(folder: Path) -> int:
+    """The seed of the demo's skin."""
+    return int(json.loads((folder / "demo.json").read_text())["seed"])
+
+
 def true_looks(folder: Path, points: F64, normals: F64, to_eye: F64) -> Looks:
     """The demo's own material, and both parts of its radiance by its own renderer, without shadows."""
     from scipy.stats import qmc
@@ -153,7 +165,7 @@ def true_looks(folder: Path, points: F64, normals: F64, to_eye: F64) -> Looks:
 
     about = json.loads((folder / "truth" / "light.json").read_text())
     table = brdf.cube_table(lambda w: light.radiance(np.array(about["coefficients"]), w), 96)
-    look = skin.material(points, json.loads((folder / "demo.json").read_text())["seed"])
+    look = skin.material(points, seed_of(folder))
     net = np.asarray(qmc.Sobol(2, scramble=False).random(SAMPLES), np.float64)
     shift = np.random.default_rng(0).random((len(points), 2))
     black = np.zeros_like(look.albedo)
