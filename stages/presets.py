@@ -63,11 +63,12 @@ def configs_for(
     holdout: str | None = None,
     name: str | None = None,
     seed: int | None = None,
+    template: str | None = None,
     registry: Iterable[Stage[Any, Any, Any]] | None = None,
     planned: Settings | None = None,
 ) -> dict[str, StageConfig]:
     """The validated settings of every stage, by the stage's name. planned: settings chosen for a time budget; they
-    override the preset.
+    override the preset. template: folder of another head template, from which the asset is made.
 
     Raises:
         UsageError: unknown preset, stage or setting, or a value outside its limits. The message lists what is allowed.
@@ -77,7 +78,7 @@ def configs_for(
     merged: dict[str, dict[str, Any]] = {n: {} for n in stages}
     of_stage = {s: _last(s, "preset", (PRESETS[preset], planned or {}, config_file or {}, sets)) for s in stages}
     classes = {name: stage.config_for(of_stage[name]) for name, stage in stages.items()}
-    for source in (PRESETS[preset], planned or {}, _shared(stages, holdout, name, seed)):
+    for source in (PRESETS[preset], planned or {}, _shared(stages, holdout, name, seed), _of_template(template)):
         for stage, own in source.items():
             if stage in merged:
                 merged[stage].update(own)
@@ -136,6 +137,13 @@ def _template(merged: dict[str, dict[str, Any]]) -> None:
     uv, template = merged.get("uv", {}), merged.get("template", {})
     if uv.get("mesh") in ("template", "both") and "template" in merged:
         template.setdefault("enabled", True)
+
+
+def _of_template(folder: str | None) -> Settings:
+    """The settings that another head template means."""
+    if folder is None:
+        return {}
+    return {"template": {"folder": str(Path(folder).absolute())}, "uv": {"mesh": "template"}}
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:

@@ -73,19 +73,21 @@ def _kept_basis(width: int) -> F64:
 def environment_figures(light: F32, image: F32) -> dict[str, float]:
     """For the report: how negative the raw light is, and how well the picture (width / 2, width, 3) represents it.
 
-    light_negative_share: of the raw light's energy; light_peak_ratio: picture's over raw maximum;
-    light_irradiance_error: largest difference of E(n) over all n, relative to the mean of E.
+    light_negative_share: of the larger of the raw light's positive and negative energy, in [0, 1];
+    light_peak_ratio: picture's over raw maximum (of the absolute values, if the raw light is nowhere positive);
+    light_irradiance_error: largest difference of E(n) over all n, relative to the mean of |E|.
     """
     raw = _picture(light, SOLVE_WIDTH)
     weights = latlong_weights(SOLVE_WIDTH, SOLVE_WIDTH // 2)[..., None]
-    total = max(float((raw.clip(min=0) * weights).sum()), 1e-30)
+    positive, negative = (float(((sign * raw).clip(min=0) * weights).sum()) for sign in (1, -1))
+    peak = float(raw.max()) if raw.max() > 0 else float(np.abs(raw).max())
     n = torch.from_numpy(latlong_directions(64, 32).reshape(-1, 3).astype(np.float32))
     wanted = sh.irradiance(torch.from_numpy(np.asarray(light, np.float32)), n).numpy()
     found = sh.irradiance(torch.from_numpy(light_from_environment(image)), n).numpy()
     figures = {
-        "light_negative_share": float((-raw.clip(max=0) * weights).sum()) / total,
-        "light_peak_ratio": float(image.max() / max(raw.max(), 1e-30)),
-        "light_irradiance_error": float(np.abs(found - wanted).max() / max(float(wanted.mean()), 1e-30)),
+        "light_negative_share": negative / max(positive, negative, 1e-30),
+        "light_peak_ratio": float(image.max()) / max(peak, 1e-30),
+        "light_irradiance_error": float(np.abs(found - wanted).max()) / max(float(np.abs(wanted).mean()), 1e-30),
     }
     return {k: round(v, 5) for k, v in figures.items()}
 

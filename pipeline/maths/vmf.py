@@ -12,6 +12,7 @@ from torch import Tensor
 from pipeline.maths.precision import full_precision
 
 EXTRA_ORDERS = 8  # error below 4e-8 over all s in float64, 1e-6 in float32
+LARGEST = 1e30  # 1 / kappa is limited to it where it is multiplied by l = 0: 0 x infinity has no value
 MIN_ORDER = 10  # lower orders use this one: starting 8 orders above order 1 would have an error of 1.4e-6
 
 
@@ -22,7 +23,7 @@ def attenuation_exponential(inv_kappa: Tensor, order: int) -> Tensor:
     Error against the exact ratio: at most 0.075 (l = 1, kappa = 1.55), of order kappa^-2 for large kappa.
     """
     l = torch.arange(order + 1, dtype=inv_kappa.dtype, device=inv_kappa.device)  # noqa: E741
-    return torch.exp(-0.5 * l * (l + 1) * inv_kappa[:, None])
+    return torch.exp(-0.5 * l * (l + 1) * inv_kappa.clamp(max=LARGEST)[:, None])
 
 
 @full_precision
@@ -62,7 +63,7 @@ def attenuation_phong(inv_shininess: Tensor, order: int) -> Tensor:
     [Ramamoorthi and Hanrahan 2001, section 3.3]; the paper's comparison [NeuFace section 5.2] uses it.
     """
     l = torch.arange(order + 1, dtype=inv_shininess.dtype, device=inv_shininess.device)  # noqa: E741
-    return torch.exp(-0.5 * l * l * inv_shininess[:, None])
+    return torch.exp(-0.5 * l * l * inv_shininess.clamp(max=LARGEST)[:, None])
 
 
 ATTENUATIONS = {

@@ -32,8 +32,9 @@ def sphere_points(n: int) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=-1)
 
 
-def test_shading_is_the_sum_of_the_two_closed_forms() -> None:
-    model = ball_model()
+@pytest.mark.parametrize("attenuation", ["exponential", "exact"])
+def test_shading_is_the_sum_of_the_two_closed_forms(attenuation: str) -> None:
+    model = ball_model(attenuation=attenuation)
     with torch.no_grad():
         model.light.coefficients.normal_(std=0.1)
         model.light.coefficients[0] = 4.0
@@ -43,9 +44,22 @@ def test_shading_is_the_sum_of_the_two_closed_forms() -> None:
     a, rho, c, s = model.spatial(0.1 * n)
     cb = (c * model.basis(wo, n)).sum(-1)
     diffuse = brdf.diffuse(a, n, model.light())
-    specular = brdf.specular(rho, cb, brdf.light_integral(brdf.reflect(wo, n), s, model.light()))
+    specular = brdf.specular(rho, cb, brdf.light_integral(brdf.reflect(wo, n), s, model.light(), attenuation))
     assert torch.allclose(found.total, diffuse + specular) and torch.allclose(found.specular, specular)
     assert (found.specular > 0).any()
+
+
+def test_shadows_darken_the_diffuse_part_alone() -> None:
+    n = sphere_points(50)
+    wo = torch.nn.functional.normalize(n + 0.5 * sphere_points(50).flip(0), dim=-1)
+    model = ball_model(shadows=True)
+    assert model.shadowing is not None
+    free = model.shade(0.1 * n, n, wo)
+    with torch.no_grad():
+        model.shadowing.ratio[:] = torch.tensor([0.5, 0.25, 0.125])[:, None, None, None]
+    dark = model.shade(0.1 * n, n, wo)
+    assert torch.allclose(dark.diffuse, free.diffuse * torch.tensor([0.5, 0.25, 0.125]), rtol=1e-5)
+    assert torch.equal(dark.specular, free.specular) and torch.allclose(dark.total, dark.diffuse + dark.specular)
 
 
 def test_without_specular_nothing_depends_on_the_view() -> None:
@@ -63,6 +77,9 @@ def test_basis_is_positive_and_sees_what_it_should() -> None:
         b, turned = basis(wo, n), basis(wo @ turn.T, n @ turn.T)
         assert b.min() >= 0 and b.shape == (100, 3)
         assert torch.allclose(b, turned, atol=1e-5) == cosine_only
+        other = n - 2 * wo * (n * wo).sum(-1, keepdim=True)  # another normal at the same cosine (and its mirror image)
+        assert torch.allclose(basis(wo, n), basis(wo, -other), atol=1e-5) == cosine_only
+        assert torch.allclose(basis(n, wo), basis(-other, wo), atol=1e-5) == cosine_only
 
 
 @pytest.mark.parametrize("views", [1, 5])

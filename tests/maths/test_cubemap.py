@@ -139,3 +139,17 @@ def test_alpha_grows_with_the_lobe() -> None:
     a = ggx_width.gauge_alpha(torch.tensor([0.0, 1e-8, 1e-3, 0.05, 1.0, 1e6]))
     assert (a.diff() >= 0).all() and float(a[0]) >= 0.02 and float(a[-1]) <= 1.0
     assert float(ggx_width.gauge_alpha(torch.tensor([1e-3]))[0]) == pytest.approx(0.02 + 0.98 * 0.02236, rel=1e-2)
+
+
+@pytest.mark.parametrize("alpha", [0.1, 0.5, 0.9])
+def test_smiths_masking_is_the_share_of_facets_that_a_view_sees(alpha: float) -> None:
+    """1 / (1 + Lambda) makes the facets' projected areas add up to the view's: the integral over half vectors of
+    D max(v.h, 0) is (1 + Lambda) n.v, by quadrature; and 0.16144 at 60 degrees for alpha = 1/2."""
+    theta, phi = np.meshgrid((np.arange(2000) + 0.5) * np.pi / 4000, (np.arange(400) + 0.5) * 2 * np.pi / 400)
+    d = alpha**2 / (np.pi * (np.cos(theta) ** 2 * (alpha**2 - 1) + 1) ** 2)
+    for angle in (0.0, np.pi / 6, np.pi / 3, 1.4):
+        v = np.sin(angle) * np.sin(theta) * np.cos(phi) + np.cos(angle) * np.cos(theta)
+        area = (d * v.clip(min=0) * np.sin(theta)).sum() * (np.pi / 4000) * (2 * np.pi / 400)
+        found = float(split_sum.smith(torch.tensor([np.cos(angle)]), torch.tensor([alpha]))[0])
+        assert (1 + found) * np.cos(angle) == pytest.approx(area, rel=2e-3)
+    assert float(split_sum.smith(torch.tensor([0.5]), torch.tensor([0.5]))[0]) == pytest.approx(0.16144, abs=1e-5)

@@ -155,6 +155,15 @@ def test_the_clamp_keeps_a_first_step_from_jumping_over_a_thin_head() -> None:
     assert not bool(hit) or float(t) != pytest.approx(0.99, abs=1e-3)
 
 
+@pytest.mark.parametrize("radius", [0.01, 1.0, 50.0])
+def test_the_sphere_is_met_up_to_its_edge_at_any_size(radius: float) -> None:
+    """At 0.99 of the radius beside the axis the chord is 2 sqrt(1 - 0.99^2) radii long, at 1.01 there is none."""
+    o = radius * torch.tensor([[0.99, 0, 3.0], [1.01, 0, 3.0]], dtype=F64)
+    d = torch.tensor([[0.0, 0, -1]], dtype=F64).expand(2, 3)
+    near, far = tracing.sphere_interval(o, d, torch.zeros(3, dtype=F64), radius)
+    assert ((far - near) / radius).tolist() == pytest.approx([2 * math.sqrt(1 - 0.99**2), 0], abs=1e-9)
+
+
 def test_sphere_interval_is_exact_from_far_away() -> None:
     """A camera at 1,000 radii, in float32: |o|^2 - b^2 would have no digits left."""
     o, d = torch.tensor([[0.1, 0, 200.0]]), torch.tensor([[0.0, 0, -1]])

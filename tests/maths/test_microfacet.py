@@ -123,3 +123,11 @@ def test_alpha_is_the_width_that_blurs_light_of_order_10_alike(kappa: float, att
     if kappa >= 10:  # the other width is another relation: its squared error is more than twice as large
         wide = float(ggx_width.gauge_alpha(torch.tensor([1 / kappa]))[0])
         assert np.interp(wide, found, misfit) > 2 * np.interp(float(ggx_width.best_fit_alpha(kappa)), found, misfit)
+
+
+def test_the_gauge_width_by_hand() -> None:
+    """sqrt(1 / (2 kappa)) where the lobe is narrow, and tan^2 of a lobe's spread otherwise: s / (2 + s)."""
+    found = ggx_width.gauge_alpha(torch.tensor([2e-4, 0.25, 2.0, 6.0], dtype=torch.float64))
+    assert found.numpy() == pytest.approx(
+        [0.02 + 0.98 * x for x in (0.0099995, 1 / 3, 0.70710678, 0.8660254)], rel=1e-5
+    )

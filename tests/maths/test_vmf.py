@@ -41,6 +41,11 @@ def test_ends_of_the_range() -> None:
         assert torch.equal(mirror, torch.ones(ORDER + 1))
         rough = function(torch.tensor([1e12]), ORDER)[0]
         assert rough[0] == 1 and rough[1:].max() < 1e-6 and torch.isfinite(rough).all()
+        infinite = torch.tensor([float("inf")], requires_grad=True)
+        even = function(infinite, ORDER)[0]
+        assert even.tolist() == [1.0] + [0.0] * ORDER
+        (slope,) = torch.autograd.grad(even.sum(), infinite)
+        assert float(slope) == 0
 
 
 @pytest.mark.parametrize("kind", ["exponential", "exact"])
@@ -56,6 +61,13 @@ def test_derivative(kind: str) -> None:
     edge = torch.tensor([0.0, 1e-30, 1e30], requires_grad=True)
     (g,) = torch.autograd.grad(vmf.ATTENUATIONS[kind](edge, ORDER).sum(), edge)
     assert torch.isfinite(g).all()
+
+
+def test_the_published_form_of_phongs_attenuation() -> None:
+    """log A_l = -l^2 / 2 p, by numbers: p = 1/2 gives e^-1, e^-4, e^-9, p = 2 their fourth roots."""
+    for p in (0.5, 2.0):
+        found = vmf.attenuation_phong(torch.tensor([1 / p], dtype=torch.float64), 3)[0].numpy()
+        assert found == pytest.approx(np.array([1.0, 0.36787944, 0.01831564, 0.00012341]) ** (0.5 / p), rel=1e-4)
 
 
 def test_error_of_the_papers_form_is_as_stated() -> None:

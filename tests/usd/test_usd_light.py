@@ -13,6 +13,7 @@ from support.synthetic_asset import smooth_light
 from pipeline.errors import StageError
 from pipeline.lighting.dome import (
     environment,
+    environment_figures,
     light_from_environment,
     light_json,
     read_light,
@@ -119,3 +120,24 @@ def test_the_dome_is_positive_and_lights_surfaces_as_the_raw_light_does() -> Non
     scaled = np.einsum("nhw,hwc,h->nc", cosine, cut, weights[:, 0])
     assert np.abs(scaled - wanted).max() > 5 * np.abs(found - wanted).max()  # what cutting alone would do
     assert image.max() < 1.3 * raw.max()
+
+
+def test_the_figures_of_a_light_by_hand() -> None:
+    """L = 1 + 1.2 z: the energies above and below 0 are as 2.2^2 to 0.2^2, the peak is 2.2, and E(n) > 0 everywhere."""
+    z = latlong_directions(256, 128)[..., 1:2]
+    light = light_from_environment(np.repeat(1 + 1.2 * z, 3, -1).astype(np.float32))
+    image = environment(light, 128)
+    figures = environment_figures(light, image)
+    assert figures["light_negative_share"] == pytest.approx((0.2 / 2.2) ** 2, rel=0.02)
+    assert figures["light_peak_ratio"] == pytest.approx(image.max() / 2.2, rel=0.01)
+    assert figures["light_irradiance_error"] < 0.02
+
+
+@pytest.mark.parametrize(("level", "share"), [(-1.0, 1.0), (-1e-6, 1.0), (0.0, 0.0), (1.0, 0.0)])
+def test_the_figures_stay_figures_at_the_extremes(level: float, share: float) -> None:
+    """A light that is nowhere positive, or dark: a broken fit must not fill the report with powers of ten."""
+    light = light_from_environment(np.full((16, 32, 3), level, np.float32))
+    figures = environment_figures(light, environment(light, 64))
+    assert figures["light_negative_share"] == pytest.approx(share, abs=1e-4)
+    assert figures["light_peak_ratio"] == pytest.approx(1.0 if level > 0 else 0.0, abs=0.02)
+    assert figures["light_irradiance_error"] == pytest.approx(share, abs=0.02)

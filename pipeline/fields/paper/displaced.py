@@ -14,7 +14,9 @@ from pipeline.fields.paper.sinusoidal import positional_encoding
 from pipeline.maths.tracing import aggressive_trace
 
 OCTAVES = 6  # L of [NeuFace section B]
-THRESHOLD, TRUNCATION, FACTOR = 5e-5, 0.05, 1.2  # metres, metres: [NeuFace section 4.4, B]
+HEAD = 0.15  # metres: radius of Omega around a head, for which the paper gives its lengths
+THRESHOLD, TRUNCATION = 5e-5 / HEAD, 0.05 / HEAD  # of Omega's radius [NeuFace section B]
+FACTOR = 1.2  # [NeuFace section 4.4]
 CELLS = 160  # nominal number of cells across Omega
 
 
@@ -42,7 +44,9 @@ class Displacement(nn.Module):
 class DisplacedSdf(nn.Module):
     """A prior, its displacement, and the learnt width beta of the Laplace density.
 
-    Lengths are in units of Omega's radius, so that learning rates do not depend on the size of the subject.
+    Lengths are in units of Omega's radius: neither learning rates nor tracing depend on the size of the subject.
+
+    Differs: the paper's lengths are metres of a head. Here they are the same shares of Omega for every subject.
     """
 
     BETA_START, BETA_MIN = 0.01, 1e-4
@@ -100,4 +104,7 @@ class DisplacedSdf(nn.Module):
             return known + moved
 
         with torch.no_grad():
-            return aggressive_trace(sdf, o, d, near, far, threshold=THRESHOLD, truncation=TRUNCATION, factor=FACTOR)
+            unit = self.known.sphere()[1]
+            return aggressive_trace(
+                sdf, o, d, near, far, threshold=THRESHOLD * unit, truncation=TRUNCATION * unit, factor=FACTOR
+            )

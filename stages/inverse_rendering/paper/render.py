@@ -1,7 +1,7 @@
 """The paper's rendering: every sample is shaded, then summed. [NeuFace section 4.4]
 
 Symbols: Omega the prior's sphere; t_0 the surface by aggressive sphere tracing; hit rays have S samples in t_0 +-
-SHELL, other rays S sparse samples across Omega; w_i weights of [NeuFace eq. 18].
+SHELL of Omega's radius, other rays S sparse samples across Omega; w_i weights of [NeuFace eq. 18].
 
 Differs: the last sample of a hit ray represents the solid behind it, up to where the ray leaves Omega, as in VolSDF:
 with a shell of 1 mm and beta near 1 mm the samples alone would be half transparent. Other rays end at Omega: an
@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from pipeline.fields.face import FaceModel
-from pipeline.fields.paper.displaced import DisplacedSdf
+from pipeline.fields.paper.displaced import HEAD, DisplacedSdf
 from pipeline.maths.density import laplace_density, ray_weights
 from pipeline.maths.sdf import unit
 from pipeline.maths.tracing import sphere_interval
 from stages.inverse_rendering.ray_sampling import Rays
 
-SHELL = 5e-4  # metres: samples lie in t_0 +- 0.5 mm
+SHELL = 5e-4 / HEAD  # of Omega's radius: samples lie in t_0 +- 0.5 mm of a head
 NEGLIGIBLE = 1e-6  # samples with a smaller weight are not shaded: eight-bit colours have steps of 4e-3
 
 
@@ -54,14 +54,15 @@ def render_samples(model: FaceModel, rays: Rays, samples: int, jitter: Tensor | 
     t0, hit, _ = geometry.trace(rays.o, rays.d, near, far)
     kept = torch.nonzero(far > near).squeeze(-1)
     o, d, t0, hit, near, far = (x[kept] for x in (rays.o, rays.d, t0, hit, near, far))
-    first = torch.where(hit, t0 - SHELL, near)
-    step = torch.where(hit, torch.full_like(t0, 2 * SHELL), far - near) / samples
+    shell = SHELL * radius
+    first = torch.where(hit, t0 - shell, near)
+    step = torch.where(hit, torch.full_like(t0, 2 * shell), far - near) / samples
     u = torch.arange(samples, device=o.device) + (0.5 if jitter is None else jitter[kept])
     x = o[:, None] + (first[:, None] + step[:, None] * u)[..., None] * d[:, None]
     flat = x.reshape(-1, 3)
     s, g, moved = geometry.with_displacement(flat)
     delta = step[:, None].repeat(1, samples)
-    delta[:, -1] += torch.where(hit, (far - t0 - SHELL).clamp(min=0), torch.zeros_like(far))
+    delta[:, -1] += torch.where(hit, (far - t0 - shell).clamp(min=0), torch.zeros_like(far))
     w, tau = ray_weights(laplace_density(s.reshape(delta.shape), geometry.beta()), delta)
     colour, specular = _shaded(model, flat, unit(g), -d.repeat_interleave(samples, 0), w.reshape(-1), samples)
     n = len(rays.d)

@@ -1,7 +1,8 @@
 """The paper's fit: its networks, sampling, losses and schedule. [NeuFace section B]
 
 Differs: sums over pixels are means over the batch, so that the weights do not depend on its size. Partly covered pixels
-are left out, and the background is black: the masks replace the paper's ground-truth model.
+are left out, and the background is black: the masks replace the paper's ground-truth model. The displacement's term
+[NeuFace eq. 24] has D in units of Omega's radius, so that its weight does not depend on the size of the subject.
 """
 
 from __future__ import annotations

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pipeline.fields.paper import displaced
 from pipeline.fields.paper.displaced import DisplacedSdf
 from pipeline.fields.paper.priors import HullPrior, SpherePrior
+from pipeline.maths.tracing import sphere_interval
 
 
 def hull(scale: float = 1.0) -> HullPrior:
@@ -53,6 +55,45 @@ def test_lengths_follow_the_scene(scale: float) -> None:
     assert other.cell / one.cell == pytest.approx(scale, rel=1e-4)
     s, g = other(x * scale)
     assert bool(torch.isfinite(s).all()) and bool(torch.isfinite(g).all())
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 50.0, 1000.0])
+def test_rays_meet_a_subject_of_any_size(scale: float) -> None:
+    """Tracing with the module's own lengths against bisection in float64, with D != 0: within 1e-4 of Omega's radius,
+    the same rays at each size, and a subject that lies I + D and not I - D away."""
+    g = moved(hull(scale))
+    with torch.no_grad():
+        g.displacement.net[-1].bias.fill_(-0.03)  # type: ignore[operator,union-attr]
+    centre, radius = g.known.sphere()
+    n = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    o = centre + 0.99 * radius * n
+    d = torch.nn.functional.normalize(0.3 * radius * n.roll(1, 0) - 0.99 * radius * n, dim=-1)
+    near, far = sphere_interval(o, d, centre, radius)
+    t, hit, s = g.trace(o, d, near, far)
+    low, high = torch.zeros(40, dtype=torch.float64), (centre + 0.3 * radius * n.roll(1, 0) - o).norm(dim=-1).double()
+
+    def at(t: torch.Tensor) -> torch.Tensor:
+        known, away = g.parts(o + t.float()[:, None] * d)
+        return (known + away).detach()
+
+    assert (at(low) > 0).all() and (at(high) < 0).all()
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        outside = at(middle) > 0
+        low, high = torch.where(outside, middle, low), torch.where(outside, high, middle)
+    assert hit.float().mean() > 0.9
+    assert ((t - high)[hit].abs() / radius).max() < 1e-3 and (s[hit].abs() / radius).max() < 5e-5 / 0.15
+    with torch.no_grad():
+        assert (g.parts(o[hit] + t[hit, None] * d[hit])[1].abs() / radius).mean() > 0.01, "D says nothing here"
+
+
+def test_the_steps_of_a_trace_are_the_papers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around a head, whose Omega has 15 cm: until 0.05 mm, at most 5 cm times 1.2 a step."""
+    seen: dict[str, float] = {}
+    monkeypatch.setattr(displaced, "aggressive_trace", lambda *a, **k: seen.update(k))
+    g = DisplacedSdf(SpherePrior(torch.zeros(3), 0.15, 8, 1), 8, 1)
+    g.trace(*(torch.zeros(1, 3),) * 2, *(torch.zeros(1),) * 2)
+    assert seen == pytest.approx({"threshold": 5e-5, "truncation": 0.05, "factor": 1.2})
 
 
 def test_beta_stays_positive() -> None:

@@ -107,6 +107,7 @@ def test_what_is_rendered_is_eq_18_by_hand() -> None:
         got = render_samples(t.model, rays, 8, None)
     assert got.kept.tolist() == [0, 1, 2]
     centre, radius = geometry.known.sphere()
+    shell = 5e-4 * radius / 0.15  # half a millimetre of a head whose sphere has 15 cm
     for i in range(3):
         to = o[i] - centre
         half = float((radius**2 - to[:2].square().sum()).sqrt())
@@ -116,13 +117,13 @@ def test_what_is_rendered_is_eq_18_by_hand() -> None:
             depth = torch.linspace(near, far, 20_001)
             s = torch.cat([geometry(o[i] + d[:, None] * rays.d[i])[0] for d in depth.split(5_000)])
             t0 = float(depth[(s < 0).nonzero()[0, 0]])
-            first, step = t0 - 5e-4, 1e-3 / 8
+            first, step = t0 - shell, 2 * shell / 8
         else:
             first, step = near, (far - near) / 8
         at = first + step * (torch.arange(8) + 0.5)
         s, g = geometry(o[i] + at[:, None] * rays.d[i])
         delta = torch.full((1, 8), step)
-        delta[0, -1] += (far - t0 - 5e-4) if hit else 0.0
+        delta[0, -1] += (far - t0 - shell) if hit else 0.0
         w, tau = ray_weights(laplace_density(s[None], geometry.beta()), delta)
         n = torch.nn.functional.normalize(g, dim=-1)
         colour = t.model.shade(o[i] + at[:, None] * rays.d[i], n, -rays.d[i].expand(8, 3)).total
