@@ -3,7 +3,8 @@
 A subject pixel counts if the first surface on its ray is inside the extent, also at a short distance behind it. The
 surface is the visual hull of all masks; its points are drawn with a z-buffer, about one point per pixel. Where the
 subject is beside the hull (hair, a mask that others contradict), the hull's nearest point decides. Far from any point
-it is decided by whether the ray meets the centre of the head, so that a head that the hull lacks is still scored.
+it is decided by whether the ray meets the centre of the head, so that a head that the hull lacks is still scored. In a
+photo with a detected face that decides before the hull does: photos from below a chin leave pieces of hull before it.
 """
 
 from __future__ import annotations
@@ -71,11 +72,12 @@ def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Exten
     return float(beyond.sum() / max(int((~beyond).sum()), 1))
 
 
-def asked(camera: Camera, alpha: F32, extent: Extent, points: F64) -> F32 | None:
+def asked(camera: Camera, alpha: F32, extent: Extent, points: F64, face_seen: bool = False) -> F32 | None:
     """(H, W) in [0, 1], at the size of alpha (H, W): 1 for pixels that count. None if all do.
 
-    points: (N, 3) on the surface of the hull."""
-    depth = _inside(camera, extent, points)
+    points: (N, 3) on the surface of the hull. face_seen: a face was detected in the photo, so nothing hides the
+    head."""
+    depth = _inside(camera, extent, points, face_seen)
     h, w = alpha.shape
     fine = np.asarray(cv2.resize(depth, (w, h), interpolation=cv2.INTER_LINEAR), np.float32)
     subject = alpha > MIN_ALPHA
@@ -83,7 +85,7 @@ def asked(camera: Camera, alpha: F32, extent: Extent, points: F64) -> F32 | None
     return out if (out < 0.5).sum() > NOTHING * max(int((alpha >= 0.5).sum()), 1) else None
 
 
-def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
+def _inside(camera: Camera, extent: Extent, points: F64, face_seen: bool) -> F32:
     """(h, w) a small picture: distance of the first surface inside the extent, in pixels of the photo."""
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
     uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, points)
@@ -104,7 +106,7 @@ def _inside(camera: Camera, extent: Extent, points: F64) -> F32:
     meets = _meets(camera, w, h, middle, radius)
     high = np.zeros((h, w), bool)
     high[at[order, 1], at[order, 0]] = _above(extent, points[order])
-    value[meets & high] = extent.head  # the head itself: its hull may have a gap
+    value[meets & (high | face_seen)] = extent.head  # the head itself: its hull may have a gap
     whole = _filled(value, meets, NEAR * extent.head * factor / unit)
     return np.asarray(cv2.medianBlur(whole, 3) / np.float32(unit), np.float32)  # removes specks of missing points
 

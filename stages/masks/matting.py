@@ -2,7 +2,9 @@
 
     c = alpha F + (1 - alpha) B        linear light, F and B the mean colours just inside and just outside
 
-is solved for alpha by least squares. Where F and B hardly differ, the blurred hard edge is used.
+is solved for alpha by least squares. Where F and B hardly differ, or no mixture of them is the pixel's colour, the
+blurred hard edge is used. Loose hair makes the edge wider than that: between a contour that leaves it out and one that
+takes it in, B is the background continued from outside, and F the mean colour of the subject nearby.
 """
 
 from __future__ import annotations
@@ -10,11 +12,16 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.masks.region import F32, LINEAR, U8, Bool, eroded
+from stages.masks.refine_contour import continued
+from stages.masks.region import F32, LINEAR, U8, Bool, dilated, eroded
 
 CONTRAST = 0.03  # difference of F and B, linear, at which colour and blurred edge have equal weight
 NOISE = 8.0  # weight of the colours' variance relative to their difference
+NEITHER = 16.0  # weight of what no mixture of both explains: a highlight at the edge
 SNAP = 0.04  # alphas this close to 0 or 1 are noise
+MARGIN = 2  # pixels beyond both contours that are matted with what is between them
+NEARBY = 9  # pixels: half-edge of the window of F; twice that where it holds nothing of the subject
+BEHIND = 8.5  # pixels: width of the window that continues the background
 
 
 def soft_edge(image: U8, inside: Bool, radius: int) -> F32:
@@ -32,18 +39,39 @@ def soft_edge(image: U8, inside: Bool, radius: int) -> F32:
     return alpha
 
 
+def between(image: U8, narrow: Bool, wide: Bool) -> F32:
+    """Alpha (H, W) where only one of two hard masks (H, W) has the subject, and MARGIN pixels beyond; elsewhere 0 or 1.
+    image: (H, W, 3) 8-bit sRGB. Where colours don't tell, `wide` is right."""
+    core, outside = eroded(narrow & wide, MARGIN), ~dilated(wide, MARGIN)
+    if (core | outside).all() or not core.any() or not outside.any():
+        return wide.astype(np.float32)
+    colour = LINEAR[image]
+    close, far = _near(colour, core, NEARBY), _near(colour, core, 2 * NEARBY)
+    foreground = np.where(close[2][..., None], close[0], far[0]), np.where(close[2], close[1], far[1]), far[2]
+    mean, variance, known = continued(colour, outside, BEHIND)
+    alpha = _blend(colour, foreground, (mean, variance[..., 0], known), wide)
+    return np.asarray(np.where(core, 1, np.where(outside, 0, alpha)), np.float32)
+
+
 def _solve(colour: F32, inside: Bool, inner: Bool, outer: Bool, radius: int) -> F32:
-    foreground, noise_f, has_f = _near(colour, inner, 2 * radius + 1)
-    background, noise_b, has_b = _near(colour, outer, 2 * radius + 1)
-    difference = foreground - background
-    square = _dot(difference, difference)
-    by_colour = _dot(colour - background, difference) / np.maximum(square, 1e-6)
-    doubt = CONTRAST**2 + NOISE * (noise_f + noise_b)
-    trust = np.where(has_f & has_b, square / (square + doubt), 0.0)
-    blurred = np.asarray(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.7), np.float32)
-    alpha = trust * by_colour.clip(0, 1) + (1 - trust) * blurred
+    foreground = _near(colour, inner, 2 * radius + 1)
+    alpha = _blend(colour, foreground, _near(colour, outer, 2 * radius + 1), inside)
     alpha = np.where(alpha < SNAP, 0, np.where(alpha > 1 - SNAP, 1, alpha))
     return np.asarray(np.where(inner, 1, np.where(outer, 0, alpha)), np.float32)
+
+
+def _blend(colour: F32, f: tuple[F32, F32, Bool], b: tuple[F32, F32, Bool], inside: Bool) -> F32:
+    """Alpha (H, W) from the colours of subject `f` and background `b`, their variances and where they are known; where
+    these don't tell, that of the blurred hard mask `inside` (H, W)."""
+    (foreground, noise_f, has_f), (background, noise_b, has_b) = f, b
+    difference = foreground - background
+    square = _dot(difference, difference)
+    by_colour = (_dot(colour - background, difference) / np.maximum(square, 1e-6)).clip(0, 1)
+    rest = colour - background - by_colour[..., None] * difference
+    doubt = CONTRAST**2 + NOISE * (noise_f + noise_b) + NEITHER * _dot(rest, rest)
+    trust = np.where(has_f & has_b, square / (square + doubt), 0.0)
+    blurred = np.asarray(cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 0.7), np.float32)
+    return np.asarray(trust * by_colour + (1 - trust) * blurred, np.float32)
 
 
 def _dot(a: F32, b: F32) -> F32:

@@ -30,9 +30,8 @@ from stages.masks.grabcut import cut
 from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
-from stages.masks.refine_contour import refined_contour
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
-from stages.masks.segment_person import of_subject
+from stages.masks.segment_person import of_subject, settled
 from stages.masks.sources import PhotoToMask, Plan, inverted, mask, plan, to_full_size
 from stages.masks.support_object import SupportedObject, distinct, find_supported_object
 from stages.masks.user_model import UserModel, hair_model, user_model
@@ -120,7 +119,8 @@ def segment(
     votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
     extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
     face = None if found_face is None else found_face.face.xyz
-    parts = _asked(masked, votes, extent, face, poses.roi_radius, context)
+    showing = {m.view.index for m, x in zip(masked, faces, strict=True) if x.face is not None}
+    parts = _asked(masked, votes, extent, face, showing, poses.roi_radius, context)
     masks = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, faces, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in masks))  # fmt: skip
@@ -150,11 +150,12 @@ def _asked(
     votes: list[Masked],
     extent: Extent | None,
     face: F64 | None,
+    showing: set[int],
     roi_radius: float,
     context: Context,
 ) -> dict[int, Path]:
     """Files of the pixels that count, by view index; only for views in which not all pixels count. face (468, 3):
-    landmarks."""
+    landmarks. showing: indices of the views with a detected face."""
     if extent is None:
         return {}
     cameras = [m.camera for m in votes]
@@ -164,7 +165,8 @@ def _asked(
     points = outline_points(hull, extent)
 
     def one(m: Masked) -> tuple[int, Path | None]:
-        part = asked(m.camera, read_alpha(_path(m.view.index, context)), extent, points)
+        part = asked(m.camera, read_alpha(_path(m.view.index, context)), extent, points,
+                     m.view.index in showing)  # fmt: skip
         path = context.workdir / "asked" / f"{m.view.index}.png"
         if part is not None:
             write_png(path, part)
@@ -292,7 +294,7 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     small = np.asarray(resized(image, w, h), np.uint8)
     new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), config.seed)
     if made.source in LEARNED:
-        new = refined_contour(small, new)
+        new = settled(small, new)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
     before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:

@@ -45,6 +45,20 @@ def pixels(c: Camera, at: tuple[float, float, float]) -> tuple[int, int]:
     return int(uv[0, 1]), int(uv[0, 0])
 
 
+def test_a_piece_of_hull_before_a_detected_face_hides_nothing() -> None:
+    c = camera(0, 0, -30, 1.6)
+    alpha = np.zeros((c.height, c.width), np.float32)
+    alpha[:, 100:540] = 1
+    toward = matrix(c.world_from_cam)[:3, 3] / np.linalg.norm(matrix(c.world_from_cam)[:3, 3])
+    piece = shell(tuple(0.3 * toward), (0.06, 0.06, 0.06))
+    row, column = pixels(c, (0.0, 0.0, 0.07))
+    for face_seen in (False, True):
+        found = asked(c, alpha, EXTENT, np.concatenate([HEAD, CHEST, piece]), face_seen)
+        assert found is not None and found[row, column] == face_seen
+        low = pixels(c, (0.0, -0.38, 0.07))
+        assert found[low] == 0
+
+
 @pytest.mark.parametrize("azimuth", [0, 60, 180])
 def test_the_chest_is_not_asked(azimuth: float) -> None:
     c = camera(0, azimuth, 10, 1.6)

@@ -7,13 +7,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from stages.masks.matting import soft_edge
+from pipeline.colour import linear_from_srgb, srgb_from_linear
+from stages.masks.matting import between, soft_edge
 from stages.masks.refine_contour import LOUD, REACH, continued, refined_contour
+from stages.masks.segment_person import settled
 
 F32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
 Bool = npt.NDArray[np.bool_]
 SIZE = 640
+HAIR = (40.0, 34.0, 30.0)
 SKIN, SHINE = (150.0, 110.0, 90.0), (205.0, 208.0, 214.0)
 REACHES = round(REACH * SIZE)
 
@@ -139,3 +142,31 @@ def test_an_affine_background_goes_on_behind_the_subject() -> None:
 def test_two_runs_are_the_same() -> None:
     picture, _ = scene(ramp())
     assert (refined_contour(picture, bitten()) == refined_contour(picture, bitten())).all()
+
+
+# ------------------------------------------------------------------ what both contours disagree about
+def test_loose_hair_is_divided_by_its_share_of_the_pixel() -> None:
+    """A dark disc whose cover falls from 1 to 0 over 12 pixels, before a wall."""
+    y, x = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
+    cover = ((192 - np.hypot(x, y)) / 12).clip(0, 1)[..., None]
+    light = cover * linear_from_srgb(np.array(HAIR) / 255) + (1 - cover) * linear_from_srgb(ramp(235, 225) / 255)
+    picture = np.asarray((255 * srgb_from_linear(light)).round(), np.uint8)
+    alpha = between(picture, disc(178), disc(196))
+    band = (cover[..., 0] > 0) & (cover[..., 0] < 1)
+    np.testing.assert_allclose(alpha[band], cover[..., 0][band], atol=0.06)
+    assert (alpha[disc(170)] == 1).all() and (alpha[~disc(200)] == 0).all()
+    assert off(settled(picture, disc(178)), cover[..., 0] >= 0.5) < 1.0
+
+
+@pytest.mark.parametrize("wall", [(245.0, 130.0), (200.0, 130.0), (120.0, 60.0)])
+def test_a_highlight_is_no_mixture_and_stays(wall: tuple[float, float]) -> None:
+    picture, truth = scene(ramp(*wall))
+    assert off(settled(picture, bitten()), truth) < 0.6
+
+
+def test_without_contrast_or_colours_of_both_sides_the_wider_contour_holds() -> None:
+    grey = np.full((SIZE, SIZE, 3), 128, np.uint8)
+    assert ((between(grey, disc(170), disc(180)) >= 0.5) == disc(180)).all()
+    everything, nothing = np.ones((SIZE, SIZE), bool), np.zeros((SIZE, SIZE), bool)
+    for narrow, wide in ((everything, everything), (nothing, nothing), (nothing, disc(180)), (disc(180), everything)):
+        assert (between(grey, narrow, wide) == wide).all()

@@ -14,6 +14,7 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.colour import srgb_from_linear
 from pipeline.transforms import rigid, rows
+from stages.masks import segment_person
 from stages.masks.grabcut import cut, cut_by_region
 from stages.masks.keying import Background, border_colours, find_background, key_out
 from stages.masks.matting import largest_parts, soft_edge
@@ -205,6 +206,23 @@ def test_person_in_a_corner_of_a_large_photo() -> None:
     assert scale < 2.5
     assert iou(found, expected) > 0.93
     assert cv2.phaseCorrelate(found.astype(np.float64), expected.astype(np.float64))[0] == pytest.approx((0, 0), abs=1)
+
+
+def test_the_looks_at_a_photo_fit_onto_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a network that returns the brightness, the mean of all looks is the brightness; one that errs on its left
+    side is right on the mean where one look in two is."""
+    y, x = np.mgrid[:240, :320]
+    grey = np.exp(-((x - 200) ** 2 + (y - 100) ** 2) / 1800)
+    image = np.repeat((255 * grey).astype(np.uint8)[..., None], 3, 2)
+    monkeypatch.setattr(segment_person, "probability", lambda square: square[..., 0].astype(np.float32) / 255)
+    for disc in (Disc(160, 120, 200, 0.0), Disc(200, 100, 60, 0.3)):
+        found = person_probability(image, disc)[0]
+        inner = np.s_[60:140, 160:240]
+        np.testing.assert_allclose(found[inner], grey[inner], atol=0.03)
+    left = np.where(np.arange(256) < 128, 1, 0).astype(np.float32) * np.ones((256, 1), np.float32)
+    monkeypatch.setattr(segment_person, "probability", lambda square: left)
+    found = person_probability(image, Disc(160, 120, 200, 0.0))[0]
+    assert found[120, 40] == found[120, 280] == pytest.approx(0.5, abs=0.01)
 
 
 def test_of_subject_drops_strays_and_fills_small_holes() -> None:
