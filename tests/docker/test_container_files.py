@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import yaml
 
-from workflows.server.access import CLIENT_LOGIN, CSRF, ORIGINS, ROOTS, SERVER_LOGIN
-from workflows.server.environment import SLOTS_ON_DISK
+from workflows.cli.main import parser
+from workflows.server.access import CLIENT_LOGIN, ROOTS, SERVER_LOGIN
 
 CLOSED = {"type": "object", "properties": {}, "additionalProperties": False}  # no variable, and none can be added
 
@@ -152,19 +152,25 @@ def test_a_server_that_is_documented_asks_for_a_login_and_answers_no_other_origi
     server = compose["services"]["server"]["environment"]
     for name in ("deploy", "worker", "batch-worker"):
         assert compose["services"][name]["environment"][CLIENT_LOGIN] == "${PREFECT_LOGIN:?}", name
-    assert server[SERVER_LOGIN].startswith("${PREFECT_LOGIN:?") and server[CSRF] == "true"
-    assert set(server[ORIGINS].split(",")) == {"http://127.0.0.1:4200", "http://localhost:4200"}
+    assert server[SERVER_LOGIN].startswith("${PREFECT_LOGIN:?")
+    options = parser().parse_args(compose["services"]["server"]["command"][1:])
+    assert options.server_only and options.allow_host == ["127.0.0.1", "server"]
+    assert compose["services"]["server"]["ports"] == ["127.0.0.1:4200:4200"]
     for name in ("worker", "batch-worker"):
         assert compose["services"][name]["environment"][ROOTS] == "/photos:/runs"
     text = (repo / "docs/operations.md").read_text()
-    before = text.partition("prefect server start")[0]
-    assert all(x in before for x in (SERVER_LOGIN, ORIGINS, CSRF)) and ROOTS in text and CLIENT_LOGIN in text
+    guide = text.partition("### Who may start what")[0]
+    assert "neuface serve --server-only" in guide and "prefect server start" not in guide
+    assert ROOTS in guide and CLIENT_LOGIN in guide
 
 
 def test_a_restart_forgets_no_slot(compose: dict[str, Any]) -> None:
     server = compose["services"]["server"]
-    name, value = SLOTS_ON_DISK
-    assert server["environment"][name] == value
+    assert server["command"][:3] == [
+        "neuface",
+        "serve",
+        "--server-only",
+    ]  # tests/workflows/test_guard.py: slots on disk
     home = server["environment"]["PREFECT_HOME"]
     assert home in [v.split(":")[1] for v in server["volumes"]] and not home.startswith("/tmp")
 

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from workflows.supply.lock import LOCKS, ROOT, differences, installed, locked
+
 # import name -> distribution, and what it is for
 NEEDED = {
     "numpy": ("numpy", "arrays"),
@@ -35,6 +37,7 @@ NEEDED = {
 }
 OPTIONAL = {"flip_evaluator": ("flip-evaluator", "the FLIP metric in the report")}
 SERVER_BREAKS = (0, 158)  # fastapi from here on: Prefect 3.8's server does not start
+SHOWN = 8  # differences from the lock that are named
 MEMORY_GB, DISK_GB = 6.0, 5.0  # a draft of 54 photos peaks at 2.9 GB; its store and the set-up's caches
 
 
@@ -54,7 +57,7 @@ class Finding:
 
 def examine(folder: Path) -> list[Finding]:
     """Everything that `neuface doctor` looks at; `folder` is where results would go."""
-    return [_python(), *_packages(), *_hardware(folder), _threads()]
+    return [_python(), *_packages(), _lock(), *_hardware(folder), _threads()]
 
 
 def _python() -> Finding:
@@ -74,19 +77,31 @@ def _packages() -> Iterator[Finding]:
                 importlib.import_module(module)
                 version = importlib.metadata.version(distribution)
             except (ImportError, OSError) as e:  # OSError: a shared library that does not load
-                yield Finding(
-                    level, distribution, f"can't be used ({e})", f"for {purpose}: pip install -r requirements.lock"
-                )
+                yield Finding(level, distribution, f"can't be used ({e})", f"for {purpose}: make setup")
                 continue
             if module == "fastapi" and tuple(int(p) for p in version.split(".")[:2]) >= SERVER_BREAKS:
                 yield Finding(
                     "fault",
                     distribution,
                     version,
-                    "Prefect's server does not start with it: pip install -r requirements.lock",
+                    "Prefect's server does not start with it: make setup",
                 )
                 continue
             yield Finding("ok", distribution, version)
+
+
+def _lock(root: Path = ROOT) -> Finding:
+    """What of the installation differs from the lock files: other versions were not tested together."""
+    if not all((root / name).is_file() for name in LOCKS):
+        return Finding("note", "lock", "not beside the program: installed from a package or an image")
+    pins = locked(root)
+    odd = differences(pins, installed())
+    if not odd:
+        return Finding("ok", "lock", f"all {len(pins)} packages as in {' and '.join(LOCKS)}")
+    told = ", ".join(odd[:SHOWN]) + (f" and {len(odd) - SHOWN} more" if len(odd) > SHOWN else "")
+    return Finding(
+        "note", "lock", f"{len(odd)} of {len(pins)} packages differ: {told}", "make setup installs the lock's"
+    )
 
 
 def _hardware(folder: Path) -> Iterator[Finding]:
@@ -115,7 +130,7 @@ def _device() -> Finding:
     try:
         import torch
     except (ImportError, OSError):
-        return Finding("fault", "device", "torch can't be loaded", "pip install -r requirements.lock")
+        return Finding("fault", "device", "torch can't be loaded", "make setup")
     if torch.cuda.is_available():
         return Finding("ok", "device", f"cuda, {torch.cuda.get_device_name(0)}")
     return Finding("note", "device", "cpu", "where there is a CUDA device, the fit runs on it")
