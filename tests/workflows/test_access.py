@@ -102,7 +102,7 @@ def test_serve_allows_the_named_folders_or_this_one(tmp_path: Path, monkeypatch:
 def from_server(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """As in a process that a worker started; the parents that the flow tied itself to."""
     parents: list[int] = []
-    monkeypatch.setattr(FlowRunContext, "get", classmethod(lambda cls: SimpleNamespace()))
+    monkeypatch.setattr(FlowRunContext, "get", classmethod(lambda cls: SimpleNamespace(flow_run=None)))
     monkeypatch.setattr(flows, "end_with", parents.append)
     return parents
 

@@ -7,10 +7,10 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import Cancelled
+from pipeline.errors import Cancelled, UsageError
 from workflows.batch.request import BatchRequest
 from workflows.cli.console import Console
-from workflows.cli.options import add_request_options, request_from
+from workflows.cli.options import a_time, add_request_options, request_from
 from workflows.run.verdict import REFUSED
 from workflows.server import environment
 
@@ -37,6 +37,21 @@ def add_commands(commands_of: Any) -> None:
         default=[],
         metavar="DIR",
         help="folder that runs may read and write; repeatable ($NEUFACE_ROOTS, else the current folder)",
+    )
+    serve.add_argument("--server-only", action="store_true", help="the server alone, for the workers of a pool")
+    serve.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="further host name or address by which the server may be called; repeatable, the first is its page's",
+    )
+    serve.add_argument(
+        "--lost-after",
+        type=a_time,
+        default=60.0,
+        metavar="TIME",
+        help="time without a sign of life after which a run is marked as crashed (60s; at least 30s)",
     )
     serve.set_defaults(run=serve_command)
 
@@ -75,7 +90,19 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
 
 def serve_command(options: argparse.Namespace, console: Console) -> int:
     """neuface serve"""
-    from workflows.server.deployments import serve
+    from workflows.server.deployments import Address, serve, serve_alone
+    from workflows.server.life import BEAT
 
+    if options.lost_after < 3 * BEAT:
+        raise UsageError(
+            "runs would be lost while they live",
+            where="--lost-after",
+            value=f"{options.lost_after:g} s",
+            limit=f"at least {3 * BEAT:.0f} s: a run gives a sign of life every {BEAT:.0f} s",
+            remedy="give it more time",
+        )
     home = Path(options.home).expanduser()
-    return serve(options.host, options.port, options.limit, home, console.note, options.root)
+    address = Address(options.host, options.port, home, tuple(options.allow_host), options.lost_after)
+    if options.server_only:
+        return serve_alone(address, console.note)
+    return serve(address, options.limit, console.note, options.root)
