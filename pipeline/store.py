@@ -29,7 +29,7 @@ from pipeline.errors import stage_error_from_os_error
 
 log = logging.getLogger(__name__)
 A = TypeVar("A", bound=Artifact)
-LINEAGE = ".lineage"
+LINEAGE, LOCKS = ".lineage", ".locks"
 MANIFEST, RUN = "manifest.json", "run.json"
 MAX_BYTES = 1 << 28  # of a manifest: a larger file is not one
 MAX_SECONDS = 1e9
@@ -115,7 +115,7 @@ class Store:
     @contextmanager
     def lock(self, stage: str, key: str) -> Iterator[None]:
         """Lock one key. The kernel releases the lock when the process ends, however it ends."""
-        folder = self.root / ".locks"
+        folder = self.root / LOCKS
         try:
             folder.mkdir(parents=True, exist_ok=True)
             handle = (folder / f"{stage}-{key}").open("w")
@@ -213,9 +213,9 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-def write_synced(path: Path, text: str) -> None:
-    """Write text and flush it to the disk."""
-    with path.open("w") as f:
-        f.write(text)
+def write_synced(path: Path, data: str | bytes, *, new: bool = False) -> None:
+    """Write a file and flush it to the disk. new: FileExistsError if it is there."""
+    with path.open("xb" if new else "wb") as f:
+        f.write(data.encode() if isinstance(data, str) else data)
         f.flush()
         os.fsync(f.fileno())

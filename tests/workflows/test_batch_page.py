@@ -86,7 +86,7 @@ def test_the_page_escapes_and_links(tree: Path) -> None:
 @pytest.mark.slow
 def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: Path) -> None:
     """7,180 captures: the page is written every few seconds while the batch runs. Ten times the captures of another
-    table may take thirty times as long on a busy machine; work that grows with their square would take a hundred."""
+    table may take sixty times as long on a busy machine; work that grows with their square would take a hundred."""
     asked = BatchRequest(root=str(tmp_path), out=str(tmp_path / "out"))
 
     def seconds(subjects: int) -> float:
@@ -96,5 +96,5 @@ def test_a_table_of_the_whole_data_set_takes_as_much_for_each_capture(tmp_path: 
         return time.process_time() - begin
 
     few = min(seconds(36) for _ in range(3))
-    assert min(seconds(359) for _ in range(3)) < 30 * few
+    assert min(seconds(359) for _ in range(3)) < 60 * few
     assert (asked.folder / "index.html").stat().st_size < 8e6

@@ -139,6 +139,109 @@ sys.exit(main(["doctor"]))
     assert (child.returncode, out, err) == (128 + number, "tidied\n", "stopped\n")
 
 
+COMMAND = """
+import os, sys, threading
+from workflows.cli.main import main
+from workflows.cli import commands
+from workflows.run.interrupt import interruptible
+def command(options, console):
+    {body}
+commands.doctor_command = command
+sys.exit(main(["doctor"]))
+"""
+
+
+def told(environment: dict[str, str], body: str) -> tuple[int, str, str]:
+    program = COMMAND.format(body=body.strip().replace("\n", "\n    "))
+    child = start(environment, "-c", program)
+    out, err = child.communicate(timeout=120)
+    return child.returncode, out, err
+
+
+@pytest.mark.parametrize("number", ALL)
+def test_an_exception_that_python_drops_is_raised_again(
+    child_environment: dict[str, str], number: signal.Signals
+) -> None:
+    body = f"""
+class Part:
+    def __del__(self):
+        os.kill(os.getpid(), {int(number)})
+        self.after = 1
+try:
+    part = Part()
+    del part
+    while True: pass
+finally:
+    print("tidied")
+"""
+    assert told(child_environment, body) == (128 + number, "tidied\n", "stopped\n")
+
+
+def test_a_library_that_catches_the_exception_does_not_make_the_command_succeed(
+    child_environment: dict[str, str],
+) -> None:
+    caught = f"""
+try:
+    os.kill(os.getpid(), {int(signal.SIGTERM)})
+    while True: pass
+except BaseException:
+    pass
+"""
+    assert told(child_environment, f"{caught}\nreturn 0") == (143, "", "stopped\n")
+    run = "with interruptible(threading.Event(), print): print('the run began')"
+    assert told(child_environment, f"{caught}\n{run}") == (143, "", "stopped\n")
+
+
+def test_the_second_signal_outside_of_a_run_ends_it_at_once(child_environment: dict[str, str]) -> None:
+    body = f"""
+try:
+    os.kill(os.getpid(), {int(signal.SIGTERM)})
+    while True: pass
+finally:
+    os.kill(os.getpid(), {int(signal.SIGHUP)})
+    while True: pass
+"""
+    assert told(child_environment, body) == (129, "", "")
+
+
+def test_a_reader_of_stdout_that_is_gone(child_environment: dict[str, str]) -> None:
+    for body in ("print('x' * 1000000)", "print('short')"):
+        program = COMMAND.format(body=f"{body}; return 0")
+        child = start(child_environment, "-c", program)
+        assert child.stdout is not None and child.stderr is not None
+        child.stdout.close()
+        assert (child.wait(120), child.stderr.read()) == (141, "")
+
+
+PUBLISHED = """
+import os, runpy, sys
+from workflows.run import publish
+real = publish.{where}
+def signalled(*arguments):
+    publish.{where} = real
+    os.kill(os.getpid(), {number})
+    import time; time.sleep(0.3)  # the thread that reads signals
+    return real(*arguments)
+publish.{where} = signalled
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize(("where", "whole"), [("published", False), ("note_published", True), ("write_owned", True)])
+def test_a_signal_while_results_are_published(
+    photos: Path, child_environment: dict[str, str], where: str, whole: bool
+) -> None:
+    """All of them are put in place, or none; the exit code is the signal's."""
+    out = photos.parent / "out"
+    program = PUBLISHED.format(where=where, number=int(signal.SIGTERM))
+    child = start(child_environment, "-c", program, TOY, "run", photos, "--out", out)
+    _, err = child.communicate(timeout=240)
+    assert child.returncode == 143, err
+    assert (out / "run.json").is_file() == whole and ("complete" in err) == whole
+    assert "Traceback" not in err and not [p for p in out.iterdir() if ".partial" in p.name]
+
+
 def test_nohup_is_heeded(photos: Path, child_environment: dict[str, str]) -> None:
     program = """
 import os, signal, sys, threading

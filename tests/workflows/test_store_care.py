@@ -70,6 +70,8 @@ def test_leftovers_of_dead_processes_go_those_of_living_ones_stay(tmp_path: Path
     for name in (f"{key}.partial-0a1b2c3d", f"{key}.scratch", f"{other}.partial-0a1b2c3d", f"{other}.scratch"):
         (tmp_path / "second" / name).mkdir(parents=True)
     age(tmp_path)
+    with store.lock("second", key):  # a stage was at work here
+        pass
     with store.lock("second", other):
         found = garbage(store, 3600)
     assert sorted(p.path.name for p in found) == [f"{key}.partial-0a1b2c3d", f"{key}.scratch"]

@@ -68,7 +68,7 @@ def main(arguments: list[str]) -> int:
             plan = make_plan(request)
             events.tell(event="plan", batch=rays_a_step(plan))
             with exclusive_run(plan.store.root, plan.out, watch.stopped, events.note):
-                record = publish(plan, run_stages(plan, watch), events.note)
+                record = publish(plan, run_stages(plan, watch), events.note, watch.stop.is_set)
     except Exception as e:
         fault = failure_of(e, events.stage)
         events.tell(event="failed", fault=fault.model_dump())

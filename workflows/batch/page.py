@@ -20,6 +20,8 @@ from pipeline.verdict import LEVELS
 from workflows.batch.captures import natural
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import ENDED, Entry, Summary
+from workflows.run.owned import write_owned
+from workflows.run.published import LIST
 from workflows.run.verdict import level_in
 
 # figure -> where run.json or metrics.json has it
@@ -35,6 +37,7 @@ FIGURES: dict[str, tuple[str, ...]] = {
 ODD = 3.5  # robust z-score from which a figure is called odd (Iglewicz and Hoaglin's limit)
 MAD = 0.6745  # quartile of the normal distribution: makes a median of deviations comparable to a standard deviation
 ENOUGH = 5  # captures below which outliers are not marked
+TABLES = ("summary.json", "summary.csv", "index.html")
 FIRST_LINE = 300  # characters of a fault that the table shows
 
 
@@ -58,7 +61,7 @@ class Row:
 
 
 def write_page(request: BatchRequest, summary: Summary) -> None:
-    """Write the three files into OUT/batch."""
+    """Write the three files into OUT/batch. A file of the user's in the way is renamed to NAME.yours-N."""
     rows = ranked([_row(e, Path(request.out).absolute()) for e in summary.entries])
     content = {
         "counts": summary.counts(),
@@ -67,9 +70,16 @@ def write_page(request: BatchRequest, summary: Summary) -> None:
         "medians": _medians(rows),
         "captures": [asdict(r) for r in rows],
     }
-    _replace(request.folder / "summary.json", json.dumps(content, indent=1))
-    _replace(request.folder / "summary.csv", _csv(rows))
-    _replace(request.folder / "index.html", _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD))
+    page = _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD)
+    texts = {"summary.json": json.dumps(content, indent=1), "summary.csv": _csv(rows), "index.html": page}
+    older = _of_an_older_batch(request.folder)
+    for name, text in texts.items():
+        write_owned(request.folder, name, text, lambda path: older)
+
+
+def _of_an_older_batch(folder: Path) -> bool:
+    """Whether the tables in a folder are of a version that did not list its files: three of them, and no list."""
+    return not (folder / LIST).exists() and all((folder / name).is_file() for name in TABLES)
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
@@ -151,13 +161,6 @@ def _csv(rows: Sequence[Row]) -> str:
         reason = " ".join(r.reason.split())[:FIRST_LINE]
         table.writerow([r.name, r.state, r.level, r.attempts, *figures, r.warnings, r.odd, r.odd_in, reason, fault])
     return stream.getvalue()
-
-
-def _replace(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(path)
 
 
 @lru_cache

@@ -28,6 +28,9 @@ class BatchRequest(BaseModel):
         None, description="views that are not fitted but used for the metrics, as in neuface run; none by default"
     )
     seed: int = Field(0, ge=0, description="seed of every random draw")
+    template: str | None = Field(
+        None, description="folder of another head template, from which the assets are made, as in neuface run"
+    )
     device: str = Field("auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(None, description="last stage to run")
     sets: tuple[str, ...] = Field((), description="one setting, stage.key=value; repeatable")
@@ -62,7 +65,18 @@ class BatchRequest(BaseModel):
 
     def run_request(self, capture: Path, name: str, sets: tuple[str, ...], own: dict[str, Any]) -> RunRequest:
         """One capture's run. `own`: settings of this capture from a list; `sets`: what earlier attempts changed."""
-        of_all = {"preset", "holdout", "seed", "device", "until", "config", "stage_limit", "force", "strict"}
+        of_all = {
+            "preset",
+            "holdout",
+            "template",
+            "seed",
+            "device",
+            "until",
+            "config",
+            "stage_limit",
+            "force",
+            "strict",
+        }
         shared = self.model_dump(include=of_all)
         return RunRequest(
             **{**shared, **own},

@@ -15,9 +15,11 @@ from workflows.cli.console import Console
 from workflows.cli.options import request_from, with_provenance, with_viewer
 from workflows.cli.view import server_of
 from workflows.run import output_dirs
-from workflows.run.interrupt import interruptible
+from workflows.run.interrupt import Interrupted, interruptible
+from workflows.run.owned import write_owned
 from workflows.run.plan import make_plan, preview
 from workflows.run.publish import publish
+from workflows.run.published import TRUTH
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
 from workflows.run.runner import run_stages
@@ -36,6 +38,7 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 
     Raises:
         StageError: a stage can't go on. UsageError: the request is wrong. Cancelled: Ctrl-C or another signal.
+        Interrupted: the same, when everything was published.
     """
     plan, watch = make_plan(request), Session(console)
     if environment.has_server():
@@ -44,10 +47,14 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 
         return run_with_session(request, watch)
     with (
-        interruptible(watch.stop, console.note),
+        interruptible(watch.stop, console.note) as caught,
         exclusive_run(plan.store.root, plan.out, watch.stopped, console.note),
     ):
-        return publish(plan, run_stages(plan, watch), console.note)
+        record = publish(plan, run_stages(plan, watch), console.note, watch.stop.is_set)
+    if caught.number is not None:  # it came when the results were being put in place
+        console.note(f"the results are in {plan.out}, complete")
+        raise Interrupted(caught.number)
+    return record
 
 
 # ------------------------------------------------------------------ commands
@@ -105,12 +112,12 @@ def demo_command(options: argparse.Namespace, console: Console) -> int:
         record = run(request, console)
     _tell(record, out)
     if "asset" in record:
-        _against_truth(out, capture, record, request)
+        _against_truth(out, capture, record, request, console)
     _tell_verdict(record)
     return exit_code(record)
 
 
-def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest) -> None:
+def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest, console: Console) -> None:
     from pipeline.capture_artifacts import Capture
     from pipeline.store import Store
     from workflows.evaluation.demo import measure
@@ -119,14 +126,18 @@ def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: Ru
     if found is None:
         return
     figures = measure(out, capture, found.artifact)
-    (out / "truth.json").write_text(json.dumps(dataclasses.asdict(figures), indent=1))
+    _write(out, "truth.json", json.dumps(dataclasses.asdict(figures), indent=1), console)
     print("against the demo's ground truth:")
-    for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact)]:
+    for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact, console)]:
         print(f"  {line}")
 
 
-def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], capture: Any) -> list[str]:
+def _material_against_truth(
+    out: Path, folder: Path, record: dict[str, Any], capture: Any, console: Console
+) -> list[str]:
     """Whether the split into diffuse and specular is right; figures and a picture into OUT/truth."""
+    import tempfile
+
     from pipeline.artifacts import FittedFace
     from pipeline.store import Store
     from pipeline.transforms import matrix
@@ -139,7 +150,11 @@ def _material_against_truth(out: Path, folder: Path, record: dict[str, Any], cap
     if fitted is None:
         return []
     place = matrix(record["capture_from_asset"])
-    lines = compare(fitted.path(fitted.artifact.field), folder, capture, place, out / "truth").lines()
+    with tempfile.TemporaryDirectory(prefix="neuface-truth-") as scratch:
+        made = Path(scratch)
+        lines = compare(fitted.path(fitted.artifact.field), folder, capture, place, made).lines()
+        for path in sorted(made.iterdir()):
+            _write(out, f"{TRUTH}/{path.name}", path.read_bytes(), console)
     return [*lines, *compare_maps(component_in(out), folder, capture, place)]
 
 
@@ -177,7 +192,13 @@ def render_command(options: argparse.Namespace, console: Console) -> int:
         width=options.width,
         samples=options.samples,
     )
-    for path, seconds in render_pictures(request):
+    if options.light or options.field:
+        from workflows.cli.relight import relit_pictures
+
+        for path, seconds in relit_pictures(request, tuple(options.light or ()), console.note, quick=options.quick):
+            print(f"{path} ({seconds:.1f} s)")
+        return 0
+    for path, seconds in render_pictures(request, console.note):
         print(f"{path} ({seconds:.1f} s)")
     return 0
 
@@ -233,6 +254,13 @@ def doctor_command(options: argparse.Namespace, console: Console) -> int:
 
 
 # ------------------------------------------------------------------ helpers
+def _write(out: Path, name: str, content: str | bytes, console: Console) -> None:
+    """OUT/NAME; a file of the user's there is renamed, and told."""
+    aside = write_owned(out, name, content)
+    if aside is not None:
+        console.note(f"{out / name} is yours: kept as {out / aside}")
+
+
 def read_record(out: Path) -> dict[str, Any]:
     """run.json of a folder that a run left.
 

@@ -15,10 +15,38 @@ from workflows.run.plan import Plan, preview
 # of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
 # workflows/run/budget.py. For orders of magnitude: earlier runs on the same machine replace it stage by stage.
 SECONDS: dict[str, dict[str, float]] = {
-    "draft": {"inverse_rendering": 100, "surface": 10, "template": 15, "uv": 12, "bake": 20, "usd": 18, "report": 5},
-    "studio": {"inverse_rendering": 780, "surface": 15, "template": 20, "uv": 25, "bake": 60, "usd": 45, "report": 10},
-    "film": {"inverse_rendering": 1500, "surface": 60, "template": 25, "uv": 60, "bake": 300, "usd": 150, "report": 30},
+    "draft": {
+        "inverse_rendering": 100,
+        "surface": 10,
+        "template": 15,
+        "uv": 12,
+        "reflectance": 300,
+        "bake": 20,
+        "usd": 18,
+        "report": 5,
+    },
+    "studio": {
+        "inverse_rendering": 780,
+        "surface": 15,
+        "template": 20,
+        "uv": 25,
+        "reflectance": 300,
+        "bake": 60,
+        "usd": 45,
+        "report": 10,
+    },
+    "film": {
+        "inverse_rendering": 1500,
+        "surface": 60,
+        "template": 25,
+        "uv": 60,
+        "reflectance": 300,
+        "bake": 300,
+        "usd": 150,
+        "report": 30,
+    },
 }
+LIGHT_STAGE_ONLY = frozenset({"reflectance"})  # other captures pass through at once
 NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subject_consent", "asset_version"})
 LOOKED_AT = 50  # earlier runs of a stage that are read, the latest first
 
@@ -47,6 +75,8 @@ def _of_stage(plan: Plan, name: str) -> tuple[float | None, str]:
     earlier = _earlier(plan, name, plan.configs[name])
     if earlier:
         return statistics.median(earlier), "runs"
+    if name in LIGHT_STAGE_ONLY and getattr(plan.source.artifact, "kind", "") != "olat":
+        return 0.0, "table"
     return SECONDS.get(plan.request.preset, {}).get(name), "table"
 
 

@@ -19,9 +19,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 PARENT = "NEUFACE_PARENT"  # the process without which a run's process must not go on
+AGAIN = 0.05  # seconds until an exception is raised again that Python dropped
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -45,6 +47,9 @@ class Caught:
     number: int | None = None
 
 
+_asked = Caught()  # of the command: outside of its runs
+
+
 @contextmanager
 def interruptible(
     stop: threading.Event, notify: Callable[[str], None], at_once: Callable[[], None] = lambda: None
@@ -57,6 +62,8 @@ def interruptible(
     if threading.current_thread() is not threading.main_thread():
         yield caught
         return
+    if _asked.number is not None:  # it came before, and its exception was lost in a library
+        raise Interrupted(_asked.number)
     numbers = _heeded()
     ours, interpreters = socket.socketpair()
     interpreters.setblocking(False)
@@ -93,17 +100,42 @@ def interruptible(
 
 
 @contextmanager
-def as_exceptions() -> Iterator[None]:
-    """Around a whole command: a signal outside of a run raises `Interrupted`, so that folders are tidied on the way."""
+def as_exceptions() -> Iterator[Caught]:
+    """Around a whole command: a signal outside of a run raises `Interrupted`, so that folders are tidied on the way.
+
+    The second signal ends the program at once. Where an exception can't be raised, such as in a `__del__`, Python drops
+    it; it is then raised again a moment later. The `Caught` tells whether one came, should a library have caught it.
+    """
+    _asked.number = None
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield _asked
         return
-    handlers = {n: signal.signal(n, _raise) for n in _heeded()}
+
+    def first(number: int, frame: FrameType | None) -> None:
+        if _asked.number is not None:
+            leave(number)
+        _asked.number = number
+        raise Interrupted(number)
+
+    def again(number: int, frame: FrameType | None) -> None:
+        if _asked.number is not None:
+            raise Interrupted(_asked.number)
+
+    def dropped(what: Any) -> None:
+        if not isinstance(what.exc_value, Interrupted):
+            hook(what)
+        elif signal.getsignal(signal.SIGALRM) is again:
+            signal.setitimer(signal.ITIMER_REAL, AGAIN)
+
+    hook, sys.unraisablehook = sys.unraisablehook, dropped
+    handlers = {n: signal.signal(n, first) for n in _heeded()} | {signal.SIGALRM: signal.signal(signal.SIGALRM, again)}
     try:
-        yield
+        yield _asked
     finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in handlers.items():
             signal.signal(number, handler)
+        sys.unraisablehook = hook
 
 
 def from_the_start() -> None:
@@ -135,7 +167,3 @@ def end_with(parent: int) -> None:
 def _heeded() -> tuple[signal.Signals, ...]:
     """All three; not SIGHUP where the user chose to ignore it (nohup)."""
     return tuple(n for n in SIGNALS if n != signal.SIGHUP or signal.getsignal(n) is not signal.SIG_IGN)
-
-
-def _raise(number: int, frame: FrameType | None) -> None:
-    raise Interrupted(number)

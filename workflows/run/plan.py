@@ -15,6 +15,7 @@ from pipeline.store import MANIFEST, Store
 from stages import registry
 from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_sets
 from stages.registry import FIT
+from workflows.run.published import FOLDERS
 from workflows.run.request import RunRequest
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -45,6 +46,7 @@ def make_plan(request: RunRequest) -> Plan:
 
     chosen, anew = _choose(request.until, request.from_stage)
     configs = check_settings(request)
+    _check_template(configs)
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
@@ -56,12 +58,14 @@ def make_plan(request: RunRequest) -> Plan:
             limit="another folder than the capture's",
             remedy=f"for example --out {out / 'asset_run'}",
         )
+    store = Store(request.store_path)
+    _apart(store.root, capture, out)
     needs_torch = any(s.name == "inverse_rendering" for s in chosen)
     return Plan(
         request,
         source,
         out,
-        Store(request.store_path),
+        store,
         chosen,
         configs,
         device_for(request.device) if needs_torch else "cpu",
@@ -92,9 +96,19 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
         holdout=request.holdout,
         name=request.name,
         seed=request.seed,
+        template=request.template,
         registry=registry.REGISTRY,
         planned=planned,
     )
+
+
+def _check_template(configs: dict[str, StageConfig]) -> None:
+    """Read another head template before anything runs. StageError says what is wrong with it."""
+    folder = getattr(configs.get("template"), "folder", "")
+    if folder:
+        from pipeline.template.load import load_template
+
+        load_template(Path(folder))
 
 
 def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
@@ -113,6 +127,20 @@ def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any,
             remedy="swap them, or leave one out",
         )
     return tuple(registry.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
+
+
+def _apart(store: Path, capture: Path, out: Path) -> None:
+    """Raises UsageError for a store among the photos or in a folder that results replace."""
+    root = store.resolve()
+    inside = [f for f in (out / name for name in FOLDERS) if root.is_relative_to(f.resolve())]
+    if root == capture.resolve() or inside:
+        raise UsageError(
+            "finished stages would land among other files",
+            where="--store",
+            value=store,
+            limit=f"another folder than the capture's, and none in {out / FOLDERS[0]} or {out / FOLDERS[1]}",
+            remedy=f"leave --store out (it is then {out / '.store'}), or name a folder of its own",
+        )
 
 
 def _names_a_folder(text: str, option: str) -> None:

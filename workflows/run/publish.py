@@ -12,62 +12,83 @@ from typing import Any
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Done, versions
-from pipeline.errors import stage_error_from_os_error
+from pipeline.errors import Cancelled, stage_error_from_os_error
+from workflows.run.owned import write_owned
 from workflows.run.plan import Plan
-from workflows.run.published import note_published, published, write_whole
-from workflows.run.replace import drop, prepare, put, tidy
+from workflows.run.published import is_record, note_published, published
+from workflows.run.replace import Replacement, drop, prepare, put, tidy
 from workflows.run.report_timing import TIMED, with_seconds
+from workflows.run.room import check_room_for_copies
 from workflows.run.verdict import verdict_of_done
 from workflows.store.roots import note_root
 
 Copies = dict[str, Path]  # path below the published folder -> file in the store
 
 
-def publish(plan: Plan, done: Iterable[Done[Any]], notify: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
-    """Copy asset/ and report/ to `plan.out` and write run.json beside them. Returns what run.json holds.
+def publish(
+    plan: Plan,
+    done: Iterable[Done[Any]],
+    notify: Callable[[str], None] = lambda text: None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Copy asset/, report/ and reflectance/ to `plan.out` and write run.json beside them. Returns what run.json holds.
 
-    Files of the user's own in these folders stay. One whose name is needed, or that was published and then edited, is
-    renamed; `notify` is called, and run.json names it under "moved_aside".
+    All folders are complete before any replaces the one before it. Files of the user's own in them stay. One whose
+    name is needed, or that was published and then edited, is renamed; `notify` is called, and run.json names it under
+    "moved_aside". stopped: whether the user stops the run; asked for the last time before anything is replaced.
 
     Raises:
         StageError: the disk is full or can't be written; what was there before is still there.
+        Cancelled: the user stopped the run; as before.
     """
     stages = {d.stage: d for d in done}
     record = run_record(plan, stages)
     try:
-        moved = _replace_folders(plan.out, stages, record["timing"])
-        for before, now in moved.items():
-            notify(f"{plan.out / before} is yours: kept as {plan.out / now}")
+        moved = _replace_folders(plan.out, stages, record["timing"], stopped)
         if moved:
             record["moved_aside"] = moved
-        write_whole(plan.out / "run.json", json.dumps(record, indent=1))
+        aside = write_owned(plan.out, "run.json", json.dumps(record, indent=1), is_record)
+        for before, now in (moved | ({"run.json": aside} if aside else {})).items():
+            notify(f"{plan.out / before} is yours: kept as {plan.out / now}")
         note_root(plan.store, plan.out, {n: d.key for n, d in stages.items()})
     except OSError as e:
         raise stage_error_from_os_error(e, plan.out) or e from e
     return record
 
 
-def _replace_folders(out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float]) -> dict[str, str]:
-    """asset/ and report/, whichever the stages made. Returns the user's files that had to move: old path -> new."""
-    known = published(out)
-    moved: dict[str, str] = {}
-    for name, copies in (("asset", asset_files(stages)), ("report", report_files(stages))):
+def _replace_folders(
+    out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float], stopped: Callable[[], bool]
+) -> dict[str, str]:
+    """asset/, report/ and reflectance/, whichever the stages made. Returns the user's files that had to move: old
+    path -> new."""
+    known, moved = published(out), dict[str, str]()
+    wanted = {"asset": asset_files(stages), "report": report_files(stages), "reflectance": reflectance_files(stages)}
+    for name in wanted:
         moved |= tidy(out, name, known)
-        if not copies:
-            continue
-        made = prepare(out, name, partial(_fill, name, copies, timing), known)
-        try:
-            both = {p: known.get(p, frozenset()) | {h} for p, h in made.hashes.items()}
-            note_published(out, {**known, **both})
-            put(made)
-        except BaseException:
-            drop(made)
-            raise
-        kept = {p: hashes for p, hashes in known.items() if not p.startswith(f"{name}/")}
-        known = {**kept, **{p: frozenset({h}) for p, h in made.hashes.items()}}
-        moved |= made.aside
-    note_published(out, known)
+    check_room_for_copies(out, (p for copies in wanted.values() for p in copies.values()))
+    made: list[Replacement] = []
+    try:
+        for name, copies in wanted.items():
+            if copies:
+                made.append(prepare(out, name, partial(_fill, name, copies, timing), known))
+        _stop_if(stopped)
+        new = {p: h for m in made for p, h in m.hashes.items()}
+        note_published(out, {**known, **{p: known.get(p, frozenset()) | {h} for p, h in new.items()}})
+        for folder in made:
+            put(folder)
+            moved |= folder.aside
+    except BaseException:
+        for folder in made:
+            drop(folder)
+        raise
+    kept = {p: h for p, h in known.items() if p.partition("/")[0] not in {m.name for m in made}}
+    note_published(out, {**kept, **{p: frozenset({h}) for p, h in new.items()}})
     return moved
+
+
+def _stop_if(stopped: Callable[[], bool]) -> None:
+    if stopped():
+        raise Cancelled("stopped by the user; finished stages are kept, nothing was published")
 
 
 def _fill(name: str, copies: Copies, timing: Mapping[str, float], folder: Path) -> None:
@@ -103,6 +124,14 @@ def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
             copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
             copies[f"{folder}/{view.index}.png"] = located.path(view.png)
     return copies
+
+
+def reflectance_files(stages: Mapping[str, Done[Any]]) -> Copies:
+    """reflectance/: the field of a light stage's capture; nothing for other captures."""
+    if "reflectance" not in stages:
+        return {}
+    located = stages["reflectance"].located
+    return {f.path.removeprefix("reflectance/"): located.path(f) for f in located.artifact.files}
 
 
 def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:

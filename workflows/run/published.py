@@ -6,10 +6,12 @@ until the run has published all, so that a process killed in between leaves noth
 
 from __future__ import annotations
 
+import glob
 import json
+import re
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +20,22 @@ from pipeline.store import MANIFEST, write_synced
 from workflows.run.report_timing import report_hash
 
 LIST = ".published.json"
-FOLDERS = ("asset", "report")
+FOLDERS = ("asset", "report", "reflectance")
+TRUTH = "truth"  # folder, and .json: of the demo, its result against the truth
+_PARTIAL = re.compile(r"\.partial-[0-9a-f]{8}$")
 Known = dict[str, frozenset[str]]  # path below OUT -> sha256 of each content that was published there
 
 
 def published(out: Path) -> Known:
     """What runs published in `out`. Without a list (of an older version), what run.json names and the store has."""
-    found = _json(out / LIST).get("files")
-    if not isinstance(found, dict):
-        return _of_an_older_run(out)
-    return {path: frozenset(map(str, hashes)) for path, hashes in found.items() if isinstance(hashes, list)}
+    return listed(out) if isinstance(_json(out / LIST).get("files"), dict) else _of_an_older_run(out)
+
+
+def listed(folder: Path) -> Known:
+    """What the list in a folder names; nothing where there is none."""
+    found = _json(folder / LIST).get("files")
+    files = found if isinstance(found, dict) else {}
+    return {path: frozenset(map(str, hashes)) for path, hashes in files.items() if isinstance(hashes, list)}
 
 
 def note_published(out: Path, files: Mapping[str, Iterable[str]]) -> None:
@@ -36,16 +44,26 @@ def note_published(out: Path, files: Mapping[str, Iterable[str]]) -> None:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file that is never seen half-written, and remove what a killed process left of an earlier attempt."""
-    for left in path.parent.glob(f".{path.name}.partial-*"):
-        left.unlink(missing_ok=True)
+    """Write a file of ours that is never seen half-written."""
+    with written_whole(path, text.encode()) as partial:
+        partial.replace(path)
+
+
+@contextmanager
+def written_whole(path: Path, data: bytes) -> Iterator[Path]:
+    """A hidden file beside `path` with this content, flushed to the disk, that the caller gives its final name.
+
+    It removes what a killed process left of an earlier attempt.
+    """
+    for left in path.parent.glob(f".{glob.escape(path.name)}.partial-*"):
+        if _PARTIAL.search(left.name) and left.is_file():
+            left.unlink(missing_ok=True)
     partial = path.with_name(f".{path.name}.partial-{uuid.uuid4().hex[:8]}")
     try:
-        write_synced(partial, text)
-        partial.replace(path)
-    except OSError:
+        write_synced(partial, data, new=True)
+        yield partial
+    finally:
         partial.unlink(missing_ok=True)
-        raise
 
 
 def is_ours(path: Path, hashes: Iterable[str]) -> bool:
@@ -57,6 +75,11 @@ def is_ours(path: Path, hashes: Iterable[str]) -> bool:
         return sha256_of(path) in known
     except OSError:
         return False
+
+
+def is_record(path: Path) -> bool:
+    """Whether a file is a run.json, whoever wrote it: older versions did not list theirs."""
+    return not path.is_symlink() and {"request", "stages", "timing", "store"} <= _json(path).keys()
 
 
 def entries(folder: Path) -> Iterator[str]:

@@ -30,7 +30,8 @@ _ASIDE = re.compile(re.escape(SIDE) + r"\d+(?=/|$)")
 
 @dataclass(slots=True)
 class Replacement:
-    """A folder on its way to OUT/NAME. hashes: of its files, by path below OUT. aside: the user's that had to move."""
+    """A folder on its way to OUT/NAME. hashes: of its files, by path below OUT. aside: the user's that had to move.
+    placed: it has its name, and under `partial` there may be the old folder."""
 
     out: Path
     name: str
@@ -39,6 +40,7 @@ class Replacement:
     ours: dict[str, int] = field(default_factory=dict)  # in the old folder; time of the last change, ns
     places: dict[str, str] = field(default_factory=dict)  # of the user's files: in the old folder -> in the new one
     aside: dict[str, str] = field(default_factory=dict)  # path below OUT -> path below OUT
+    placed: bool = False
 
 
 def prepare(out: Path, name: str, fill: Callable[[Path], None], known: Known) -> Replacement:
@@ -98,6 +100,11 @@ def _places(final: Path, users: Iterable[str], new: set[str]) -> dict[str, str]:
     return places
 
 
+def free_side(folder: Path, name: str) -> str:
+    """NAME.yours-N, a name that nothing in the folder has."""
+    return next(n for n in _sides(name) if not os.path.lexists(folder / n))
+
+
 def _sides(path: str) -> Iterator[str]:
     number = 1
     while True:
@@ -125,16 +132,21 @@ def put(made: Replacement) -> None:
     made.partial.rename(ready)
     made.partial = ready
     if final.is_symlink() or (final.exists() and not final.is_dir()):  # the user's: no run ever made such a thing
-        side = next(n for n in _sides(made.name) if not os.path.lexists(made.out / n))
+        side = free_side(made.out, made.name)
         final.rename(made.out / side)
         made.aside[made.name] = side
     old = swap(ready, final)
+    made.placed = True
     if old is not None:
         made.aside |= _retire(old, final, made)
 
 
 def drop(made: Replacement) -> None:
-    """Forget a folder that did not get its final name. The user's files in it are links."""
+    """Forget a folder that did not get its final name. The user's files in it are links.
+
+    One that has its name stays; what is left of the old one holds the user's files, and the next run tidies it."""
+    if made.placed:
+        return
     shutil.rmtree(made.partial, ignore_errors=True)
 
 
@@ -187,7 +199,7 @@ def tidy(out: Path, name: str, known: Known) -> dict[str, str]:
     """Remove what killed runs left beside OUT/NAME. Returns the user's files that were found and put aside."""
     final = out / name
     found: dict[str, str] = {}
-    left = [*out.glob(f".{name}.swap-*"), *out.glob(f".{name}.old-*")]
+    left = [*_left(out, name, "swap"), *_left(out, name, "old")]
     if left and not os.path.lexists(final):
         left.pop().rename(final)
     for folder in left:
@@ -197,9 +209,15 @@ def tidy(out: Path, name: str, known: Known) -> dict[str, str]:
             return is_ours(folder / path, known.get(f"{name}/{path}", ())) or any(_same(folder / path, n) for n in near)
 
         found |= _rescue(folder, final, name, safe)
-    for folder in out.glob(f".{name}.partial-*"):  # copies and links, never the only one
+    for folder in _left(out, name, "partial"):  # copies and links, never the only one
         shutil.rmtree(folder, ignore_errors=True)
     return found
+
+
+def _left(out: Path, name: str, kind: str) -> list[Path]:
+    """What runs called .NAME.KIND-........ in out. A folder of the user's own with such a beginning is none of them."""
+    ours = re.compile(re.escape(f".{name}.{kind}-") + r"[0-9a-f]{8}")
+    return [p for p in sorted(out.iterdir()) if ours.fullmatch(p.name) and p.is_dir() and not p.is_symlink()]
 
 
 def _rescue(old: Path, final: Path, name: str, safe: Callable[[str], bool]) -> dict[str, str]:
@@ -211,7 +229,7 @@ def _rescue(old: Path, final: Path, name: str, safe: Callable[[str], bool]) -> d
         try:
             _link(old / path, final / place)
         except OSError:  # a file where a folder would be: keep the whole old folder
-            kept = next(n for n in _sides(name) if not os.path.lexists(final.with_name(n)))
+            kept = free_side(final.parent, name)
             old.rename(final.with_name(kept))
             return {**moved, name: kept}
         moved[f"{name}/{path}"] = f"{name}/{place}"

@@ -28,6 +28,11 @@ class RunRequest(BaseModel):
     )
     name: str | None = Field(default=None, description="name of the asset")
     seed: int = Field(default=0, description="seed of every random draw")
+    template: str | None = Field(
+        default=None,
+        description="folder of another head template (docs/template.md); the asset is made from it, unless uv.mesh "
+        "says otherwise",
+    )
     device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(default=None, description="last stage to run")
     from_stage: str | None = Field(

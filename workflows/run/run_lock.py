@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from pipeline.errors import Cancelled, stage_error_from_os_error
+from pipeline.store import LOCKS
 from workflows.run.output_dirs import writable
 
 POLL = 0.2  # seconds between two attempts
@@ -66,7 +67,7 @@ def lock_is_free(path: Path) -> bool:
 
 
 def _path(store: Path, out: Path) -> Path:
-    return store.absolute() / ".locks" / f"run-{hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:32]}"
+    return store.absolute() / LOCKS / f"run-{hashlib.sha256(str(out.resolve()).encode()).hexdigest()[:32]}"
 
 
 def _take(path: Path) -> IO[str] | None:

@@ -16,6 +16,7 @@ from stages.registry import FIT
 from workflows.run.budget import START_UP, planned
 from workflows.run.early import ends_early
 from workflows.run.plan import Plan, check_settings
+from workflows.run.room import check_room_for_stage
 from workflows.run.session import Session
 from workflows.run.watchdog import time_limit
 
@@ -51,6 +52,7 @@ def run_stages(
         inputs, config = inputs_from(stage, finished), plan.configs[stage.name]
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
+        check_room_for_stage(stage, inputs, config, plan.store)
         with around(stage, inputs, config), time_limit(stage.name, plan.request.stage_limit, watch.late):
             result = execute_stage(
                 stage,

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from pipeline.errors import StageError
-from pipeline.store import Store
+from pipeline.store import LOCKS, Store
 from workflows.cli.console import Console
 from workflows.run.run_lock import is_held
 
@@ -94,11 +94,11 @@ def purge_command(options: argparse.Namespace, console: Console) -> int:
 
 
 def _store(path: Path) -> Store:
-    if not path.is_dir():
+    if not (path / LOCKS).is_dir():  # every store has one; what lies in another folder is none of our business
         raise StageError(
             "there is no store",
             where=path,
-            value="nothing",
+            value="a folder without finished stages" if path.is_dir() else "nothing",
             limit="the folder of finished stages of a run",
             remedy="name OUT/.store, or the folder that --store named",
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shutil
 import time
@@ -10,16 +11,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.store import LINEAGE, Store, lineage
+from pipeline.store import LINEAGE, LOCKS, Store, lineage
 from stages.registry import SOURCE
 from workflows.batch.captures import RECORDS
+from workflows.batch.page import TABLES
 from workflows.batch.state import Entry
-from workflows.run.published import FOLDERS, LIST, published, split
+from workflows.run.published import FOLDERS, LIST, TRUTH, is_ours, is_record, listed, published, split
 from workflows.run.run_lock import lock_is_free
 from workflows.store.roots import Root, forget_root, roots
 
 DAY = 86400.0
 _KEY = re.compile(r"([0-9a-f]{64})(\.scratch|\.partial-[0-9a-f]+)?")
+_HALF = re.compile(r"\..+\.(partial|swap|old)-[0-9a-f]{8}|\.probe-[0-9a-f]{8}")  # what killed runs left in OUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +45,7 @@ def garbage(store: Store, older_than: float, now: float | None = None) -> list[P
     limit = max(older_than, DAY) if _busy(store) else older_than
     found = []
     for stage, key, kind, path in _pieces(store):
-        if not lock_is_free(store.root / ".locks" / f"{stage}-{key}"):
+        if not lock_is_free(store.root / LOCKS / f"{stage}-{key}"):
             continue
         if kind.startswith(".partial"):
             found.append(Piece(path, "left by a process that died", _size(path)))
@@ -59,7 +62,7 @@ def remove(store: Store, pieces: Iterable[Piece]) -> None:
     """Take pieces out of the store; one that a process took up meanwhile stays."""
     for piece in pieces:
         match = _KEY.fullmatch(piece.path.name)
-        if match is None or not lock_is_free(store.root / ".locks" / f"{piece.path.parent.name}-{match[1]}"):
+        if match is None or not lock_is_free(store.root / LOCKS / f"{piece.path.parent.name}-{match[1]}"):
             continue
         shutil.rmtree(piece.path, ignore_errors=True)
         if match[2] is None:
@@ -67,7 +70,7 @@ def remove(store: Store, pieces: Iterable[Piece]) -> None:
 
 
 def _busy(store: Store) -> bool:
-    return any(not lock_is_free(p) for p in (store.root / ".locks").glob("run-*"))
+    return any(not lock_is_free(p) for p in (store.root / LOCKS).glob("run-*"))
 
 
 def _pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
@@ -75,8 +78,14 @@ def _pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
     for stage in sorted(p for p in store.root.iterdir() if p.is_dir() and not p.name.startswith(".")):
         for path in sorted(stage.iterdir()):
             match = _KEY.fullmatch(path.name)
-            if match is not None and path.is_dir() and not path.is_symlink():
+            if match is not None and path.is_dir() and not path.is_symlink() and _is_ours(store, stage.name, match[1]):
                 yield stage.name, match[1], match[2] or "", path
+
+
+def _is_ours(store: Store, stage: str, key: str) -> bool:
+    """Whether a stage worked on this key here: other programs have folders with names of 64 digits too."""
+    traces = (store.root / LOCKS / f"{stage}-{key}", store.root / LINEAGE / f"{stage}-{key}.json")
+    return any(p.is_file() for p in traces)
 
 
 def _size(path: Path) -> int:
@@ -88,9 +97,11 @@ def _size(path: Path) -> int:
 class Purge:
     """All that a subject left: folders and files to remove, and the runs among them.
 
-    What stays: the photos, and users: files of the user's own, and edited ones, in the folders of results.
+    What stays: the photos, and users: files of the user's own, and edited ones, in the folders of results. top: the
+    folder that the user named.
     """
 
+    top: Path
     paths: tuple[Path, ...]
     outs: tuple[Path, ...]
     photos: tuple[Path, ...]
@@ -118,27 +129,37 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
         log = out / RECORDS / "logs" / f"{entry.name.replace('/', '__')}.log"
         paths |= {p for p in (path, log) if p.exists()}
     if entries and (out / RECORDS).is_dir():  # the table names the subject; the next batch writes it anew
-        tables = ("summary.json", "summary.csv", "index.html")
-        paths |= {out / RECORDS / n for n in tables if (out / RECORDS / n).exists()}
+        ours, theirs = _tables(out / RECORDS)
+        paths, users = paths | ours, users | theirs
     for o in outs:  # the throw-away server of a run keeps its parameters
         home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
         paths |= {home} if home.is_dir() else set()
-    return Purge(tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+    return Purge(out, tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+
+
+def _tables(folder: Path) -> tuple[set[Path], set[Path]]:
+    """A batch's tables, as it wrote them, and files of the user's with such names. Older versions kept no list."""
+    known, older = listed(folder), not (folder / LIST).exists()
+    there = {folder / n for n in TABLES if os.path.lexists(folder / n)}
+    ours = {p for p in there if is_ours(p, known.get(p.name, ())) or (older and p.is_file() and not p.is_symlink())}
+    return ours, there - ours
 
 
 def _results(out: Path) -> tuple[set[Path], set[Path]]:
     """What runs left in a folder of results, and what is the user's there: foreign files, and edited ones."""
     known = published(out)
-    ours = {out / n for n in ("run.json", LIST, "truth", "truth.json") if (out / n).exists()}
-    for pattern in (".*.partial-*", ".probe-*"):
-        ours |= set(out.glob(pattern))
-    theirs = {p for p in out.iterdir() if p.name not in (*FOLDERS, ".store") and p not in ours}
-    for name in FOLDERS:
+    ours = {out / n for n in ("run.json", "truth.json") if is_ours(out / n, known.get(n, ()))}
+    ours |= {p for p in (out / LIST, out / "run.json") if is_record(p) or (p.name == LIST and p.is_file())}
+    ours |= {p for p in out.iterdir() if _HALF.fullmatch(p.name)}
+    folders = (*FOLDERS, TRUTH)
+    theirs = {p for p in out.iterdir() if p.name not in (*folders, ".store") and p not in ours}
+    for name in folders:
         mine, users = split(out, name, known)
         theirs |= {out / name / p for p in users}
         if mine or not users:
             ours |= {out / name / p for p in mine} if users else {p for p in (out / name,) if p.is_dir()}
-    return ours, theirs
+    links = {p for p in ours if p.is_symlink()}  # no run ever makes one
+    return ours - links, theirs | links
 
 
 def purge(found: Purge, store: Store) -> list[Path]:
@@ -150,20 +171,18 @@ def purge(found: Purge, store: Store) -> list[Path]:
             path.unlink(missing_ok=True)
     for out in found.outs:
         forget_root(store, out)
-        for folder in [*(out / n for n in FOLDERS), out]:
+        for folder in sorted({q for p in found.paths for q in p.parents if q.is_relative_to(out)}, reverse=True):
             _remove_empty(folder)
-        if out.parent.is_dir() and not any(out.parent.iterdir()):
-            out.parent.rmdir()
+        _remove_empty(out)
+        if found.top in out.parent.parents:
+            _remove_empty(out.parent)
     return [p for p in found.paths if p.exists()]
 
 
 def _remove_empty(folder: Path) -> None:
-    """A folder and those below it, as far as they hold nothing."""
-    if folder.is_dir() and not folder.is_symlink():
-        for child in list(folder.iterdir()):
-            _remove_empty(child)
-        if not any(folder.iterdir()):
-            folder.rmdir()
+    """A folder, if it holds nothing. An empty folder of the user's own inside it counts as something."""
+    if folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _roots_of(out: Path, store: Store) -> list[Root]:
@@ -199,12 +218,12 @@ def _made_from(photos: set[Path], store: Store) -> Iterator[Path]:
     while grown:
         grown = False
         for path, origins in known.items():
-            if path not in taken and origins & reached:
-                stage, _, key = path.stem.rpartition("-")
+            stage, _, key = path.stem.rpartition("-")
+            if path not in taken and origins & reached and _KEY.fullmatch(key):
                 taken.add(path)
                 reached.add(f"{stage}/{key}")
                 grown = True
     for path in taken:
         stage, _, key = path.stem.rpartition("-")
         yield path
-        yield from (store.root / stage).glob(f"{key}*")
+        yield from (p for p in (store.root / stage).glob(f"{key}*") if _KEY.fullmatch(p.name))

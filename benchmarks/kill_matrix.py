@@ -1,0 +1,244 @@
+"""What a run does that is told to stop: every signal at every moment, as a table for docs/benchmarks/signals.md.
+
+    python -m benchmarks.kill_matrix FOLDER [--signals INT TERM HUP KILL TWICE] [--write]
+
+FOLDER gets a small demo capture, one run that nothing disturbs, and a run for each signal. That run is started again
+and again into the same folder, and the signal comes each time at the next moment: during the imports, a share of the
+way through each stage, and while results are published. At the end it goes through undisturbed, and must have the bytes
+of the first run. Columns of earlier calls with the same FOLDER are kept; `--signals` alone makes their table. TWICE
+is SIGTERM and, half a second later, SIGTERM again.
+
+A cell has the exit code and the seconds until the process was gone; "done": the moment did not come, the stage
+was faster. A fault is in words, and makes the exit code 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+from benchmarks.generated import print_or_write
+from pipeline.demo.capture import write_demo_capture
+from stages.registry import REGISTRY
+from workflows.run import host_info
+from workflows.run.run_lock import is_held
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "benchmarks" / "signals.md"
+BEGIN, END = "<!-- made by benchmarks/kill_matrix.py -->", "<!-- end -->"
+SIGNALS = ("INT", "TERM", "HUP", "KILL", "TWICE")
+AT_ONCE = {"KILL", "TWICE"}
+START_UP = (0.05, 0.15, 0.4, 1.0, 2.0)  # seconds after the start of the process
+SHARES = (0.1, 0.6)  # of a stage's seconds
+SMALL = tuple(word for setting in (
+    "inverse_rendering.steps=40", "inverse_rendering.grid_cells=64", "inverse_rendering.batch=512",
+    "uv.target_faces=4000", "bake.size=256", "bake.fit_standard=false", "usd.preview_size=64", "usd.high=false",
+    "usd.environment_width=64",
+) for word in ("--set", setting)) + ("--holdout", "every:5:2")  # fmt: skip
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}  # other work makes it no slower
+VIEWS, SIZE = 16, 96
+MARK = "NEUFACE_KILL_MATRIX"
+LAST, SAME = "then undisturbed", "the same bytes"
+PATIENCE = 1800.0  # seconds until a run counts as hanging
+LIMIT = 60.0  # seconds from the first signal to the end
+TRACES = re.compile(r"Traceback|\*\*\* |Exception ignored|Segmentation fault|Aborted")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """When a signal comes. come: whether it is here; wait: seconds after that; over: whether it will not come."""
+
+    name: str
+    come: Callable[[], bool]
+    wait: float
+    over: Callable[[], bool] = lambda: False
+
+
+@dataclass
+class Cell:
+    """code: exit code, negative for a signal that the system dealt with; None where the moment did not come."""
+
+    code: int | None
+    seconds: float = 0.0
+    faults: list[str] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        if self.faults:
+            return "; ".join(self.faults)
+        if self.code is None:
+            return "done"
+        return f"{self.code if self.code >= 0 else 128 - self.code}, {self.seconds:.1f} s"
+
+
+def command(folder: Path, out: Path) -> list[str]:
+    """One run, as the console script starts it."""
+    return [sys.executable, "-m", "workflows.cli", "run", str(folder / "capture"), "--out", str(out), *SMALL]
+
+
+def start(folder: Path, out: Path, mark: str) -> subprocess.Popen[str]:
+    """The run's process, in a group of its own; all that it starts has the mark in its environment."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_API")}
+    with (folder / "said.txt").open("w") as said:
+        return subprocess.Popen(command(folder, out), stdin=subprocess.DEVNULL, stdout=said, stderr=said, text=True,
+                                cwd=ROOT, env={**kept, **ONE_THREAD, "PYTHONPATH": str(ROOT), MARK: mark},
+                                start_new_session=True)  # fmt: skip
+
+
+def moments(folder: Path, out: Path, seconds: dict[str, float]) -> Iterator[Moment]:
+    """In the order in which a run comes to them. seconds: of each stage, undisturbed."""
+    for wait in START_UP:
+        yield Moment(f"{wait:g} s after the start", lambda: True, wait)
+    names = [s.name for s in REGISTRY]
+    for number, stage in enumerate(names):
+        for share in SHARES:
+            yield Moment(f"{stage}, {share:.0%}", partial(_begun, out, [stage]), share * seconds[stage],
+                         partial(_begun, out, names[number + 1 :]))  # fmt: skip
+    yield Moment("publishing", partial(_publishes, out), 0.0)
+
+
+def _begun(out: Path, stages: Sequence[str]) -> bool:
+    """Whether one of the stages is under way; no stages: whether results are published."""
+    under_way = any(any((out / ".store" / s).glob("*.partial-*")) for s in stages)
+    return under_way or (not stages and _publishes(out))
+
+
+def _publishes(out: Path) -> bool:
+    return any(out.glob(".asset.partial-*"))
+
+
+def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
+    """One run that gets the signal at this moment, and what it left."""
+    mark = uuid.uuid4().hex
+    before = (out / "run.json").is_file(), left_in(out)
+    process = start(folder, out, mark)
+    end = time.monotonic() + PATIENCE
+    while not (moment.come() or moment.over()) and process.poll() is None and time.monotonic() < end:
+        time.sleep(0.005)
+    if not moment.over():
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(moment.wait)
+    if process.poll() is not None or moment.over():
+        process.kill()
+        process.wait()
+        return Cell(None)
+    struck = time.monotonic()
+    number = signal.SIGTERM if name == "TWICE" else signal.Signals[f"SIG{name}"]
+    process.send_signal(number)
+    if name == "TWICE":
+        time.sleep(0.5)
+        process.send_signal(number)
+    code = process.wait(PATIENCE)
+    cell = Cell(code, time.monotonic() - struck)
+    cell.faults = list(_faults(folder, out, cell, number, name, mark, before))
+    return cell
+
+
+def _faults(
+    folder: Path, out: Path, cell: Cell, number: signal.Signals, name: str, mark: str, before: tuple[bool, set[Path]]
+) -> Iterator[str]:
+    assert cell.code is not None
+    code = cell.code if cell.code >= 0 else 128 - cell.code
+    if code != 128 + number:
+        yield f"exit code {code}"
+    if cell.seconds > LIMIT:
+        yield f"{cell.seconds:.0f} s until the end"
+    found = TRACES.search((folder / "said.txt").read_text(errors="replace"))
+    if found:
+        yield f"says {found[0].strip()}"
+    time.sleep(0.1)  # the kernel ends children after their parent
+    if left := survivors(mark):
+        yield f"{len(left)} processes live on"
+    if out.is_dir() and is_held(out / ".store", out):
+        yield "the lock is held"
+    published = [p for p in ("asset", "report", "run.json") if (out / p).exists()]
+    if not before[0] and len(published) not in (0, 3):
+        yield f"published {', '.join(published)} alone"
+    if name not in AT_ONCE and (left := left_in(out) - before[1]):
+        yield f"left {len(left)} partial folders"
+
+
+def left_in(out: Path) -> set[Path]:
+    """Folders of results that are being made."""
+    return {*(out / ".store").glob("*/*.partial-*"), *out.glob(".*.partial-*")}
+
+
+def survivors(mark: str) -> list[int]:
+    """Processes with this mark in their environment that still run."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if f"{MARK}={mark}".encode() in (entry / "environ").read_bytes():
+                found.append(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+def run_through(folder: Path, out: Path) -> dict[str, object]:
+    """Let a run go to its end. Returns its run.json."""
+    process = start(folder, out, uuid.uuid4().hex)
+    code = process.wait(PATIENCE)
+    if code not in (0, 3):
+        raise SystemExit(f"the run failed with exit code {code}: {(folder / 'said.txt').read_text()}")
+    record: dict[str, object] = json.loads((out / "run.json").read_text())
+    return record
+
+
+def column(folder: Path, name: str, whole: dict[str, object]) -> dict[str, Cell]:
+    """One signal at all moments, and whether the run that is left alone afterwards has the same bytes."""
+    out = folder / f"{name}-{uuid.uuid4().hex[:8]}"
+    timing = {n: float(s) for n, s in whole["timing"].items()}  # type: ignore[attr-defined]
+    cells = {}
+    for moment in moments(folder, out, timing):
+        cells[moment.name] = strike(folder, out, moment, name)
+        print(f"{name:5} {moment.name:28} {cells[moment.name]}", flush=True)
+    same = run_through(folder, out)["asset_hash"] == whole["asset_hash"]
+    cells[LAST] = Cell(0, 0.0, [SAME if same else "OTHER BYTES"])
+    (folder / f"{name}.json").write_text(json.dumps({n: asdict(c) for n, c in cells.items()}))
+    return cells
+
+
+def table(cells: dict[str, dict[str, Cell]]) -> str:
+    """Markdown: a row for each moment, a column for each signal."""
+    heads = [n if n == "TWICE" else f"SIG{n}" for n in cells]
+    rows = [f"| moment | {' | '.join(heads)} |", "|---" * (len(cells) + 1) + "|"]
+    for moment in next(iter(cells.values())):
+        rows.append(f"| {moment} | {' | '.join(str(c[moment]) for c in cells.values())} |")
+    about = f"{host_info.describe(host_info.machine())}; {VIEWS} photos of {SIZE} px, one thread, `{' '.join(SMALL)}`"
+    return "\n".join([BEGIN, about, "", *rows, END])
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Exit code 1 if any cell is a fault."""
+    p = argparse.ArgumentParser()
+    p.add_argument("folder", type=Path)
+    p.add_argument("--signals", nargs="*", choices=SIGNALS, default=list(SIGNALS))
+    p.add_argument("--write", action="store_true")
+    given = p.parse_args(arguments)
+    folder = given.folder.absolute()
+    write_demo_capture(folder / "capture", views=VIEWS, size=SIZE)
+    if given.signals:
+        whole = run_through(folder, folder / "whole")
+        for name in given.signals:
+            column(folder, name, whole)
+    known = {n: json.loads((folder / f"{n}.json").read_text()) for n in SIGNALS if (folder / f"{n}.json").is_file()}
+    cells = {n: {moment: Cell(**c) for moment, c in rows.items()} for n, rows in known.items()}
+    print_or_write(["--write"] if given.write else [], PAGE, table(cells))
+    faults = [f for c in cells.values() for cell in c.values() for f in cell.faults if f != SAME]
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

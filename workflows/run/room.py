@@ -1,0 +1,64 @@
+"""Is there enough room on a disk? Asked before a stage and before results are copied, not after minutes of work.
+
+What is asked for is the least that will surely be written: sizes of files that are copied, and a few bytes a texel. A
+disk that fills up all the same is reported when a write fails (`pipeline/errors.py`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pipeline.contract import Stage, StageConfig, key
+from pipeline.errors import DiskError
+from pipeline.store import MANIFEST, Store, file_refs
+
+SPARE = 4 << 20  # bytes: manifests, records, and a stage's small files
+BYTES_A_TEXEL = 8  # of all maps together; those of the demo's head have 67
+COPIED = {"capture": ("source",), "usd": ("bake",)}  # stage -> inputs whose files it copies
+
+
+def check_room_for_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig, store: Store) -> None:
+    """Raises DiskError if the store's disk has less room than the stage needs; a stored result needs none."""
+    if not (store.folder(stage.name, key(stage, inputs, config)) / MANIFEST).is_file():
+        check_room(store.root, least(stage.name, inputs, config), f"for the stage {stage.name}", "--store")
+
+
+def check_room_for_copies(out: Path, files: Iterable[Path]) -> None:
+    """Raises DiskError if the disk of `out` has less free bytes than copies of the files have."""
+    check_room(out, SPARE + sum(p.stat().st_size for p in files), "for the results", "--out")
+
+
+def least(stage: str, inputs: Any, config: StageConfig) -> int:
+    """Bytes that a stage writes at least, less than half of what is measured."""
+    copied = (getattr(inputs, name, None) for name in COPIED.get(stage, ()))
+    size = sum(ref.size for located in copied if located is not None for ref in file_refs(located.artifact))
+    texels = int(getattr(config, "size", 0)) ** 2 if stage == "bake" else 0
+    return SPARE + size + BYTES_A_TEXEL * texels
+
+
+def check_room(folder: Path, needed: int, what: str, option: str) -> None:
+    """Raises DiskError if less than `needed` bytes are free for this user on the disk of `folder`, which may not exist.
+
+    A file system that does not know its free bytes has enough.
+    """
+    there = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
+    total, _, free = shutil.disk_usage(there)
+    if total > 0 and free < needed:
+        raise DiskError(
+            "not enough space is left on the disk",
+            where=folder,
+            value=f"{free / 1e6:.1f} MB free on the disk of {_mount_of(there)}",
+            limit=f"at least {needed / 1e6:.1f} MB {what}",
+            remedy=f"free space on this disk, or choose another one with {option}; finished stages are kept",
+        )
+
+
+def _mount_of(folder: Path) -> Path:
+    place = folder.resolve()
+    while not os.path.ismount(place):
+        place = place.parent
+    return place
