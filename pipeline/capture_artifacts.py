@@ -11,7 +11,7 @@ from pipeline.artifacts import Artifact, FileRef, Matrix
 from pipeline.verdict import Finding
 
 CaptureKind = Literal[
-    "facescape", "transforms", "idr", "metashape", "realityscan", "colmap", "photos", "video"
+    "olat", "facescape", "transforms", "idr", "metashape", "realityscan", "colmap", "photos", "video"
 ]  # fmt: skip
 
 
@@ -20,7 +20,8 @@ class CaptureSource(Artifact):
 
     photos: or the single video file. cameras: files that describe cameras, for the kinds that have them. plates: photos
     of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the face along +Z, if
-    a file beside the capture contains it. passed_over: names of pictures whose format is not supported.
+    a file beside the capture contains it. passed_over: names of pictures whose format is not supported. stage: the
+    pictures under single lights and the tracking pictures of a light stage.
     """
 
     kind: CaptureKind
@@ -30,6 +31,7 @@ class CaptureSource(Artifact):
     plates: tuple[FileRef, ...] = ()
     metres_from_world: Matrix | None = None
     passed_over: tuple[str, ...] = ()
+    stage: tuple[FileRef, ...] = ()
 
 
 class GivenCamera(Artifact):
@@ -98,16 +100,54 @@ class ColourChart(Artifact):
     fits: tuple[ChartFound, ...]
 
 
+class StageLight(Artifact):
+    """One lamp of a light stage, in the capture's coordinates: a small Lambertian disc.
+
+    position: metres (the capture's unit). axis: unit vector along which it shines. intensity: radiant intensity along
+    the axis, linear RGB: a white Lambertian surface that faces it at distance d has the value intensity / (pi d^2).
+    frame: when its pictures were taken, counted with the tracking pictures.
+    """
+
+    index: int
+    position: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    intensity: tuple[float, float, float]
+    frame: int
+
+
+class StageFrame(Artifact):
+    """A picture of a light stage, linear. camera: index of the view with its camera. number: the light's index, or of a
+    tracking picture its frame."""
+
+    camera: int
+    number: int
+    image: FileRef
+
+
+class LightStage(Artifact):
+    """Pictures under one light at a time, and how they were lit. The capture's views are the pictures under all lights.
+
+    frames: under single lights; tracking: under all lights, at later times. gain: the views' values are those of the
+    files times gain (their files are too bright for a photo's range); frames and tracking are as in the files.
+    """
+
+    lights: tuple[StageLight, ...]
+    frames: tuple[StageFrame, ...]
+    tracking: tuple[StageFrame, ...] = ()
+    gain: float = 1.0
+
+
 class Capture(Artifact):
     """The imported photos, checked. colours_drift: white balance or exposure differ between the photos, so that one
     colour has several values. metres_from_world: see CaptureSource. chart: None if no colour checker was found, or the
-    search is off."""
+    search is off. stage: the pictures under single lights of a light stage."""
 
     kind: CaptureKind
     views: tuple[CaptureView, ...]
     colours_drift: bool = False
     chart: ColourChart | None = None
     metres_from_world: Matrix | None = None
+    stage: LightStage | None = None
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()

@@ -7,6 +7,7 @@ without the subject. Hidden files and other sub-folders are ignored.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,14 +15,18 @@ from pipeline.artifacts import FileRef, Located
 from pipeline.capture_artifacts import CaptureKind, CaptureSource
 from pipeline.errors import StageError
 from pipeline.transforms import rows
-from stages.capture.readers import describe, find_reader
+from stages.capture.readers import describe, facescape, find_reader, idr, transforms
 from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key
 from stages.capture.readers.facescape_scale import metres_from_world
+from stages.capture.readers.olat import Pictures, pictures_of
 from stages.capture.readers.values import printable
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp",
-                    ".jxl", ".jp2", ".jfif", ".rw2", ".orf", ".pef", ".srw")  # fmt: skip
+                    ".jxl", ".jp2", ".jfif", ".rw2", ".orf", ".pef", ".srw", ".hif", ".heics", ".gif", ".psd", ".tga",
+                    ".crw", ".x3f", ".3fr", ".fff", ".iiq", ".nrw", ".rwl", ".erf", ".kdc", ".dcr", ".mrw", ".sr2",
+                    ".srf", ".gpr")  # fmt: skip
+CAMERA_FILES = (*transforms.NAMES, *idr.NAMES, facescape.PARAMS)
 MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
 MIN_PHOTOS = 3  # two views leave the depth along their common line undetermined, and nothing can check it
 
@@ -44,6 +49,8 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
             limit="a folder with photos",
             remedy="check the path; give the folder that contains the photos, not a photo",
         )
+    for name in CAMERA_FILES:  # a link that leads nowhere must not turn given cameras into solved ones
+        _is_readable_file(folder / name)
     found = find_reader(folder)
     if found is not None:
         return _described(folder, *found)
@@ -80,13 +87,15 @@ def _source(
     masks: Sequence[Path],
     plates: Sequence[Path],
 ) -> CaptureSource:
-    for path in (*photos, *cameras, *masks, *plates):
+    pictures = pictures_of(folder) if kind == "olat" else Pictures()
+    stage = sorted([*pictures.single.values(), *pictures.tracking.values()])
+    for path in (*photos, *cameras, *masks, *plates, *stage):
         _can_be_written(path)
-    refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates)]
+    refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates, stage)]
     world = metres_from_world(folder) if kind == "facescape" else None
     return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
                          metres_from_world=None if world is None else rows(world),
-                         passed_over=_passed_over(photos))  # fmt: skip
+                         passed_over=_passed_over(photos), stage=refs[4])  # fmt: skip
 
 
 def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
@@ -143,9 +152,24 @@ def _once(views: Sequence[Declared]) -> None:
 
 
 def _pictures(folder: Path) -> list[Path]:
-    """Photos directly in the folder, in natural order."""
-    found = (p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES)
-    return sorted((p for p in found if not p.name.startswith(".") and p.is_file()), key=lambda p: natural_key(p.name))
+    """Photos directly in the folder, in natural order. Raises StageError if one of them is no file."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".")]
+    for path in found:
+        _is_readable_file(path)
+    return sorted((p for p in found if p.is_file()), key=lambda p: natural_key(p.name))
+
+
+def _is_readable_file(path: Path) -> None:
+    """Raises StageError for a link that leads nowhere, a pipe or a device. Nothing, a file and a folder are none."""
+    if os.path.lexists(path) and not path.is_file() and not path.is_dir():
+        link = path.is_symlink()
+        raise StageError(
+            "this is no file",
+            where=printable(str(path)),
+            value=f"a link to {printable(str(path.readlink()))}" if link else "a pipe, a socket or a device",
+            limit="a file, or a link to one",
+            remedy="put the file back that it leads to, or remove it" if link else "remove it from the folder",
+        )
 
 
 def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: str) -> list[Path]:

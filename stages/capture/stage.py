@@ -77,14 +77,21 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
             for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
     useless = [c.name for c, v in zip(candidates, views, strict=True) if c.mask is not None and v.mask is None]
     masked = sum(v.mask is not None for v in views)
+    stage = None
+    if source.artifact.kind == "olat":
+        from stages.capture.light_stage import import_stage
+
+        found = import_stage(source, views, context)
+        stage, views = found.stage, found.views
+        selection.warnings.extend(found.warnings)
     findings = (*judge(seen, [n for n in selection.absent if n not in described], source.artifact.passed_over),
-                *given_masks(masked, useless))  # fmt: skip
+                *given_masks(masked, useless), *(found.findings if stage else ()))  # fmt: skip
     warnings = (
         selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
     )
     warnings += made.partly_masked(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
-                   metres_from_world=source.artifact.metres_from_world,
+                   metres_from_world=source.artifact.metres_from_world, stage=stage,
                    left_out=tuple(selection.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip
 
 
@@ -110,4 +117,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=5, inputs=Inputs, config=Config, output=Capture, run=run)
+STAGE = Stage(name="capture", version=6, inputs=Inputs, config=Config, output=Capture, run=run)

@@ -204,6 +204,30 @@ def test_photos_of_other_formats_are_told_with_their_names(tmp_path: Path, gathe
     assert "convert them to JPEG, PNG, TIFF or EXR" in told[0]
 
 
+@pytest.mark.parametrize("suffix", [".heic", ".HIF", ".gif", ".psd", ".CR3", ".3fr", ".dng", ".webp", ".avif"])
+def test_photos_of_another_format_alone_are_refused_by_name(tmp_path: Path, suffix: str) -> None:
+    for i in range(3):
+        (tmp_path / f"p{i}{suffix}").write_bytes(b"x")
+    with pytest.raises(StageError, match="no photos") as caught:
+        scan_capture(tmp_path)
+    assert f"p0{suffix}" in str(caught.value) and "convert them" in caught.value.remedy
+
+
+@pytest.mark.parametrize("name", ["e.jpg", "mask/a.png", "params.json", "transforms.json", "cameras_sphere.npz"])
+@pytest.mark.parametrize("kind", ["dangling", "loop", "pipe"])
+def test_what_is_no_file_is_refused_by_name(tmp_path: Path, name: str, kind: str) -> None:
+    folder = plain(tmp_path / "c")
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("nowhere" if kind == "dangling" else path.name)
+    with pytest.raises(StageError, match="no file") as caught:
+        scan_capture(folder)
+    assert str(path) in str(caught.value)
+
+
 def test_a_photo_s_name_that_is_not_utf8(tmp_path: Path) -> None:
     folder = plain(tmp_path / "c")
     (folder / "a.jpg").rename(os.fsdecode(os.fsencode(folder) + b"/\xff.jpg"))

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipeline.errors import StageError, UsageError
+from workflows.run.owned import partial_name, put_owned
 
 if TYPE_CHECKING:
     from pipeline.camera import PinholeCamera
+    from pipeline.images import F32
+    from pipeline.transforms import F64
     from stages.usd.render.render import Light, Renderer
 
 CAPTURED = "captured"
@@ -37,15 +40,17 @@ class RenderRequest:
     samples: int = 0
 
 
-def render_pictures(request: RenderRequest) -> Iterator[tuple[Path, float]]:
+def render_pictures(
+    request: RenderRequest, notify: Callable[[str], None] = lambda text: None
+) -> Iterator[tuple[Path, float]]:
     """NAME.exr (linear RGBA, premultiplied) and NAME.png for each view; yields the EXR and the seconds it took.
+
+    A file of the user's own of such a name, a photo for example, is renamed to NAME.yours-N, and `notify` is called.
 
     Raises:
         StageError: something of the asset, the cameras or the light is missing or damaged. UsageError: no such view.
     """
-    from pipeline.images import write_exr
     from stages.usd.render.exported import load_exported
-    from stages.usd.render.previews import write_rgba_png
     from stages.usd.render.render import Renderer
 
     root = component_in(request.folder)
@@ -56,10 +61,29 @@ def render_pictures(request: RenderRequest) -> Iterator[tuple[Path, float]]:
         start = time.perf_counter()
         shown = view.scaled(request.width) if request.width else view
         rgba = renderer.render(shown, samples=request.samples, light=light)
-        path = request.out / f"{name}.exr"
-        write_exr(path, rgba)
-        write_rgba_png(path.with_suffix(".png"), rgba)
-        yield path, time.perf_counter() - start
+        yield put_picture(request.out, name, rgba, notify), time.perf_counter() - start
+
+
+def put_picture(folder: Path, name: str, rgba: Any, notify: Callable[[str], None]) -> Path:
+    """Write NAME.exr and NAME.png of a picture (H, W, 4), linear and premultiplied; a foreign file of that name is
+    kept aside. Returns the path of the EXR."""
+    from pipeline.images import write_exr
+    from stages.usd.render.previews import write_rgba_png
+
+    _put(folder, f"{name}.exr", write_exr, rgba, notify)
+    _put(folder, f"{name}.png", write_rgba_png, rgba, notify)
+    return folder / f"{name}.exr"
+
+
+def _put(folder: Path, name: str, write: Callable[[Path, Any], None], rgba: Any, notify: Callable[[str], None]) -> None:
+    made = partial_name(folder, name)
+    try:
+        write(made, rgba)
+        aside = put_owned(folder, name, made)
+        if aside is not None:
+            notify(f"{folder / name} is yours: kept as {folder / aside}")
+    finally:
+        made.unlink(missing_ok=True)
 
 
 def component_in(folder: Path) -> Path:
@@ -85,7 +109,6 @@ def light_named(name: str, renderer: Renderer, root: Path) -> Light | None:
     Raises:
         StageError: the file can't be read, or holds no light.
     """
-    from pipeline.images import read_linear
     from pipeline.maths import studio_lights
     from stages.usd.render.previews import captured
     from stages.usd.render.relight import Environment
@@ -94,10 +117,8 @@ def light_named(name: str, renderer: Renderer, root: Path) -> Light | None:
     if name == CAPTURED:
         return captured(renderer, root)
     kind = Environment if renderer.asset.f0 is None else StandardLight
-    if name in studio_lights.LIGHTS:
-        return kind(renderer, studio_lights.picture(name, MADE_WIDTH), name)
-    path = Path(name)
-    if path.suffix.lower() not in ENVIRONMENTS or not path.is_file():
+    picture, path = light_picture(name), Path(name)
+    if picture is None:
         raise StageError(
             "this light can't be read",
             where=name,
@@ -105,7 +126,18 @@ def light_named(name: str, renderer: Renderer, root: Path) -> Light | None:
             limit=f"{CAPTURED}, {', '.join(studio_lights.LIGHTS)}, or a file {' or '.join(ENVIRONMENTS)}",
             remedy="give --env an equirectangular picture",
         )
-    return kind(renderer, read_linear(path), path.name)
+    return kind(renderer, picture, path.name)
+
+
+def light_picture(name: str) -> F32 | None:
+    """The lat-long picture of a made light or of a file; None if the name is neither's."""
+    from pipeline.images import read_linear
+    from pipeline.maths import studio_lights
+
+    if name in studio_lights.LIGHTS:
+        return studio_lights.picture(name, MADE_WIDTH)
+    path = Path(name)
+    return read_linear(path) if path.suffix.lower() in ENVIRONMENTS and path.is_file() else None
 
 
 def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, PinholeCamera]:
@@ -116,14 +148,19 @@ def _views(request: RenderRequest, root: Path, renderer: Renderer) -> dict[str, 
         turns = 2 * np.pi * np.arange(request.turntable) / request.turntable
         return {f"turn_{i:03d}": framing(renderer, float(t), TURNTABLE_SIDE) for i, t in enumerate(turns)}
     if request.cameras is not None:
-        found = _given(request.cameras, request.folder)
+        found = given_cameras(request.cameras, request.folder)
         chosen = list(found)
     else:
         captured = read_cameras(root.parent / "lookdev.usda")
         found = {i: view for i, (view, _) in captured.items()}
         chosen = [i for i, (_, held_out) in captured.items() if held_out] or list(found)
-    if request.views is not None:
-        chosen = _indices(request.views)
+    return chosen_views(request.views, found, chosen)
+
+
+def chosen_views(listed: str | None, found: dict[int, PinholeCamera], chosen: list[int]) -> dict[str, PinholeCamera]:
+    """The cameras of --views by their number as text; without it, the chosen ones. Raises UsageError."""
+    if listed is not None:
+        chosen = _indices(listed)
     missing = [i for i in chosen if i not in found]
     if missing:
         raise UsageError(
@@ -149,23 +186,23 @@ def _indices(text: str) -> list[int]:
     return [int(p) for p in parts]
 
 
-def _given(params: Path, folder: Path) -> dict[int, PinholeCamera]:
+def given_cameras(params: Path, folder: Path) -> dict[int, PinholeCamera]:
     """Cameras of a params.json, moved from the capture's world into the asset's by the run's own matrix."""
     from pipeline.camera import PinholeCamera
     from pipeline.transforms import inverse_rigid, matrix, rescale_camera
     from stages.capture.readers.facescape import given_view, is_valid, read_params, view_indices
 
-    record = folder / "run.json"
-    try:
-        capture_from_asset = matrix(json.loads(record.read_text())["capture_from_asset"]).reshape(4, 4)
-    except (OSError, ValueError, KeyError) as e:
-        raise StageError(
-            "where the capture lies in the asset's world is not known",
-            where=record,
-            value=e,
-            limit="the run.json of a finished run",
-            remedy="name a run's folder, or leave --cameras out to use the cameras in lookdev.usda",
-        ) from e
+    if not params.is_file():
+        raise UsageError(
+            "there is no file with cameras",
+            where="--cameras",
+            value=params,
+            limit="the params.json of a capture",
+            remedy="check the path, or leave --cameras out to use the cameras in lookdev.usda",
+        )
+    capture_from_asset = capture_from_asset_of(
+        folder, "name a run's folder, or leave --cameras out to use the cameras in lookdev.usda"
+    )
     found = read_params(params)
     out = {}
     for index in view_indices(found):
@@ -175,3 +212,20 @@ def _given(params: Path, folder: Path) -> dict[int, PinholeCamera]:
             pose = rescale_camera(matrix(np.linalg.inv(capture_from_asset)), capture_from_cam)
             out[index] = PinholeCamera(matrix(camera.K), pose, width, height, np.array(camera.distortion, np.float64))
     return out
+
+
+def capture_from_asset_of(folder: Path, remedy: str = "name a run's folder") -> F64:
+    """4x4 similarity of a run's record. Raises StageError, with this remedy, if there is none."""
+    from pipeline.transforms import matrix
+
+    record = folder / "run.json"
+    try:
+        return matrix(json.loads(record.read_text())["capture_from_asset"]).reshape(4, 4)
+    except (OSError, ValueError, KeyError) as e:
+        raise StageError(
+            "where the capture lies in the asset's world is not known",
+            where=record,
+            value=e,
+            limit="the run.json of a finished run",
+            remedy=remedy,
+        ) from e

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.capture_artifacts import CaptureKind
-from stages.capture.readers import colmap, facescape, idr, metashape, realityscan, transforms
+from stages.capture.readers import colmap, facescape, idr, metashape, olat, realityscan, transforms
 from stages.capture.readers.described import Described, Reader
 
-# the most explicit first: a COLMAP model is often the by-product of a transforms.json beside it
+# the most explicit first: a light stage has FaceScape's params.json too,
+# and a COLMAP model is often the by-product of a transforms.json beside it
 READERS: dict[CaptureKind, Reader] = {
+    "olat": olat,
     "facescape": facescape,
     "transforms": transforms,
     "idr": idr,

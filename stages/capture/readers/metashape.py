@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from pipeline.transforms import F64, apply, inverse_rigid, rigid, similarity
+from pipeline.transforms import F64, apply, inverse_rigid, rigid, scale_of, similarity
 from stages.capture.readers.cameras import (
     checked_frame,
     checked_K,
@@ -113,7 +113,7 @@ def _world_from_chunk(chunk: ElementTree.Element, name: str) -> F64:
 
 def _rigid_part(world_from_chunk: F64, chunk_from_cam: F64) -> F64:
     """world_from_cam (4, 4): the rotation of the product, and the camera centre in the world."""
-    scale = float(np.cbrt(np.linalg.det(world_from_chunk[:3, :3])))
+    scale = scale_of(world_from_chunk)
     centre = apply(world_from_chunk, chunk_from_cam[None, :3, 3])[0]
     return rigid(world_from_chunk[:3, :3] / scale @ chunk_from_cam[:3, :3], centre)
 

@@ -1,0 +1,25 @@
+"""Settings of the reflectance stage."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from pipeline.contract import StageConfig
+from pipeline.units import Texels, Unit
+
+
+class Config(StageConfig):
+    """Settings of the reflectance stage; they matter for captures of a light stage only."""
+
+    size: Texels = Field(512, ge=64, le=4096, description="width and height of the field's maps in texels")
+    every: Annotated[int, Unit("lights")] = Field(
+        7, ge=0, le=100, description="every how many lights one is left out of the fit and predicted instead; 0: none"
+    )
+    camera: int = Field(-1, ge=-1, description="number of a camera that is left out of the fit; -1: none")
+    normal_prior: float = Field(
+        0.02, ge=0, le=100, description="weight of the surface's normal against the one that the pictures say"
+    )
+    order: int = Field(3, ge=0, le=5, description="order of the harmonics for light by way of other skin; 3: 16 terms")
+    motion: bool = Field(True, description="measure how the head moved, from the tracking pictures")

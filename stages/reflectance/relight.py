@@ -1,0 +1,92 @@
+"""Pictures of a reflectance field: lamps, several of them, and environments.
+
+Texels are shaded once for a camera; pixels are means of texels. `look_up` finds which, by rays through each pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.camera import PinholeCamera
+from pipeline.images import F32
+from pipeline.transforms import F64, pixel_centres
+from stages.reflectance.field import Field, Lamp, distant_lamp
+
+SAMPLES = 2  # rays along each side of a pixel
+QUICK, FULL = 64, 384  # lamps of an environment
+
+
+def look_up(field: Field, camera: PinholeCamera, samples: int = SAMPLES) -> Any:
+    """Sparse (H W, T) matrix from texels to pixels. Its rows sum to the share of a pixel that the mesh covers."""
+    from scipy.sparse import csr_array
+
+    fine = camera.scaled(camera.width * samples)
+    origin, rays = fine.rays(pixel_centres(fine.width, fine.height))
+    far, face = field.whole.hits(np.broadcast_to(origin, rays.shape), rays)
+    hit = np.flatnonzero(face >= 0)
+    at, face = origin + far[hit, None] * rays[hit], face[hit]
+    corners = field.charts.uvs.astype(np.float64)[field.charts.faces[face]]
+    triangles = field.mesh.vertices.astype(np.float64)[field.mesh.faces[face]]
+    uv = (corners * barycentric(triangles, at)[..., None]).sum(1)
+    size = field.points.size
+    x, y = uv[:, 0] * size - 0.5, (1 - uv[:, 1]) * size - 0.5
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    pixel = (hit // fine.width // samples) * camera.width + (hit % fine.width) // samples
+    rows, columns, weights = [], [], []
+    for dx in (0, 1):
+        for dy in (0, 1):
+            column, row = (np.clip(v, 0, size - 1) for v in (left + dx, top + dy))
+            share = np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top))
+            rows.append(pixel)
+            columns.append(field.nearest[row * size + column])
+            weights.append(share / samples**2)
+    shape = (camera.width * camera.height, len(field.known))
+    return csr_array((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
+
+
+def barycentric(corners: F64, at: F64) -> F64:
+    """(N, 3) weights of points (N, 3) on triangles (N, 3, 3)."""
+    a, b, c = corners.transpose(1, 0, 2)
+    u, v, w = b - a, c - a, at - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    wu, wv = (w * u).sum(1), (w * v).sum(1)
+    below = np.maximum(uu * vv - uv * uv, 1e-30)
+    s, t = (vv * wu - uv * wv) / below, (uu * wv - uv * wu) / below
+    return np.stack([1 - s - t, s, t], 1)
+
+
+def picture(camera: PinholeCamera, table: Any, radiance: F32) -> F32:
+    """(H, W, 4) linear RGBA, premultiplied, of texels' radiance (T, 3). table: of `look_up`."""
+    rgb = np.asarray(table @ radiance, np.float32)
+    alpha = np.asarray(table.sum(axis=1), np.float32).reshape(-1, 1)
+    return np.concatenate([rgb, alpha], 1).reshape(camera.height, camera.width, 4)
+
+
+def under_lamps(
+    field: Field,
+    cameras: Sequence[PinholeCamera],
+    lamps: Sequence[Lamp],
+    tick: Callable[[int, int], None],
+    rays: int = 3,
+) -> list[F32]:
+    """Radiance (T, 3) towards each camera under all lamps together. tick: lamps done, of all."""
+    total = [np.zeros((len(field.known), 3), np.float32) for _ in cameras]
+    for done, lamp in enumerate(lamps):
+        tick(done, len(lamps))
+        arrives = field.arrives(lamp, rays)
+        for sum_, camera in zip(total, cameras, strict=True):
+            sum_ += field.radiance(lamp, camera.eye, arrives)
+    return total
+
+
+def lamps_of(environment: F32, name: str, *, quick: bool) -> list[Lamp]:
+    """Distant lamps of a lat-long picture (H, 2 H, 3) in asset coordinates. quick: fewer of them."""
+    from pipeline.lighting.median_cut import checked_environment
+    from pipeline.lighting.median_cut import lamps as cut
+
+    found = cut(checked_environment(environment, name), QUICK if quick else FULL)
+    return [distant_lamp(d.astype(np.float64), f.astype(np.float64))
+            for d, f in zip(found.directions, found.flux, strict=True)]  # fmt: skip

@@ -1,0 +1,35 @@
+"""Reflectance stage: how each texel answers light, from pictures under one light at a time; a ReflectanceField."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.artifacts import CameraSet, Located, ReflectanceField, UvMesh
+from pipeline.capture_artifacts import Capture
+from pipeline.contract import Context, Stage
+from stages.reflectance.config import Config
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The pictures and lights, the cameras, and the mesh with its charts."""
+
+    capture: Located[Capture]
+    poses: Located[CameraSet]
+    uv: Located[UvMesh]
+
+
+def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
+    """Measure the motion, sample the pictures, split them into the field, fill what no camera saw, and score it.
+
+    Raises:
+        StageError: too few lights or cameras are left for the fit, or the head moved too far.
+    """
+    if inputs.capture.artifact.stage is None:
+        return ReflectanceField(present=False)
+    from stages.reflectance.build import build
+
+    return build(inputs.capture, inputs.poses, inputs.uv, config, context)
+
+
+STAGE = Stage(name="reflectance", version=1, inputs=Inputs, config=Config, output=ReflectanceField, run=run)
