@@ -8,8 +8,8 @@ normal n of the doubled area; Q (3, 2) an orthonormal basis of the person's tria
 
 which is Sumner and Popovic's problem with each triangle's fourth vertex eliminated (it takes the part of S along the
 normal, exactly), triangles weighted by their area. A vertex that the expression leaves where it is on the template
-stays on the person, so that an expression moves the same vertices on everybody. Each quad is cut both ways: the result
-does not depend on a choice of diagonals.
+stays on the person, so that an expression moves the same vertices on everybody. Near the border of the neck nothing
+moves (neck.py). Each quad is cut both ways: the result does not depend on a choice of diagonals.
 
 Eyes, teeth and tongue make the rigid motion that they make in the template, about their own middle; what is not rigid
 in it (a tongue that comes out) is added.
@@ -36,7 +36,9 @@ from scipy.sparse.linalg import splu
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.followers import BENDING, rigid_motion
 from pipeline.registration.lids import BLINK, GAP, facing
+from pipeline.registration.neck import neck_share
 from pipeline.template.model import SKIN, Expressions, Template
+from pipeline.transforms import scale_of
 
 CONTACT = 10.0  # of the mean diagonal of the system: weight of lids that meet
 MOST = 1.5  # largest scale of a blink
@@ -61,15 +63,16 @@ def transferred(template: Template, vertices: F64, world_from_template: F64) -> 
     given = template.expressions
     if given is None:
         return Expressions((), np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
-    scale = float(np.cbrt(np.linalg.det(world_from_template[:3, :3])))
+    scale = scale_of(world_from_template)
     turn = world_from_template[:3, :3] / scale
     person = (vertices - world_from_template[:3, 3]) @ turn / scale  # in the template's frame
     skin = template.quads[template.parts[SKIN]]
     before, after = triangles(template.vertices, skin), triangles(person, skin)
     system = csr_array(after.gradient.T @ diags_array(np.repeat(after.area, 2)) @ after.gradient)
     starts, rows, offsets = [0], [], []
+    share = neck_share(template)[:, None]
     for name in given.names:
-        wanted = template.expression(name)
+        wanted = template.expression(name) * share
         moves = np.linalg.norm(wanted, axis=1) > LEAST
         out = _on_skin(template.vertices, wanted, moves, before, after, system)
         if name in BLINK:

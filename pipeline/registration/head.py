@@ -66,6 +66,11 @@ def kept_quads(head: Head, regions: tuple[str, ...]) -> Mask:
     return np.asarray(np.array([n not in LEFT_OUT for n in regions])[head.region], np.bool_)
 
 
+def of_triangles(head: Head, of_quad: Indices, regions: tuple[str, ...]) -> Indices:
+    """(F,) values of the cage's quads, of_quad (Q,), at the triangles that the textured mesh has of the head."""
+    return np.asarray(np.repeat(of_quad[kept_quads(head, regions)], 2 * 4**head.levels), np.int64)
+
+
 def load_head(path: Path) -> Head:
     """The head of an npz that `save` wrote."""
     with np.load(path, allow_pickle=False) as z:

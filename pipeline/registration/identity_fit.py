@@ -8,7 +8,8 @@ is; s, R, t the similarity world_from_template; w (K,) identity weights in stand
     E = sum rho(|r| / sigma) + |w|^2                   landmarks: all three coordinates; surface points: n . r only
 
 rho is Cauchy's: its weight is 1 / (1 + (|r| / (SOFT sigma))^2), so that a landmark that is wrong, or that means another
-place on this person, does not pull. The prior |w|^2 is that of the persons of which the basis was made.
+place on this person, does not pull. Where many are wrong, only those take part that agree with one similarity, found
+in samples of four. The prior |w|^2 is that of the persons of which the basis was made.
 
 Source: Blanz and Vetter, A morphable model for the synthesis of 3D faces (1999), for the maximum a posteriori;
 the similarity by linearised rotations.
@@ -21,15 +22,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import StageError
-from pipeline.meshes import F64, Indices
+from pipeline.meshes import F64, Indices, Mask
 from pipeline.template.model import Template
-from pipeline.transforms import apply, similarity, umeyama
+from pipeline.transforms import apply, scale_of, similarity, umeyama
 
 LANDMARK_SIGMA = 0.003  # metres: scatter of the network's landmarks around the template's, on persons and scans
 MAX_RESIDUAL = 0.006  # metres, median: a template whose landmarks are further off does not fit this face
 ROUNDS = 12  # Gauss-Newton steps; 6 are enough on all captures
 SOFT = 2.0  # sigmas at which a datum has half of its weight
 MIN_DATA = 8  # landmarks: fewer do not determine a similarity well
+SAMPLES = 200  # fours of landmarks: one of 16 is right if half of the landmarks are
+AGREE = 0.4  # share of the landmarks that a similarity must suit
+WRONG, MANY = 5.0, 0.15  # sigmas from which a landmark is wrong; share of the landmarks that may be
 STEP = 3.0  # largest change of an identity weight in one step
 
 
@@ -46,6 +50,11 @@ class Data:
     sigma: F64
     normals: F64 | None = None
 
+    def only(self, use: Mask) -> Data:
+        """The data use (N,)."""
+        normals = None if self.normals is None else self.normals[use]
+        return Data(self.corners[use], self.weights[use], self.where[use], self.sigma[use], normals)
+
 
 @dataclass(frozen=True, slots=True)
 class PlacedHead:
@@ -61,7 +70,7 @@ class PlacedHead:
     @property
     def scale(self) -> float:
         """World units per metre of the template."""
-        return float(np.cbrt(np.linalg.det(self.world_from_template[:3, :3])))
+        return scale_of(self.world_from_template)
 
 
 def landmark_data(template: Template, landmarks: F64, sigma: float = LANDMARK_SIGMA) -> Data:
@@ -91,7 +100,12 @@ def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None =
         StageError: too few data, or they are not finite.
     """
     _check(data)
-    world, weights = _start(template, data[0]) if start is None else (start.world_from_template, start.weights)
+    every = data[0]
+    if start is None:
+        (world, use), weights = _start(template, every), np.zeros(0)
+        data = (every if use.all() else every.only(use), *data[1:])
+    else:
+        world, weights = start.world_from_template, start.weights
     basis = None if template.shape is None else template.shape.basis * template.shape.deviation[:, None, None]
     weights = np.zeros(0) if basis is None else np.resize(weights, len(basis)) if len(weights) else np.zeros(len(basis))
     normal = np.eye(7 + len(weights))
@@ -101,19 +115,45 @@ def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None =
         weights = weights + np.clip(step[7:], -STEP, STEP)
         world = _turned(world, step[:7])
     vertices = apply(world, template.identity(weights))
-    residual = np.linalg.norm(_residual(template, data[0], world, weights)[0], axis=1)
+    residual = np.linalg.norm(_residual(template, every, world, weights)[0], axis=1)
     # the covariance is the inverse of the normal matrix; robust weights are taken as they are
     deviation = float(np.sqrt(np.linalg.inv(normal)[6, 6]))
     return PlacedHead(world, weights, vertices, residual, deviation)
 
 
-def _start(template: Template, landmarks: Data) -> tuple[F64, F64]:
-    """Least squares similarity of the mean head, then again without the worst third."""
+def _start(template: Template, landmarks: Data) -> tuple[F64, Mask]:
+    """Least squares similarity of the mean head, then again without the worst third; and which landmarks (N,) are
+    used: all, unless too many are wrong. Those would make the most probable head tiny under a huge scale."""
     at = (template.vertices[landmarks.corners] * landmarks.weights[..., None]).sum(1)
-    world = umeyama(at, landmarks.where)
-    off = np.linalg.norm(apply(world, at) - landmarks.where, axis=1)
+    off = _away(umeyama(at, landmarks.where), at, landmarks.where)
     use = off <= np.quantile(off, 0.67)
-    return umeyama(at[use], landmarks.where[use]), np.zeros(0)
+    plain = umeyama(at[use], landmarks.where[use])
+    if (_away(plain, at, landmarks.where) > WRONG * LANDMARK_SIGMA).mean() <= MANY:
+        return plain, np.ones(len(at), np.bool_)
+    agree = _away(_sampled(at, landmarks.where), at, landmarks.where) <= WRONG * LANDMARK_SIGMA
+    if agree.sum() < MIN_DATA:
+        return plain, np.ones(len(at), np.bool_)
+    return umeyama(at[agree], landmarks.where[agree]), agree
+
+
+def _sampled(at: F64, where: F64) -> F64:
+    """Of the similarities of SAMPLES fours of landmarks that with which a share AGREE of them agrees best."""
+    random, best = np.random.default_rng(0), (umeyama(at, where), np.inf)
+    for _ in range(SAMPLES):
+        four = random.choice(len(at), 4, replace=False)
+        world = umeyama(at[four], where[four])
+        if not np.isfinite(world).all() or np.linalg.det(world[:3, :3]) <= 0:
+            continue
+        off = float(np.quantile(_away(world, at, where), AGREE))
+        if off < best[1]:
+            best = world, off
+    return best[0]
+
+
+def _away(world: F64, at: F64, where: F64) -> F64:
+    """(N,) distances of the places at (N, 3) of the template from those of the world where (N, 3), in the template's
+    metres."""
+    return np.asarray(np.linalg.norm(apply(world, at) - where, axis=1) / max(scale_of(world), 1e-12))
 
 
 def _residual(template: Template, data: Data, world: F64, weights: F64) -> tuple[F64, F64]:
@@ -131,7 +171,7 @@ def _normal_equations(
     left, right = np.zeros((size, size)), np.zeros(size)
     left[range(7, size), range(7, size)] = 1.0
     right[7:] = -weights
-    turn = world[:3, :3] / np.cbrt(np.linalg.det(world[:3, :3]))
+    turn = world[:3, :3] / scale_of(world)
     for part in data:
         r, there = _residual(template, part, world, weights)
         J = np.zeros((len(r), 3, size))

@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.meshes import F64, Mask
 from pipeline.registration.expressions import transferred
 from pipeline.registration.followers import rigid_motion
+from pipeline.registration.neck import neck_share
 from pipeline.template.model import SKIN, Expressions, Template
 
 HEAD, JAW, EYES = "head", "jaw", ("eye_left", "eye_right")
@@ -91,7 +92,7 @@ def jaw_axis(template: Template) -> tuple[F64, F64] | None:
 
 def jaw_weights(template: Template, turn: F64, on_axis: F64) -> F64:
     """(V,) how far each vertex follows the jaw."""
-    moved = template.expression(OPENS)
+    moved = template.expression(OPENS) * neck_share(template)[:, None]
     with_jaw = (template.vertices - on_axis) @ turn.T + on_axis - template.vertices
     share = (moved * with_jaw).sum(1) / np.maximum((with_jaw**2).sum(1), 1e-12)
     out = np.clip(share, 0, 1) * _inside(template, SKIN)

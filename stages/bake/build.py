@@ -20,8 +20,10 @@ from stages.bake.ambient import ambient
 from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
 from stages.bake.dilate import HALO, nearest_rows
+from stages.bake.eyes import Eyes
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
+from stages.bake.mouth import Inside
 from stages.bake.regions import Votes, areas
 from stages.bake.smooth import continued
 from stages.bake.standard_observe import standard_material
@@ -88,17 +90,21 @@ class Baker:
         scratch: Path | None = None,
         skin_code: int = -1,
         fit_standard: bool = True,
+        eyes: Eyes | None = None,
+        mouth: Inside | None = None,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
-        `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given."""
+        `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
+        `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
         self._step, self._scratch = step, scratch
         self._occluder = Occluder(mesh)
         self._known = _known(
-            field, mesh, views, self._occluder, lambda done, total: step(done, total, "ambient occlusion")
+            field, mesh, views, self._occluder, mouth, lambda done, total: step(done, total, "ambient occlusion")
         )
+        self._known = replace(self._known, eyes=eyes)
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
         self.material_figures: dict[str, float] = {}
@@ -112,6 +118,11 @@ class Baker:
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
+
+    @property
+    def standard_fitted(self) -> bool:
+        """Whether the maps are those of the fitted standard material."""
+        return self._known.standard is not None
 
     def tile(self, number: int) -> Baked:
         """Bake all texels that a chart of this tile touches.
@@ -158,11 +169,18 @@ def _per_tile(side: int, count: int) -> int:
 
 
 def _known(
-    field: Field, mesh: Mesh, views: Sequence[FittedPhoto], occluder: Occluder, step: Callable[[int, int], None]
+    field: Field,
+    mesh: Mesh,
+    views: Sequence[FittedPhoto],
+    occluder: Occluder,
+    mouth: Inside | None,
+    step: Callable[[int, int], None],
 ) -> Known:
     normals = meshes.unit(mesh.normals)
     seen = seen_weight(mesh.vertices.astype(np.float64), normals, views, occluder) > 0
     albedo = continued(mesh, field.material(mesh.vertices).albedo.astype(np.float64), seen)
+    if mouth is not None:
+        albedo = mouth.in_place_of(albedo, ~seen)
     return Known(ambient(mesh, occluder, step), (~seen).astype(np.float32), albedo.astype(np.float32))
 
 

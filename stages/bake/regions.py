@@ -40,8 +40,12 @@ class Votes:
         y, x = ((p - q).astype(np.float32)[:, None] for p, q in ((row, top), (column, left)))
         upper = self.image[top, left] * (1 - x) + self.image[top, right] * x
         lower = self.image[low, left] * (1 - x) + self.image[low, right] * x
-        votes = upper * (1 - y) + lower * y
-        return np.where(votes.max(1) > FEW_VOTES, self.codes[votes.argmax(1)], 0).astype(np.uint8)
+        return elected(self.codes, upper * (1 - y) + lower * y)
+
+
+def elected(codes: U8, votes: npt.NDArray[np.floating]) -> U8:
+    """(N,) code with the most of the votes (N, L) of codes (L,); 0 with too few."""
+    return np.where(votes.max(1) > FEW_VOTES, codes[votes.argmax(1)], 0).astype(np.uint8)
 
 
 def areas(mesh: Mesh, charts: Charts, votes: Votes | None) -> dict[int, float]:
@@ -75,16 +79,21 @@ class Poll:
                 mine = label == code
                 self._votes.setdefault(int(code), np.zeros(self._count))[seen[mine]] += cosine[seen[mine]]
 
-    def votes(self) -> dict[int, F64]:
-        """(count,) votes by code."""
-        return self._votes
-
     def result(self, spread: Callable[[F64], F32]) -> Votes | None:
         """The votes as a picture, which `spread` makes from (N, L); None if there are none."""
-        if not self._votes:
-            return None
-        codes = sorted(self._votes)
-        return Votes(np.array(codes, np.uint8), spread(np.stack([self._votes[c] for c in codes], 1)))
+        return Votes(self._codes, spread(self._table())) if self._votes else None
+
+    def winners(self) -> U8:
+        """(count,) code of each point; 0 without votes."""
+        return elected(self._codes, self._table()) if self._votes else np.zeros(self._count, np.uint8)
+
+    @property
+    def _codes(self) -> U8:
+        return np.array(sorted(self._votes), np.uint8)
+
+    def _table(self) -> F64:
+        """(count, L) votes by code, ascending."""
+        return np.stack([self._votes[c] for c in sorted(self._votes)], 1)
 
 
 def read_labels(path: Path) -> U8:

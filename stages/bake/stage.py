@@ -14,6 +14,7 @@ from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface,
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
@@ -22,7 +23,8 @@ SCAN = "scan"  # folder of the maps of the scan's mesh, if the asset has both me
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The mesh, the field, the cameras and masks for the visibility of texels, and the photos for the fine detail."""
+    """The mesh, the field, the cameras and masks for the visibility of texels, the photos for the fine detail, and
+    the registered head for its eyes."""
 
     surface: Located[Surface]
     uv: Located[UvMesh]
@@ -30,6 +32,7 @@ class Inputs:
     poses: Located[CameraSet]
     masks: Located[MaskSet]
     capture: Located[Capture]
+    template: Located[RegisteredHead]
 
 
 class Config(StageConfig):
@@ -72,8 +75,10 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline.visibility import seen_by
     from stages.bake.build import Baker, Photos
     from stages.bake.deviation import zero_set_rms
+    from stages.bake.eyes import painted_eyes
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
+    from stages.bake.mouth import inside_of
     from stages.bake.statistics import together
     from stages.bake.write import joined, write_maps
 
@@ -92,7 +97,11 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     labels = inputs.masks.artifact.label_names
     skin = labels.index("face") if "face" in labels else -1
-    baker = Baker(field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard)
+    eyes = painted_eyes(inputs.template, field, mesh, views, response) if uv.artifact.of_template else None
+    mouth = inside_of(inputs.template, mesh) if uv.artifact.of_template else None
+    baker = Baker(
+        field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth
+    )
     parts, counted, judged, areas = [], [], [], Counter[int]()
     for number in range(baker.tiles):
         baked = baker.tile(number)
@@ -106,6 +115,9 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
     figures = all_tiles.figures(detail=baker.detailed) | baker.material_figures
     figures |= {k: round(1000 * v, 5) for k, v in sizes.items() if v}
+    head = inputs.template.artifact
+    if uv.artifact.of_template:
+        figures |= {k: head.figures[k] for k in ("eyes_fitted", "iris_pixels") if k in head.figures}
     levels = {"render": mesh, "high": meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))}
     if uv.artifact.proxy is not None:
         levels["proxy"] = meshes.load(uv.path(uv.artifact.proxy))
@@ -120,9 +132,15 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         lod_rms_mm={name: round(1000 * zero_set_rms(field, level), 5) for name, level in levels.items()},
         figures=figures,
         regions=region_shares(areas, labels),
-        warnings=all_tiles.warnings(baker.residual, len(views)),
+        standard_fitted=baker.standard_fitted,
+        warnings=all_tiles.warnings(baker.residual, len(views)) + unfitted_eyes(head, uv.artifact),
         findings=judge(texels_of_all(judged), figures, person=shows_person(inputs.masks.artifact)),
     )
+
+
+def unfitted_eyes(head: RegisteredHead, uv: UvMesh) -> tuple[str, ...]:
+    """Why eyes of the asset stay the template's own."""
+    return (f"eyes stay the template's own: {head.eyes_reason}",) if uv.of_template and head.eyes_reason else ()
 
 
 def region_shares(areas: Mapping[int, float], names: Sequence[str]) -> dict[str, float]:
@@ -140,4 +158,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=9, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=11, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -17,7 +17,7 @@ For each alpha of a list the error Q - 2 F0 G + F0^2 H is one parabola in F0. Ov
 pooled (WIDTH), because F0 varies slowly; towards the mean of its group a prior pulls where there is little evidence.
 alpha is one number a group: one still light of low order does not determine it from place to place.
 
-The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and SKIN_F0 where a layer does not explain
+The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and USUAL_F0 where a layer does not explain
 MIN_EXPLAINED of what changes with the view. Everything else has no prior for F0, and then no layer; nor one where
 F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos are clipped. An object without any
 other material keeps the one that is read off NeuFace's lobe. At last r follows by linear least squares, pooled over
@@ -33,13 +33,14 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.lighting import standard
-from pipeline.meshes import F32, F64, Mask, Mesh
+from pipeline.meshes import F32, F64, Mask, Mesh, areas
 from stages.bake.smooth import Smoother
 
 ALPHAS = np.array([0.09, 0.12, 0.16, 0.20, 0.25, 0.31, 0.38, 0.47, 0.6], np.float32)
 WIDTH = 0.005  # metres: F0 is pooled over it
 EDGES, LEAST_WIDTH = 0.7, 1.5  # mean edges of the mesh over which the albedo's correction is pooled, and F0 at least
-SKIN_RANGE, SKIN_F0 = (0.02, 0.045), 0.028
+SKIN_RANGE = (0.02, 0.045)
+USUAL_F0 = 0.028  # of skin, index 1.40; microfacet.SKIN_F0 is the convention that the light's level assumes
 F0_SPREAD, TRUST = 0.01, 3.0  # standard deviation of F0 inside a group; observations that count as one
 SKIN_ROUGHNESS, ROUGHNESS_SPREAD = 0.45, 0.05
 OBJECT_SPREAD = 0.15  # of roughness, about the same mean
@@ -67,12 +68,13 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,). figures: for the report. plausible:
-    false if the only material is none that exists."""
+    """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,); received (V, 3): S. figures: for the
+    report. plausible: false if the only material is none that exists."""
 
     correction: F32
     f0: F32
     roughness: F32
+    received: F32
     figures: dict[str, float]
     plausible: bool = True
 
@@ -98,7 +100,7 @@ def fit(
     check()
     sums = _sums(normals, seen, w, lit, len(normals))
     often = np.bincount(seen.vertex[w > 0], minlength=len(normals)) >= MIN_VIEWS
-    edge = float(np.sqrt(2.3 * _area(mesh) / max(len(mesh.faces), 1)))
+    edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
     near = Smoother(mesh, max(WIDTH, LEAST_WIDTH * edge))
     h, g = (near(x * often[:, None]) for x in (sums.h, sums.g))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
@@ -120,14 +122,9 @@ def fit(
     correction = _correction(mesh, normals, at, albedo, seen, w, lit, f0, roughness, edge)
     return Fitted(
         correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
+        (at.irradiance / np.pi).astype(np.float32),
         {k: round(v, 5) for k, v in figures.items()}, bool(skin.any()) or "gloss_rest_refused_f0" not in figures,
     )  # fmt: skip
-
-
-def _area(mesh: Mesh) -> float:
-    from pipeline.meshes import areas
-
-    return float(areas(mesh.vertices, mesh.faces).sum())
 
 
 def _weights(normals: F64, seen: Seen) -> F64:
@@ -176,7 +173,7 @@ def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
     """The material of a group by the evidence of its vertices `own` (V,)."""
     low, high = SKIN_RANGE if is_skin else (0.0, 1.0)
     if own.sum() < MIN_VERTICES:
-        return _Group(SKIN_F0 if is_skin else 0.0, 0, SKIN_ROUGHNESS, 1.0, 0.0)
+        return _Group(USUAL_F0 if is_skin else 0.0, 0, SKIN_ROUGHNESS, 1.0, 0.0)
     h, g, q = (np.maximum(x[own].sum(0), 1e-30) if x is not sums.g else x[own].sum(0) for x in (sums.h, sums.g, sums.q))
     mean = (g / h).clip(low, high)
     error = np.maximum(q - 2 * mean * g + mean**2 * h, 1e-30)
@@ -187,7 +184,7 @@ def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
     explained = 1 - float(error[k]) / max(float(sums.bare[own].sum()), 1e-30)
     variance = float(error[k]) / max(3 * float(sums.weight[own].sum()), 1e-30)
     if explained < MIN_EXPLAINED:  # the photos say nothing: skin is as usual, everything else has no layer
-        return _Group(SKIN_F0 if is_skin else 0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained)
+        return _Group(USUAL_F0 if is_skin else 0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained)
     if not is_skin and mean[k] > DIELECTRIC:
         return _Group(0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained, float(mean[k]))
     rough = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost)

@@ -11,13 +11,13 @@ from pipeline.fields.protocol import Field
 from pipeline.lighting.dome import environment
 from pipeline.lighting.median_cut import lamps
 from pipeline.lighting.standard import COUNT, arrivals
-from pipeline.meshes import F64, Indices, Mask, Mesh, unit
+from pipeline.meshes import F64, Mask, Mesh, unit
 from pipeline.transforms import inverse_rigid, matrix, project
 from pipeline.visibility import FittedPhoto
 from stages.bake import detail_kernels as kernels
 from stages.bake import standard_fit
 from stages.bake.detail import Detail, shade
-from stages.bake.regions import FEW_VOTES, Poll
+from stages.bake.regions import Poll
 from stages.bake.smooth import continued
 
 DOME_WIDTH = 256  # columns of the picture that is cut into lamps
@@ -67,10 +67,4 @@ def _skin(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask
         pose = inverse_rigid(matrix(view.camera.world_from_cam))
         uv = project(matrix(view.camera.K), pose, np.array(view.camera.distortion), x)[0]
         poll.ask(view, cosine, uv)
-    votes: dict[int, F64] = poll.votes()
-    best = max(votes, default=0)
-    if code < 0 or not best:
-        return np.zeros(len(x), np.bool_)
-    total = np.stack([votes.get(c, np.zeros(len(x))) for c in range(best + 1)], 1)
-    winner: Indices = total.argmax(1)
-    return np.asarray((total.max(1) > FEW_VOTES) & (winner == code))
+    return np.asarray((poll.winners() == code) & (code > 0), np.bool_)

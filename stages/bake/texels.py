@@ -9,20 +9,22 @@ Symbols
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline import tangents
 from pipeline.errors import StageError
+from pipeline.eyes import material
 from pipeline.fields.protocol import Field
 from pipeline.maths import microfacet
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.raster import Hits
 from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
-from stages.bake.standard_fit import Fitted
+from stages.bake.eyes import Eyes
+from stages.bake.standard_fit import CORRECTION, Fitted
 
 NEWTON_STEPS = 3
 MIN_SLOPE = 0.3  # of d along N: lower limit of the slope in Newton's step
@@ -66,12 +68,13 @@ class Samples:
 class Known:
     """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; albedo (V, 3), where
     unseen continued from the surroundings. standard: the fitted material of standard shaders; None: it is converted
-    from NeuFace's."""
+    from NeuFace's. eyes: the fitted eyes, if there are any."""
 
     ambient: F32
     unseen: F32
     albedo: F32
     standard: Fitted | None = None
+    eyes: Eyes | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +113,12 @@ def sample(
     """Sample everything that the maps need. Raises StageError if the field is not finite."""
     at = place(field, mesh, frame, hits)
     x, straight = at.x.astype(np.float32), at.world.astype(np.float32)
-    material = field.material(x)
+    own = field.material(x)
     ratio = np.asarray(field.irradiance_ratio(x), np.float32)
-    strength = material.rho * tangents.dot(material.coefficients, field.basis(straight, straight))
-    f0 = microfacet.f0_from_lobe(strength, material.inv_kappa)
-    roughness = microfacet.roughness_from_inv_kappa(material.inv_kappa)
-    albedo, support = np.asarray(material.albedo, np.float32), np.zeros(len(x), np.float32)
+    strength = own.rho * tangents.dot(own.coefficients, field.basis(straight, straight))
+    f0 = microfacet.f0_from_lobe(strength, own.inv_kappa)
+    roughness = microfacet.roughness_from_inv_kappa(own.inv_kappa)
+    albedo, support = np.asarray(own.albedo, np.float32), np.zeros(len(x), np.float32)
     _check("albedo", albedo)
     if detail is not None:
         more, support = detail.added(points(field, mesh, hits, at, albedo, ratio))
@@ -135,9 +138,9 @@ def sample(
     found = Samples(
         albedo=physical,
         base_color=np.asarray(base, np.float32),
-        rho=np.asarray(material.rho, np.float32),
-        coefficients=np.asarray(material.coefficients, np.float32),
-        inv_kappa=np.asarray(material.inv_kappa, np.float32),
+        rho=np.asarray(own.rho, np.float32),
+        coefficients=np.asarray(own.coefficients, np.float32),
+        inv_kappa=np.asarray(own.inv_kappa, np.float32),
         irradiance_ratio=ratio,
         f0=np.asarray(f0, np.float32),
         roughness=np.asarray(roughness, np.float32),
@@ -149,9 +152,33 @@ def sample(
         unseen=unseen,
         clamped=np.abs(albedo - physical).max(1),
     )
+    if known is not None and known.eyes is not None:
+        found = _with_eyes(found, field, mesh, hits, at, known.eyes, known.standard)
     for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
         _check(name, getattr(found, name))
     return found
+
+
+def _with_eyes(
+    found: Samples, field: Field, mesh: Mesh, hits: Hits, at: Placed, eyes: Eyes, standard: Fitted | None
+) -> Samples:
+    """The samples with the fitted eyes: their own colours, the cornea's reflection, and the ball as it is."""
+    corner = mesh.faces[hits.face]
+    rows, albedo = eyes.at(corner[:, 0].astype(np.int64), at.x - at.moved[:, None] * at.n)
+    if not len(rows):
+        return found
+    base = albedo
+    if standard is not None:
+        received = tangents.mixed(standard.received[corner[rows]], hits.weights[rows])
+        lit = shade(field.light, at.n[rows], found.irradiance_ratio[rows])
+        base = albedo * (lit / np.maximum(received, 1e-6)).clip(*CORRECTION)
+    changed = {f.name: getattr(found, f.name).copy() for f in fields(Samples)}
+    changed["albedo"][rows] = albedo.clip(*ALBEDO_RANGE)
+    changed["base_color"][rows] = base.clip(*ALBEDO_RANGE)
+    changed["f0"][rows], changed["roughness"][rows] = material.F0, material.ROUGHNESS
+    changed["normal"][rows], changed["displacement"][rows] = (0, 0, 1), 0
+    changed["clamped"][rows] = np.abs(albedo - albedo.clip(*ALBEDO_RANGE)).max(1)
+    return Samples(**changed)
 
 
 def land(field: Field, start: F64, normal: F64) -> tuple[F64, F64, Mask]:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 
+from pipeline.eyes.fit import FittedBall
+from pipeline.head_artifacts import FittedEye
 from pipeline.registration.quality import Distances, distances, face_piercings, outer_quads, quad_quality, seen_share
 from pipeline.registration.scan import Scan
 from stages.template.register import Registration
@@ -37,6 +40,8 @@ def figures_of(found: Registration, regions: tuple[str, ...], skin: Distances) -
         "displaced_95_mm": skin.displaced_most,
         "seen": seen_share(head, regions),
         "eyes_closed": float(found.closed),
+        "eyes_fitted": float(sum(not b.reason for b in found.eyes.values())),
+        "iris_pixels": min((b.pixels for b in found.eyes.values()), default=0.0),
         "folded": found.fitted.folded,
         "pierced": face_piercings(head, regions),
         "repairs": found.fitted.repairs,
@@ -47,3 +52,17 @@ def figures_of(found: Registration, regions: tuple[str, ...], skin: Distances) -
         "aspect_1_percent": quads.aspect,
     }
     return {name: round(float(value), 5) for name, value in values.items()}
+
+
+def fitted_eye(part: str, ball: FittedBall) -> FittedEye:
+    """An eye for the artifact, rounded to micrometres."""
+    eye = ball.eye
+    figures = {"pixels": ball.pixels, "score": ball.score, "shown": ball.shown, "off_mm": 1000 * ball.off}
+    return FittedEye(
+        part=part,
+        centre=cast(tuple[float, float, float], tuple(round(float(x), 6) for x in eye.centre)),
+        radius=round(eye.radius, 6),
+        iris=round(eye.iris, 6),
+        axes=tuple(tuple(round(float(x), 9) for x in row) for row in eye.axes),
+        figures={k: round(float(v), 4) for k, v in figures.items()},
+    )

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from pipeline.meshes import F64, Indices, Mesh
+from pipeline.eyes.fit import FittedBall, fitted_eyes
+from pipeline.eyes.place import eye_displacement, eye_rows, with_eyes
+from pipeline.meshes import F64, Indices, Mesh, triangles_of
 from pipeline.registration.cage import Cage, cage_of
 from pipeline.registration.displacement import displacement
 from pipeline.registration.followers import followed
@@ -18,14 +20,16 @@ from pipeline.registration.lids import REST, closing, lids_closed, with_lids
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
 from pipeline.registration.quality import outer_quads
 from pipeline.registration.refine_identity import refined
+from pipeline.registration.rig import EYES
 from pipeline.registration.scan import Scan
-from pipeline.registration.subdivision import limit, subdivided
-from pipeline.template.model import Template
+from pipeline.registration.subdivision import Level, limit, subdivided
+from pipeline.template.model import SKIN, Template
 from pipeline.visibility import FittedPhoto, Occluder, seen_weight
 
 AROUND = 0.25  # metres of the template: the surface further from the head's middle is not looked at
 ASKED = 30_000  # vertices of the surface whose visibility is computed; the others take that of the nearest
 LANDMARK_REACH = 0.006  # metres of the template: a landmark further from the surface does not guide
+ADULT = 1.1  # metres per metre of the template of an average adult: the unit of a capture of unknown scale
 CLOSED_LIDS = 2.0  # weight of what pulls closed lids together, in that of a point on the surface
 
 Step = Callable[[int, int, str], None]
@@ -35,7 +39,7 @@ Step = Callable[[int, int, str], None]
 class Registration:
     """placed: similarity and identity. fitted: the cage's skin; cage: its operators. head: the result; landmarks_mm:
     median distance of the face's landmarks from the template's, metres of the template times 1000; closed: whether the
-    eyes are."""
+    eyes are; eyes: by part, also those that stay the template's own."""
 
     placed: PlacedHead
     cage: Cage
@@ -43,6 +47,7 @@ class Registration:
     head: Head
     landmarks_mm: float
     closed: bool
+    eyes: Mapping[str, FittedBall]
 
 
 def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> Scan:
@@ -67,31 +72,76 @@ def _seen(part: Mesh, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
 
 
 def register(
-    template: Template, landmarks: F64, placed: PlacedHead, scan: Scan, levels: int, step: Step
+    template: Template,
+    landmarks: F64,
+    placed: PlacedHead,
+    scan: Scan,
+    levels: int,
+    step: Step,
+    views: Sequence[FittedPhoto] = (),
+    metric: bool = True,
 ) -> Registration:
-    """The template on the scan, from where the landmarks (468, 3) place it."""
-    step(0, 4, "identity")
+    """The template on the scan, from where the landmarks (468, 3) place it. views: photos that show the eyes; metric:
+    whether the scan's unit is known."""
+    step(0, 5, "identity")
     placed = refined(template, landmarks, placed, scan)
     cage = cage_of(template)
     closed = lids_closed(template, placed, cage, scan)
     start = with_lids(template, placed, REST if closed else 0.0)
-    step(1, 4, "deformation")
+    step(1, 5, "deformation")
     rest, guides = start[cage.of_template], guides_for(template, placed, cage, scan, landmarks, closed)
-    found = fitted(cage, rest, scan, guides, placed.scale, lambda: step(1, 4, "deformation"))
+    found = fitted(cage, rest, scan, guides, placed.scale, lambda: step(1, 5, "deformation"))
     vertices = followed(template, start, cage.of_template, found.vertices, found.rotations, placed.scale)
-    step(2, 4, "displacement")
+    step(2, 5, "eyes")
     level = subdivided(template.quads, len(vertices), levels)
+    unit = 1.0 if metric else placed.scale / ADULT
+    eyes = eyes_between_lids(template, vertices, level, placed, scan, views, unit, closed=closed)
+    known_eyes = {part: found.eye for part, found in eyes.items() if not found.reason}
+    vertices = with_eyes(template, start, vertices, known_eyes)
+    step(3, 5, "displacement")
     regions, parts = (index_of(x, len(template.quads)) for x in (template.regions, template.parts))
     free = np.repeat(outer_quads(regions, tuple(template.regions)), 4**levels)
-    moved, seen = displacement(*limit_surface(vertices, level), free, scan, placed.scale)
+    points, normals, quads = limit_surface(vertices, level)
+    moved, seen = displacement(points, normals, quads, free, scan, placed.scale)
+    lids = points[np.unique(quads[free])]
+    for part, eye in known_eyes.items():
+        own = eye_rows(level, template.parts[part], levels)
+        moved[own] = eye_displacement(points, normals, own, lids, eye, unit)
     known = np.isfinite(landmarks[template.landmarks.network]).all(1)
     away = np.linalg.norm(template.landmark_points(vertices) - landmarks[template.landmarks.network], axis=1)[known]
-    step(3, 4, "figures")
+    step(4, 5, "figures")
     head = Head(
         vertices, template.quads, template.uvs, template.uv_quads, regions, parts,
         moved.astype(np.float32), seen.astype(np.float32), levels,
     )  # fmt: skip
-    return Registration(placed, cage, found, head, 1000 * float(np.median(away)) / placed.scale, closed)
+    return Registration(placed, cage, found, head, 1000 * float(np.median(away)) / placed.scale, closed, eyes)
+
+
+def eyes_between_lids(
+    template: Template,
+    vertices: F64,
+    level: Level,
+    placed: PlacedHead,
+    scan: Scan,
+    views: Sequence[FittedPhoto],
+    unit: float,
+    *,
+    closed: bool,
+) -> Mapping[str, FittedBall]:
+    """The eyes of the registered head's vertices (V, 3), by part; level: its subdivisions; unit: world units of one
+    metre."""
+    balls = {part: vertices[template.part_vertices(part)] for part in EYES if part in template.parts}
+    if not balls or not views:
+        return {}
+    points, normals, quads = limit_surface(vertices, level)
+    steps = len(quads) // len(template.quads)
+    skin = quads[np.repeat(np.isin(np.arange(len(template.quads)), template.parts[SKIN]), steps)]
+    lids = Occluder(Mesh(points.astype(np.float32), normals.astype(np.float32), triangles_of(skin)))
+    axes = (placed.world_from_template[:3, :3] / placed.scale).T
+    found = fitted_eyes(balls, axes, scan, views, lids, unit)
+    if not closed:
+        return found
+    return {part: replace(f, reason="the eyes are closed") for part, f in found.items()}
 
 
 def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, landmarks: F64, closed: bool) -> Guides:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, RegisteredHead, Surface
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
+from pipeline.head_artifacts import RegisteredHead
 from stages.template.config import Config as Config
 
 if TYPE_CHECKING:
@@ -63,10 +64,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     why = refused_placing(1000 * float(np.median(placed.residual)), placed.scale, metric=inputs.poses.artifact.metric)
     if why:
         return _refused(config, why)
-    step(0, 4, "visibility")
+    step(0, 5, "visibility")
     views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
     scan = scan_of(meshes.load(inputs.surface.path(inputs.surface.artifact.mesh)), placed, views)
-    found = register(template, landmarks, placed, scan, config.levels, step)
+    found = register(template, landmarks, placed, scan, config.levels, step, views, inputs.poses.artifact.metric)
     return _registered(found, template, scan, config, context)
 
 
@@ -74,7 +75,7 @@ def _registered(
     found: Registration, template: Template, scan: Scan, config: Config, context: Context
 ) -> RegisteredHead:
     from pipeline.registration.rig import rig_of
-    from stages.template.figures import figures_of, region_figures
+    from stages.template.figures import figures_of, fitted_eye, region_figures
     from stages.template.judge import judge, refused_fit
 
     regions = tuple(template.regions)
@@ -103,6 +104,8 @@ def _registered(
         world_from_template=tuple(tuple(float(x) for x in row) for row in found.placed.world_from_template),
         identity=tuple(round(float(w), 6) for w in found.placed.weights),
         figures=figures,
+        eyes=tuple(fitted_eye(part, ball) for part, ball in found.eyes.items() if not ball.reason),
+        eyes_reason="; ".join(f"{part}: {ball.reason}" for part, ball in found.eyes.items() if ball.reason),
         distances_mm={n: (d.median, d.most, d.displaced_median, d.displaced_most) for n, d in by_region.items()},
         quality=judge(figures),
     )
@@ -120,4 +123,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=4, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=5, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.contract import StageConfig
 from pipeline.units import Pixels
+from stages.usd.naming import check_name
 
 
 class Config(StageConfig):
@@ -36,3 +37,8 @@ class Config(StageConfig):
         0, ge=0, le=8, description="rays along each side of a pixel in these renders; 0: one ray, 64 on silhouettes"
     )
     preview_size: Pixels = Field(512, ge=64, le=4096, description="side of the preview pictures")
+
+    @field_validator("name")
+    @classmethod
+    def _valid(cls, name: str) -> str:
+        return check_name(name)  # a UsageError of its own, before the first stage

@@ -16,7 +16,6 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
-    RegisteredHead,
     Surface,
     TextureSet,
     UsdAsset,
@@ -24,6 +23,7 @@ from pipeline.artifacts import (
 )
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
+from pipeline.head_artifacts import RegisteredHead
 from stages.usd.config import Config as Config
 
 
@@ -46,12 +46,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     from pipeline.verdict import verdict_of_inputs
     from stages.usd import judge
     from stages.usd.check.validate import checks_run, found_in
-    from stages.usd.naming import check_name
-    from stages.usd.render.previews import render_held_out, render_previews, render_thumbnail
+    from stages.usd.render.previews import load_scene, render_held_out, render_previews, render_thumbnail
     from stages.usd.write.export import THUMBNAIL, export
     from stages.usd.write.mark import mark
 
-    name = check_name(config.name)
+    name = config.name
     total = 4
     context.progress(0, total, "writing the component")
     made = export(
@@ -69,8 +68,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     written, warnings = made.written, list(made.notes)
     root = context.workdir / "asset" / f"{name}.usd"
     context.progress(1, total, "rendering previews")
-    written.append(render_thumbnail(root, root.parent / THUMBNAIL, context.check))
-    written += render_previews(root, config.preview_size, context.workdir / "previews", context.check)
+    scene = load_scene(root, context.check)
+    written.append(render_thumbnail(scene, root.parent / THUMBNAIL))
+    written += render_previews(scene, config.preview_size, context.workdir / "previews", context.check)
     context.progress(2, total, "checking it")
     found = []
     for file in [f for f in written if f.parent == context.workdir / "asset" and f.name in _roots(name)]:
@@ -80,7 +80,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     context.progress(3, total, "rendering held-out views from the asset")
     views: tuple[HeldOutView, ...] = ()
     if config.render_views:
-        views = render_held_out(root, inputs.poses.artifact, inputs.inverse_rendering.artifact, config.samples, context)
+        views = render_held_out(
+            scene, inputs.poses.artifact, inputs.inverse_rendering.artifact, config.samples, context
+        )
     findings = (
         *judge.validity(found),
         *judge.against_model(_pictures(inputs, views, context)),
@@ -133,4 +135,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=12, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=13, inputs=Inputs, config=Config, output=UsdAsset, run=run)

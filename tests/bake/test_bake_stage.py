@@ -25,6 +25,7 @@ from stages.uv.config import Config as UvConfig
 from stages.uv.decimate import decimated
 from stages.uv.unwrap import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.ball_head import no_head
 from tests.support.field_artifacts import fitted, poses
 
 PNG = {
@@ -72,6 +73,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
         poses(tmp_path),
         Located(MaskSet(masks=(mask,)), tmp_path),
         photographed(tmp_path),
+        no_head(tmp_path),
     )
 
 

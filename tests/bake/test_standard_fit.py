@@ -62,7 +62,7 @@ def test_where_nothing_shines_objects_have_no_layer_and_skin_is_as_usual() -> No
     dull = fitted(0.0, 0.5, skin=False)
     assert (dull.f0 == 0).all()
     np.testing.assert_allclose(np.median(dull.correction), 1, rtol=0.01)
-    np.testing.assert_allclose(fitted(0.0, 0.5, skin=True).f0, fits.SKIN_F0, rtol=1e-2)
+    np.testing.assert_allclose(fitted(0.0, 0.5, skin=True).f0, fits.USUAL_F0, rtol=1e-2)
 
 
 def test_an_object_of_no_dielectric_is_refused() -> None:
@@ -79,7 +79,7 @@ def test_without_photos_the_prior_is_all() -> None:
     mesh, at, albedo, seen = scene(0.04, 0.45)
     none = fits.Seen(seen.vertex[:0], seen.wo[:0], seen.colour[:0], seen.predicted[:0])
     n = mesh.normals.astype(np.float64)
-    for skin, wanted in ((True, fits.SKIN_F0), (False, 0.0)):
+    for skin, wanted in ((True, fits.USUAL_F0), (False, 0.0)):
         found = fits.fit(mesh, n, at, albedo, none, np.full(len(albedo), skin))
         np.testing.assert_allclose(found.f0, wanted, rtol=1e-3)
         np.testing.assert_allclose(found.correction, 1, rtol=1e-3)

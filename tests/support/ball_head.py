@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.artifacts import Located, RegisteredHead
+from pipeline.artifacts import Located
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import Mesh, unit
 from pipeline.template.model import Points, Template
 

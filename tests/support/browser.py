@@ -102,13 +102,13 @@ class Tab:
 
 
 @contextmanager
-def tab(profile: Path) -> Iterator[Tab]:
-    """A new browser with one empty page. `profile`: an empty folder."""
+def tab(profile: Path, *options: str) -> Iterator[Tab]:
+    """A new browser with one empty page. `profile`: an empty folder; options: of the browser."""
     ours_read, theirs_write = os.pipe()
     theirs_read, ours_write = os.pipe()
     # the browser reads from descriptor 3 and writes to 4
     command = 'exec 3<&"$1" 4>&"$2"; shift 2; exec "$@"'
-    program = [str(installed()), *OPTIONS, f"--user-data-dir={profile}"]
+    program = [str(installed()), *OPTIONS, *options, f"--user-data-dir={profile}"]
     process = subprocess.Popen(["bash", "-c", command, "bash", str(theirs_read), str(theirs_write), *program],
                                pass_fds=(theirs_read, theirs_write), stderr=subprocess.DEVNULL)  # fmt: skip
     os.close(theirs_read)

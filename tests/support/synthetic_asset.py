@@ -18,13 +18,13 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
-    RegisteredHead,
     Surface,
     TextureMap,
     TextureSet,
     UvMesh,
 )
 from pipeline.capture_artifacts import Capture, CaptureView
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import rows
 

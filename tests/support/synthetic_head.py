@@ -11,8 +11,9 @@ import numpy as np
 from support.synthetic_asset import RADIUS, SyntheticInputs, texture_arrays, write_inputs, write_textures, write_tiles
 
 from pipeline import meshes
-from pipeline.artifacts import FileRef, Located, MaskSet, RegisteredHead, Surface
+from pipeline.artifacts import FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
+from pipeline.head_artifacts import FittedEye, RegisteredHead
 from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.rig import Rig
 from pipeline.registration.subdivision import subdivided
@@ -120,3 +121,12 @@ def template_inputs(folder: Path, mesh: Literal["template", "both"] = "template"
         scan = own.model_copy(update={"maps": maps})
         bake = Located(bake.artifact.model_copy(update={"scan": scan}), bake.folder)
     return replace(plain, surface=surface, template=template, uv=Located(uv, folder / "uv"), bake=bake)
+
+
+def with_fitted_eye(inputs: SyntheticInputs) -> SyntheticInputs:
+    """The same with side 5 as a fitted eye."""
+    eye = FittedEye(
+        part="eye_left", centre=(0, 0, 0), radius=RADIUS, iris=0.3 * RADIUS, axes=((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    )
+    registered = inputs.template.artifact.model_copy(update={"eyes": (eye,)})
+    return replace(inputs, template=Located(registered, inputs.template.folder))

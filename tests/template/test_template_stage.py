@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from pipeline import meshes, tiles
-from pipeline.artifacts import CameraSet, FileRef, Located, MaskSet, RegisteredHead, Surface
+from pipeline.artifacts import CameraSet, FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.errors import StageError
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.registration.head import Head
 from pipeline.registration.subdivision import subdivided
 from pipeline.template.load import OWN, load_template

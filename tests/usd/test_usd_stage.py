@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdShade
-from support.synthetic_asset import SyntheticInputs, ball, cameras, run_stage, texture_arrays, write_inputs
+from support.synthetic_asset import (
+    SyntheticInputs,
+    ball,
+    cameras,
+    run_stage,
+    texture_arrays,
+    write_inputs,
+    write_textures,
+)
 
 from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
@@ -17,6 +26,9 @@ from pipeline.images import read_encoded, read_exr
 from pipeline.transforms import inverse_rigid, matrix, project
 from stages.usd.naming import check_name, name_from
 from stages.usd.stage import STAGE, Config, Inputs
+from stages.usd.write.maps import look_of
+from stages.usd.write.mesh import read_mesh
+from stages.usd.write.obj import write_obj
 from stages.usd.write.shading import ior_from_f0
 
 
@@ -67,6 +79,52 @@ def test_component_structure(exported) -> None:
     surface = UsdShade.Shader(material.ComputeSurfaceSource()[0])
     assert surface.GetInput("useSpecularWorkflow").Get() == 0
     assert surface.GetInput("ior").Get() == pytest.approx(1.402, abs=2e-3)  # of the synthetic mean F0 of 0.028
+
+
+def test_the_materialx_numbers_are_those_of_the_look(exported) -> None:
+    """What a shader computes from the network's numbers: reflectance along the normal, the normal map's frame, and
+    where the table of the bases is looked up."""
+    stage = Usd.Stage.Open(str(exported[0] / "asset/head.usd"))
+    prims = {p.GetPath().name: UsdShade.Shader(p) for p in stage.Traverse() if "/openpbr/" in str(p.GetPath())}
+    surface, weight = prims["surface"], prims["weight"]
+    ior, factor = surface.GetInput("specular_ior").Get(), weight.GetInput("in2").Get()
+    assert factor * ((ior - 1) / (ior + 1)) ** 2 == pytest.approx(1, rel=1e-5)  # F0 of the map, and no other
+
+    def source(node: UsdShade.Shader, name: str) -> tuple[str, str]:
+        """Kind and file of the node that feeds an input."""
+        found = UsdShade.Shader(node.GetInput(name).GetConnectedSources()[0][0].source.GetPrim())
+        file = found.GetInput("file")
+        return found.GetIdAttr().Get(), Path(file.Get().path).name if file else ""
+
+    bounded = prims["f0_bounded"]
+    assert source(weight, "in1")[0] == "ND_clamp_float" and source(bounded, "in") == ("ND_image_float", "head_f0.exr")
+    bent = prims["bent_normal"]
+    assert source(bent, "normal")[0] == "ND_normal_vector3" and source(bent, "tangent")[0] == "ND_tangent_vector3"
+    assert source(bent, "in") == ("ND_image_vector3", "head_normal.png")
+    assert source(surface, "geometry_normal")[0] == "ND_normalmap_float"
+    assert source(surface, "specular_roughness") == ("ND_image_float", "head_roughness.png")
+    basis = {p.GetPath().name: UsdShade.Shader(p) for p in stage.Traverse() if "/neuface_basis/" in str(p.GetPath())}
+    place, row = basis["place"], basis["row"]  # u: n.v, v: 2 / kappa, as the table is written
+    assert source(place, "in1")[0] == "ND_facingratio_float" and source(place, "in2")[0] == "ND_multiply_float"
+    assert source(row, "in1") == ("ND_image_float", "head_inv_kappa.exr") and row.GetInput("in2").Get() == 2
+    assert source(basis["basis_0"], "texcoord")[0] == "ND_combine2_vector2"
+    assert basis["surface"].GetInput("specular_weight").Get() == 1
+    assert basis["surface"].GetInput("specular_ior").Get() == pytest.approx(1.5)  # of the R in the table
+
+
+@pytest.mark.parametrize("f0", [0.02, 0.08])
+def test_the_index_of_refraction_is_that_of_the_f0_map(f0: float, inputs: SyntheticInputs, tmp_path: Path) -> None:
+    """F0 of the map, not skin's: (1 + sqrt F0) / (1 - sqrt F0), and F0 itself as Ks of the OBJ's material."""
+    arrays = texture_arrays(64)
+    bake = write_textures(tmp_path, {**arrays, "f0": np.full_like(arrays["f0"], f0)})
+    (tmp_path / "asset/textures").mkdir(parents=True)
+    shutil.copy(tmp_path / "albedo.exr", tmp_path / "asset/textures/head_albedo.exr")
+    look = look_of(bake, "head", tmp_path / "asset")
+    assert look.ior == pytest.approx({0.02: 1.3294, 0.08: 1.7888}[f0], abs=1e-3)
+    write_obj(tmp_path, "head", read_mesh(inputs.uv.path(inputs.uv.artifact.mesh)), look)
+    said = dict(line.split(maxsplit=1) for line in (tmp_path / "head.mtl").read_text().splitlines() if " " in line)
+    assert [float(x) for x in said["Ks"].split()] == pytest.approx([f0] * 3, abs=1e-4)
+    assert float(said["Ni"]) == pytest.approx(look.ior, abs=1e-4)
 
 
 def test_mesh_survives_the_round_trip(exported, inputs: SyntheticInputs) -> None:
@@ -156,6 +214,9 @@ import pickle, sys
 from pathlib import Path
 sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
 from pipeline.contract import Context
+from stages.usd.write.maps import look_of
+from stages.usd.write.mesh import read_mesh
+from stages.usd.write.obj import write_obj
 from stages.usd.write.shading import ior_from_f0
 from stages.usd.stage import STAGE, Config, Inputs
 made = pickle.loads((Path(sys.argv[2]) / "inputs.pkl").read_bytes())

@@ -14,15 +14,10 @@ def test_a_thumbnail_stays_in_the_folder_that_was_named(tmp_path: Path, monkeypa
     (tmp_path / "link").symlink_to(tmp_path / "real")
 
     class Still:
-        def __init__(self, asset: object) -> None: ...
-
         def render(self, view: object, light: object) -> np.ndarray:
             return np.ones((8, 8, 4), np.float32)
 
-    monkeypatch.setattr(previews, "Renderer", Still)
-    monkeypatch.setattr(previews, "load_exported", lambda root: root)
-    monkeypatch.setattr(previews, "captured", lambda *_: None)
     monkeypatch.setattr(previews, "framing", lambda *_: None)
     asked = tmp_path / "link" / "." / "default.png"
-    found = previews.render_thumbnail(tmp_path / "head.usd", asked, lambda: None)
+    found = previews.render_thumbnail(previews.Scene(Still(), None), asked)  # type: ignore[arg-type]
     assert found == tmp_path / "link" / "default.png" and (tmp_path / "real" / "default.png").is_file()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +40,22 @@ def view_of(camera: Camera) -> PinholeCamera:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The exported asset under the captured light: its rays and shadows are set up once for all pictures."""
+
+    renderer: Renderer
+    light: Light | None
+
+
+def load_scene(root: Path, check: Callable[[], None]) -> Scene:
+    """The scene of the asset NAME.usd."""
+    renderer = Renderer(load_exported(root))
+    return Scene(renderer, captured(renderer, root, check))
+
+
 def render_held_out(
-    root: Path, cameras: CameraSet, face: FittedFace, samples: int, context: Context
+    scene: Scene, cameras: CameraSet, face: FittedFace, samples: int, context: Context
 ) -> tuple[HeldOutView, ...]:
     """Write asset_views/I.exr and .png for each view that the fit predicted, at its scale, in its camera's colours.
 
@@ -51,16 +66,14 @@ def render_held_out(
     wanted = wanted or [(i, factor_for(by_index[i])) for i in spread(face.fitted_views, FITTED_SHOWN) if i in by_index]
     if not wanted:
         return ()
-    renderer = Renderer(load_exported(root))
-    light = captured(renderer, root, context.check)
     responses, out = {v.index: v.response for v in face.held_out}, []
     for number, (index, scale) in enumerate(wanted):
         context.check()
         context.progress(number, len(wanted), f"asset view {index}")
         response = responses.get(index, UNCHANGED)
-        rgba = as_photographed(
-            renderer.render(view_of(by_index[index]), factor=scale, samples=samples, light=light), response
-        )
+        view = view_of(by_index[index])
+        shown = scene.renderer.render(view, factor=scale, samples=samples, light=scene.light)
+        rgba = as_photographed(shown, response)
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
         write_exr(exr, rgba)
         write_rgba_png(png, rgba)
@@ -95,28 +108,23 @@ def factor_for(camera: Camera) -> int:
     return fits[0] if fits and min(camera.width, camera.height) // fits[0] >= 64 else 1
 
 
-def render_previews(root: Path, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
+def render_previews(scene: Scene, size: int, folder: Path, check: Callable[[], None]) -> list[Path]:
     """Write SIDE.png under the captured light and shape_SIDE.png in grey, from three sides."""
-    renderer = Renderer(load_exported(root))
-    light = captured(renderer, root, check)
     written = []
     for side, degrees in SIDES.items():
-        view = framing(renderer, np.radians(degrees), size)
-        for name, options in ((side, {"light": light}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
+        view = framing(scene.renderer, np.radians(degrees), size)
+        for name, options in ((side, {"light": scene.light}), (f"shape_{side}", {"light": GREY_LIGHT, "plain": True})):
             check()
             written.append(folder / f"{name}.png")
-            write_rgba_png(written[-1], renderer.render(view, **options))
+            write_rgba_png(written[-1], scene.renderer.render(view, **options))
     return written
 
 
-def render_thumbnail(root: Path, path: Path, check: Callable[[], None]) -> Path:
+def render_thumbnail(scene: Scene, path: Path) -> Path:
     """Write a picture of the head, slightly from one side, under the captured light."""
-    check()
-    renderer = Renderer(load_exported(root))
-    light = captured(renderer, root, check)
-    view = framing(renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
+    view = framing(scene.renderer, np.radians(THUMBNAIL_TURN), THUMBNAIL_SIDE)
     path = Path(os.path.normpath(path))  # symbolic links stay: the store's folder may be one
-    write_rgba_png(path, renderer.render(view, light=light))
+    write_rgba_png(path, scene.renderer.render(view, light=scene.light))
     return path
 
 

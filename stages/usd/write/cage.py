@@ -14,11 +14,13 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 from scipy.sparse import csr_array
 
 from pipeline import meshes
-from pipeline.artifacts import Located, RegisteredHead
-from pipeline.meshes import F32, F64, Charts, Indices, triangles_of
+from pipeline.artifacts import Located
+from pipeline.head_artifacts import RegisteredHead
+from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
 from pipeline.registration.head import Head, kept_quads, load_head
 from pipeline.registration.rig import load_rig
 from pipeline.registration.subdivision import limit, subdivided
+from stages.usd.write.eyes import eye_quads
 from stages.usd.write.mesh import UvSurface
 from stages.usd.write.rig import MeshRig, mesh_rig
 
@@ -29,7 +31,8 @@ LEVELS_KEY = "neufaceSubdivisions"  # customData of the cage: steps after which 
 @dataclass(frozen=True, slots=True)
 class CageSurface:
     """vertices (V, 3), quads (Q, 4), uvs (U, 2), uv_quads (Q, 4): the cage without what the asset leaves out. rows
-    (V,): of its vertices in the template. levels: subdivisions after which its vertices carry the displacement."""
+    (V,): of its vertices in the template. levels: subdivisions after which its vertices carry the displacement. eyes
+    (Q,): fitted eyes, which have a material of their own."""
 
     vertices: F64
     quads: Indices
@@ -37,13 +40,14 @@ class CageSurface:
     uv_quads: Indices
     rows: Indices
     levels: int
+    eyes: Mask
 
 
 @dataclass(frozen=True, slots=True)
 class TemplateMesh:
     """cage: the control cage. coarse: triangles of its first subdivision, displaced. rest: what the scan shows beside
     it. heights (n,): displacement in metres at the vertices of the textured mesh. rig, coarse_rig: expressions and
-    joints of cage and coarse."""
+    joints of cage and coarse. coarse_eyes (F,): triangles of coarse that are fitted eyes; None without any."""
 
     cage: CageSurface
     coarse: UvSurface
@@ -51,6 +55,7 @@ class TemplateMesh:
     heights: F32
     rig: MeshRig | None = None
     coarse_rig: MeshRig | None = None
+    coarse_eyes: Mask | None = None
 
 
 def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool) -> TemplateMesh:
@@ -64,8 +69,10 @@ def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, r
     used = np.unique(quads)
     heights = np.zeros(len(textured.vertices), np.float32)
     heights[: len(used)] = head.displacement[used]
-    cage, (coarse, points) = _cage(head, kept), _coarse(head, kept)
-    made = TemplateMesh(cage, coarse, _rest(textured, 2 * len(quads)), heights)
+    eyes = eye_quads(head, registered.artifact)[kept]
+    cage, (coarse, points) = _cage(head, kept, eyes), _coarse(head, kept)
+    fine_eyes = np.repeat(eyes, len(coarse.faces) // len(eyes)) if eyes.any() else None
+    made = TemplateMesh(cage, coarse, _rest(textured, 2 * len(quads)), heights, coarse_eyes=fine_eyes)
     found = registered.artifact.rig
     if found is None or not rigged:
         return made
@@ -73,16 +80,16 @@ def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, r
     return replace(made, rig=mesh_rig(rig).of_vertices(cage.rows), coarse_rig=mesh_rig(rig, points))
 
 
-def _cage(head: Head, kept: meshes.Mask) -> CageSurface:
+def _cage(head: Head, kept: Mask, eyes: Mask) -> CageSurface:
     rows, quads = np.unique(head.quads[kept], return_inverse=True)
     used, uv_quads = np.unique(head.uv_quads[kept], return_inverse=True)
     return CageSurface(
         head.vertices[rows], quads.reshape(-1, 4), head.uvs[used].astype(np.float32), uv_quads.reshape(-1, 4),
-        rows.astype(np.int64), head.levels,
+        rows.astype(np.int64), head.levels, eyes,
     )  # fmt: skip
 
 
-def _coarse(head: Head, kept: meshes.Mask) -> tuple[UvSurface, csr_array]:
+def _coarse(head: Head, kept: Mask) -> tuple[UvSurface, csr_array]:
     """The mesh, and the stencil (n, V) of its limit points from the template's vertices. A step's vertex points come
     first in the next one, so the vertices of the first steps have the same rows in the finest."""
     steps = min(COARSE, head.levels)

@@ -14,9 +14,11 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
 
 from pipeline import tiles
+from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
+from stages.usd.write.eyes import EYES, bind_eyes, eye_material, pieces
 from stages.usd.write.materialx import materialx_networks
-from stages.usd.write.mesh import UvSurface, on_tile, tile_count
+from stages.usd.write.mesh import UvSurface, tile_count
 from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
 from stages.usd.write.variants import (
@@ -140,25 +142,30 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
     return detached(stage)
 
 
-def package_layer(who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None) -> Sdf.Layer:
+def package_layer(
+    who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None, eyes: Mask | None = None
+) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
     tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
-    of the mesh's first vertices."""
+    of the mesh's first vertices; eyes (n,): of its first triangles, those with the eyes' material."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
-    if count == 1 and rig is None:
+    if count == 1 and rig is None and eyes is None:
         _fill(stage, who.name, mesh, None, look)
     else:
         UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
         skeleton = _geo(stage, who.name, rig)
-        for t in range(count):
-            number = tiles.FIRST + t
-            material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
-            preview_networks(stage, material, look.on_tile(t))
-            part = on_tile(mesh, t, count)
+        for piece in pieces(mesh, count, eyes):
+            number, part = tiles.FIRST + piece.tile, piece.mesh
+            kind = EYES if piece.eyes else RENDER
+            if piece.eyes:
+                material = eye_material(stage, f"/{who.name}/mtl/{EYES}_{number}", look.on_tile(piece.tile))
+            else:
+                material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
+                preview_networks(stage, material, look.on_tile(piece.tile))
             made, used = (
-                _mesh(stage, f"/{who.name}/geo/render_{number}", part, material),
+                _mesh(stage, f"/{who.name}/geo/{kind}_{number}", part, material),
                 np.unique(part.faces).astype(np.int64),
             )
             if rig is not None and skeleton is not None and used[-1] < len(rig.weights):
@@ -171,6 +178,8 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: Uv
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
     material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
     shown = _shown(stage, f"/{name}/geo", mesh, material)
+    if isinstance(mesh, TemplateMesh) and mesh.cage.eyes.any():
+        bind_eyes(shown[0], mesh.cage.eyes, eye_material(stage, f"/{name}/mtl/{EYES}", look), material)
     if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
         bind(stage, shown[0], mesh.rig, skeleton)
     stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from pxr import Gf, Sdf
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, RegisteredHead, Surface, TextureSet, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
 from pipeline.lighting.dome import environment, environment_figures, light_json, read_light
 from stages.usd.config import Config
@@ -105,15 +106,17 @@ def export(
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
-    light_mesh, light_rig = (mesh, None) if head is None else (with_rest(head), head.coarse_rig)
+    light_mesh, light_rig, light_eyes = mesh, None, None
+    if head is not None:
+        light_mesh, light_rig, light_eyes = with_rest(head), head.coarse_rig, head.coarse_eyes
     if config.usdz:
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
         plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
-        single = component.package_layer(who, light_mesh, plain, light_rig)
+        single = component.package_layer(who, light_mesh, plain, light_rig, light_eyes)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")
-        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig)
+        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig, light_eyes)
     if config.obj:
         written += write_obj(folder, name, mesh, look)
     check()

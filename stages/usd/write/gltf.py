@@ -8,6 +8,8 @@ whose texture is sRGB-encoded F0 over its largest value, so that eight bits are 
 coordinates is top left in glTF, so v becomes 1 - v. glTF has no UDIM tiles: each tile becomes a primitive with its own
 material and coordinates in the unit square. The same content gives the same bytes.
 
+Fitted eyes are a primitive with a material of its own: the colours of their tile, and KHR_materials_ior of the cornea.
+
 Expressions are morph targets of the primitives that they move, as sparse accessors: offsets of positions and normals
 at the moved vertices only. Primitives of one mesh must have the same targets, so what no expression moves is a second
 mesh.
@@ -25,9 +27,11 @@ import numpy.typing as npt
 
 from pipeline import tiles
 from pipeline.colour import srgb_from_linear
+from pipeline.eyes.material import IOR, ROUGHNESS
 from pipeline.images import read_encoded, read_exr
-from pipeline.meshes import F32, Indices, vertex_normals
-from stages.usd.write.mesh import UvSurface, on_tile, tile_count
+from pipeline.meshes import F32, Indices, Mask, vertex_normals
+from stages.usd.write.eyes import EYES, pieces
+from stages.usd.write.mesh import UvSurface, tile_count
 from stages.usd.write.package import bounded_png
 from stages.usd.write.rig import MeshRig
 from stages.usd.write.shading import Look
@@ -105,18 +109,22 @@ def write_glb(
     folder: Path,
     metadata: dict[str, str],
     rig: MeshRig | None = None,
+    eyes: Mask | None = None,
 ) -> None:
-    """Write the file. `folder`: base of the look's paths. `metadata`: from the user. rig: of the mesh's first
-    vertices."""
+    """Write the file. `folder`: base of the look's paths. `metadata`: from the user. rig: of the mesh's first vertices;
+    eyes (n,): of its first triangles, those with the eyes' material."""
     binary, count = _Binary(), tile_count(mesh)
     looks = [look.on_tile(t) for t in range(count)]
     bent = [] if rig is None else bent_normals(mesh, rig)
     meshes: list[dict[str, Any]] = []
     moving: list[dict[str, Any]] = []
     still: list[dict[str, Any]] = []
-    for t in range(count):
-        part = on_tile(mesh, t, count)
-        made = _primitive(part, t, binary)
+    wet: list[int] = []  # tiles with eyes
+    for piece in pieces(mesh, count, eyes):
+        part = piece.mesh
+        if piece.eyes:
+            wet.append(piece.tile)
+        made = _primitive(part, count + len(wet) - 1 if piece.eyes else piece.tile, binary)
         if rig is not None and part.faces.max() < len(rig.weights):
             made["targets"] = _targets(corners(part)[0], rig, bent, binary)
         (moving if "targets" in made else still).append(made)
@@ -131,6 +139,7 @@ def write_glb(
     names = [name] if count == 1 else [f"{name}_{tiles.FIRST + t}" for t in range(count)]
     top = max((_top(folder / x.f0) for x in looks if x.f0), default=0.0)
     materials = [_material(n, x, folder, binary, images, top) for n, x in zip(names, looks, strict=True)]
+    materials += [_eye_material(names[t], materials[t]) for t in wet]
     asset: dict[str, Any] = {"version": "2.0", "generator": "NeuFace Asset"}
     if metadata:
         asset["extras"] = metadata
@@ -138,7 +147,7 @@ def write_glb(
             asset["copyright"] = metadata["license"]
     document = {
         "asset": asset,
-        "extensionsUsed": sorted(materials[0].get("extensions", {})),
+        "extensionsUsed": sorted({e for m in materials for e in m.get("extensions", {})}),
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"mesh": i, "name": m["name"]} for i, m in enumerate(meshes)],
@@ -204,6 +213,16 @@ def _targets(vertex: Indices, rig: MeshRig, bent: list[F32], binary: _Binary) ->
             }
         )
     return out
+
+
+def _eye_material(name: str, skin: dict[str, Any]) -> dict[str, Any]:
+    """The eyes' material beside that of their tile, whose colours it shows."""
+    surface = {"baseColorTexture": skin["pbrMetallicRoughness"]["baseColorTexture"], "metallicFactor": 0.0}
+    return {
+        "name": f"{name}_{EYES}",
+        "pbrMetallicRoughness": surface | {"roughnessFactor": ROUGHNESS},
+        "extensions": {"KHR_materials_ior": {"ior": IOR}},
+    }
 
 
 def _top(f0: Path) -> float:

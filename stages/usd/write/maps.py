@@ -67,7 +67,7 @@ def write_maps(
     if heights is not None:
         written += write_heights(bake, mesh, heights, name, folder)
     figures: dict[str, float] = {}
-    if divide and not shadows_fitted(bake) and not standard_fitted(bake):
+    if divide and not shadows_fitted(bake) and not bake.artifact.standard_fitted:
         shown, found = divided_albedo(bake, mesh, light, name, folder, check)
         written += shown
         figures |= found
@@ -117,11 +117,6 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
     return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
-def standard_fitted(bake: Located[TextureSet]) -> bool:
-    """Whether the standard material was fitted: its base colour is then free of the photos' shadows."""
-    return any(name.startswith("gloss_") for name in bake.artifact.figures)
-
-
 def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     """Copy every file of every map as NAME_map.format."""
     count = bake.artifact.tiles
@@ -138,7 +133,7 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for which, texture in sorted(bake.artifact.maps.items()):
-        if which == "neuface_albedo" and not standard_fitted(bake):
+        if which == "neuface_albedo" and not bake.artifact.standard_fitted:
             continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = folder / f"{name}_{which}.{form}"

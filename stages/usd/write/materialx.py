@@ -73,15 +73,37 @@ def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look
         made.append("neuface_basis")
         _surface(stage, f"{path}/neuface_basis", look, basis=True)
     if made:
-        prim = material.GetPrim()
-        prim.AddAppliedSchema(CONFIG_SCHEMA)  # not ApplyAPI: some builds have no plugin of this schema
-        prim.CreateAttribute("config:mtlx:version", T.String, False, Sdf.VariabilityUniform).Set(VERSION)
-        output = UsdShade.Shader.Get(stage, f"{path}/{made[0]}/surface").ConnectableAPI()
-        material.CreateSurfaceOutput("mtlx").ConnectToSource(output, "out")
-        if look.displacement:
-            height = _displacement(stage, f"{path}/{made[0]}", look.displacement)
-            material.CreateDisplacementOutput("mtlx").ConnectToSource(height.ConnectableAPI(), "out")
+        _outputs(stage, material, f"{path}/{made[0]}", look)
     return made
+
+
+def eye_network(stage: Usd.Stage, material: UsdShade.Material, look: Look, ior: float, roughness: float) -> None:
+    """Author `openpbr` of an eye: the head's colours under a clear surface of one roughness."""
+    path = f"{material.GetPath()}/openpbr"
+    nodes = _Nodes(stage, path)
+    surface = shader(stage, f"{path}/surface", SURFACE)
+    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, look.albedo, SRGB))
+    for name, value in (
+        ("base_weight", 1.0),
+        ("specular_weight", 1.0),
+        ("specular_ior", ior),
+        ("specular_roughness", roughness),
+    ):
+        surface.CreateInput(name, T.Float).Set(value)
+    surface.CreateOutput("out", T.Token)
+    _outputs(stage, material, path, look)
+
+
+def _outputs(stage: Usd.Stage, material: UsdShade.Material, network: str, look: Look) -> None:
+    """Make a network the material's MaterialX surface, with its displacement."""
+    prim = material.GetPrim()
+    prim.AddAppliedSchema(CONFIG_SCHEMA)  # not ApplyAPI: some builds have no plugin of this schema
+    prim.CreateAttribute("config:mtlx:version", T.String, False, Sdf.VariabilityUniform).Set(VERSION)
+    output = UsdShade.Shader.Get(stage, f"{network}/surface").ConnectableAPI()
+    material.CreateSurfaceOutput("mtlx").ConnectToSource(output, "out")
+    if look.displacement:
+        height = _displacement(stage, network, look.displacement)
+        material.CreateDisplacementOutput("mtlx").ConnectToSource(height.ConnectableAPI(), "out")
 
 
 def _displacement(stage: Usd.Stage, path: str, file: str) -> UsdShade.Shader:

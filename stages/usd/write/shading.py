@@ -108,6 +108,26 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
         material.CreateDisplacementOutput().ConnectToSource(preview, "displacement")
 
 
+def eye_preview(stage: Usd.Stage, material: UsdShade.Material, look: Look, ior: float, roughness: float) -> None:
+    """Author `preview` of an eye: the head's colours and displacement under a clear surface of one roughness."""
+    path = str(material.GetPath())
+    reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", T.String).Set("st")
+    st = reader.CreateOutput("result", T.Float2)
+    surface = shader(stage, f"{path}/preview", "UsdPreviewSurface")
+    surface.CreateInput("useSpecularWorkflow", T.Int).Set(0)
+    for name, value in (("metallic", 0.0), ("ior", ior), ("roughness", roughness)):
+        surface.CreateInput(name, T.Float).Set(value)
+    connect(surface.CreateInput("diffuseColor", T.Color3f), _texture(stage, st, f"{path}/albedo", look.albedo, "sRGB"))
+    surface.CreateOutput("surface", T.Token)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    if look.displacement:
+        height = _texture(stage, st, f"{path}/{HEIGHT}", look.displacement, "raw", "r")
+        connect(surface.CreateInput("displacement", T.Float), height)
+        surface.CreateOutput("displacement", T.Token)
+        material.CreateDisplacementOutput().ConnectToSource(surface.ConnectableAPI(), "displacement")
+
+
 def _texture(
     stage: Usd.Stage, st: UsdShade.Output, path: str, file: str, space: str, channel: str = "rgb"
 ) -> UsdShade.Output:

@@ -1,0 +1,106 @@
+"""Fits the eyes of a registered head: ball to the surface between the lids, iris to the photos.
+
+An eye whose iris the photos do not resolve, or whose lids are closed, stays the template's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.eyes.ball import IRIS, RADIUS, SPREAD, Eye, sphere_on, turned
+from pipeline.eyes.iris import LEAST_PIXELS, Iris, find_iris
+from pipeline.eyes.picture import directions_at, plane, sights
+from pipeline.meshes import F64
+from pipeline.registration.scan import Scan
+from pipeline.visibility import FittedPhoto, Occluder
+
+SIDE = 160  # pixels of the picture in which the iris is searched
+REACH = 0.003  # metres: the surface further from the ball is none of the eye
+ALIKE = 1e-5  # metres: by which the radii of a person's eyes differ
+APART = np.radians(20.0)  # between the gazes of both eyes: more, and one of them is no iris
+SIZES = 0.15  # largest relative difference of their irises
+
+
+@dataclass(frozen=True, slots=True)
+class FittedBall:
+    """eye; off: median distance of the surface from the ball, metres; pixels across the iris; score and shown: of its
+    edge; reason: why the eye stays the template's own, "" if it does not."""
+
+    eye: Eye
+    off: float
+    pixels: float
+    score: float
+    shown: float
+    reason: str
+
+
+def fitted_eyes(
+    balls: Mapping[str, F64], axes: F64, scan: Scan, views: Sequence[FittedPhoto], lids: Occluder, unit: float
+) -> dict[str, FittedBall]:
+    """By part. balls: the vertices (n, 3) of the template's eyes where the skin puts them; axes (3, 3): rows to the
+    person's left, up, front; lids: the head without its eyes; unit: world units of one metre."""
+    first = {name: _ball(ball, axes, scan, views, lids, unit, RADIUS * unit, SPREAD) for name, ball in balls.items()}
+    radius = float(np.mean([eye.radius for eye, _ in first.values()])) if first else 0.0
+    same = {name: _ball(ball, axes, scan, views, lids, unit, radius, ALIKE) for name, ball in balls.items()}
+    return paired({name: _with_iris(eye, off, views, lids, unit) for name, (eye, off) in same.items()})
+
+
+def paired(found: Mapping[str, FittedBall]) -> dict[str, FittedBall]:
+    """Two eyes with an iris of the same size; both with a reason if they are no pair."""
+    good = [f.eye for f in found.values() if not f.reason]
+    if len(good) != 2:
+        return dict(found)
+    one, other = good
+    apart = float(np.arccos(np.clip(one.axes[2] @ other.axes[2], -1, 1)))
+    sizes = abs(one.iris - other.iris) / max(one.iris, other.iris)
+    if apart > APART or sizes > SIZES:
+        why = f"the two gazes are {np.degrees(apart):.0f} degrees apart, the irises differ by {sizes:.0%}"
+        return {name: replace(f, reason=f.reason or why) for name, f in found.items()}
+    iris = (one.iris + other.iris) / 2
+    return {name: replace(f, eye=replace(f.eye, iris=iris)) for name, f in found.items()}
+
+
+def _ball(
+    ball: F64, axes: F64, scan: Scan, views: Sequence[FittedPhoto], lids: Occluder, unit: float, radius: float,
+    spread: float,
+) -> tuple[Eye, float]:  # fmt: skip
+    """The ball on the fitted surface where it is seen between the lids, and the surface's median distance from it.
+    ball (n, 3): where the skin puts it; radius: the usual one, spread: its deviation in metres."""
+    middle = 0.5 * (ball.min(0) + ball.max(0))
+    own = float(np.linalg.norm(ball - middle, axis=1).mean())
+    start = middle + (own - radius) * axes[2]  # its front stays where it is
+    eye, off = Eye(start, radius, axes, IRIS * unit), 0.0
+    for _ in range(2):
+        directions = directions_at(plane(SIDE)[sights(eye, views, lids, SIDE).shown()])
+        if not len(directions):
+            break
+        normals = directions @ axes
+        points = eye.points(directions)
+        signed, weight = scan.along(points, normals, REACH * unit)
+        use = np.isfinite(signed) & (weight > 0)
+        there = points[use] + signed[use, None] * normals[use]
+        centre, size = sphere_on(there, weight[use], start, radius, unit, spread)
+        eye = replace(eye, centre=centre, radius=size)
+        away = np.abs(np.linalg.norm(there - centre, axis=1) - size)
+        off = float(np.median(away)) if len(away) else 0.0
+    return eye, off
+
+
+def _with_iris(eye: Eye, off: float, views: Sequence[FittedPhoto], lids: Occluder, unit: float) -> FittedBall:
+    seen = sights(eye, views, lids, SIDE)
+    iris = find_iris(*seen.combined(), float(np.arcsin(IRIS * unit / eye.radius)))
+    found = replace(eye, axes=turned(eye.axes, iris.gaze @ eye.axes), iris=eye.radius * float(np.sin(iris.angle)))
+    pixels = 2 * found.iris * float(np.median(seen.pixels)) if len(seen.pixels) else 0.0
+    return FittedBall(found, off, pixels, iris.score, iris.shown, _why_not(pixels, iris))
+
+
+def _why_not(pixels: float, iris: Iris) -> str:
+    """Why the iris is not known; "" if it is."""
+    if pixels < LEAST_PIXELS:
+        return f"the iris is {pixels:.2g} pixels across, fewer than {LEAST_PIXELS:g}"
+    if not iris.found:
+        return f"no edge of an iris: score {iris.score:.2g}, {iris.shown:.0%} of the circle seen"
+    return ""

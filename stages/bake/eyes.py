@@ -1,0 +1,116 @@
+"""Colours of the fitted eyes: what the photos show between the lids, completed where they show nothing.
+
+Symbols: I radiance that the photos show (a low quantile, without the lamps' reflections), S radiance of a surface of
+albedo 1 there (stages/bake/detail.py); a = I / S. What no photo shows of the iris takes the median of its ring around
+the gaze; the sclera behind the lids that of the sclera that is seen. Seen and completed fade over FADE.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from pipeline.artifacts import Located
+from pipeline.eyes.ball import Eye
+from pipeline.eyes.iris import angle_from
+from pipeline.eyes.picture import REACH, Sights, directions_at, looked_up, places_of, plane, sights
+from pipeline.fields.protocol import Field
+from pipeline.head_artifacts import FittedEye, RegisteredHead
+from pipeline.meshes import F32, F64, Indices, Mask, Mesh
+from pipeline.registration.head import load_head, of_triangles
+from pipeline.visibility import FittedPhoto, Occluder
+from stages.bake.detail import shade
+
+SIDE = 256  # pixels of an eye's picture: 0.12 mm
+FADE = 0.0008  # metres
+LIMBUS = 1.1  # angles of the iris from which on the ball is sclera
+RINGS = 24  # of the iris
+PLAIN = (0.62, 0.56, 0.52)  # albedo of a sclera that no photo shows
+
+
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """of_vertex (V,): number of the eye of each vertex of the mesh, -1 for none. eyes, albedo: each eye and the picture
+    (SIDE, SIDE, 3) of its albedo."""
+
+    of_vertex: Indices
+    eyes: tuple[Eye, ...]
+    albedo: tuple[F32, ...]
+
+    def at(self, vertex: Indices, points: F64) -> tuple[Indices, F32]:
+        """Of points (N, 3) on triangles with a vertex (N,): the rows (n,) on an eye, and their albedo (n, 3)."""
+        which = self.of_vertex[vertex]
+        rows = np.flatnonzero(which >= 0)
+        out = np.zeros((len(rows), 3), np.float32)
+        for i, (eye, image) in enumerate(zip(self.eyes, self.albedo, strict=True)):
+            own = which[rows] == i
+            out[own] = looked_up(image, places_of(eye.local(points[rows[own]])))
+        return rows, out
+
+
+def eye_of(stored: FittedEye) -> Eye:
+    """The eye of an artifact."""
+    return Eye(np.array(stored.centre), stored.radius, np.array(stored.axes), stored.iris)
+
+
+def painted_eyes(
+    registered: Located[RegisteredHead], field: Field, mesh: Mesh, views: Sequence[FittedPhoto], responses: F64
+) -> Eyes | None:
+    """The fitted eyes of the textured mesh, which begins with the head's quads; None without any. responses (views, 3,
+    3): e_n A_n of each photo."""
+    stored, ref = registered.artifact.eyes, registered.artifact.head
+    if not stored or ref is None:
+        return None
+    names = registered.artifact.parts
+    head = load_head(registered.path(ref))
+    part = of_triangles(head, head.part, registered.artifact.regions)
+    of_vertex = np.full(len(mesh.vertices), -1, np.int64)
+    for i, one in enumerate(stored):
+        of_vertex[np.unique(mesh.faces[: len(part)][part == names.index(one.part)])] = i
+    lids = mesh.faces[(of_vertex[mesh.faces] < 0).all(1)]
+    occluder = Occluder(Mesh(mesh.vertices, mesh.normals, lids))
+    eyes = tuple(eye_of(one) for one in stored)
+    seen = (sights(eye, views, occluder, SIDE) for eye in eyes)
+    pictures = tuple(painted(eye, s, field, responses) for eye, s in zip(eyes, seen, strict=True))
+    return Eyes(of_vertex, eyes, pictures)
+
+
+def painted(eye: Eye, seen: Sights, field: Field, responses: F64) -> F32:
+    """(SIDE, SIDE, 3) albedo of an eye."""
+    side = seen.side
+    plain = np.empty_like(seen.colour)
+    for i, view in enumerate(seen.views):
+        plain[i] = seen.colour[i] @ np.linalg.inv(responses[view]).T.astype(np.float32)
+    shown, weight = Sights(plain, seen.weight, seen.pixels, seen.views, side).combined()
+    directions = directions_at(plane(side).reshape(-1, 2))
+    ratio = np.asarray(field.irradiance_ratio(eye.points(directions).astype(np.float32)), np.float32)
+    lit = shade(field.light, directions @ eye.axes, ratio).reshape(side, side, 3)
+    return completed(shown / lit, weight > 0, eye)
+
+
+def completed(albedo: F32, seen: Mask, eye: Eye) -> F32:
+    """(side, side, 3) the albedo of an eye where it is seen (side, side), continued where it is not."""
+    side = len(albedo)
+    angle = angle_from(np.array([0.0, 0.0, 1.0]), side)
+    limbus = float(np.arcsin(eye.iris / eye.radius))
+    white = seen & (angle > LIMBUS * limbus)
+    sclera = np.median(albedo[white], axis=0) if white.any() else np.array(PLAIN)
+    around = np.tile(np.asarray(sclera, np.float32), (side, side, 1))
+    ring = np.minimum((angle / limbus * RINGS).astype(np.int64), RINGS)
+    known = np.full((RINGS + 1, 3), np.nan)
+    for r in range(RINGS):
+        own = seen & (ring == r)
+        if own.any():
+            known[r] = np.median(albedo[own], axis=0)
+    known[RINGS] = sclera
+    at = np.flatnonzero(np.isfinite(known[:, 0]))
+    profile = np.stack([np.interp(np.arange(RINGS + 1), at, known[at, c]) for c in range(3)], 1)
+    inside = ring < RINGS
+    around[inside] = profile[ring[inside]]
+    pixel = 2 * REACH / side * eye.radius
+    away = cv2.distanceTransform(seen.astype(np.uint8), cv2.DIST_L2, 5) * pixel
+    share = np.clip(away / FADE, 0, 1)[..., None]
+    return np.asarray(around + share * (np.where(seen[..., None], albedo, 0) - around), np.float32).clip(0, 1)
