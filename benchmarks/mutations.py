@@ -1,123 +1,33 @@
-"""Single wrong changes to the product, and the tests that must notice each.
+"""Makes single wrong changes to the product, and sees whether the tests that must notice each do.
 
     python -m benchmarks.mutations                 # all of them: a table; exit code 1 if one survives
     python -m benchmarks.mutations --only hull     # those whose file or tests have "hull" in their name
+    python -m benchmarks.mutations --write         # all of them, and docs/benchmarks/mutations.md, .json
 
 Each change is made in a copy of the tree, where its tests then run; nothing here is touched. Before that the tests run
-once on the unchanged copy: a test that fails there proves nothing. tests/docs/test_mutations.py keeps the list in step
-with the code.
+once on the unchanged copy: a test that fails there proves nothing. The list is in benchmarks/mutation_list.py.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.mutation_list import MUTATIONS, Mutation
+
 ROOT = Path(__file__).resolve().parents[1]
+PAGE, RECORD = ROOT / "docs/benchmarks/mutations.md", ROOT / "docs/benchmarks/mutations.json"
+NOT_RUN = "not made yet"
 PARTS = ("benchmarks", "docker", "docs", "pipeline", "stages", "tests", "workflows")
 LIMIT, PATIENCE = 900.0, 5.0  # seconds, and times all tests' own time: what hangs on a change has noticed it
 FAILED = 1  # pytest's exit code where tests failed; 2 to 5 say that they did not run
-
-
-@dataclass(frozen=True)
-class Mutation:
-    """A text that stands once in a file, what stands there instead, and the tests (files, or FILE::TEST) that fail."""
-
-    file: str
-    before: str
-    after: str
-    tests: str
-
-    @property
-    def change(self) -> str:
-        """In one line."""
-        return f"{self.file}: {' '.join(self.before.split())} -> {' '.join(self.after.split()) or 'nothing'}"
-
-
-MUTATIONS = (
-    # ---------------------------------------------------------------- equations
-    Mutation("pipeline/maths/vmf.py", "-0.5 * l * (l + 1) * inv_kappa", "-0.5 * l * l * inv_kappa",
-             "tests/maths/test_vmf.py"),
-    Mutation("pipeline/maths/brdf.py", "return 2 * (n * wo)", "return (n * wo)", "tests/maths/test_brdf.py"),
-    Mutation("pipeline/maths/sh.py", "v = (-1) ** (l // 2 + 1)", "v = (-1) ** (l // 2)", "tests/maths/test_sh.py"),
-    Mutation("pipeline/maths/density.py", "torch.exp(-before) * -torch.expm1(-depth)", "torch.exp(-before) * depth",
-             "tests/maths/test_density.py"),
-    Mutation("pipeline/fields/paper/material.py", "positional_encoding(u, OCTAVES), angles(wo, n)]",
-             "positional_encoding(u, OCTAVES), angles(n, wo)]",
-             "tests/fields/test_reflectance.py::test_the_direct_integral_by_hand"),
-    Mutation("pipeline/fields/appearance.py", "(c * self(wo, n)).sum(-1)", "(c * self(wo, n)).mean(-1)",
-             "tests/fields/test_reflectance.py::test_the_integral_of_a_sum_of_lobes_is_c_times_b"),
-    Mutation("pipeline/fields/calibration.py", "+ m - m.mean(0)", "+ m",
-             "tests/fields/test_face.py::test_calibration_is_the_identity_plus_what_differs_by_hand"),
-    Mutation("stages/inverse_rendering/objective.py", '"nij,nj->ni"', '"nji,nj->ni"',
-             "tests/inverse_rendering/test_objective.py::test_calibration_applies_each_views_matrix"),
-    Mutation("stages/inverse_rendering/objective.py", "settings.white * losses", "settings.rgb * losses",
-             "tests/inverse_rendering/test_objective.py::test_the_objective_is_eq_20_by_hand"),
-    Mutation("stages/inverse_rendering/paper/trainer.py", "settings.displacement * moved.mean()",
-             "settings.eikonal * moved.mean()",
-             "tests/inverse_rendering/paper/test_paper.py::test_the_terms_are_eq_20_by_hand"),
-    Mutation("stages/inverse_rendering/ray_sampling.py", "self.at(i, share / share.mean())", "self.at(i)",
-             "tests/inverse_rendering/test_fit.py::test_a_ray_stands_for_as_many_as_it_was_drawn_from"),
-    Mutation("pipeline/colour.py", "v <= 0.04045, v / 12.92", "v <= 0.04045, v / 12.0", "tests/core/test_colour.py"),
-    # ---------------------------------------------------------------- cameras and poses
-    Mutation("pipeline/transforms.py", "out[:2, 2] += 0.5", "out[:2, 2] += 0.0", "tests/core/test_transforms.py"),
-    Mutation("pipeline/transforms.py", "to_from_world[:3, :3] / scale @", "to_from_world[:3, :3] @",
-             "tests/core/test_transforms.py"),
-    Mutation("pipeline/transforms.py", "np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])", "np.ones(3)",
-             "tests/core/test_transforms.py::test_the_nearest_similarity_is_found_and_never_mirrors"),
-    Mutation("stages/poses/normalise.py", "weights = 1.0 / np.maximum(distance,",
-             "weights = 1.0 + 0 * np.maximum(distance,", "tests/poses/test_poses_normalise.py"),
-    Mutation("stages/poses/scale.py", "<= MET * max(", "<= 100 * MET * max(", "tests/poses/test_poses_scale.py"),
-    # ---------------------------------------------------------------- masks and hull
-    Mutation("stages/masks/refine_contour.py", "UNIT * (behind - own)", "UNIT * (own - behind)",
-             "tests/masks/test_masks_refine_contour.py::test_a_contour_that_is_nearly_right_becomes_right"),
-    Mutation("stages/masks/face_labels.py", "(out > 0) & (out != EYES)", "(out > 0)",
-             "tests/masks/test_masks_faces.py"),
-    Mutation("pipeline/hull.py", "1.2 * np.sqrt(3) / 2 * cell * factor", "0.2 * cell * factor",
-             "tests/pipeline/test_hull.py::test_coarse_to_fine_equals_every_voxel_asked"),
-    # ---------------------------------------------------------------- UVs and maps
-    Mutation("stages/uv/pack.py", "reach = OVERLOOKED + 0.5 * padding * G", "reach = OVERLOOKED",
-             "tests/uv/test_uv_build.py::test_packing_keeps_shapes_and_distance"),
-    Mutation("stages/uv/pack.py", "[[s, c], [-c, s]]", "[[s, c], [c, -s]]",
-             "tests/uv/test_uv_build.py::test_packing_turns_without_mirroring"),
-    Mutation("stages/bake/texels.py", "np.where(landed[:, None], gradient, n)", "np.where(landed[:, None], n, n)",
-             "tests/bake/test_bake_maps.py::test_normal_map_gives_back_the_gradient"),
-    Mutation("pipeline/ray_casting.py", 'found["primID"] >= 0', 'found["primID"] > 0',
-             "tests/bake/test_bake_sight.py::test_distances_to_a_mesh_by_hand"),
-    # ---------------------------------------------------------------- USD and report
-    Mutation("pipeline/maths/latlong.py", "np.pi * (1 - 2 * (np.arange(width) + 0.5) / width)",
-             "np.pi * (2 * (np.arange(width) + 0.5) / width - 1)", "tests/usd/test_usd_light.py"),
-    Mutation("stages/usd/write/ggx_conversion.py", "REFERENCE_F0 * a + b", "REFERENCE_F0 * a",
-             "tests/usd/test_usd_ggx_conversion.py"),
-    Mutation("pipeline/lighting/median_cut.py", "np.minimum(image[..., :3], HALF_MAX)",
-             "np.minimum(image[..., :3], 1e3)",
-             "tests/usd/test_usd_relight.py::test_infinite_suns_are_bounded"),
-    Mutation("stages/report/metrics.py", "-10 * float(np.log10(", "-20 * float(np.log10(",
-             "tests/report/test_report_metrics.py"),
-    # ---------------------------------------------------------------- verdict
-    Mutation("pipeline/verdict.py", 'if not np.isfinite(value):\n            return "unusable"',
-             'if not np.isfinite(value):\n            return "good"', "tests/pipeline/test_verdict.py"),
-    Mutation("pipeline/verdict.py", "return max(levels, key=LEVELS.index", "return min(levels, key=LEVELS.index",
-             "tests/pipeline/test_verdict.py"),
-    # ---------------------------------------------------------------- store and workflows
-    Mutation("pipeline/store.py", "None if sha256_of(path) == ref.sha256 else", "None if True else",
-             "tests/core/test_contract.py::test_a_damaged_artifact_is_found_and_made_anew"),
-    Mutation("pipeline/contract.py", '"version": stage.version', '"version": 0',
-             "tests/core/test_contract.py::test_key_is_the_digest_of_what_it_names"),
-    Mutation("workflows/store/gc.py", "elif (stage, key) not in needed:", "else:",
-             "tests/workflows/test_store_care.py::test_what_a_published_folder_names_stays_and_the_rest_goes"),
-    Mutation("workflows/batch/schedule.py", "if resource.free == 0:", "if resource.free < -1000:",
-             "tests/workflows/test_schedule.py"),
-    Mutation("workflows/run/budget.py", "stage = left - slower * rung.after", "stage = left",
-             "tests/workflows/test_budget.py"),
-)  # fmt: skip
 
 
 def copied(to: Path) -> Path:
@@ -161,12 +71,50 @@ def fate(tree: Path, mutation: Mutation, limit: float = LIMIT) -> tuple[str, str
     return ("survived" if code == 0 else "unclear"), said
 
 
+def recorded() -> list[str]:
+    """What came of each change of the list when it was made last; NOT_RUN where it never was."""
+    known: dict[str, str] = json.loads(RECORD.read_text()) if RECORD.is_file() else {}
+    return [known.get(m.change, NOT_RUN) for m in MUTATIONS]
+
+
+def page() -> str:
+    """The document: a row for each change, in the order of the list."""
+    fates = recorded()
+    lines = [
+        "# Wrong changes that tests notice",
+        "",
+        "Each row is one wrong change of a line of the product, made in a copy of the tree, and the tests that ran.",
+        "`killed`: a test failed, as it should. `survived`: none did. Made by `python -m benchmarks.mutations --write`",
+        "from `benchmarks/mutation_list.py`; `tests/docs/test_mutations.py` checks that every text still stands in its",
+        "file, and that this page has every change.",
+        "",
+        f"{fates.count('killed')} of {len(fates)} were killed when they were made last.",
+        "",
+        "| file | change | tests | |",
+        "|---|---|---|---|",
+    ]
+    for m, fate_of in zip(MUTATIONS, fates, strict=True):
+        lines.append(f"| `{m.file}` | {_code(m.before)} -> {_code(m.after)} | `{m.tests}` | {fate_of} |")
+    return "\n".join(lines) + "\n"
+
+
+def _code(text: str) -> str:
+    """As code in a cell of a table."""
+    return f"`{' '.join(text.split())}`".replace("|", "\\|") if text.strip() else "nothing"
+
+
 def main(arguments: list[str]) -> int:
     """Run them, print a line each; 1 if one is not killed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--only", default="", help="text in the name of the file or of the tests")
-    only = parser.parse_args(arguments).only
-    chosen = [m for m in MUTATIONS if only in m.file or only in m.tests]
+    parser.add_argument(
+        "--only", nargs="+", default=[""], help="texts, one of them in the name of the file or of the tests"
+    )
+    parser.add_argument("--write", action="store_true", help=f"write the table of {PAGE.relative_to(ROOT)}")
+    options = parser.parse_args(arguments)
+    only = options.only
+    chosen = [m for m in MUTATIONS if any(text in m.file or text in m.tests for text in only)]
+    if not chosen:
+        parser.error(f"no change has {only!r} in the name of its file or tests")
     with tempfile.TemporaryDirectory(prefix="mutations") as folder:
         tree = copied(Path(folder) / "tree")
         begun = time.monotonic()
@@ -175,11 +123,16 @@ def main(arguments: list[str]) -> int:
         if code != 0:
             print(f"the tests fail without any change: {said}")
             return 2
-        fates = []
+        fates: list[str] = []
+        known = {m.change: f for m, f in zip(MUTATIONS, recorded(), strict=True)}
         for m in chosen:
             begun = time.monotonic()
             what, said = fate(tree, m, limit)
             fates.append(what)
+            known[m.change] = what
+            if options.write:  # at once: a run that is stopped has not worked for nothing
+                RECORD.write_text(json.dumps(known, indent=1) + "\n")
+                PAGE.write_text(page())
             print(f"{what:9} {time.monotonic() - begun:4.0f} s  {m.change}\n{'':17}{said}", flush=True)
     print(f"{fates.count('killed')} of {len(fates)} killed")
     return 0 if set(fates) <= {"killed"} else 1

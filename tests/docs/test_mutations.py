@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutations import MUTATIONS, PARTS, Mutation, fate
+from benchmarks.mutation_list import MUTATIONS, Mutation
+from benchmarks.mutations import NOT_RUN, PAGE, PARTS, fate, main, page, recorded
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -24,8 +25,14 @@ def test_each_change_can_be_made_and_has_its_tests(mutation: Mutation) -> None:
 
 
 def test_the_list_spans_the_product() -> None:
-    assert len(MUTATIONS) >= 30 and len({m.change for m in MUTATIONS}) == len(MUTATIONS)
+    assert len(MUTATIONS) >= 60 and len({m.change for m in MUTATIONS}) == len(MUTATIONS)
     assert {m.file.split("/")[0] for m in MUTATIONS} == {"pipeline", "stages", "workflows"} <= set(PARTS)
+
+
+def test_the_page_says_what_was_measured_and_none_survived() -> None:
+    """Made by --write; a change that was never made says so."""
+    assert PAGE.read_text() == page()
+    assert set(recorded()) <= {"killed", NOT_RUN}
 
 
 @pytest.mark.parametrize(
@@ -48,3 +55,9 @@ def test_a_change_is_killed_only_by_a_test_that_fails_and_is_taken_back(
     assert fate(tmp_path, Mutation("code_to_change.py", "1 + 1", "1 + 2", "test_it.py"))[0] == expected
     assert code.read_text() == "def f():\n    return 1 + 1\n" and code.stat().st_mtime_ns == before
     assert fate(tmp_path, Mutation("code_to_change.py", "1 + 7", "1", "test_it.py"))[0] == "unclear"
+
+
+def test_a_choice_without_changes_is_refused() -> None:
+    with pytest.raises(SystemExit) as e:
+        main(["--only", "no such name"])
+    assert e.value.code == 2
