@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 export DO_NOT_TRACK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lint format bench lock clean
+.PHONY: help setup demo test check lint format bench nightly lock sbom clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,23 +46,36 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 # A stamp each, so that the set-up happens once per change of a lock.
-$(VENV)/.ready: requirements.lock pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+# Every file is checked against the locks' hashes. A build of torch that requirements-torch.lock does not know is
+# refused: `make setup TORCH_CHECK=` takes it unchecked. The third line adds the libraries that a CUDA build needs.
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+TORCH_CHECK ?= --require-hashes
+$(VENV)/.ready: requirements.lock requirements-torch.lock pyproject.toml | $(BIN)/python
+	$(PIP) --require-hashes --no-deps -r requirements.lock
+	sed $(if $(TORCH_CHECK),,-n -e 's/ .*//' -e '/^torch/p') requirements-torch.lock > $(VENV)/torch.txt
+	$(PIP) $(TORCH_CHECK) --no-deps -r $(VENV)/torch.txt
+	$(PIP) "$$(sed -n 's/^\(torch==[^ ]*\).*/\1/p' requirements-torch.lock)"
+	$(PIP) --no-deps -e .
 	@touch $@
 
 $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.lock
+	$(PIP) --require-hashes --no-deps -r requirements-dev.lock
 	@touch $@
 
-# torch's CPU builds carry a local version label ("+cpu") that only some package sources know: it is cut off.
-COMPILE = $(BIN)/pip-compile --quiet --strip-extras --no-header --annotation-style=line \
+sbom: $(VENV)/.ready ## a bill of materials of what is installed and shipped, in out/sbom.cdx.json
+	$(BIN)/python -m workflows.supply.sbom --out out/sbom.cdx.json
+
+nightly: $(VENV)/.ready-dev ## hours: 10,000 damaged files for every reader; every signal at every moment of a run
+	NEUFACE_FUZZ=10000 $(BIN)/python -m pytest -q tests/fuzz $(SPREAD)
+	$(BIN)/python -m benchmarks.kill_matrix out/signals
+
+COMPILE = $(BIN)/pip-compile --quiet --strip-extras --no-header --generate-hashes --allow-unsafe \
 	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 lock: $(VENV)/.ready-dev ## the newest versions that pyproject allows, into the lock files
 	$(COMPILE) --upgrade -o requirements.lock pyproject.toml
 	$(COMPILE) --upgrade --extra dev -c requirements.lock -o requirements-dev.lock pyproject.toml
-	sed -i -e 's/+cpu//' -e '1i # Exact versions of all that pyproject needs; made by `make lock`. Without hashes: every package source has' \
-		-e '1i # its own build of torch. Where only the CUDA build is found, that one gets installed.' requirements*.lock
+	$(BIN)/python -m workflows.supply.relock .
+	$(BIN)/python -m workflows.supply.sbom --write
 
 clean: ## removes what was built here (not .venv, not your runs)
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

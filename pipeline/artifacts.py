@@ -245,37 +245,6 @@ class Surface(Artifact):
     findings: tuple[Finding, ...] = ()
 
 
-class RegisteredHead(Artifact):
-    """The head template on the fitted surface; if it does not hold, registered is false and reason says why.
-
-    head: npz of pipeline.registration.head; rig: of pipeline.registration.rig, if the template has joints. template,
-    licence: its name and licence. regions, parts: names that the file's indices refer to. levels: subdivisions of the
-    displacement. quads: of the control cage. world_from_template: 4x4 similarity to asset coordinates; identity:
-    weights in standard deviations. figures: by name, see docs/stages/template.md. distances_mm: by region (median and
-    95 % of the subdivided head's distance from the fitted surface, then both with displacement), over skin that the
-    photos show. quality: the checks; they count for the stage uv where the asset is made from this head, and for no
-    verdict else.
-    """
-
-    registered: bool
-    reason: str = ""
-    head: FileRef | None = None
-    rig: FileRef | None = None
-    template: str = ""
-    licence: str = ""
-    regions: tuple[str, ...] = ()
-    parts: tuple[str, ...] = ()
-    levels: int = 0
-    quads: int = 0
-    world_from_template: Matrix = ()
-    identity: tuple[float, ...] = ()
-    figures: dict[str, float] = {}
-    distances_mm: dict[str, tuple[float, float, float, float]] = {}
-    quality: tuple[Finding, ...] = ()
-    warnings: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-
-
 class UvMesh(Artifact):
     """A mesh with charts. npz: vertices (V, 3), normals (V, 3), faces (F, 3), uvs (U, 2) float32, uv_faces (F, 3).
 
@@ -331,7 +300,8 @@ class TextureSet(Artifact):
     texels under charts. figures: shares of the covered texels that no photo shows (`unseen`), whose albedo was clamped
     (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a texel and median edge of the photos'
     finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of the surface's area by region name;
-    empty without labelled photos. scan: those of the scan's mesh, if the asset has both meshes."""
+    empty without labelled photos. standard_fitted: base colour, F0 and roughness were fitted to the photos; else they
+    are converted from NeuFace's lobe. scan: those of the scan's mesh, if the asset has both meshes."""
 
     size: int
     tiles: int = 1
@@ -342,6 +312,7 @@ class TextureSet(Artifact):
     lod_rms_mm: dict[str, float] = {}
     figures: dict[str, float] = {}
     regions: dict[str, float] = {}
+    standard_fitted: bool = False
     scan: TextureSet | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
@@ -361,6 +332,28 @@ class UsdAsset(Artifact):
     figures: dict[str, float] = {}
     stated: dict[str, str] = {}
     checks: int
+    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
+
+
+class ReflectanceField(Artifact):
+    """How each texel answers light from every direction, measured by a light stage; if the capture is of none, present
+    is false. files: maps, mesh and basis.json (docs/reflectance.md); size: texels along each side of the maps.
+
+    lights: number of those in the fit; left_out: lights, and cameras those, that were kept from it for the figures.
+    alphas: GGX widths of the global lobes. motion: 4x4 of the head in asset coordinates by frame. figures: by name,
+    see docs/stages/reflectance.md.
+    """
+
+    present: bool
+    files: tuple[FileRef, ...] = ()
+    size: int = 0
+    lights: int = 0
+    left_out: tuple[int, ...] = ()
+    cameras: tuple[int, ...] = ()
+    alphas: tuple[float, ...] = ()
+    motion: dict[str, Matrix] = {}
+    figures: dict[str, float] = {}
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

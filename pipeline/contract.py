@@ -7,6 +7,7 @@ the key in the store. If it is missing, it runs the stage in a partial folder an
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import importlib.metadata
 import json
@@ -24,11 +25,12 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.artifacts import Artifact, FileRef, Located
-from pipeline.errors import Cancelled, stage_error_from_os_error
+from pipeline.errors import Cancelled, NeufaceError, stage_error_from_os_error
 from pipeline.store import Store
 from pipeline.units import FilledIn
 
 log = logging.getLogger(__name__)
+FULL = 1 << 16  # bytes free on a disk below which a library's failure to write is put down to it
 
 
 class StageConfig(BaseModel):
@@ -206,11 +208,22 @@ def _folders(store: Store, stage: str, k: str) -> Iterator[tuple[Path, Path]]:
     scratch.mkdir(parents=True, exist_ok=True)
     try:
         yield partial, scratch
-    except BaseException:
+    except BaseException as e:
+        full = not isinstance(e, OSError | NeufaceError) and isinstance(e, Exception) and _is_full(partial)
         shutil.rmtree(partial, ignore_errors=True)
         if scratch.is_dir() and not any(scratch.iterdir()):
             scratch.rmdir()
+        if full:  # libraries in C++ tell it in ways of their own
+            raise OSError(errno.ENOSPC, f"{type(e).__name__}: {e}") from e
         raise
+
+
+def _is_full(folder: Path) -> bool:
+    try:
+        total, _, free = shutil.disk_usage(folder)
+    except OSError:
+        return False
+    return total > 0 and free < FULL
 
 
 def peak_memory_mb() -> float:

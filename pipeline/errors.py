@@ -81,6 +81,11 @@ _DISK_REMEDIES = {
     errno.EROFS: ("the disk is read-only", "choose a writable folder with --out or --store"),
     errno.EACCES: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
     errno.EPERM: ("permission denied", "choose a folder that this user may write to, or change its permissions"),
+    errno.ESTALE: ("the network disk was disconnected", "connect it again, and repeat the command"),
+    errno.ENOTCONN: ("the network disk was disconnected", "connect it again, and repeat the command"),
+    errno.ENODEV: ("the disk was removed", "connect it again, and repeat the command"),
+    errno.EMFILE: ("too many files are open", "raise the limit (ulimit -n)"),
+    errno.ENFILE: ("too many files are open on this machine", "close other programs, or raise fs.file-max"),
     errno.ENOTDIR: ("a file is where a folder is needed", "remove that file or choose another folder"),
 }
 

@@ -49,7 +49,7 @@ def frames(mesh: Mesh, charts: Charts) -> Frames:
             total[:, axis] += np.bincount(group[:, i], weighted[:, axis], len(total))
     mean = total[group]
     lost = (mean * mean).sum(-1) < 1e-12
-    mean[lost] = _any_across(n[lost])
+    mean[lost] = any_across(n[lost])
     return Frames(_unit(mean).astype(np.float32), sign.astype(np.float32))
 
 
@@ -60,7 +60,7 @@ def at(frame: Frames, mesh: Mesh, face: Indices, weights: npt.NDArray[np.floatin
     raw = mixed(frame.tangent[face], w)
     tangent = raw - normal * dot(normal, raw)[:, None]
     lost = dot(tangent, tangent) < 1e-12
-    tangent[lost] = _any_across(normal[lost])
+    tangent[lost] = any_across(normal[lost])
     tangent = _unit(tangent)
     return tangent, np.cross(normal, tangent) * frame.sign[face, None], normal
 
@@ -85,7 +85,7 @@ def _angle(x: F64, normal: F64, i: int) -> F64:
     return out
 
 
-def _any_across(n: F64) -> F64:
+def any_across(n: F64) -> F64:
     """(M, 3) arbitrary unit vectors orthogonal to n (M, 3)."""
     axis = np.eye(3)[np.abs(n).argmin(1)] if len(n) else np.zeros((0, 3))
     return _unit(np.cross(axis, n))

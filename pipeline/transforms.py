@@ -58,6 +58,11 @@ def similarity(scale: float, rotation: F64, translation: F64) -> F64:
     return rigid(scale * rotation, translation)
 
 
+def scale_of(m: F64) -> float:
+    """The scale of a similarity (4, 4), or of its upper left part (3, 3)."""
+    return float(np.cbrt(np.linalg.det(m[:3, :3])))
+
+
 def umeyama(source: F64, target: F64) -> F64:
     """4x4 similarity with the least squared distance from source (N, 3) to target (N, 3) [Umeyama 1991]; its scale is 0
     if the source is one point."""
@@ -71,7 +76,7 @@ def umeyama(source: F64, target: F64) -> F64:
 
 def rescale_camera(to_from_world: F64, world_from_cam: F64) -> F64:
     """A camera's rigid 4x4 pose after a similarity of its world (the scale moves the centre, not the axes)."""
-    scale = float(np.cbrt(np.linalg.det(to_from_world[:3, :3])))
+    scale = scale_of(to_from_world)
     turned = to_from_world[:3, :3] / scale @ world_from_cam[:3, :3]
     return rigid(turned, to_from_world[:3, :3] @ world_from_cam[:3, 3] + to_from_world[:3, 3])
 

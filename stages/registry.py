@@ -14,6 +14,7 @@ from stages.capture.stage import STAGE as CAPTURE
 from stages.inverse_rendering.stage import STAGE as INVERSE_RENDERING
 from stages.masks.stage import STAGE as MASKS
 from stages.poses.stage import STAGE as POSES
+from stages.reflectance.stage import STAGE as REFLECTANCE
 from stages.report.stage import STAGE as REPORT
 from stages.surface.stage import STAGE as SURFACE
 from stages.template.stage import STAGE as TEMPLATE
@@ -31,6 +32,7 @@ REGISTRY: tuple[Stage[Any, Any, Any], ...] = (
     SURFACE,
     TEMPLATE,
     UV,
+    REFLECTANCE,
     BAKE,
     USD,
     REPORT,

@@ -26,6 +26,7 @@ from workflows.run.verdict import last_lines, level_in, state_name
 from workflows.server.access import check_folders
 from workflows.server.adapter import execute_as_task, publish_result, report_batch, with_slot
 from workflows.server.flow_signature import takes
+from workflows.server.life import signs_of_life
 
 CAPTURE_FLOW: dict[str, Any] = {
     "name": "capture-to-asset",
@@ -64,7 +65,7 @@ def _run_capture(asked: Mapping[str, Any], watch: Session | None) -> Any:
         plan, note = make_plan(request), watched.observer.note
         with exclusive_run(plan.store.root, plan.out, watched.stopped, note):
             done = run_stages(plan, watched, execute_as_task, with_slot(plan, watched.stopped))
-            record = publish(plan, done, note)
+            record = publish(plan, done, note, watched.stop.is_set)
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))
     return record if name is None else Completed(name=name, message="\n".join(last_lines(record)), data=record)
@@ -98,14 +99,17 @@ def _watched(asked: Mapping[str, Any], known: Session | None = None) -> Iterator
     """The session of this flow: that of the command (`known`), or a new one. Signals stop it at a checkpoint,
     and not at any place, as Prefect's own handler would.
 
-    A run that a server started may only use the allowed folders, and ends with the worker that started it.
+    A run that a server started may only use the allowed folders, and ends with the worker that started it. Each run
+    gives its server signs of life.
     """
-    from_server = known is None and FlowRunContext.get() is not None
+    context = FlowRunContext.get()
+    from_server = known is None and context is not None
     if from_server:
         end_with(int(os.environ.get(PARENT, os.getppid())))
         check_folders(asked)
     watch = known or Session()
-    with interruptible(watch.stop, watch.observer.note) as caught:
+    signs = signs_of_life(context.flow_run if context is not None else None)
+    with signs, interruptible(watch.stop, watch.observer.note) as caught:
         try:
             yield watch
             return

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.artifacts import Camera, CameraSet, Located
-from pipeline.capture_artifacts import Capture
+from pipeline.capture_artifacts import Capture, CaptureKind
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.faces.landmarks3d import head_frame
@@ -27,6 +27,9 @@ from stages.poses.write_cameras import camera_of, camera_set
 if TYPE_CHECKING:
     from stages.poses.mapper import Model
 
+# FaceScape: metres or millimetres; a light stage: metres; the other formats have arbitrary units
+UNITS: dict[CaptureKind, Unit] = {"facescape": "guess", "olat": "metres"}
+
 
 def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """The capture's cameras in asset coordinates, without views whose photos contradict them. If most views are
@@ -40,8 +43,7 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
         for v, c in ((v, v.camera) for v in capture.artifact.views)
         if c is not None
     ]
-    # only FaceScape defines its unit: metres or millimetres; the other formats have arbitrary units
-    auto: Unit = "guess" if capture.artifact.kind == "facescape" else "unknown"
+    auto: Unit = UNITS.get(capture.artifact.kind, "unknown")
     unit: Unit = auto if config.unit == "auto" else config.unit
     wrong, findings = _contradicted(capture, cameras, config, context) if config.check else ([], ())
     names = tuple(cameras[i].name for i in wrong)

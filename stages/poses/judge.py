@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.artifacts import Camera, CameraSet
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.directions import Counts, around, count_seen, parts, share_seen, spread, view_directions
-from pipeline.transforms import F64, matrix
+from pipeline.transforms import F64, matrix, scale_of
 from pipeline.verdict import Finding, Limits, judged
 from stages.poses.normalise import PLAUSIBLE_ROI
 
@@ -39,7 +39,7 @@ MIRRORED = Limits(0.0, 0.5, lower=False)
 def judge(found: CameraSet, capture: Capture, points: F64 | None) -> tuple[Counts, tuple[Finding, ...]]:
     """Directions seen by the fitted views, and the findings. points: (M, 3) sparse points in asset coordinates, or
     None."""
-    views, stated = capture.views, found.source == "given" and capture.kind == "facescape"
+    views, stated = capture.views, found.source == "given" and capture.kind in ("facescape", "olat")
     fitted = fitted_cameras(found.cameras, views)
     directions = view_directions(fitted)
     counts = count_seen(directions)
@@ -125,7 +125,7 @@ def _scale(found: CameraSet, stated: bool) -> Finding:
     """The check of the subject's size, which must be a head's if the scale is known. An unknown scale is no fault,
     unless the cameras' format defines its unit (stated) and no unit gives a head's size."""
     low, high = PLAUSIBLE_ROI
-    capture_unit = float(np.cbrt(np.linalg.det(matrix(found.capture_from_asset)[:3, :3])))
+    capture_unit = scale_of(matrix(found.capture_from_asset))
     radius = found.roi_radius * (1.0 if found.metric else capture_unit)
     known = found.metric or stated
     off = max(low / radius, radius / high, 1.0) if known else 1.0

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
-from pipeline.transforms import F64, apply, inverse_rigid, matrix, project, rays, umeyama
+from pipeline.transforms import F64, apply, inverse_rigid, matrix, project, rays, scale_of, umeyama
 
 DICTIONARIES = {
     "aruco_4x4": cv2.aruco.DICT_4X4_250,
@@ -178,7 +178,7 @@ def by_markers(seen: Sequence[tuple[Camera, Mapping[int, F64]]], edge: float) ->
 
 def by_world(metres_from_world: F64) -> tuple[Scale, F64]:
     """The scale and the rotation (3, 3) to upright axes of a published similarity (4, 4)."""
-    s = float(np.cbrt(np.linalg.det(metres_from_world[:3, :3])))
+    s = scale_of(metres_from_world)
     return Scale(s, "from FaceScape's scale dictionary"), np.asarray(metres_from_world[:3, :3] / s, np.float64)
 
 
@@ -232,7 +232,7 @@ def by_positions(
     a = np.stack([matrix(c.world_from_cam)[:3, 3] for c in known])
     b = np.array([places[c.index] for c in known])
     found = umeyama(a, b)
-    scale, residual = float(np.cbrt(np.linalg.det(found[:3, :3]))), apply(found, a) - b
+    scale, residual = scale_of(found), apply(found, a) - b
     spread = float(np.sqrt(((b - b.mean(0)) ** 2).sum(1).mean()))
     wrong = float(np.sqrt((residual**2).sum(1).mean() * len(b) / (len(b) - 7 / 3)))
     if scale <= 0 or spread < MIN_SPREAD * wrong:

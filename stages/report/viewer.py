@@ -21,6 +21,7 @@ from markupsafe import Markup
 
 from pipeline import tiles
 from pipeline.images import read_encoded, read_exr, shrink
+from pipeline.lighting.median_cut import HALF_MAX
 from pipeline.maths import studio_lights
 from stages.report.collect import Results
 from stages.report.pictures import U8, png_uri, scale_colours
@@ -29,7 +30,6 @@ from stages.report.viewer_cameras import cameras_shown
 F32 = npt.NDArray[np.float32]
 MAP_SIDE = 1024  # texels of a map that only the view shows
 LIGHT_WIDTH = 128  # columns of a light: more than the captured light's order 10 or a rough surface can show
-HALF_MAX = 65504.0  # largest half float
 MAPS = ("ambient_occlusion", "irradiance_ratio", "confidence", "coverage", "region")
 LABELS = {"key": "studio, key lamp", "overcast": "overcast sky", "sunset": "sunset"}
 MODULES = (  # in the order of their imports, by the name under which others import them

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, RegisteredHead, Surface, UvMesh
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, UvMesh
 from pipeline.contract import Context, Stage
+from pipeline.head_artifacts import RegisteredHead
 from pipeline.verdict import Finding
 from stages.uv.config import Config as Config
 

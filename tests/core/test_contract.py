@@ -16,7 +16,7 @@ import pytest
 
 from pipeline.artifacts import Located
 from pipeline.contract import Stage, execute, inputs_from, key
-from pipeline.errors import Cancelled, StageError
+from pipeline.errors import Cancelled, DiskError, StageError
 from pipeline.store import Store
 from tests.support.points import hold
 from tests.support.toy_stages import FIRST, SECOND, THIRD, Config, FirstInputs, Number, SlowConfig, source
@@ -141,6 +141,18 @@ def test_a_failed_stage_leaves_nothing_that_looks_finished(
         run_second(store, photos, SlowConfig(fault=fault))
     assert [e for e in entries(store, "second") if not e.endswith(".scratch")] == []
     assert len(entries(store, "first")) == 1  # what was finished before stays
+
+
+@pytest.mark.parametrize(("free", "kind"), [(0, DiskError), (1 << 20, ZeroDivisionError)])
+def test_a_librarys_error_on_a_full_disk_is_the_disks(
+    photos: Path, store: Store, monkeypatch: pytest.MonkeyPatch, free: int, kind: type[Exception]
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: (1 << 30, 0, free))
+    with pytest.raises(kind) as e:
+        run_second(store, photos, SlowConfig(fault="bug"))
+    assert not list(store.root.glob("*/*.partial-*"))
+    if kind is DiskError:
+        assert "no space is left" in str(e.value) and "ZeroDivisionError: a bug" in str(e.value)
 
 
 def test_a_full_disk_is_told_in_plain_words(photos: Path, store: Store) -> None:

@@ -59,7 +59,7 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
     )
     at_uv = Located(textured, folders["uv"])
     maps = bake.run(
-        bake.Inputs(surface, at_uv, face, rig, masks, capture),
+        bake.Inputs(surface, at_uv, face, rig, masks, capture, no_head(surface.folder)),
         bake.Config(size=256),
         context("bake"),
     )

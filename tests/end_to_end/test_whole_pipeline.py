@@ -33,7 +33,19 @@ SMALL = {
     "usd.preview_size": 128,
 }
 SHOWN = 40  # differences that a failure lists
-STAGES = ["capture", "poses", "masks", "inverse_rendering", "surface", "template", "uv", "bake", "usd", "report"]
+STAGES = [
+    "capture",
+    "poses",
+    "masks",
+    "inverse_rendering",
+    "surface",
+    "template",
+    "uv",
+    "reflectance",
+    "bake",
+    "usd",
+    "report",
+]
 
 
 @pytest.fixture(scope="module")

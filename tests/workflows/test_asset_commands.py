@@ -59,7 +59,7 @@ def test_validate_writes_json(run_folder: Path, tmp_path: Path, capsys: pytest.C
 def test_render_shows_the_held_out_views_as_the_run_did(run_folder: Path, tmp_path: Path) -> None:
     """By default, and from the capture's own cameras: through another world and back."""
     assert main(["render", str(run_folder), "--out", str(tmp_path / "a")]) == 0
-    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["3.exr", "3.png", "9.exr", "9.png"]
+    assert sorted(p.name for p in (tmp_path / "a").glob("[!.]*")) == ["3.exr", "3.png", "9.exr", "9.png"]
     wanted = read_exr(run_folder / "asset_views/3.exr")[0]
     np.testing.assert_allclose(read_exr(tmp_path / "a/3.exr")[0], wanted, atol=2e-3)
     given = ["--cameras", str(run_folder / "params.json"), "--views", "3"]

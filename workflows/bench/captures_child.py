@@ -19,7 +19,7 @@ from typing import Literal
 
 from workflows.bench.captures_find import PROJECT
 
-CHILD = (sys.executable, "-m", "workflows.cli")
+CHILD = (sys.executable, "-m", "workflows.server.kept_child", str(os.getpid()), "-m", "workflows.cli")
 GRACE = 30.0  # seconds that a run has to stop at its next checkpoint before it is killed
 FINISHED = re.compile(r"^\[\d+/\d+\] (\w+): (?:(\d+(?:\.\d+)?) s|reused)\s*$")
 BEGUN = re.compile(r"^\[\d+/\d+\] (\w+):")

@@ -5,7 +5,6 @@ A folder's own `truth/` is only for scoring: no run gets its path, and no reader
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,12 +87,23 @@ def _found(folder: Path, holdout: str | None) -> Found:
 
 
 def gathered(capture: Found, place: Path) -> Path:
-    """What a run is given: the capture's own folder, or a new one at `place` with links to photos and cameras that lie
-    apart."""
+    """What a run is given: the capture's own folder, or one at `place` with links to photos and cameras that lie apart.
+
+    Raises UsageError if `place` holds anything but links.
+    """
     if capture.beside is None:
         return capture.capture
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir(parents=True)
+    place.mkdir(parents=True, exist_ok=True)
+    if others := sorted(p.name for p in place.iterdir() if not p.is_symlink()):
+        raise UsageError(
+            "a folder for links to photos holds other files",
+            where=place,
+            value=", ".join(others[:3]),
+            limit="links alone",
+            remedy="move these files away, or choose another --out",
+        )
+    for old in place.iterdir():
+        old.unlink()
     for file in (capture.beside, *sorted(p for p in capture.capture.iterdir() if p.is_file())):
         (place / file.name).symlink_to(file.resolve())
     return place

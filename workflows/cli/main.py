@@ -13,6 +13,8 @@ import pipeline.threads  # noqa: F401  isort: skip  (before anything that loads 
 
 import argparse
 import logging
+import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -95,6 +97,13 @@ def _render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
     render.add_argument("--out", required=True, metavar="OUT", help="folder for the pictures")
     render.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
+    render.add_argument(
+        "--light", action="append", metavar="X,Y,Z[,R,G,B]",
+        help="by the reflectance field of a light stage: a lamp at this place, metres in the capture's world, of this "
+        "radiant intensity (1,1,1); several add up",
+    )  # fmt: skip
+    render.add_argument("--field", action="store_true", help="by the reflectance field, also without --light")
+    render.add_argument("--quick", action="store_true", help="with --field and --env: fewer lamps for the environment")
     render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
     render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
     render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
@@ -147,13 +156,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     try:
         _unicode(options)
-        with as_exceptions():
+        with as_exceptions() as caught:
             code: int = options.run(options, console)
+            sys.stdout.flush()
+        if caught.number is not None:  # and a library caught the exception
+            raise Interrupted(caught.number)
     except Interrupted as e:
         code = code_of(e.number)
         with suppress(OSError):
             console.close()
             print("stopped", file=sys.stderr)
+    except BrokenPipeError:  # whoever read stdout is gone, as in `neuface settings | head`
+        code = code_of(signal.SIGPIPE)
+        with suppress(OSError):  # what is still unwritten goes nowhere, without a word at the exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Exception as e:
         console.close()
         known = (

@@ -27,6 +27,7 @@ METAVARS = {
     "out": "DIR",
     "store": "DIR",
     "holdout": "RULE",
+    "template": "DIR",
     "until": "STAGE",
     "from_stage": "STAGE",
     "subjects": "LIST",

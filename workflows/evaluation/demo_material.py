@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, write_png_from_linear
-from pipeline.transforms import apply, pixel_centres
+from pipeline.transforms import apply, pixel_centres, scale_of
 
 F64 = npt.NDArray[np.float64]
 SAMPLES = 256  # light samples of each lobe at a pixel
@@ -183,7 +183,7 @@ def fitted_looks(model: Any, points: F64, to_eye: F64, capture_from_asset: F64) 
     from pipeline.maths.sdf import unit
 
     asset_from_capture: F64 = np.asarray(np.linalg.inv(capture_from_asset), np.float64)
-    turn = asset_from_capture[:3, :3] / np.cbrt(np.linalg.det(asset_from_capture[:3, :3]))
+    turn = asset_from_capture[:3, :3] / scale_of(asset_from_capture)
     parts = []
     for i in range(0, len(points), CHUNK):
         x = torch.from_numpy(apply(asset_from_capture, points[i : i + CHUNK]).astype(np.float32))
@@ -227,7 +227,7 @@ def _lights(model: Any, folder: Path, capture_from_asset: F64, gain: float) -> t
     d = torch.nn.functional.normalize(
         torch.randn(SPHERE, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64), dim=-1
     )
-    turn = capture_from_asset[:3, :3] / np.cbrt(np.linalg.det(capture_from_asset[:3, :3]))
+    turn = capture_from_asset[:3, :3] / scale_of(capture_from_asset)
     own_d = d @ torch.from_numpy(turn)  # capture -> asset
     b, a = sh.radiance(true, d).numpy(), sh.radiance(own, own_d).numpy()
     b4, a4 = sh.radiance(true[:25], d).numpy(), sh.radiance(own[:25], own_d).numpy()

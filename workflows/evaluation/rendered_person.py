@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.camera import PinholeCamera
-from pipeline.transforms import apply, corner_K_from_centre_K, inverse_rigid, matrix, rigid, umeyama
+from pipeline.transforms import apply, corner_K_from_centre_K, inverse_rigid, matrix, rigid, scale_of, umeyama
 from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry
 from workflows.evaluation.albedo import Labels, albedo_figures
@@ -134,11 +134,11 @@ def refined(asset: Any, points: F64) -> F64:
         keep = distance <= min(float(np.quantile(distance, CLOSEST)), FARTHEST)
         if keep.sum() < 7:  # as many as there are unknowns
             return total
-        scale = np.cbrt(np.linalg.det(total[:3, :3]))
+        scale = scale_of(total)
         on, plane = apply(total, samples[nearest[keep]]), normals[nearest[keep]] @ total[:3, :3].T / scale
         total = _step(on, plane, target[keep]) @ total
     moved = np.linalg.norm(apply(total, target) - target, axis=1).max()
-    grown = abs(np.cbrt(np.linalg.det(total[:3, :3])) - 1)
+    grown = abs(scale_of(total) - 1)
     return total if moved < LARGEST_MOVE and grown < LARGEST_GROWTH else np.eye(4)
 
 
