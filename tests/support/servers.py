@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -109,12 +110,13 @@ class Process:
         return self
 
     def kill(self) -> None:
-        """SIGKILL for it and all that it started."""
-        if self.child is not None:
-            for pid in [self.child.pid, *descendants(self.child.pid)]:
+        """SIGKILL for it and all that it started. Only once: the number of a process that is gone may be another's."""
+        child, self.child = self.child, None
+        if child is not None:
+            for pid in [child.pid, *descendants(child.pid)]:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGKILL)
-            self.child.wait()
+            child.wait()
 
     def __enter__(self) -> Process:
         return self.start()
@@ -159,12 +161,18 @@ def login_headers(url: str, login: str) -> dict[str, str]:
 
 
 def ask(url: str, path: str, body: dict[str, Any] | None = None, login: str | None = None) -> Any:
-    """One call of a Prefect server's API."""
+    """One call of a Prefect server's API. On a busy machine it answers 503: try again, as Prefect's clients do."""
     data = None if body is None else json.dumps(body).encode()
-    headers = {"Content-Type": "application/json", **(login_headers(url, login) if login else {})}
-    request = urllib.request.Request(f"{url}{path}", data, headers)
-    with urllib.request.urlopen(request, timeout=30) as answer:
-        return json.loads(answer.read())
+    end = time.monotonic() + PATIENCE
+    while True:
+        try:
+            headers = {"Content-Type": "application/json", **(login_headers(url, login) if login else {})}
+            with urllib.request.urlopen(urllib.request.Request(f"{url}{path}", data, headers), timeout=60) as answer:
+                return json.loads(answer.read())
+        except urllib.error.HTTPError as e:
+            if e.code != 503 or time.monotonic() > end:
+                raise
+            time.sleep(0.5)
 
 
 def wait_healthy(url: str, seconds: float = PATIENCE) -> None:

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -202,7 +203,7 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
         login = (home / "login").read_text().strip()
         assert (home / "login").stat().st_mode & 0o777 == 0o600 and home.stat().st_mode & 0o777 == 0o700
         assert login not in (home / "server.log").read_text() and login not in (tmp_path / "log").read_text()
-        wait_for(lambda: len(ask(url, "/deployments/filter", {}, login)) == 2)
+        wait_for(lambda: served(url, login, child) == 2)
         answers_no_stranger(url, login)
         sockets = [line.split() for f in ("tcp", "tcp6") for line in Path(f"/proc/net/{f}").read_text().splitlines()]
         listening = [s[1] for s in sockets if s[1].endswith(f":{port:04X}") and s[3] == "0A"]
@@ -242,7 +243,7 @@ def test_the_server_of_serve_ends_with_it(
     try:
         wait_healthy(url)
         login = (tmp_path / "home/login").read_text().strip()
-        wait_for(lambda: len(ask(url, "/deployments/filter", {}, login)) == 2, 240)
+        wait_for(lambda: served(url, login, child) == 2)
         servers = descendants(child.pid)
         child.send_signal(number)
         # 0 where Prefect's own handler was there already: it calls that a regular end
@@ -255,6 +256,21 @@ def test_the_server_of_serve_ends_with_it(
         with suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)
         child.wait()
+        for written in (tmp_path / "log", tmp_path / "home/server.log"):  # shown where the test fails
+            print(written.read_text() if written.is_file() else f"no {written}")
+
+
+def served(url: str, login: str, child: subprocess.Popen[bytes]) -> int:
+    """Deployments that the server of `neuface serve` knows; 0 while it does not answer."""
+    assert child.poll() is None, "neuface serve ended"
+    try:
+        return len(ask(url, "/deployments/filter", {}, login))
+    except urllib.error.HTTPError:
+        raise
+    except OSError as e:
+        print(f"no answer: {e}")
+        time.sleep(0.5)
+        return 0
 
 
 def is_alive(pid: int) -> bool:

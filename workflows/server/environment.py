@@ -16,9 +16,18 @@ OFFLINE = {
 SLOTS_ON_DISK = ("PREFECT_SERVER_CONCURRENCY_LEASE_STORAGE", "prefect.server.concurrency.lease_storage.filesystem")
 
 
+# A fit keeps every core busy for minutes beside the server: with Prefect's own limits (seconds) a question of the
+# database fails there, and the client gives up after five answers "try again".
+PATIENT = {
+    "PREFECT_SERVER_DATABASE_TIMEOUT": "60",
+    "PREFECT_SERVER_DATABASE_CONNECTION_TIMEOUT": "60",
+    "PREFECT_CLIENT_MAX_RETRIES": "10",
+}
+
+
 def defaults() -> None:
-    """Quiet and offline, unless the user set it."""
-    for name, value in OFFLINE.items():
+    """Quiet, offline and patient, unless the user set it."""
+    for name, value in {**OFFLINE, **PATIENT}.items():
         os.environ.setdefault(name, value)
 
 
