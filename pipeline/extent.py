@@ -50,21 +50,19 @@ def core(extent: Extent) -> tuple[F64, float]:
 
 def signed(extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0) -> F64:
     """(N,) s at points (N, 3), for the solid grown by `grown`; an approximate distance if the radii differ."""
-    return signed_and_gradient(extent, points, grown)[0]
+    value = _of_ellipsoid(extent, points)[0]
+    for cut in extent.cuts:
+        value = np.maximum(value, np.asarray(points, np.float64) @ np.asarray(cut.normal) - cut.offset)
+    return np.asarray(value - grown, np.float64)
 
 
 def signed_and_gradient(
     extent: Extent, points: npt.NDArray[np.floating], grown: float = 0.0
 ) -> tuple[F64, F64]:  # fmt: skip
     """s (N,) at points (N, 3) and its gradient (N, 3), of unit length."""
-    axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
-    local = (np.asarray(points, np.float64) - np.asarray(extent.centre)) @ axes.T
-    first = np.linalg.norm(local / radii, axis=1)
-    second = np.maximum(np.linalg.norm(local / radii**2, axis=1), 1e-12)
-    # at the centre both are 0 and the distance is the smallest radius
-    value = np.where(first > 1e-9, first * (first - 1) / second, -radii.min())
-    slope = local / radii**2 / second[:, None]
-    gradient = np.where(first[:, None] > 1e-9, slope, [0.0, 1.0, 0.0]) @ axes
+    value, steepest, second = _of_ellipsoid(extent, points)
+    away = np.any(steepest != 0, axis=1, keepdims=True)
+    gradient = np.where(away, steepest / second[:, None], [0.0, 1.0, 0.0]) @ np.asarray(extent.axes, np.float64)
     for cut in extent.cuts:
         normal = np.asarray(cut.normal)
         beyond = np.asarray(points, np.float64) @ normal - cut.offset
@@ -72,6 +70,17 @@ def signed_and_gradient(
         value = np.where(larger, beyond, value)
         gradient = np.where(larger[:, None], normal, gradient)
     return np.asarray(value - grown, np.float64), np.asarray(gradient, np.float64)
+
+
+def _of_ellipsoid(extent: Extent, points: npt.NDArray[np.floating]) -> tuple[F64, F64, F64]:
+    """Distance (N,) of points (N, 3) to the ellipsoid, q = x / r^2 (N, 3) in its own axes, and |q| (N,)."""
+    axes, radii = np.asarray(extent.axes, np.float64), np.asarray(extent.radii, np.float64)
+    local = (np.asarray(points, np.float64) - np.asarray(extent.centre)) @ axes.T
+    scaled = local / radii**2
+    first = np.sqrt(np.einsum("ij,ij->i", local, scaled))
+    second = np.maximum(np.sqrt(np.einsum("ij,ij->i", scaled, scaled)), 1e-12)
+    # at the centre both are 0 and the distance is the smallest radius
+    return np.where(first > 1e-9, first * (first - 1) / second, -radii.min()), scaled, second
 
 
 def bounds(extent: Extent, grown: float = 0.0) -> tuple[F64, F64]:

@@ -27,26 +27,26 @@ Settings = Mapping[str, Mapping[str, Any]]
 PRESETS: dict[str, dict[str, dict[str, Any]]] = {
     "draft": {
         "inverse_rendering": {"preset": "draft"},
-        "surface": {"resolution": 288},
+        "surface": {"resolution": 512},
         "uv": {"target_faces": 50_000},
         "bake": {"size": 1024},
     },
     "studio": {
         "inverse_rendering": {"preset": "studio"},
-        "surface": {"resolution": 320},
+        "surface": {"resolution": 640},
         "uv": {"target_faces": 60_000},
         "bake": {"size": 2048},
     },
     "film": {
         "inverse_rendering": {"preset": "film"},
-        "surface": {"resolution": 512},
+        "surface": {"resolution": 896},
         "uv": {"target_faces": 100_000},
         "bake": {"size": 4096},
     },
     # Not part of that scale: the paper's own model and schedule, for comparison (docs/model.md). For a GPU.
     "paper": {
         "inverse_rendering": {"preset": "paper"},
-        "surface": {"resolution": 320},
+        "surface": {"resolution": 640},
         "uv": {"target_faces": 60_000},
         "bake": {"size": 2048},
     },

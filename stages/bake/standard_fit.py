@@ -219,5 +219,6 @@ def _correction(
         for z in (m * (seen.colour - specular), m * m)
     )
     smooth = Smoother(mesh, EDGES * edge)
-    typical = 1e-3 * below[below > 0].mean() if (below > 0).any() else 1.0
+    dark = albedo**2 + 1e-12  # so that the pull to 1 does not depend on how dark the surface is
+    typical = 1e-3 * dark * (below / dark)[below > 0].mean() if (below > 0).any() else np.ones(1)
     return np.asarray(((smooth(above) + typical) / (smooth(below) + typical)).clip(*CORRECTION))

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Extent
 from pipeline.errors import StageError
-from pipeline.extent import signed_and_gradient
+from pipeline.extent import signed, signed_and_gradient
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
@@ -100,6 +100,16 @@ def wall_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
     return np.maximum(box, beyond), np.where((beyond > box)[:, None], away, slope)
 
 
+def _wall(points: F64, grid: Lattice) -> F64:
+    """The distances (N,) of `wall_distance` alone, several times faster."""
+    low, high = grid.lower + INSET * grid.h, grid.upper - INSET * grid.h
+    out = np.maximum(low[0] - points[:, 0], points[:, 0] - high[0])
+    for i in (1, 2):
+        np.maximum(out, low[i] - points[:, i], out=out)
+        np.maximum(out, points[:, i] - high[i], out=out)
+    return out if grid.extent is None else np.maximum(out, signed(grid.extent, points))
+
+
 def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
     """(N,) g: the larger of SDF (N,) and wall distance (N,) within a cell of the wall, elsewhere the SDF alone.
 
@@ -142,7 +152,7 @@ def solid(field: Field, points: F64, grid: Lattice) -> F32:
                 limit="finite everywhere",
                 remedy="fit the model again with another seed or a smaller learning rate",
             )
-        out[start : start + QUERY] = cut(value, wall_distance(p, grid)[0], grid)
+        out[start : start + QUERY] = cut(value, _wall(p, grid), grid)
     return out
 
 

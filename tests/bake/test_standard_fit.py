@@ -52,6 +52,18 @@ def test_an_objects_material_is_found(f0: float, roughness: float) -> None:
     assert np.median(found.correction) == pytest.approx(1.1, rel=0.03)
 
 
+def test_black_is_corrected_as_much_as_white() -> None:
+    """Without a pull that follows the albedo, black hair beside skin kept the error of the field."""
+    mesh, at, albedo, seen = scene(0.0, 0.45, scale=1.5)
+    dark = mesh.vertices[:, 0] > 0
+    colour = np.where(dark[seen.vertex, None], 0.004, 1.0) * seen.colour
+    albedo = np.where(dark[:, None], 0.004, 1.0) * albedo
+    seen = fits.Seen(seen.vertex, seen.wo, colour, colour)
+    found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, np.zeros(len(albedo), bool))
+    inside = mesh.vertices[:, 0] > 0.3 * RADIUS  # the pooling crosses the edge
+    assert np.median(found.correction[inside]) == pytest.approx(1.5, rel=0.03)
+
+
 def test_skin_stays_skin() -> None:
     """Metal labelled as skin is at the range's upper end; within the range the photos decide."""
     assert fitted(0.5, 0.45, skin=True).figures["gloss_skin_f0"] < 2 * fits.SKIN_RANGE[1]

@@ -30,6 +30,14 @@ def test_presets_spend_more_from_draft_to_film() -> None:
         assert len(set(values)) == 3
 
 
+@pytest.mark.parametrize("preset", ["draft", "studio", "film"])
+def test_the_mesh_is_finer_than_the_field(preset: str) -> None:
+    """At equal cells marching cubes cuts off what is thinner than a cell: outlines of hair and ears moved inwards."""
+    configs = configs_for(preset, {})
+    grid = configs["inverse_rendering"].model_dump()["grid_cells"]
+    assert configs["surface"].model_dump()["resolution"] >= 1.75 * grid
+
+
 def test_shared_options_reach_the_stages_that_have_them() -> None:
     configs = configs_for("draft", {}, holdout="every:5:2", name="anna", seed=7)
     assert configs["capture"].model_dump()["holdout"] == "every:5:2"
