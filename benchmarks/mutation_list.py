@@ -95,10 +95,10 @@ MUTATIONS = (
              "tests/fields/paper/test_displaced.py"),
     Mutation("pipeline/fields/paper/shading.py", "DIELECTRIC * (1 - m) + skin.albedo * m",
              "DIELECTRIC + skin.albedo * m",
-             "tests/inverse_rendering/paper/test_paper.py::test_disneys_f0_and_width_by_hand"),
+             "tests/fields/paper/test_disney_shading.py::test_disneys_f0_and_width_by_hand"),
     Mutation("pipeline/fields/paper/shading.py", 'alpha if self.spec.light == "cubemap" else skin.inv_kappa',
              "skin.inv_kappa",
-             "tests/inverse_rendering/paper/test_paper.py::test_disneys_f0_and_width_by_hand"),
+             "tests/fields/paper/test_disney_shading.py::test_disneys_f0_and_width_by_hand"),
     # ---------------------------------------------------------------- the fit
     Mutation("stages/inverse_rendering/paper/trainer.py", "settings.white * losses",
              "settings.specular_energy * losses",

@@ -107,7 +107,7 @@ def _wall(points: F64, grid: Lattice) -> F64:
     for i in (1, 2):
         np.maximum(out, low[i] - points[:, i], out=out)
         np.maximum(out, points[:, i] - high[i], out=out)
-    return out if grid.extent is None else np.maximum(out, signed(grid.extent, points))
+    return np.asarray(out if grid.extent is None else np.maximum(out, signed(grid.extent, points)), np.float64)
 
 
 def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:
