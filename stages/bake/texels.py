@@ -33,8 +33,8 @@ MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradi
 ARRIVED_CELLS = 1e-3  # |d| below this many cells needs no further step: 2 micrometres
 LANDED_CELLS = 0.05  # |d| below this many cells counts as on the surface
 MIN_Z = 0.05  # of a tangent-space normal: shaders can't use normals that point into the surface
-# Fresh snow is the brightest. Soot (0.005) is not the darkest: a phone's tone curve shows black hair as a third of that,
-# and with soot's albedo it was a flat grey cap.
+# Fresh snow is the brightest. Soot (0.005) is not the darkest: a phone's tone curve shows black hair as a third of
+# that, and with soot's albedo it was a flat grey cap.
 ALBEDO_RANGE = (0.001, 0.95)
 
 
