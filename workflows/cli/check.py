@@ -77,6 +77,7 @@ def check_command(options: argparse.Namespace, console: Console) -> int:
                 break
             if not (options.solve or _has_cameras(done)):
                 break
+    console.close()
     verdict, solved = verdict_of_done(done), len(done) > 1 or fault is not None
     if options.json != "-":
         print("\n".join(table(verdict)))

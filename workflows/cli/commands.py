@@ -5,26 +5,28 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import sys
 import webbrowser
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
+from workflows.cli.dry_run import dry_run
 from workflows.cli.options import request_from, with_provenance, with_viewer
+from workflows.cli.summary import tell
 from workflows.cli.view import server_of
 from workflows.run import output_dirs
+from workflows.run.estimate import expected
 from workflows.run.interrupt import Interrupted, interruptible
 from workflows.run.owned import write_owned
-from workflows.run.plan import make_plan, preview
+from workflows.run.plan import make_plan
 from workflows.run.publish import publish
 from workflows.run.published import TRUTH
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
 from workflows.run.runner import run_stages
 from workflows.run.session import Session
-from workflows.run.verdict import exit_code, last_lines
+from workflows.run.verdict import exit_code
 from workflows.server import environment
 
 # The demo: enough views and pixels to recognise the face, few enough for minutes on two cores.
@@ -41,6 +43,7 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
         Interrupted: the same, when everything was published.
     """
     plan, watch = make_plan(request), Session(console)
+    console.expect({e.step.stage: e.seconds for e in expected(plan)}, request.budget)
     if environment.has_server():
         environment.defaults()
         from workflows.flows import run_with_session
@@ -60,11 +63,12 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 # ------------------------------------------------------------------ commands
 def run_command(options: argparse.Namespace, console: Console) -> int:
     """neuface run"""
+    if options.json:
+        console.to_json()
     request = request_from(options, RunRequest)
     request = request.model_copy(update={"config": with_viewer(options, with_provenance(options, request.config))})
     if options.dry_run:
-        for step in preview(make_plan(request)):
-            print(f"{step.stage:18} {step.action:10} {(step.key or '')[:12]}")
+        dry_run(make_plan(request), console)
         return 0
     try:
         record = run(request, console)
@@ -72,13 +76,14 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         console.close()
         console.note("stopped; run the same command again to resume")
         raise
-    _tell(record, Path(options.out))
-    _tell_verdict(record)
+    tell(record, Path(options.out), console)
     return exit_code(record)
 
 
 def demo_command(options: argparse.Namespace, console: Console) -> int:
     """neuface demo"""
+    if options.json:
+        console.to_json()
     from pipeline.demo.capture import write_demo_capture
 
     out, capture = Path(options.out), Path(options.out) / "capture"
@@ -110,26 +115,25 @@ def demo_command(options: argparse.Namespace, console: Console) -> int:
             ) from e
         console.close()
         record = run(request, console)
-    _tell(record, out)
-    if "asset" in record:
-        _against_truth(out, capture, record, request, console)
-    _tell_verdict(record)
+    truth = _against_truth(out, capture, record, request, console) if "asset" in record else []
+    tell(record, out, console, truth)
     return exit_code(record)
 
 
-def _against_truth(out: Path, capture: Path, record: dict[str, Any], request: RunRequest, console: Console) -> None:
+def _against_truth(
+    out: Path, capture: Path, record: dict[str, Any], request: RunRequest, console: Console
+) -> list[str]:
+    """Lines: how the result compares with what the demo was made of. Figures and a picture go into OUT."""
     from pipeline.capture_artifacts import Capture
     from pipeline.store import Store
     from workflows.evaluation.demo import measure
 
     found = Store(request.store_path).load("capture", record["stages"]["capture"]["key"], Capture)
     if found is None:
-        return
+        return []
     figures = measure(out, capture, found.artifact)
     _write(out, "truth.json", json.dumps(dataclasses.asdict(figures), indent=1), console)
-    print("against the demo's ground truth:")
-    for line in [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact, console)]:
-        print(f"  {line}")
+    return [*figures.lines(), *_material_against_truth(out, capture, record, found.artifact, console)]
 
 
 def _material_against_truth(
@@ -211,8 +215,7 @@ def report_command(options: argparse.Namespace, console: Console) -> int:
         **{**record["request"], "out": str(out), "store": record["store"], "from_stage": "report", "until": None}
     )
     record = run(request, console)
-    _tell(record, out)
-    _tell_verdict(record)
+    tell(record, out, console)
     return exit_code(record)
 
 
@@ -282,22 +285,3 @@ def read_record(out: Path) -> dict[str, Any]:
         ) from e
     found: dict[str, Any] = record
     return found
-
-
-def _tell(record: dict[str, Any], out: Path) -> None:
-    """The paths of the results, on stdout."""
-    if "asset" in record:
-        print(f"asset  {out / record['asset']}")
-    page = out / "report" / "index.html"
-    if "report" in record["stages"] and page.is_file():
-        print(f"report {page}")
-    reused = sum(s["reused"] for s in record["stages"].values())
-    print(f"run    {out / 'run.json'} ({len(record['stages'])} stages, {reused} reused)")
-    sys.stdout.flush()
-
-
-def _tell_verdict(record: dict[str, Any]) -> None:
-    """The last lines on stdout: how good it is, and why."""
-    for line in last_lines(record):
-        print(line)
-    sys.stdout.flush()

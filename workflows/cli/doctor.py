@@ -33,7 +33,6 @@ NEEDED = {
     "prefect": ("prefect", "runs"),
     "fastapi": ("fastapi", "Prefect's server"),
     "jinja2": ("jinja2", "the report"),
-    "tqdm": ("tqdm", "progress bars"),
 }
 OPTIONAL = {"flip_evaluator": ("flip-evaluator", "the FLIP metric in the report")}
 SERVER_BREAKS = (0, 158)  # fastapi from here on: Prefect 3.8's server does not start

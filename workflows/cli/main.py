@@ -19,13 +19,14 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
-from pipeline.errors import NeufaceError, UsageError, stage_error_from_os_error
+from pipeline.errors import Cancelled, NeufaceError, UsageError, stage_error_from_os_error
 from workflows.batch import commands as batch_commands
 from workflows.batch import schedule
 from workflows.bench import commands as bench_commands
 from workflows.cli import check, commands, settings
 from workflows.cli.console import Console
 from workflows.cli.options import add_request_options
+from workflows.cli.parsing import Parser
 from workflows.run.interrupt import Interrupted, as_exceptions, code_of
 from workflows.run.request import RunRequest
 from workflows.store import commands as store_commands
@@ -38,12 +39,13 @@ EXAMPLES = """examples:
   neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
 """
 
+JSON_HELP = "one JSON object per line on standard output: stages, progress, warnings, verdict"
 ENV_HELP = "captured, key, overcast, sunset, or a lat-long .hdr or .exr"
 
 
 def parser() -> argparse.ArgumentParser:
     """All commands and their options."""
-    p = argparse.ArgumentParser(
+    p = Parser(
         prog="neuface",
         description="Photos of a head in, a relightable USD asset out.",
         epilog=EXAMPLES,
@@ -58,6 +60,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
     demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
     add_request_options(demo, RunRequest, only=("preset", "device", "store"))
+    demo.add_argument("--json", action="store_true", help=JSON_HELP)
     demo.set_defaults(run=commands.demo_command)
     validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
     validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
@@ -74,7 +77,9 @@ def parser() -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
     bench_commands.add_commands(commands_of.add_parser("bench", help="measurements that repeat"))
     batch_commands.add_commands(commands_of)
-    store_commands.add_commands(commands_of.add_parser("store", help="what finished stages take on disk: gc, purge"))
+    store_commands.add_commands(
+        commands_of.add_parser("store", help="what finished stages take on disk: ls, gc, purge")
+    )
     schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
     settings.add_options(commands_of.add_parser("settings", help="every setting: meaning, limits, presets"))
     doctor = commands_of.add_parser("doctor", help="is this machine ready?")
@@ -89,7 +94,8 @@ def _run_options(run: argparse.ArgumentParser) -> None:
     run.add_argument("--license", help="licence of the capture; recorded in the asset")
     run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
     run.add_argument("--no-viewer", action="store_true", help="no 3D view in the report")
-    run.add_argument("--dry-run", action="store_true", help="print what would be run and what reused, then stop")
+    run.add_argument("--dry-run", action="store_true", help="print the plan: what would run, and why; then stop")
+    run.add_argument("--json", action="store_true", help=JSON_HELP)
     run.set_defaults(run=commands.run_command)
 
 
@@ -165,6 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = code_of(e.number)
         with suppress(OSError):
             console.close()
+            console.result("stopped", exit_code=code)
             print("stopped", file=sys.stderr)
     except BrokenPipeError:  # whoever read stdout is gone, as in `neuface settings | head`
         code = code_of(signal.SIGPIPE)
@@ -178,6 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if known is None or options.verbose:
             raise
         code = known.exit_code
+        console.result("stopped" if isinstance(known, Cancelled) else "error", text=str(known), exit_code=code)
         with suppress(OSError):  # the terminal may be gone
             print(f"error: {known}", file=sys.stderr)
     return code

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from pipeline.contract import Done, StageConfig
-from workflows.run.plan import Plan, preview
+from pipeline.store import RUN
+from workflows.run.plan import Plan, Step, preview
 
 # Seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: medians of four captures
 # of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
@@ -46,6 +49,9 @@ SECONDS: dict[str, dict[str, float]] = {
         "report": 30,
     },
 }
+# The stages before the fit, whatever the preset: the demo, 16 photos of 160 px, on two cores that other work shared.
+EARLY: dict[str, float] = {"capture": 15, "poses": 55, "masks": 55}
+REUSED = 0.3  # seconds to compare a stored result with its hashes
 LIGHT_STAGE_ONLY = frozenset({"reflectance"})  # other captures pass through at once
 NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subject_consent", "asset_version"})
 LOOKED_AT = 50  # earlier runs of a stage that are read, the latest first
@@ -70,6 +76,25 @@ def remaining_time(plan: Plan, done: Sequence[Done[Any]], begun: float) -> str:
     return f"the rest ({which}) takes about {_words(total)} ({origin})"
 
 
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What is expected of one stage: how long it takes (s; None where nothing is known), and how it is known: "runs",
+    "table", or "store" for a result that is there already."""
+
+    step: Step
+    seconds: float | None
+    origin: str
+
+
+def expected(plan: Plan) -> list[Expected]:
+    """Every stage of the plan, in order. Only manifests and records in the store are read."""
+    found = []
+    for step in preview(plan):
+        seconds, origin = (REUSED, "store") if step.action == "reused" else _of_stage(plan, step.stage)
+        found.append(Expected(step, seconds, origin))
+    return found
+
+
 def _of_stage(plan: Plan, name: str) -> tuple[float | None, str]:
     """Seconds of a stage and where they are from: "runs" or "table"."""
     earlier = _earlier(plan, name, plan.configs[name])
@@ -77,21 +102,36 @@ def _of_stage(plan: Plan, name: str) -> tuple[float | None, str]:
         return statistics.median(earlier), "runs"
     if name in LIGHT_STAGE_ONLY and getattr(plan.source.artifact, "kind", "") != "olat":
         return 0.0, "table"
-    return SECONDS.get(plan.request.preset, {}).get(name), "table"
+    return SECONDS.get(plan.request.preset, {}).get(name, EARLY.get(name)), "table"
 
 
 def _earlier(plan: Plan, name: str, config: StageConfig) -> list[float]:
     """Seconds of this stage in earlier runs with the same settings, whatever they were of."""
-    wanted, found = _timed(config.model_dump(mode="json")), []
-    records = sorted(plan.store.root.glob(f"{name}/*/run.json"), key=lambda p: -p.stat().st_mtime)
-    for path in records[:LOOKED_AT]:
+    return [float(run["seconds"]) for _, run in records(plan, name, config)]
+
+
+def records(plan: Plan, name: str, config: StageConfig) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Folder and run.json of earlier results of a stage with the same settings on the same device, the latest first.
+
+    They are looked for in the plan's store, and in those of the runs beside it: runs/anna when runs/bert is planned.
+    """
+    stores = {plan.store.root, *plan.out.parent.glob("*/.store")}
+    paths = [p for store in stores for p in store.glob(f"{name}/*/{RUN}")]
+    wanted = _timed(config.model_dump(mode="json"))
+    for path in sorted(paths, key=_modified, reverse=True)[:LOOKED_AT]:
         try:
             run = json.loads(path.read_text())
-            if _timed(run["config"]) == wanted and run["device"] == plan.device:
-                found.append(float(run["seconds"]))
+            if _timed(run["config"]) == wanted and run["device"] == plan.device and float(run["seconds"]) >= 0:
+                yield path.parent, run
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             continue  # a run that is being removed, or of a version that wrote something else
-    return found
+
+
+def _modified(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # it is being removed
+        return 0.0
 
 
 def _timed(config: dict[str, Any]) -> dict[str, Any]:

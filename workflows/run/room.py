@@ -40,6 +40,11 @@ def least(stage: str, inputs: Any, config: StageConfig) -> int:
     return SPARE + size + BYTES_A_TEXEL * texels
 
 
+def size_of(folder: Path) -> int:
+    """Bytes of the files below a folder; links are not followed."""
+    return sum(p.lstat().st_size for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
+
+
 def check_room(folder: Path, needed: int, what: str, option: str) -> None:
     """Raises DiskError if less than `needed` bytes are free for this user on the disk of `folder`, which may not exist.
 

@@ -1,4 +1,4 @@
-"""`neuface store gc` and `neuface store purge`."""
+"""`neuface store ls`, `neuface store gc` and `neuface store purge`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
     from workflows.cli.options import a_time
 
     of = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
+    ls = of.add_parser("ls", help="what takes space, by stage and by run")
+    ls.add_argument("store", metavar="STORE", help="the store: OUT/.store, or what --store named")
+    ls.set_defaults(run=ls_command)
     gc = of.add_parser("gc", help="remove what no published folder needs; a later run makes it again")
     gc.add_argument("store", metavar="STORE", help="the store: OUT/.store, or what --store named")
     gc.add_argument(
@@ -29,6 +32,14 @@ def add_commands(parser: argparse.ArgumentParser) -> None:
     purge.add_argument("--store", metavar="STORE", help="its store (DIR/.store)")
     purge.add_argument("--dry-run", action="store_true", help="print what would be removed, and remove nothing")
     purge.set_defaults(run=purge_command)
+
+
+def ls_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface store ls"""
+    from workflows.store.usage import table, usage
+
+    print("\n".join(table(usage(_store(Path(options.store))))))
+    return 0
 
 
 def gc_command(options: argparse.Namespace, console: Console) -> int:

@@ -17,6 +17,7 @@ from workflows.batch.captures import RECORDS
 from workflows.batch.page import TABLES
 from workflows.batch.state import Entry
 from workflows.run.published import FOLDERS, LIST, TRUTH, is_ours, is_record, listed, published, split
+from workflows.run.room import size_of
 from workflows.run.run_lock import lock_is_free
 from workflows.store.roots import Root, forget_root, roots
 
@@ -44,23 +45,23 @@ def garbage(store: Store, older_than: float, now: float | None = None) -> list[P
     needed = {(stage, key) for root in roots(store) for stage, key in root.keys.items()}
     limit = max(older_than, DAY) if _busy(store) else older_than
     found = []
-    for stage, key, kind, path in _pieces(store):
+    for stage, key, kind, path in pieces(store):
         if not lock_is_free(store.root / LOCKS / f"{stage}-{key}"):
             continue
         if kind.startswith(".partial"):
-            found.append(Piece(path, "left by a process that died", _size(path)))
+            found.append(Piece(path, "left by a process that died", size_of(path)))
         elif now - path.stat().st_mtime < limit:
             continue
         elif kind == ".scratch":
-            found.append(Piece(path, "checkpoints of an abandoned fit", _size(path)))
+            found.append(Piece(path, "checkpoints of an abandoned fit", size_of(path)))
         elif (stage, key) not in needed:
-            found.append(Piece(path, "no published folder was made from it", _size(path)))
+            found.append(Piece(path, "no published folder was made from it", size_of(path)))
     return found
 
 
-def remove(store: Store, pieces: Iterable[Piece]) -> None:
+def remove(store: Store, found: Iterable[Piece]) -> None:
     """Take pieces out of the store; one that a process took up meanwhile stays."""
-    for piece in pieces:
+    for piece in found:
         match = _KEY.fullmatch(piece.path.name)
         if match is None or not lock_is_free(store.root / LOCKS / f"{piece.path.parent.name}-{match[1]}"):
             continue
@@ -73,8 +74,8 @@ def _busy(store: Store) -> bool:
     return any(not lock_is_free(p) for p in (store.root / LOCKS).glob("run-*"))
 
 
-def _pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
-    """(stage, key, "" | ".scratch" | ".partial-...", folder)"""
+def pieces(store: Store) -> Iterator[tuple[str, str, str, Path]]:
+    """Every result: (stage, key, "" | ".scratch" | ".partial-...", folder). Other programs' folders are left out."""
     for stage in sorted(p for p in store.root.iterdir() if p.is_dir() and not p.name.startswith(".")):
         for path in sorted(stage.iterdir()):
             match = _KEY.fullmatch(path.name)
@@ -86,10 +87,6 @@ def _is_ours(store: Store, stage: str, key: str) -> bool:
     """Whether a stage worked on this key here: other programs have folders with names of 64 digits too."""
     traces = (store.root / LOCKS / f"{stage}-{key}", store.root / LINEAGE / f"{stage}-{key}.json")
     return any(p.is_file() for p in traces)
-
-
-def _size(path: Path) -> int:
-    return sum(p.lstat().st_size for p in path.rglob("*") if p.is_file() and not p.is_symlink())
 
 
 # ------------------------------------------------------------------ purge
@@ -110,7 +107,7 @@ class Purge:
     @property
     def size(self) -> int:
         """Bytes."""
-        return sum(_size(p) if p.is_dir() else p.lstat().st_size for p in self.paths)
+        return sum(size_of(p) if p.is_dir() else p.lstat().st_size for p in self.paths)
 
 
 def belongings(subject: str, out: Path, store: Store) -> Purge:

@@ -1,0 +1,110 @@
+"""`neuface run --dry-run`: what would run and why, the time, the disk and the memory; nothing is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from workflows.cli.main import main
+from workflows.run import estimate, needs
+from workflows.run.plan import make_plan
+from workflows.run.request import RunRequest
+
+pytestmark = pytest.mark.usefixtures("toys")
+
+
+def neuface(photos: Path, *options: str) -> None:
+    assert main(["run", str(photos), "--out", str(photos.parent / "out"), *options]) == 0
+
+
+def planned(photos: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[dict[str, str], str]:
+    """Stage -> the rest of its line; and the whole text."""
+    capsys.readouterr()
+    neuface(photos, "--dry-run", *options)
+    text = capsys.readouterr().out
+    rows = (line.partition(" ") for line in text.splitlines()[:3])
+    return {name: rest.strip() for name, _, rest in rows}, text
+
+
+def test_what_is_new_what_is_reused_and_what_changed(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows, _ = planned(photos, capsys)
+    assert all(row.startswith("made ") and row.endswith(" new") for row in rows.values())
+    neuface(photos)
+    rows, text = planned(photos, capsys)
+    assert all(row.startswith("reused ") for row in rows.values()) and "everything is in the store" in text
+    rows, _ = planned(photos, capsys, "--set", "second.plus=3")
+    assert rows["first"].startswith("reused")
+    assert rows["second"].endswith("setting changed: second.plus 0 -> 3")
+    assert rows["third"].endswith("input changed: second")
+    rows, _ = planned(photos, capsys, "--from-stage", "third")
+    assert rows["third"].endswith("asked for with --from-stage") and rows["second"].startswith("reused")
+    (photos / "c.jpg").write_bytes(b"another photo")
+    rows, _ = planned(photos, capsys)
+    assert rows["first"].endswith("the photos changed, or the program did")
+    assert rows["second"].endswith("input changed: first")
+
+
+def test_what_left_the_store_and_what_is_damaged(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import shutil
+
+    neuface(photos)
+    store = photos.parent / "out/.store"
+    next((store / "second").glob("*/manifest.json")).write_text("{")
+    shutil.rmtree(next(p for p in (store / "third").iterdir() if len(p.name) == 64))
+    rows, _ = planned(photos, capsys)
+    assert rows["second"].endswith("what the store has is damaged")
+    assert rows["third"].endswith("input changed: second")
+
+
+def test_a_checkpoint_is_told(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    neuface(photos, "--until", "first")
+    plan = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "out")))
+    from workflows.run.plan import preview
+
+    key = preview(plan)[1].key
+    assert key is not None
+    scratch = plan.store.scratch("second", key)
+    scratch.mkdir(parents=True)
+    (scratch / "step.txt").write_text("4")
+    rows, _ = planned(photos, capsys)
+    assert rows["second"].endswith("new; goes on from its checkpoint")
+
+
+def test_settings_that_are_not_the_presets(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, text = planned(photos, capsys)
+    assert "settings: those of the preset draft" in text
+    _, text = planned(photos, capsys, "--set", "first.plus=2", "--seed", "7")
+    assert "first.plus = 2 (preset: 0)" in text and "third.seed = 7 (preset: 0)" in text
+
+
+def test_time_disk_and_memory(
+    photos: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(estimate.SECONDS, "draft", {"first": 20.0, "second": 700.0})
+    monkeypatch.setattr(needs, "KEPT_MB", {"first": 40, "second": 50})
+    rows, text = planned(photos, capsys)
+    assert rows["second"].split("  ")[0] == "made" and "12 min" in rows["second"]
+    assert "time: about 12 min (measured on two cores); not known for third" in text
+    assert "disk: about 91 MB; " in text and "memory: about 2.7 GB; " in text  # 1 MB for what is not known
+    assert not (photos.parent / "out").exists()
+
+
+def test_earlier_runs_beside_this_one_tell_the_time(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(photos), "--out", str(photos.parent / "before")]) == 0
+    for path in (photos.parent / "before/.store").glob("*/*/run.json"):
+        path.write_text(json.dumps({**json.loads(path.read_text()), "seconds": 100.0, "peak_memory_mb": 512.0}))
+    _, text = planned(photos, capsys)
+    assert "time: about 5 min (earlier runs here)" in text and "memory: about 0.5 GB" in text
+
+
+def test_the_plan_for_programs(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    neuface(photos, "--dry-run", "--json", "--set", "first.plus=2")
+    plan: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert plan["event"] == "plan"
+    assert [(s["stage"], s["action"], s["why"]) for s in plan["stages"]] == [
+        (name, "made", "new") for name in ("first", "second", "third")]  # fmt: skip
+    assert plan["settings"] == {"first.plus": {"value": 2, "preset": 0}}
+    assert {"disk_bytes", "memory_mb"} <= plan.keys()

@@ -1,0 +1,45 @@
+"""A parser of options that says which word was meant: "unknown option --presett; did you mean --preset?"."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import sys
+from collections.abc import Collection, Sequence
+from typing import Any
+
+
+def meant(word: str, choices: Collection[str]) -> str:
+    """ "; did you mean run?", or nothing where no choice is like the word."""
+    near = difflib.get_close_matches(word, list(choices), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+class Parser(argparse.ArgumentParser):
+    """As argparse's, for a command and all of its sub-commands. Wrong usage exits with code 2."""
+
+    def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """As argparse's; an option that no command knows is an error here, before missing ones are complained of."""
+        words = sys.argv[1:] if args is None else list(args)
+        self._refuse_unknown(words if self._subparsers is None else words[: self._own(words)])
+        return super().parse_known_args(words, namespace)
+
+    def _refuse_unknown(self, words: Sequence[str]) -> None:
+        known = list(self._option_string_actions)
+        for word in words:
+            if word == "--":
+                return
+            name = word.partition("=")[0]
+            if name.startswith("--") and not any(option.startswith(name) for option in known):
+                self.error(f"unknown option {name}{meant(name, known)}")
+
+    @staticmethod
+    def _own(words: Sequence[str]) -> int:
+        """How many words come before the sub-command."""
+        return next((i for i, word in enumerate(words) if not word.startswith("-")), len(words))
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            choices = [str(c) for c in action.choices]
+            text = f"{value!r} is not one of {', '.join(choices)}{meant(str(value), choices)}"
+            raise argparse.ArgumentError(action, text)
