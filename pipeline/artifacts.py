@@ -254,7 +254,8 @@ class UvMesh(Artifact):
     under charts, if there are several; utilisation: their mean. face_share: share of the area under charts that belongs
     to the face; None if the face is unknown. of_template: the mesh is the subdivided and displaced cage of the
     RegisteredHead, without the regions that the asset leaves out (pipeline.registration.head), then what lies beside.
-    scan: the decimated scan with its own charts, if the asset has both meshes.
+    scan: the decimated scan with its own charts, if the asset has both meshes. quads: of `uv.remesh=quads`: pairs of
+    faces 2 q and 2 q + 1 that are one quad in space and texture; 0: triangles.
     """
 
     mesh: FileRef
@@ -263,6 +264,7 @@ class UvMesh(Artifact):
     scan: UvMesh | None = None
     vertices: int
     faces: int
+    quads: int = 0
     charts: int
     tiles: int = 1
     utilisation: float

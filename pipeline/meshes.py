@@ -135,6 +135,32 @@ def triangles_of(quads: Indices) -> Faces:
     return np.asarray(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
 
 
+def whole_quads(faces: Faces, uv_faces: Faces) -> Mask:
+    """(F / 2,) pairs of triangles 2 q and 2 q + 1 (F, 3) that are one quad in space and in the texture: both halves
+    have the diagonal from the first to the third corner. A pair that a seam of the charts cuts is no quad."""
+    halves = [(f[0::2, 0] == f[1::2, 0]) & (f[0::2, 2] == f[1::2, 1]) for f in (faces, uv_faces)]
+    return np.asarray(halves[0] & halves[1], np.bool_)
+
+
+def polygons(faces: Faces, quads: Mask) -> tuple[Indices, Indices]:
+    """Corner counts (P,) and all corners (n,) of paired triangles (F, 3) as quads where `quads` (F / 2,), else as two
+    triangles each; in the order of the triangles."""
+    pair = np.asarray(faces, np.int64).reshape(-1, 6)
+    both = np.where(quads[:, None], np.concatenate([pair[:, [0, 1, 2, 5]], pair[:, :2]], 1), pair)
+    kept = np.arange(6) < np.where(quads, 4, 6)[:, None]
+    sizes = np.stack([np.where(quads, 4, 3), np.where(quads, 0, 3)], 1).ravel()
+    return sizes[sizes > 0], both[kept]
+
+
+def fans(counts: Indices) -> Indices:
+    """(F, 3) corner indices of the triangles, as fans, of faces with `counts` (P,) corners."""
+    start = np.cumsum(counts) - counts
+    triangles = counts - 2
+    first = np.repeat(start, triangles)
+    turn = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    return np.asarray(np.stack([first, first + turn + 1, first + turn + 2], 1), np.int64)
+
+
 def edges(faces: Faces) -> Indices:
     """(3 F, 2) directed edges, in the order of the faces' sides 0-1, 1-2, 2-0 (all first sides first)."""
     f = np.asarray(faces, np.int64)

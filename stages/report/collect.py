@@ -89,6 +89,7 @@ def figures(r: Results) -> dict[str, Any]:
         "uv": {
             "vertices": uv.vertices,
             "faces": uv.faces,
+            "quads": uv.quads,
             "charts": uv.charts,
             "tiles": uv.tiles,
             "utilisation": uv.utilisation,

@@ -72,11 +72,20 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ):
         if h.get(key) is not None:
             out.append((f"{h[key]:.3f}", what, meaning))
-    out.append((f"{metrics['uv']['faces']:,}", "triangles", f"{metrics['uv']['charts']} charts"))
+    out.append(_faces(metrics["uv"]))
     maps = metrics["maps"]
     times = f"{maps['tiles']} × " if maps["tiles"] > 1 else ""
     out.append((f"{times}{maps['size']}²", "texels", f"{100 * maps['covered_share']:.0f} % of them used"))
     return out
+
+
+def _faces(uv: Mapping[str, Any]) -> tuple[str, str, str]:
+    """The row with the number of faces, and of quads how far they are from the dense mesh."""
+    if not uv["quads"]:
+        return f"{uv['faces']:,}", "triangles", f"{uv['charts']} charts"
+    apart = uv["faces"] - 2 * uv["quads"]
+    besides = f"{apart:,} triangles, " if apart else ""
+    return f"{uv['quads']:,}", "quads", f"{besides}{uv['charts']} charts, {uv['deviation_rms_mm']:.2g} mm off (RMS)"
 
 
 def sections(metrics: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:

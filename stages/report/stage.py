@@ -64,4 +64,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
-STAGE = Stage(name="report", version=11, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=12, inputs=Inputs, config=Config, output=Report, run=run)

@@ -18,6 +18,7 @@ from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import front_of
 from stages.uv.judge import judge
+from stages.uv.quads import quadded
 from stages.uv.remesh import remeshed
 from stages.uv.unwrap import COARSER, most_tiles, unwrap
 
@@ -30,7 +31,7 @@ Step = Callable[[int, int, str], None]
 @dataclass(frozen=True, slots=True)
 class Built:
     """The decimated mesh, its charts, the proxy, the charts' figures, and the distances of mesh and proxy from the
-    dense mesh (m)."""
+    dense mesh (m). quads: number of its pairs of triangles that are quads (meshes.whole_quads); 0 for triangles."""
 
     mesh: Mesh
     charts: Charts
@@ -40,6 +41,7 @@ class Built:
     proxy_deviation: Deviation
     warnings: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
+    quads: int = 0
 
 
 def build(
@@ -65,7 +67,8 @@ def build(
             remedy="run the surface stage again",
         )
     step(0, 4, "decimating")
-    mesh = (remeshed if config.remesh == "uniform" else decimate.decimated)(dense, config.target_faces)
+    ways = {"adaptive": decimate.decimated, "uniform": remeshed, "quads": quadded}
+    mesh = ways[config.remesh](dense, config.target_faces)
     proxy = decimate.decimated(mesh, config.proxy_faces)
     with ThreadPoolExecutor(1) as beside:  # the distances between the meshes do not depend on the charts
         away = beside.submit(_away, dense, mesh, proxy)
@@ -83,7 +86,8 @@ def build(
     short = _too_few(config, texel, tiles, footprint.texel(*others, config.tile_size))
     span = float(np.ptp(mesh.vertices, axis=0).max())
     findings = judge(quality, deviation, span, against, _opened(found, mesh), crumpled(mesh))
-    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings)
+    quads = int(meshes.whole_quads(mesh.faces, charts.faces).sum()) if config.remesh == "quads" else 0
+    return Built(mesh, charts, proxy, quality, deviation, rough, _warnings(quality, against) + short, findings, quads)
 
 
 def _opened(dense: meshes.Topology, mesh: Mesh) -> float:

@@ -43,24 +43,26 @@ class Surface:
     front: Front | None = None
 
 
-def surface_of(mesh: Mesh, smooth: F64, front: Front | None = None) -> Surface:
-    """Prepare a mesh with smoothed vertices (V, 3) for cutting. front: the face, whose charts are larger."""
+def surface_of(mesh: Mesh, smooth: F64, front: Front | None = None, *, quads: bool = False) -> Surface:
+    """Prepare a mesh with smoothed vertices (V, 3) for cutting. front: the face, whose charts are larger. quads: the
+    faces are pairs, each a quad, which seams go around."""
     weight = seam_weights(smooth, mesh.faces)
-    pairs = dual(smooth, mesh.faces, weight)
+    pairs = dual(smooth, mesh.faces, weight, quads=quads)
     area = meshes.areas(smooth, mesh.faces)
     return Surface(smooth, mesh.vertices.astype(np.float64), mesh.faces, area, pairs, weight, front)
 
 
 def unwrapped(
-    mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE, front: Front | None = None
+    mesh: Mesh, smooth: F64, padding: float, tiling: Tiling = ONE, front: Front | None = None, *, quads: bool = False
 ) -> Charts | None:
     """Charts, or None if the mesh can't be cut into a few discs that can be parameterised.
 
     smooth: (V, 3) smoothed vertices. padding: between charts, in uv. Charts are made for one tile; for several tiles,
-    only charts that are too large for a tile are cut further. front: the face, whose charts are larger.
+    only charts that are too large for a tile are cut further. front: the face, whose charts are larger. quads: see
+    `surface_of`.
     """
-    surface = surface_of(mesh, smooth, front)
-    label = segment(smooth, mesh.faces, surface.pairs)
+    surface = surface_of(mesh, smooth, front, quads=quads)
+    label = segment(smooth, mesh.faces, surface.pairs, quads=quads)
     if front is not None:
         label = without_fragments(smooth, mesh.faces, face_parted(label, front, surface.pairs), surface.pairs)
     known: dict[bytes, Flat] = {}

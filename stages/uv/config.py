@@ -25,9 +25,10 @@ class Config(StageConfig):
         "tile of its own",
     )
     target_faces: Triangles = Field(50_000, ge=200, le=2_000_000, description="triangles of the textured mesh")
-    remesh: Literal["adaptive", "uniform"] = Field(
+    remesh: Literal["adaptive", "uniform", "quads"] = Field(
         "adaptive",
-        description="adaptive: fewer triangles where it is flat; uniform: equal triangles, for sculpting and quads",
+        description="adaptive: fewer triangles where it is flat; uniform: equal triangles, for sculpting; quads: equal "
+        "quads, half as many as uv.target_faces, for subdivision and animation",
     )
     proxy_faces: Triangles = Field(
         5_000, ge=100, le=200_000, description="triangles of the proxy, a coarse mesh for display"

@@ -64,7 +64,7 @@ def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Con
     if rest is None:
         return mesh, charts
     rest = decimate.decimated(rest, config.target_faces // REST)
-    own = unwrap(rest, config.changed(tiles=1))
+    own = unwrap(rest, config.changed(tiles=1, remesh="adaptive"))  # triangles
     moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
     return joined([(mesh, charts), (rest, moved)])
 

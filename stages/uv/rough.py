@@ -31,14 +31,14 @@ SHORT = 1e-3
 MIN_HEIGHT = 1e-2  # of a face's length: height of faces without area, so that they have texels
 
 
-def in_pieces(mesh: Mesh, smooth: F64) -> tuple[F64, Faces, Indices] | None:
+def in_pieces(mesh: Mesh, smooth: F64, *, quads: bool = False) -> tuple[F64, Faces, Indices] | None:
     """Texture vertices (U, 2) at one common scale, faces (F, 3) into them and the chart (F,) of each; not packed. None
     if more than MAX_PIECES charts would be needed.
 
-    smooth: (V, 3) smoothed vertices.
+    smooth: (V, 3) smoothed vertices. quads: see `surface_of`.
     """
-    surface = surface_of(mesh, smooth)
-    label = segment(smooth, mesh.faces, surface.pairs)
+    surface = surface_of(mesh, smooth, quads=quads)
+    label = segment(smooth, mesh.faces, surface.pairs, quads=quads)
     known: dict[bytes, Flat] = {}
     for _ in range(ROUNDS):
         flats = flats_of(surface, label, known)

@@ -30,6 +30,7 @@ LARGER_BEND = 0.5  # the same if a small piece is merged
 MIN_PIECE = 0.012  # of the area: smaller pieces are merged with a neighbour
 ROUNDS = 400
 ENDS = 0.3  # of a piece's area at each of its ends, when it is split
+TOGETHER = 20.0  # times the cost of an edge: of the diagonal of a quad, so that seams go around the quad
 FLOW = 20_000  # largest capacity of an edge (integer)
 SWEEPS, STRAIGHTEN = 24, 0.06  # of the span: how much border length weighs against bending
 
@@ -53,17 +54,33 @@ def seam_weights(vertices: F64, faces: Faces) -> F64:
     return np.asarray(1 + FRONT_COST * t * t * (3 - 2 * t), np.float64)
 
 
-def dual(vertices: F64, faces: Faces, weights: F64) -> Dual:
-    """Pairs of faces across the inner edges of a manifold, sorted. vertices (V, 3), faces (F, 3), weights (V,)."""
+def dual(vertices: F64, faces: Faces, weights: F64, *, quads: bool = False) -> Dual:
+    """Pairs of faces across the inner edges of a manifold, sorted. vertices (V, 3), faces (F, 3), weights (V,). quads:
+    the faces 2 q and 2 q + 1 are a quad; its diagonal costs TOGETHER times as much."""
     first, second, _ = meshes.paired_edges(faces, len(vertices))
     edge = np.sort(meshes.edges(faces)[first], axis=1)
     length = np.linalg.norm(vertices[edge[:, 0]] - vertices[edge[:, 1]], axis=1)
-    return Dual(first % len(faces), second % len(faces), edge, length, length * weights[edge].mean(1))
+    a, b, cost = first % len(faces), second % len(faces), length * weights[edge].mean(1)
+    return Dual(a, b, edge, length, np.where(a // 2 == b // 2, TOGETHER * cost, cost) if quads else cost)
 
 
-def segment(vertices: F64, faces: Faces, pairs: Dual) -> Indices:
-    """(F,) piece of each face, numbered from 0; every piece is connected."""
+def segment(vertices: F64, faces: Faces, pairs: Dual, *, quads: bool = False) -> Indices:
+    """(F,) piece of each face, numbered from 0; every piece is connected. quads: the faces 2 q and 2 q + 1 are a quad,
+    which stays in one piece."""
     vectors = meshes.area_vectors(vertices, faces)
+    if quads:
+        return np.repeat(_segmented(vertices, vectors.reshape(-1, 2, 3).sum(1), _of_quads(pairs)), 2)
+    return _segmented(vertices, vectors, pairs)
+
+
+def _of_quads(pairs: Dual) -> Dual:
+    """Pairs of neighbouring quads, from pairs of their halves."""
+    a, b = pairs.a // 2, pairs.b // 2
+    apart = a != b
+    return Dual(a[apart], b[apart], pairs.edge[apart], pairs.length[apart], pairs.cost[apart])
+
+
+def _segmented(vertices: F64, vectors: F64, pairs: Dual) -> Indices:
     area = np.linalg.norm(vectors, axis=1)
     label = _grown(vectors, area, pairs)
     label = _straightened(label, vectors, area, pairs, float(np.ptp(vertices, axis=0).max()))
@@ -153,11 +170,12 @@ def _straightened(label: Indices, vectors: F64, area: F64, pairs: Dual, span: fl
     """
     n = len(area)
     unit = vectors / np.maximum(area, 1e-30)[:, None]
-    near = np.repeat(np.arange(n)[:, None], 3, 1)  # across a border a face is its own neighbour
-    cost = np.zeros((n, 3))
     faces, others = np.concatenate([pairs.a, pairs.b]), np.concatenate([pairs.b, pairs.a])
     order = np.argsort(faces, kind="stable")
     slot = np.arange(len(order)) - np.searchsorted(faces[order], faces[order])
+    sides = int(slot.max(initial=2)) + 1  # 3, or 4 of a quad
+    near = np.repeat(np.arange(n)[:, None], sides, 1)  # across a border a face is its own neighbour
+    cost = np.zeros((n, sides))
     near[faces[order], slot] = others[order]
     cost[faces[order], slot] = np.concatenate([pairs.cost, pairs.cost])[order]
     for sweep in range(SWEEPS):

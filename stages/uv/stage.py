@@ -90,6 +90,7 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
         proxy=context.file(f"{prefix}{PROXY}"),
         vertices=len(built.mesh.vertices),
         faces=len(built.mesh.faces),
+        quads=built.quads,
         charts=built.quality.charts,
         tiles=len(built.quality.tile_utilisation),
         utilisation=built.quality.utilisation,
@@ -107,4 +108,4 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=9, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=10, inputs=Inputs, config=Config, output=UvMesh, run=run)

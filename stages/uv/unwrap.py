@@ -50,11 +50,12 @@ def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float 
     scaled = Mesh((mesh.vertices.astype(np.float64) * (UNIT / span)).astype(np.float32), mesh.normals, mesh.faces)
     padding = config.padding / config.texture_size
     tiling = Tiling(most_tiles(config, texel), None if texel is None else 1 / (COARSER * texel * config.tile_size))
-    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front)
+    quads = config.remesh == "quads"
+    own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front, quads=quads)
     if own is not None:
         return _with_texels(own, mesh, config, tiling, front)
     log.info("uv: the mesh can't be cut into a few discs; cutting further")
-    found = in_pieces(scaled, points)
+    found = in_pieces(scaled, points, quads=quads)
     if found is not None:
         uvs, faces, _ = found
         even = evened(uvs, faces, meshes.areas(mesh.vertices, mesh.faces))

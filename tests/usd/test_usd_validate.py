@@ -12,7 +12,8 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from pipeline.errors import StageError
-from stages.usd.check.chart_checks import _fans, overlap
+from pipeline.meshes import fans
+from stages.usd.check.chart_checks import overlap
 from stages.usd.check.validate import checks_run, validate
 from stages.usd.judge import validity
 
@@ -235,8 +236,8 @@ def test_overlap_is_the_share_of_covered_texels(shift: float, share: float) -> N
     assert overlap(np.concatenate([square, square + [1, 0]])) == 0
 
 
-def test_faces_with_more_corners_are_fans() -> None:
-    assert _fans(np.array([3, 5, 4])).tolist() == [
+def test_faces_with_more_corners_arefans() -> None:
+    assert fans(np.array([3, 5, 4])).tolist() == [
         [0, 1, 2], [3, 4, 5], [3, 5, 6], [3, 6, 7], [8, 9, 10], [8, 10, 11],
     ]  # fmt: skip
 

@@ -27,6 +27,7 @@ NEEDED = {
     "trimesh": ("trimesh", "meshes"),
     "embreex": ("embreex", "rays against meshes"),
     "pymeshlab": ("pymeshlab", "mesh repair"),
+    "pyinstantmeshes": ("pyinstantmeshes", "quads"),
     "fast_simplification": ("fast-simplification", "mesh decimation"),
     "xatlas": ("xatlas", "UV charts"),
     "pxr": ("usd-core", "the asset"),

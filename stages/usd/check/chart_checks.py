@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pxr import UsdGeom
 
-from pipeline import raster
+from pipeline import meshes, raster
 from stages.usd.check.findings import Finding
 
 F64 = npt.NDArray[np.float64]
@@ -22,7 +22,7 @@ def chart_findings(mesh: UsdGeom.Mesh, st: F64) -> list[Finding]:
     """Findings on texture coordinates st (N, 2) of all faces' corners, in the order of the mesh's indices. Faces are
     triangulated as fans."""
     where, counts = str(mesh.GetPath()), np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64)
-    corner = _fans(counts)
+    corner = meshes.fans(counts)
     points = np.asarray(mesh.GetPointsAttr().Get(), np.float64)
     index = np.asarray(mesh.GetFaceVertexIndicesAttr().Get(), np.int64)
     x, t = points[index[corner]], st[corner]
@@ -52,12 +52,3 @@ def overlap(triangles: F64) -> float:
         layers = raster.layers(raster.in_texels(own, RASTER), RASTER)
         covered, twice = covered + int((layers > 0).sum()), twice + int((layers > 1).sum())
     return twice / max(covered, 1)
-
-
-def _fans(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(F, 3) corner indices of the triangles of faces with `counts` corners."""
-    start = np.cumsum(counts) - counts
-    triangles = counts - 2
-    first = np.repeat(start, triangles)
-    turn = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack([first, first + turn + 1, first + turn + 2], 1)

@@ -18,7 +18,7 @@ from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.lighting.dome import read_light
-from pipeline.meshes import vertex_normals
+from pipeline.meshes import fans, vertex_normals
 from pipeline.transforms import apply
 from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.mesh import UvSurface, tile_count
@@ -176,11 +176,13 @@ def read_usd_mesh(path: Path) -> UvSurface:
 
 
 def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
-    """In the stage's world. Normals that are not authored, or of a moved mesh, are those of the triangles."""
+    """In the stage's world, quads as two triangles. Normals that are not authored, or of a moved mesh, are those of the
+    triangles."""
     from pxr import UsdGeom
 
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32).reshape(-1, 3)
+    corners = fans(np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64))
+    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32)[corners]
     vertices, normals = np.array(mesh.GetPointsAttr().Get(), np.float32), mesh.GetNormalsAttr()
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim())).T  # USD multiplies row vectors
     moved = not np.array_equal(world, np.eye(4))
@@ -191,9 +193,7 @@ def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
         np.array(normals.Get(), np.float32) if own else vertex_normals(vertices, faces),
         faces,
         np.array(st.Get(), np.float32),
-        np.array(st.GetIndices(), np.int32).reshape(-1, 3)
-        if st.IsIndexed()
-        else np.arange(faces.size, dtype=np.int32).reshape(-1, 3),
+        np.array(st.GetIndices(), np.int32)[corners] if st.IsIndexed() else corners.astype(np.int32),
     )
 
 

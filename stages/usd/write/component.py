@@ -18,7 +18,7 @@ from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.eyes import EYES, bind_eyes, eye_material, pieces
 from stages.usd.write.materialx import materialx_networks
-from stages.usd.write.mesh import UvSurface, tile_count
+from stages.usd.write.mesh import UvSurface, faces_of, tile_count
 from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
 from stages.usd.write.variants import (
@@ -228,15 +228,17 @@ def _shown(
 
 
 def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:
-    """Author a triangle mesh. Vertices without a face are left out; normals are normalised."""
-    used, faces = np.unique(mesh.faces, return_inverse=True)
-    uv_used, uv_faces = np.unique(mesh.uv_faces, return_inverse=True)
+    """Author a mesh of triangles, or of quads if it is paired. Vertices without a face are left out; normals are
+    normalised."""
+    counts, corners, uv_corners = faces_of(mesh)
+    used, faces = np.unique(corners, return_inverse=True)
+    uv_used, uv_faces = np.unique(uv_corners, return_inverse=True)
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(mesh.vertices[used], np.float32))
     normals = mesh.normals[used].astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     out = UsdGeom.Mesh.Define(stage, path)
     out.CreatePointsAttr(points)
-    out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    out.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(counts))
     out.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(faces.ravel(), np.int32)))
     out.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, np.float32)))
     out.SetNormalsInterpolation(UsdGeom.Tokens.vertex)

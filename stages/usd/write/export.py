@@ -57,7 +57,7 @@ def export(
 ) -> Export:
     """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
-    mesh = read_mesh(uv.path(uv.artifact.mesh))
+    mesh = read_mesh(uv.path(uv.artifact.mesh), paired=uv.artifact.quads > 0)
     head = template_mesh(template, mesh, rigged=config.expressions) if uv.artifact.of_template else None
     proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
     high, left_out = _high(surface, mesh) if config.high else (None, [])
@@ -106,7 +106,7 @@ def export(
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
     written += [folder / f for f in (*layers, "environment.exr", "light.json")]
     check()
-    light_mesh, light_rig, light_eyes = mesh, None, None
+    light_mesh, light_rig, light_eyes = replace(mesh, paired=False), None, None  # viewers want triangles
     if head is not None:
         light_mesh, light_rig, light_eyes = with_rest(head), head.coarse_rig, head.coarse_eyes
     if config.usdz:
@@ -163,7 +163,7 @@ def _scan(
     """The scan's mesh beside the template's, and its maps NAME_scan_*; None if there is none."""
     if uv.artifact.scan is None or bake.artifact.scan is None:
         return None
-    mesh = read_mesh(uv.path(uv.artifact.scan.mesh))
+    mesh = read_mesh(uv.path(uv.artifact.scan.mesh), paired=uv.artifact.scan.quads > 0)
     baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
     made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
     return mesh, made

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from pipeline import tiles
+from pipeline import meshes, tiles
 from pipeline.errors import StageError
 from pipeline.meshes import Charts
 
@@ -24,16 +24,18 @@ CANDIDATES = 12  # nearest triangles that are searched for the exact nearest poi
 
 @dataclass(frozen=True, slots=True)
 class UvSurface:
-    """Triangles with texture coordinates. vertices, normals (V, 3); faces, uv_faces (F, 3); uvs (U, 2), v up."""
+    """Triangles with texture coordinates. vertices, normals (V, 3); faces, uv_faces (F, 3); uvs (U, 2), v up. paired:
+    the faces are pairs, and written as quads where no seam cuts them (meshes.whole_quads)."""
 
     vertices: F32
     normals: F32
     faces: I32
     uvs: F32
     uv_faces: I32
+    paired: bool = False
 
 
-def read_mesh(path: Path, *, with_uvs: bool = True) -> UvSurface:
+def read_mesh(path: Path, *, with_uvs: bool = True, paired: bool = False) -> UvSurface:
     """Read a mesh npz. Without uvs (a proxy) those arrays are empty. StageError if the arrays do not match."""
     with np.load(path, allow_pickle=False) as f:
         stored = {k: f[k] for k in f.files}
@@ -48,6 +50,7 @@ def read_mesh(path: Path, *, with_uvs: bool = True) -> UvSurface:
         np.asarray(stored["faces"], np.int32),
         np.asarray(stored["uvs"], np.float32),
         np.asarray(stored["uv_faces"], np.int32),
+        paired,
     )
     fault = _fault(mesh, with_uvs)
     if fault:
@@ -93,6 +96,15 @@ def on_tile(mesh: UvSurface, tile: int, count: int) -> UvSurface:
     mine = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces)) == tile
     moved = (mesh.uvs - np.array([tile, 0], np.float32)).clip(0, 1)
     return UvSurface(mesh.vertices, mesh.normals, mesh.faces[mine], moved, mesh.uv_faces[mine])
+
+
+def faces_of(mesh: UvSurface) -> tuple[I32, I32, I32]:
+    """The faces as they are written: their numbers of corners (P,), the corners' vertices and texture vertices (n,)."""
+    if not mesh.paired:
+        return np.full(len(mesh.faces), 3, np.int32), mesh.faces.ravel(), mesh.uv_faces.ravel()
+    quads = meshes.whole_quads(mesh.faces, mesh.uv_faces)
+    counts, corners = meshes.polygons(mesh.faces, quads)
+    return counts.astype(np.int32), corners.astype(np.int32), meshes.polygons(mesh.uv_faces, quads)[1].astype(np.int32)
 
 
 def charts_of(uv_faces: I32, count: int) -> I32:

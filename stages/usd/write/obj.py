@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline import tiles
 from pipeline.meshes import Charts
-from stages.usd.write.mesh import UvSurface, tile_count
+from stages.usd.write.mesh import UvSurface, faces_of, tile_count
 from stages.usd.write.shading import MATERIAL, Look
 
 
@@ -19,10 +19,15 @@ def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path
     """Write the files: metres, +Y up, as the asset. Indices start at 1; v, vt and vn are indexed separately."""
     normals = mesh.normals.astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    vertex, uv, count = mesh.faces + 1, mesh.uv_faces + 1, tile_count(mesh)
+    count = tile_count(mesh)
+    sizes, corners, uv_corners = faces_of(mesh)
     tile = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces))
     home = np.zeros((len(mesh.uvs), 2), np.float32)
     home[mesh.uv_faces.ravel(), 0] = np.repeat(tile, 3)
+    of_face = home[uv_corners[np.cumsum(sizes) - sizes], 0].astype(int).tolist()
+    texts = [f"{a}/{p}/{a}" for a, p in zip((corners + 1).tolist(), (uv_corners + 1).tolist(), strict=True)]
+    ends = np.cumsum(sizes).tolist()
+    faces = ["f " + " ".join(texts[end - n : end]) for n, end in zip(sizes.tolist(), ends, strict=True)]
     lines = ["# Captured head, metres, +Y up. Made by NeuFace Asset.", f"mtllib {name}.mtl", f"o {name}"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"vt {u:.7g} {v:.7g}" for u, v in (mesh.uvs - home).clip(0, 1).tolist()]
@@ -32,10 +37,7 @@ def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path
         called = MATERIAL if count == 1 else f"{MATERIAL}_{tiles.FIRST + t}"
         materials += _material(called, look.on_tile(t))
         lines += [f"usemtl {called}", "s 1"]
-        lines += [
-            f"f {a}/{p}/{a} {b}/{q}/{b} {c}/{r}/{c}"
-            for (a, b, c), (p, q, r) in zip(vertex[tile == t].tolist(), uv[tile == t].tolist(), strict=True)
-        ]
+        lines += [face for face, at in zip(faces, of_face, strict=True) if at == t]
     obj, mtl = folder / f"{name}.obj", folder / f"{name}.mtl"
     obj.write_text("\n".join(lines) + "\n")
     mtl.write_text("\n".join(materials) + "\n")
