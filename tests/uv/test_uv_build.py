@@ -293,7 +293,7 @@ def test_packing_a_line_and_a_point() -> None:
 def test_many_charts_go_to_the_other_packer(dense: Mesh, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unwrap, "MANY_CHARTS", 0)
     for ours in ("unwrapped", "in_pieces"):
-        monkeypatch.setattr(unwrap, ours, lambda *_: None)
+        monkeypatch.setattr(unwrap, ours, lambda *_, **__: None)
     charts = unwrap.unwrap(decimate.decimated(dense, 2000), Config(texture_size=512, padding=4))
     assert painted(charts, 500)[0].max() == 1
     assert (unwrap.signed_areas(charts.uvs.astype(np.float64), charts.faces) > 0).mean() > 0.99

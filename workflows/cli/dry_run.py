@@ -19,11 +19,7 @@ ORIGINS = {"runs": "earlier runs here", "table": "measured on two cores", "store
 
 
 def dry_run(plan: Plan, console: Console) -> None:
-    """Print the plan on standard output, or tell it as an event.
-
-    Raises:
-        UsageError: never for a plan that `make_plan` made.
-    """
+    """Print the plan on standard output, or tell it as an event."""
     stages = expected(plan)
     why, wanted = reasons(plan, [e.step for e in stages]), needs(plan, stages)
     if console.events is not None:
