@@ -83,7 +83,7 @@ def test_a_chart_that_collapsed_to_a_line_is_laid_flat_anew(monkeypatch: pytest.
     faces[::40] = len(fallen) + np.arange(len(where)).reshape(-1, 3)
     broken = Charts(loose.astype(np.float32), faces)
     assert measure(mesh, broken).empty > 0.01
-    monkeypatch.setattr(unwrap, "unwrapped", lambda *_: broken)
+    monkeypatch.setattr(unwrap, "unwrapped", lambda *_, **__: broken)
     sound(mesh, unwrap.unwrap(mesh, Config(texture_size=512, padding=4)))
 
 

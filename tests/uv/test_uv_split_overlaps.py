@@ -115,7 +115,7 @@ def test_charts_that_fold_are_mended_before_they_are_packed(uvs: np.ndarray, mon
     before = measure(mesh, Charts(uvs.astype(np.float32), mesh.faces))
     assert before.overlap > 0.1
     for ours in ("unwrapped", "in_pieces"):  # as where our own charts do not lie flat
-        monkeypatch.setattr(unwrapping, ours, lambda *_: None)
+        monkeypatch.setattr(unwrapping, ours, lambda *_, **__: None)
     monkeypatch.setattr(unwrapping, "_cut", lambda *_: (uvs * 1000, mesh.faces))  # as if xatlas had made these
     charts = unwrap(mesh, Config())
     quality = measure(mesh, charts)

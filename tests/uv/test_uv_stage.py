@@ -74,7 +74,7 @@ def test_failing_unwrap_is_a_stage_error(inputs: Inputs, tmp_path: Path, monkeyp
     fake.Atlas, fake.ChartOptions, fake.PackOptions = Broken, types.SimpleNamespace, types.SimpleNamespace  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "xatlas", fake)
     for ours in ("unwrapped", "in_pieces"):  # a mesh that only xatlas can take
-        monkeypatch.setattr(unwrap, ours, lambda *_: None)
+        monkeypatch.setattr(unwrap, ours, lambda *_, **__: None)
     with pytest.raises(StageError, match="unwrapped"):
         run(inputs, Config(target_faces=2000), Context(tmp_path, tmp_path))
     assert "out of range" in str(unwrap._failed("a face index is out of range"))
