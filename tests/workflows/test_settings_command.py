@@ -75,7 +75,7 @@ def test_json_has_a_record_for_each(capsys: pytest.CaptureFixture[str]) -> None:
     assert one == {
         "key": "surface.resolution", "stage": "surface", "name": "resolution", "unit": "grid cells", "default": 256,
         "allowed": "whole number, 16 to 1024", "meaning": one["meaning"], "only": [],
-        "presets": {"draft": 288, "studio": 320, "film": 512, "paper": 320},
+        "presets": {"draft": 512, "studio": 640, "film": 896, "paper": 640},
     }  # fmt: skip
 
 
