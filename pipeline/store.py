@@ -80,7 +80,7 @@ class Store:
 
     def load_run(self, stage: str, key: str) -> dict[str, object]:
         """`run.json` of a finished artifact: seconds, memory, versions. Empty if it is missing or damaged."""
-        found = _json(self.folder(stage, key) / RUN)
+        found = read_object(self.folder(stage, key) / RUN)
         seconds = found.get("seconds", 0.0)
         if isinstance(seconds, int | float) and 0 <= seconds < MAX_SECONDS:
             return found
@@ -161,12 +161,12 @@ class Store:
 
 def lineage(path: Path) -> dict[str, list[str]]:
     """The inputs of a key; empty if unknown."""
-    found = _json(path)
+    found = read_object(path)
     return {k: v for k, v in found.items() if isinstance(v, list) and all(isinstance(x, str) for x in v)}
 
 
-def _json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file; empty if there is none."""
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file; empty if the file is missing, damaged, too large or holds something else."""
     try:
         found = json.loads(path.read_bytes()) if path.stat().st_size <= MAX_BYTES else {}
     except (OSError, ValueError, RecursionError):

@@ -41,6 +41,7 @@ def test_distances_and_gradients() -> None:
     assert signed(ball, np.array([[0.4, 0, 0]]), 0.03) == pytest.approx([0.07])
     x = np.random.default_rng(0).uniform(-0.3, 0.4, (2000, 3))
     value, gradient = signed_and_gradient(ball, x)
+    np.testing.assert_array_equal(value, signed(ball, x))
     step = 1e-6 * np.eye(3)
     numeric = np.stack([(signed(ball, x + s) - signed(ball, x - s)) / 2e-6 for s in step], 1)
     smooth = np.abs(np.linalg.norm(numeric, axis=1) - 1) < 1e-6

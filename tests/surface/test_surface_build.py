@@ -189,6 +189,15 @@ def test_small_bumps_on_a_steep_field_are_not_walled_off() -> None:
     assert to_tip.max() < 0.8 * got.cell
 
 
+def test_the_fast_wall_distance_is_that_with_a_gradient() -> None:
+    extent = Extent(centre=(0.06, 0.02, 0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1)), radii=(0.12, 0.1, 0.14),
+                    cuts=(Cut(normal=(0.0, -1.0, 0.0), offset=0.05),), head=0.15)  # fmt: skip
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (5000, 3))
+    for cutting in (None, extent):
+        grid = extract.lattice(AnalyticField(sphere(0.1), (0.12, 0.13, 0.12)), 64, cutting)
+        np.testing.assert_allclose(extract._wall(points, grid), extract.wall_distance(points, grid)[0], atol=1e-15)
+
+
 def test_the_mesh_is_closed_at_the_extent() -> None:
     """A sphere cut by a slanting plane and by a ball: closed, on the sphere inside, on plane or ball elsewhere."""
     normal = np.array([0.3, -0.9, 0.1]) / np.linalg.norm([0.3, -0.9, 0.1])

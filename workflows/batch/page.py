@@ -16,6 +16,7 @@ from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined, Template
 
+from pipeline.store import read_object
 from pipeline.verdict import LEVELS
 from workflows.batch.captures import natural
 from workflows.batch.request import BatchRequest
@@ -120,7 +121,7 @@ def _row(entry: Entry, out: Path) -> Row:
     if entry.state not in ENDED:
         return row
     folder, link = out / entry.name, f"../{quote(entry.name)}"
-    run, metrics = _json(folder / "run.json"), _json(folder / "report" / "metrics.json")
+    run, metrics = read_object(folder / "run.json"), read_object(folder / "report" / "metrics.json")
     stages = run.get("stages", {})
     run["peak_memory_mb"] = max((s.get("peak_memory_mb") or 0 for s in stages.values()), default=None)
     troubles = run.get("verdict", {}).get("findings", ())
@@ -134,14 +135,6 @@ def _row(entry: Entry, out: Path) -> Row:
     if (folder / "report/index.html").is_file():
         row.report = f"{link}/report/index.html"
     return row
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _at(content: Mapping[str, Any], path: Sequence[str]) -> float | None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from stages.presets import configs_for
@@ -14,6 +12,7 @@ from workflows.run.forecast import in_words
 from workflows.run.needs import Needs, free_memory_mb, needs
 from workflows.run.plan import Plan
 from workflows.run.reasons import reasons
+from workflows.run.room import free_bytes
 
 ORIGINS = {"runs": "earlier runs here", "table": "measured on two cores", "store": ""}
 
@@ -69,7 +68,7 @@ def _time(plan: Plan, stages: Sequence[Expected]) -> str:
 
 
 def _room(plan: Plan, wanted: Needs) -> list[str]:
-    free = _free(plan.store.root)
+    free = free_bytes(plan.store.root)
     there = "" if free is None else f"; {_bytes(free)} are free on the disk of {plan.store.root}"
     lines = [f"disk: about {_bytes(wanted.disk)}{there}"]
     if wanted.memory is not None:
@@ -77,13 +76,6 @@ def _room(plan: Plan, wanted: Needs) -> list[str]:
         there = "" if memory is None else f"; {memory / 1024:.1f} GB are free"
         lines.append(f"memory: about {wanted.memory / 1000:.1f} GB{there}")
     return lines
-
-
-def _free(folder: Path) -> int | None:
-    """Bytes that are free on the disk of a folder, which may not exist; None where the file system does not tell."""
-    there = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    total, _, free = shutil.disk_usage(there)
-    return free if total > 0 else None
 
 
 def _bytes(size: float) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.store import read_object
 from workflows.cli.console import Console
 from workflows.run.verdict import exit_code, last_lines
 
@@ -57,10 +57,7 @@ def held_out(record: Mapping[str, Any], out: Path) -> dict[str, Any]:
     """
     if METRICS not in _published(record, out):
         return {}
-    try:
-        content = json.loads((out / METRICS).read_text())["holdout"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+    content = read_object(out / METRICS).get("holdout")
     return content if isinstance(content, dict) else {}
 
 

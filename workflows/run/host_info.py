@@ -26,7 +26,7 @@ def machine() -> dict[str, Any]:
     return {
         "processor": _line(Path("/proc/cpuinfo"), "model name") or platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
-        "memory_gb": round(_kilobytes(Path("/proc/meminfo"), "MemTotal") / 1e6, 1),
+        "memory_gb": round(kilobytes("MemTotal") / 1e6, 1),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -58,8 +58,9 @@ def _line(path: Path, name: str) -> str:
         return ""
 
 
-def _kilobytes(path: Path, name: str) -> float:
-    text = _line(path, name).split()
+def kilobytes(name: str) -> float:
+    """Of memory, by its name in /proc/meminfo; 0 where the system does not tell."""
+    text = _line(Path("/proc/meminfo"), name).split()
     return float(text[0]) if text else 0.0
 
 

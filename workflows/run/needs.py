@@ -5,10 +5,10 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
 from pipeline.store import file_refs
 from workflows.run.estimate import Expected, records
+from workflows.run.host_info import kilobytes
 from workflows.run.plan import Plan
 from workflows.run.room import size_of
 
@@ -57,9 +57,4 @@ def _kept(plan: Plan, stage: str) -> float:
 
 def free_memory_mb() -> float | None:
     """MB that this machine can give to a program now; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return None
-    found = next((line.split()[1] for line in lines if line.startswith("MemAvailable:")), None)
-    return float(found) / 1024 if found is not None and found.isdecimal() else None
+    return kilobytes("MemAvailable") / 1024 or None

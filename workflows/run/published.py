@@ -13,10 +13,9 @@ import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from pipeline.artifacts import sha256_of
-from pipeline.store import MANIFEST, write_synced
+from pipeline.store import MANIFEST, read_object, write_synced
 from workflows.run.report_timing import report_hash
 
 LIST = ".published.json"
@@ -28,12 +27,12 @@ Known = dict[str, frozenset[str]]  # path below OUT -> sha256 of each content th
 
 def published(out: Path) -> Known:
     """What runs published in `out`. Without a list (of an older version), what run.json names and the store has."""
-    return listed(out) if isinstance(_json(out / LIST).get("files"), dict) else _of_an_older_run(out)
+    return listed(out) if isinstance(read_object(out / LIST).get("files"), dict) else _of_an_older_run(out)
 
 
 def listed(folder: Path) -> Known:
     """What the list in a folder names; nothing where there is none."""
-    found = _json(folder / LIST).get("files")
+    found = read_object(folder / LIST).get("files")
     files = found if isinstance(found, dict) else {}
     return {path: frozenset(map(str, hashes)) for path, hashes in files.items() if isinstance(hashes, list)}
 
@@ -79,7 +78,7 @@ def is_ours(path: Path, hashes: Iterable[str]) -> bool:
 
 def is_record(path: Path) -> bool:
     """Whether a file is a run.json, whoever wrote it: older versions did not list theirs."""
-    return not path.is_symlink() and {"request", "stages", "timing", "store"} <= _json(path).keys()
+    return not path.is_symlink() and {"request", "stages", "timing", "store"} <= read_object(path).keys()
 
 
 def entries(folder: Path) -> Iterator[str]:
@@ -106,7 +105,7 @@ def split(out: Path, name: str, known: Known) -> tuple[list[str], list[str]]:
 # ------------------------------------------------------------------ before there was a list
 def _of_an_older_run(out: Path) -> Known:
     """From run.json and the manifests in its store. Files in neither are taken for the user's and kept."""
-    record = _json(out / "run.json")
+    record = read_object(out / "run.json")
     stages, timing = record.get("stages"), record.get("timing")
     if not isinstance(stages, dict) or not isinstance(timing, dict):
         return {}
@@ -121,7 +120,7 @@ def _of_an_older_run(out: Path) -> Known:
 
 
 def _published_of(stage: str, folder: Path, timing: Mapping[str, float]) -> Iterator[tuple[str, str]]:
-    manifest = _json(folder / MANIFEST)
+    manifest = read_object(folder / MANIFEST)
     files = [f for f in manifest.get("files", ()) if isinstance(f, dict) and {"path", "sha256"} <= f.keys()]
     if stage == "usd":
         top = str(manifest.get("root", "")).rpartition("/")[0]
@@ -136,11 +135,3 @@ def _published_of(stage: str, folder: Path, timing: Mapping[str, float]) -> Iter
     for view in manifest.get(field, ()):
         for kind in ("exr", "png"):
             yield f"report/{below}/{view['index']}.{kind}", view[kind]["sha256"]
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pipeline.contract import Stage
-from pipeline.store import RUN, Store
+from pipeline.store import RUN, Store, read_object
 from stages.registry import SOURCE
 from workflows.run.plan import Plan, Step
 
@@ -53,7 +52,7 @@ def _reason(plan: Plan, stage: Stage[Any, Any, Any], step: Step, before: str | N
 
 def _keys_before(plan: Plan) -> dict[str, str]:
     """Stage -> key of the run that the output folder is from; empty where there is none, or it used another store."""
-    record = _json(plan.out / "run.json")
+    record = read_object(plan.out / "run.json")
     if Path(str(record.get("store", ""))).resolve() != plan.store.root.resolve():
         return {}
     stages = record.get("stages")
@@ -63,7 +62,7 @@ def _keys_before(plan: Plan) -> dict[str, str]:
 
 def _settings_changed(plan: Plan, stage: Stage[Any, Any, Any], before: str) -> str:
     """ "bake.size 1024 -> 4096"; empty if none did, or it is not known."""
-    old = _json(plan.store.folder(stage.name, before) / RUN).get("config")
+    old = read_object(plan.store.folder(stage.name, before) / RUN).get("config")
     if not isinstance(old, Mapping):
         return ""
     new = plan.configs[stage.name].model_dump(mode="json")
@@ -74,11 +73,3 @@ def _settings_changed(plan: Plan, stage: Stage[Any, Any, Any], before: str) -> s
 
 def _has_checkpoint(store: Store, stage: str, key: str) -> bool:
     return any(store.scratch(stage, key).glob("*"))
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}

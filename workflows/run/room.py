@@ -50,16 +50,26 @@ def check_room(folder: Path, needed: int, what: str, option: str) -> None:
 
     A file system that does not know its free bytes has enough.
     """
-    there = next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
-    total, _, free = shutil.disk_usage(there)
-    if total > 0 and free < needed:
+    free = free_bytes(folder)
+    if free is not None and free < needed:
         raise DiskError(
             "not enough space is left on the disk",
             where=folder,
-            value=f"{free / 1e6:.1f} MB free on the disk of {_mount_of(there)}",
+            value=f"{free / 1e6:.1f} MB free on the disk of {_mount_of(_nearest(folder))}",
             limit=f"at least {needed / 1e6:.1f} MB {what}",
             remedy=f"free space on this disk, or choose another one with {option}; finished stages are kept",
         )
+
+
+def free_bytes(folder: Path) -> int | None:
+    """Bytes that are free for this user on the disk of a folder, which may not exist; None if it does not tell."""
+    total, _, free = shutil.disk_usage(_nearest(folder))
+    return free if total > 0 else None
+
+
+def _nearest(folder: Path) -> Path:
+    """The folder, or the first above it that exists."""
+    return next(p for p in (folder, *folder.absolute().parents) if p.is_dir())
 
 
 def _mount_of(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.store import Store
+from pipeline.store import Store, read_object
 
 ROOTS = ".roots"
 
@@ -45,7 +45,7 @@ def roots(store: Store) -> Iterator[Root]:
     if store.root.name == ".store":
         folders |= {p.parent for pattern in ("run.json", "*/run.json", "*/*/run.json") for p in beside.glob(pattern)}
     for out in sorted(f for f in folders if f is not None):
-        record = _json(out / "run.json")
+        record = read_object(out / "run.json")
         stages = record.get("stages")
         if isinstance(stages, dict) and _serves(store, record):
             keys = {n: str(s["key"]) for n, s in stages.items() if isinstance(s, dict) and "key" in s}
@@ -57,16 +57,8 @@ def _serves(store: Store, record: dict[str, Any]) -> bool:
 
 
 def _out_of(path: Path) -> Path | None:
-    out = _json(path).get("out")
+    out = read_object(path).get("out")
     return Path(out) if isinstance(out, str) else None
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _name(out: Path) -> str:
