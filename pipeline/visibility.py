@@ -22,13 +22,15 @@ MIN_ALPHA = 0.5
 
 @dataclass(frozen=True, slots=True)
 class FittedPhoto:
-    """A fitted photo and its camera; its mask, clipped pixels and labels, if they exist."""
+    """A fitted photo and its camera; its mask, clipped pixels, labels and the pixels that count in the fit, if they
+    exist."""
 
     camera: Camera
     mask: Path | None
     photo: Path | None = None
     clipped: Path | None = None
     labels: Path | None = None
+    asked: Path | None = None
 
 
 def seen_by(
@@ -47,6 +49,7 @@ def seen_by(
             None if photo is None else capture.path(photo.image),
             None if photo is None or photo.clipped is None else capture.path(photo.clipped),
             None if mask is None or mask.labels is None else masks.path(mask.labels),
+            None if mask is None or mask.asked is None else masks.path(mask.asked),
         )
 
     return tuple(view(c) for c in poses.cameras if c.index in used)
@@ -76,6 +79,14 @@ def seen_weight(points: F64, normals: F64, views: Sequence[FittedPhoto], occlude
     return total
 
 
+def best_cosine(points: F64, normals: F64, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
+    """(N,) largest cosine towards a view that sees the point; 0 if none does. points, normals (N, 3)."""
+    best = np.zeros(len(points))
+    for view in views:
+        np.maximum(best, view_cosines(view, points, normals, occluder)[0], out=best)
+    return best
+
+
 def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
     """(N,) cosine towards the camera if the view sees the point, else 0; (N, 2) position in the photo, pixels. points,
     normals (N, 3)."""
@@ -90,6 +101,8 @@ def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occlude
     live = np.flatnonzero((cosine > 0) & framed)
     if view.mask is not None:
         live = live[picked(_alpha(view.mask), camera, uv[live]) > MIN_ALPHA]
+    if view.asked is not None:  # elsewhere the subject is not fitted, so that its colours there mean nothing
+        live = live[picked(_alpha(view.asked), camera, uv[live]) > MIN_ALPHA]
     start = points[live] + LIFT * occluder.span * normals[live]
     out = np.zeros(len(points))
     if len(live):

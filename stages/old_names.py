@@ -39,6 +39,7 @@ REMOVED = frozenset(  # now constants in the code
         "masks.min_agreement",
         "masks.max_deviation",
         "inverse_rendering.even_from",
+        "inverse_rendering.robust",
         "inverse_rendering.open_from",
         "inverse_rendering.open_until",
         "uv.iterations",

@@ -14,7 +14,7 @@ from pipeline import footprint, meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
-from pipeline.visibility import FittedPhoto, Occluder, seen_weight
+from pipeline.visibility import FittedPhoto, Occluder, best_cosine
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.confidence import SIZE as SIGHT
@@ -29,6 +29,7 @@ from stages.bake.smooth import continued
 from stages.bake.standard_observe import standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
+from stages.bake.unseen import LENGTH, region_colours, replaced_share
 
 log = logging.getLogger("neuface.bake")
 
@@ -92,19 +93,19 @@ class Baker:
         fit_standard: bool = True,
         eyes: Eyes | None = None,
         mouth: Inside | None = None,
+        region: Indices | None = None,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
-        `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth."""
+        `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
+        vertex (unseen.region_of); None: one region."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
         self._step, self._scratch = step, scratch
         self._occluder = Occluder(mesh)
-        self._known = _known(
-            field, mesh, views, self._occluder, mouth, lambda done, total: step(done, total, "ambient occlusion")
-        )
-        self._known = replace(self._known, eyes=eyes)
+        around = ambient(mesh, self._occluder, lambda done, total: step(done, total, "ambient occlusion"))
+        self._known = replace(_known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes)
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
         self.material_figures: dict[str, float] = {}
@@ -174,14 +175,20 @@ def _known(
     views: Sequence[FittedPhoto],
     occluder: Occluder,
     mouth: Inside | None,
-    step: Callable[[int, int], None],
+    region: Indices | None,
+    around: F32,
 ) -> Known:
-    normals = meshes.unit(mesh.normals)
-    seen = seen_weight(mesh.vertices.astype(np.float64), normals, views, occluder) > 0
-    albedo = continued(mesh, field.material(mesh.vertices).albedo.astype(np.float64), seen)
+    """around (V,): ambient occlusion."""
+    cosine = best_cosine(mesh.vertices.astype(np.float64), meshes.unit(mesh.normals), views, occluder)
+    replaced = replaced_share(cosine)
+    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), replaced == 0
+    if well.any():
+        region = np.zeros(len(well), np.int64) if region is None else region
+        albedo = continued(mesh, albedo, well, region_colours(albedo, region, well), LENGTH)
     if mouth is not None:
-        albedo = mouth.in_place_of(albedo, ~seen)
-    return Known(ambient(mesh, occluder, step), (~seen).astype(np.float32), albedo.astype(np.float32))
+        albedo = mouth.in_place_of(albedo, cosine == 0)
+    unseen = (cosine == 0).astype(np.float32)
+    return Known(around, unseen, replaced.astype(np.float32), albedo.astype(np.float32))
 
 
 def _detail(

@@ -14,7 +14,8 @@ from scipy.sparse.linalg import splu
 from pipeline.meshes import F64, Mask, Mesh
 
 COTANGENTS = (1e-3, 1e3)
-STIFF, SOFT = 1e8, 1e-2  # 1/m^2: known vertices keep their values, others follow their neighbours
+STIFF = 1e8  # 1/m^2: known vertices keep their values
+FAR = 10.0  # metres: unknown vertices follow their neighbours only
 
 
 def laplacian(mesh: Mesh) -> tuple[F64, Any]:
@@ -54,14 +55,15 @@ class Smoother:
         return np.asarray(both[:, :-1] / np.maximum(both[:, -1:], 1e-9))
 
 
-def continued(mesh: Mesh, values: F64, known: Mask) -> F64:
-    """(V, C) values (V, C) at known vertices (V,), and the harmonic continuation (K u = 0) at the others.
+def continued(mesh: Mesh, values: F64, known: Mask, target: F64 | None = None, length: float = FAR) -> F64:
+    """(V, C) values (V, C) at known vertices (V,), and their continuation at the others: harmonic (K u = 0), or drawn
+    to target (V, C) over a length in metres, by the screened Poisson equation K u + M (u - target) / length^2 = 0.
 
-    Components without a known vertex take the mean of all known values.
+    Components without a known vertex take the target, by default the mean of all known values.
     """
     if known.all() or not known.any():
         return values
     mass, k = laplacian(mesh)
-    pull = mass * np.where(known, STIFF, SOFT)
-    wanted = np.where(known[:, None], values, values[known].mean(0))
+    pull = mass * np.where(known, STIFF, length**-2)
+    wanted = np.where(known[:, None], values, values[known].mean(0) if target is None else target)
     return np.asarray(splu(csc_array(k + diags_array(pull))).solve(pull[:, None] * wanted))

@@ -15,6 +15,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
 from pipeline.head_artifacts import RegisteredHead
+from pipeline.meshes import Indices, Mesh
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
@@ -99,9 +100,11 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     skin = labels.index("face") if "face" in labels else -1
     eyes = painted_eyes(inputs.template, field, mesh, views, response) if uv.artifact.of_template else None
     mouth = inside_of(inputs.template, mesh) if uv.artifact.of_template else None
+    region = _regions(inputs.masks, mesh)
     baker = Baker(
-        field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth
-    )
+        field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
+        region,
+    )  # fmt: skip
     parts, counted, judged, areas = [], [], [], Counter[int]()
     for number in range(baker.tiles):
         baked = baker.tile(number)
@@ -138,6 +141,22 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     )
 
 
+def _regions(masks: Located[MaskSet], mesh: Mesh) -> Indices | None:
+    """(V,) region of the head of each vertex, by the head template placed on the face's landmarks; None without a
+    face."""
+    from pipeline.faces.landmarks3d import load_landmarks
+    from pipeline.registration.identity_fit import placed_on_face
+    from pipeline.template.load import load_template
+    from stages.bake.unseen import region_of
+
+    found = masks.artifact.landmarks
+    if found is None:
+        return None
+    template = load_template()
+    head = placed_on_face(template, load_landmarks(masks.path(found)))
+    return None if head is None else region_of(mesh.vertices.astype(np.float64), template, head)
+
+
 def unfitted_eyes(head: RegisteredHead, uv: UvMesh) -> tuple[str, ...]:
     """Why eyes of the asset stay the template's own."""
     return (f"eyes stay the template's own: {head.eyes_reason}",) if uv.of_template and head.eyes_reason else ()
@@ -158,4 +177,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=14, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=15, inputs=Inputs, config=Config, output=TextureSet, run=run)

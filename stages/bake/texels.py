@@ -68,12 +68,13 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; albedo (V, 3), where
-    unseen continued from the surroundings. standard: the fitted material of standard shaders; None: it is converted
-    from NeuFace's. eyes: the fitted eyes, if there are any."""
+    """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; replaced (V,): how far
+    the albedo is replaced by albedo (V, 3), because no photo shows it well (unseen.py). standard: the fitted material
+    of standard shaders; None: it is converted from NeuFace's. eyes: the fitted eyes, if there are any."""
 
     ambient: F32
     unseen: F32
+    replaced: F32
     albedo: F32
     standard: Fitted | None = None
     eyes: Eyes | None = None
@@ -131,7 +132,8 @@ def sample(
         around = tangents.dot(known.ambient[corner], hits.weights)
         unseen = tangents.dot(known.unseen[corner], hits.weights)
         nearby = tangents.mixed(known.albedo[corner], hits.weights)
-        albedo = np.asarray(albedo + unseen[:, None] * (nearby - albedo), np.float32)
+        replaced = tangents.dot(known.replaced[corner], hits.weights)
+        albedo = np.asarray(albedo + replaced[:, None] * (nearby - albedo), np.float32)
     physical = base = albedo.clip(*ALBEDO_RANGE)
     if known is not None and known.standard is not None:
         fitted, corner = known.standard, mesh.faces[hits.face]

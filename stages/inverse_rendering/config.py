@@ -146,10 +146,12 @@ class Config(StageConfig):
         description="initial geometry; hull: of the masks; template: the hull, cut by the head template on the face "
         "landmarks; auto: template where the hull hides the face",
     )
-    # trust in the photos
-    robust: bool = Field(
-        default=True,
-        description="weights of pixels and photos, learned with the fit: what only some photos show gets a low weight",
+    unseen_smoothing: Metres = Field(
+        default=0.006,
+        ge=0,
+        le=0.1,
+        description="length over which the surface is smoothed at the end where no photo shows it; 0: it keeps the "
+        "facets of the initial geometry",
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")

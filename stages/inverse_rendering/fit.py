@@ -169,7 +169,9 @@ class Trainer(TrainingLoop):
             self.grid.find_band()
 
     def finish(self) -> None:
-        """Make the SDF a distance again, after the last step."""
+        """Smooth what no photo shows, and make the SDF a distance again, after the last step."""
+        if self.settings.unseen_smoothing > 0:
+            self.grid.smooth_untouched(self.settings.unseen_smoothing)
         self.grid.redistance()
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:

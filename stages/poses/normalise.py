@@ -29,6 +29,7 @@ ONE_SPOT = 0.02  # smallest spread of the cameras relative to their distance: le
 LEVEL = 0.7  # smallest horizontal share of the eyes' distance: a head that lies on its side gives no front
 FACE_OFF = 10.0  # degrees: a given world is unchanged if the face differs less from upright and +Z
 UP_LIMIT = np.cos(np.radians(45.0))
+UPRIGHT = np.cos(np.radians(30.0))  # between a head's up direction and that of the floor under it
 POINTS_WITHIN, POINTS_MARGIN = 0.95, 1.2  # share of the points inside the radius; margin, as a factor
 POINTS_SHRINK = 0.95  # of the frames' radius, lower limit: hair and bald heads have few points, and must stay inside
 POINTS_TAIL, SHIFT_LIMIT = 0.02, 0.12  # share of weight beyond the range; of the radius
@@ -59,8 +60,8 @@ def normalise(
     points: (M, 3) sparse points or None. given: given cameras; the axes and the unit of their world are kept if
     plausible. unit: of a given world; guess: the one that gives the subject a head's size. known: a known scale, used
     instead of both. eyes: in a solved world; the subject then looks along +Z. axes: (3, 3) asset_from_capture of a
-    given world, if known. head: in a given world; the subject is then upright and looks along +Z, unless `axes` is
-    given. guess: a plausible scale where none is known; the unit still counts as
+    given world, if known. head: the subject is then upright and looks along +Z, unless `axes` is given. guess: a
+    plausible scale where none is known; the unit still counts as
     unknown. Raises StageError if the cameras do not look at a common point, or are all in one spot.
     """
     centres, directions = viewing_rays(cameras)
@@ -82,7 +83,13 @@ def normalise(
         if given and axes is not None
         else given_axes(poses, warnings, _in_view(head, centre, radius))
         if given
-        else solved_axes(poses, centre, _floor(points, centres, centre, radius), _facing(eyes, centre, radius))
+        else _solved(
+            poses,
+            centre,
+            _floor(points, centres, centre, radius),
+            _facing(eyes, centre, radius),
+            _in_view(head, centre, radius),
+        )
     )
     if known is not None:
         scale, metric, source = _checked_scale(known, radius, warnings), True, known.source
@@ -231,6 +238,14 @@ def _floor(points: F64 | None, centres: F64, centre: F64, radius: float) -> F64 
     near = points[np.linalg.norm(points - centre, axis=1) < AROUND * radius] - centre
     support = find_support(near, centres - centre, radius, 0)
     return support.normal if support is not None and is_level(support, centres - centre) else None
+
+
+def _solved(poses: F64, centre: F64, floor: F64 | None, left: F64 | None, head: HeadFrame | None) -> F64:
+    """(3, 3) asset_from_capture of a solved world: the head's axes, if its landmarks are known. A plane counts as the
+    floor of a head, of a bust on a table, only if the head is upright on it: else it is the wall behind a person."""
+    if head is not None and (floor is None or floor @ head.axes[1] < UPRIGHT):
+        return head.axes
+    return solved_axes(poses, centre, floor, left if head is None else head.axes[0])
 
 
 def _facing(eyes: Eyes | None, centre: F64, radius: float) -> F64 | None:

@@ -8,6 +8,7 @@ from pipeline.artifacts import CameraSet, Located
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import StageError
+from pipeline.faces.landmarks3d import head_frame
 from stages.poses.config import Config
 from stages.poses.judge import groups, mirrored
 from stages.poses.mirrored import find_mirrored
@@ -45,8 +46,10 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
     faces = find_faces(capture, cameras, context.check)
     eyes = eyes_of([(c, face.pupils) for c, face in faces])
     known = known_scale(capture, cameras, config, eyes, warnings)
+    face = landmarks_of(faces)
+    head = None if face is None else head_frame(face)
     found = normalise(
-        cameras, model.points, given=False, known=known, eyes=eyes, guess=lambda: size_of_head(landmarks_of(faces))
+        cameras, model.points, given=False, known=known, eyes=eyes, head=head, guess=lambda: size_of_head(face)
     )
     warnings += found.warnings
     if missing:

@@ -74,11 +74,11 @@ def test_only_the_eye_s_texels_get_its_surface() -> None:
     hits = raster.rasterise(raster.texel_corners(charts, 64), 64, 0, 64)
     image = np.full((16, 16, 3), 0.33, np.float32)
     of_vertex = np.where(np.arange(2 * count) < count, 0, -1)
-    known = Known(np.ones(2 * count, np.float32), np.zeros(2 * count, np.float32), np.zeros((2 * count, 3), np.float32),
+    known = Known(*(np.full(2 * count, v, np.float32) for v in (1, 0, 0)), np.zeros((2 * count, 3), np.float32),
                   eyes=Eyes(of_vertex, (EYE,), (image,)))  # fmt: skip
     field, frame = AnalyticField(sphere(0.012)), tangents.frames(mesh, charts)
     found = sample(field, mesh, frame, hits, known)
-    plain = sample(field, mesh, frame, hits, Known(known.ambient, known.unseen, known.albedo))
+    plain = sample(field, mesh, frame, hits, Known(known.ambient, known.unseen, known.replaced, known.albedo))
     eye = mesh.faces[hits.face, 0] < count
     assert eye.any() and (~eye).any()
     np.testing.assert_allclose(found.base_color[eye], 0.33, atol=1e-6)

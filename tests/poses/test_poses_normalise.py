@@ -171,6 +171,39 @@ def test_a_face_says_what_is_in_front() -> None:
         np.testing.assert_array_equal(found, without)
 
 
+def test_a_wall_behind_a_person_is_no_floor() -> None:
+    """Photos around a person before a wall, from above and below: the wall's plane has the cameras on one side and
+    nothing behind it. A bust on a table is upright on it, and the table is more exact than the face."""
+    poses = [camera_on_orbit(a, e, 1.0, TARGET) for e in (-30, 5, 40, 65) for a in np.linspace(-75, 75, 9)]
+    random = np.random.default_rng(7)
+    lean = Rotation.from_euler("x", -35, degrees=True).as_matrix()
+    wall = random.uniform(-0.4, 0.4, (2000, 3)) * (1, 1, 0) @ lean.T + TARGET - [0, 0, 0.2]
+    turned = similarity(2.0, Rotation.from_euler("xyz", [40, 160, 70], degrees=True).as_matrix(), np.ones(3))
+    seen = apply(turned, np.concatenate([head_points(1500), wall]))
+    turn = turned[:3, :3] / 2.0
+    for tilt, upright in ((0.0, True), (60.0, True)):
+        looks = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+        at = apply(turned, TARGET[None])[0]
+        head = HeadFrame(looks @ turn.T, at, at, at)
+        found = normalise(cameras(poses, turned), seen, given=False, head=head).capture_from_asset
+        axes = found[:3, :3] / np.cbrt(np.linalg.det(found[:3, :3]))
+        assert (np.abs(axes - head.axes.T).max() < 1e-9) == upright
+
+
+def test_a_floor_under_a_bust_is_more_exact_than_its_face() -> None:
+    poses = [camera_on_orbit(a, e, 1.0, TARGET) for e in (20, 45) for a in range(0, 360, 30)]
+    random = np.random.default_rng(4)
+    table = random.uniform(-0.4, 0.4, (900, 3)) * (1, 0, 1) + TARGET + (0, -0.1, 0)
+    points = np.concatenate([head_points(1500), table[np.linalg.norm(table - TARGET, axis=1) > 0.12]])
+    for tilt, by_floor in ((12.0, True), (50.0, False)):
+        axes = Rotation.from_euler("x", tilt, degrees=True).as_matrix()
+        head = HeadFrame(axes, TARGET, TARGET, TARGET)
+        found = normalise(cameras(poses), points, given=False, head=head).capture_from_asset[:3, 1]
+        up = found / np.linalg.norm(found)
+        assert (up[1] > 0.9999) == by_floor
+        assert (up @ axes[1] > 0.9999) != by_floor
+
+
 def test_points_far_off_do_not_move_the_centre() -> None:
     table = np.random.default_rng(1).uniform(-4, 4, (5000, 3)) + [0, -3, 0]
     clean = normalise(cameras(orbit()), head_points(), given=False)

@@ -1,0 +1,72 @@
+"""Albedo where photos show the surface badly or not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.meshes import Mesh
+from pipeline.registration.identity_fit import PlacedHead
+from pipeline.template.load import load_template
+from stages.bake.smooth import continued
+from stages.bake.unseen import CLEAR, GRAZING, LENGTH, REGIONS, REST, region_colours, region_of, replaced_share
+
+TEMPLATE = load_template()
+
+
+def strip(length: float, step: float) -> Mesh:
+    """A flat strip along x, one step wide."""
+    n = round(length / step) + 1
+    x = np.arange(n) * step
+    vertices = np.concatenate([np.stack([x, np.full(n, y), np.zeros(n)], 1) for y in (0.0, step)]).astype(np.float32)
+    i = np.arange(n - 1)
+    faces = np.concatenate([np.stack([i, i + 1, i + 1 + n], 1), np.stack([i, i + 1 + n, i + n], 1)]).astype(np.int32)
+    return Mesh(vertices, np.tile(np.float32([0, 0, 1]), (2 * n, 1)), faces)
+
+
+def placed(scale: float) -> PlacedHead:
+    world = np.diag([scale, scale, scale, 1.0])
+    return PlacedHead(world, np.zeros(0), TEMPLATE.vertices * scale, np.zeros(0), 0.0)
+
+
+def test_what_photos_show_well_is_kept_and_what_they_do_not_is_replaced() -> None:
+    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]))
+    np.testing.assert_allclose(share, [1, 1, 0.5, 0, 0], atol=1e-12)
+    assert (np.diff(replaced_share(np.linspace(0, 1, 50))) <= 0).all()
+
+
+def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
+    """Black hair seen in front, skin of the face: the back of the head is black; a region that no photo shows has the
+    colour of the whole."""
+    region = np.repeat([0, 3, 1], [100, 300, 50])
+    seen = np.concatenate([np.arange(100) < 30, np.ones(300, bool), np.zeros(50, bool)])
+    albedo = np.where((region == 0)[:, None], 0.02, 0.6) * np.ones((450, 3))
+    albedo[~seen] = 9.0  # means nothing
+    found = region_colours(albedo, region, seen)
+    np.testing.assert_allclose(found[region == 0], 0.02)
+    np.testing.assert_allclose(found[region != 0], 0.6)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_regions_are_those_of_the_placed_template(scale: float) -> None:
+    for name in ("scalp", "neck", "ears"):
+        middle = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions[name]]].mean(1)
+        assert (region_of(middle * scale, TEMPLATE, placed(scale)) == REGIONS.index(name)).all()
+    assert (region_of(np.array([[0.0, -0.5, 0.0]]) * scale, TEMPLATE, placed(scale)) == REST).all()
+
+
+def test_the_seen_rim_fades_over_the_length() -> None:
+    """Source of the expected values: u'' = u / L^2 on a half line, u = exp(-x / L)."""
+    mesh = strip(0.2, 5e-4)
+    x = mesh.vertices[:, 0].astype(np.float64)
+    seen = x <= 0.05
+    u = continued(mesh, np.ones((len(x), 1)), seen, np.zeros((len(x), 1)), LENGTH)[:, 0]
+    np.testing.assert_allclose(u, np.exp(-(x - x[seen].max()).clip(0) / LENGTH), atol=0.01)
+
+
+def test_with_all_or_nothing_seen_the_albedo_is_unchanged() -> None:
+    mesh = strip(0.01, 1e-3)
+    albedo = np.random.default_rng(0).uniform(size=(len(mesh.vertices), 3))
+    for seen in (True, False):
+        whole = np.full(len(albedo), seen)
+        np.testing.assert_array_equal(continued(mesh, albedo, whole, np.zeros_like(albedo), LENGTH), albedo)
