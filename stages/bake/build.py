@@ -29,7 +29,7 @@ from stages.bake.smooth import continued
 from stages.bake.standard_observe import standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
-from stages.bake.unseen import LENGTH, region_colours, replaced_share
+from stages.bake.unseen import CLEAR, LENGTH, region_colours, replaced_share
 
 log = logging.getLogger("neuface.bake")
 
@@ -181,10 +181,10 @@ def _known(
     """around (V,): ambient occlusion."""
     cosine = best_cosine(mesh.vertices.astype(np.float64), meshes.unit(mesh.normals), views, occluder)
     replaced = replaced_share(cosine)
-    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), replaced == 0
+    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), cosine >= CLEAR
     if well.any():
         region = np.zeros(len(well), np.int64) if region is None else region
-        albedo = continued(mesh, albedo, well, region_colours(albedo, region, well), LENGTH)
+        albedo = continued(mesh, albedo, well, region_colours(albedo, region, cosine), LENGTH)
     if mouth is not None:
         albedo = mouth.in_place_of(albedo, cosine == 0)
     unseen = (cosine == 0).astype(np.float32)

@@ -19,6 +19,7 @@ from pipeline.template.model import Template
 
 GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, from the second on it is kept
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
+BEST = 1 / 3  # of the well seen vertices: at the hair's outline the wall shines through
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
 # Metres from the head template within which a vertex belongs to its region: hair is thick; a collar is no neck.
 NEAR = {"scalp": 0.04, "neck": 0.012, "ears": 0.02, "face": 0.02}
@@ -44,12 +45,18 @@ def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
     return np.where(distance <= reach, names[nearest], REST).astype(np.int64)
 
 
-def region_colours(albedo: F64, region: Indices, seen: Mask) -> F64:
-    """(V, 3) for each vertex the median albedo (V, 3) of the well seen (V,) vertices of its region (V,)."""
-    whole = np.median(albedo[seen], axis=0)
-    out = np.broadcast_to(whole, albedo.shape).copy()
+def region_colours(albedo: F64, region: Indices, cosine: F64) -> F64:
+    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): those with the
+    largest cosines (V,), the upper BEST of all that are seen well."""
+    seen = cosine >= CLEAR
+    out = np.broadcast_to(_median(albedo, cosine, seen), albedo.shape).copy()
     for code in np.unique(region):
         mine = region == code
         if (mine & seen).sum() >= max(MIN_SHARE * mine.sum(), 1):
-            out[mine] = np.median(albedo[mine & seen], axis=0)
+            out[mine] = _median(albedo, cosine, mine & seen)
     return out
+
+
+def _median(albedo: F64, cosine: F64, of: Mask) -> F64:
+    best = of & (cosine >= np.quantile(cosine[of], 1 - BEST))
+    return np.asarray(np.median(albedo[best], axis=0), np.float64)

@@ -101,6 +101,11 @@ class Config(StageConfig):
         description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo",
     )
+    skin_light: bool = Field(
+        default=True,
+        description="correct the low bands of the light during the fit so that the albedo of the face does not depend "
+        "on the direction that it faces",
+    )
     albedo_level: Annotated[float, Field(ge=0.01, le=0.95)] | Literal["auto", "fitted"] = Field(
         default=AUTO,
         description="luminance of the face's albedo, linear, if it was measured; auto: from the lobe and the whites of "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -24,6 +24,7 @@ from stages.inverse_rendering.model_selection import (
 )
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import Batch, PixelTable
+from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
@@ -36,17 +37,20 @@ UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
 KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
 SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
+SKIN_AT = (0.4, 0.5)  # shares of the fit at which the light is corrected by the skin: the albedo follows between
 
 
 @dataclass(slots=True)
 class Trainer(TrainingLoop):
     """The state of a running fit. prior: the surface with which refined geometry is compared."""
 
-    counted: ClassVar[tuple[str, ...]] = (*TrainingLoop.counted, "shadows_solved")
+    counted: ClassVar[tuple[str, ...]] = (*TrainingLoop.counted, "shadows_solved", "skin_asked", "skin_tells")
 
     prior: Start | None = None
     level: int = 0
     shadows_solved: int = 0
+    skin_asked: int = 0
+    skin_tells: bool = False  # the light's low bands are those that the skin tells
     validation: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -120,7 +124,21 @@ class Trainer(TrainingLoop):
         if self.shadows_solved < due:
             self.model.solve_shadows()
             self.shadows_solved = due
+        due = sum(self.share() >= s for s in SKIN_AT) if self.settings.skin_light else 0
+        if self.choices is not None and self.skin_asked < due:
+            self.ask_skin(self.choices)
+            self.skin_asked = due
         return rate
+
+    def ask_skin(self, choices: Choices) -> None:
+        """Correct the light by the skin, if photos show a face."""
+        light = choices.facts.get("light", {})
+        explained = light.get("explained") if choices.light_known else None
+        found = correct_light(self.model, self.views, None if explained is None else float(explained), self.device)
+        if found is not None:
+            self.skin_tells = True
+            self.choices = replace(choices, facts=choices.facts | {"light": light | found})
+            self.optimiser.state.pop(next(self.model.light.parameters()), None)
 
     def set_rates(self) -> float:
         """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
@@ -144,7 +162,7 @@ class Trainer(TrainingLoop):
             group["lr"] = group["start"] * decay * warm
             if interlude and not light_known:
                 group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
-            elif light_known and light:
+            elif light and (light_known or self.skin_tells):
                 group["lr"] *= 0.0 if interlude else KNOWN_LIGHT_RATE
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
@@ -153,6 +171,7 @@ class Trainer(TrainingLoop):
         _hashed(self.model).encoding.open_levels(opened)
         # the reflectance adapts to the new light, not the surface
         still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
+        still |= self.skin_tells and p < SKIN_AT[self.skin_asked - 1] + SETTLING
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step
@@ -182,10 +201,12 @@ class Trainer(TrainingLoop):
 
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
-        later, there is no sparse-albedo prior, which would move albedo into the lobe."""
+        later, there is no sparse-albedo prior, which would move albedo into the lobe. If skin tells the light's colour,
+        nothing draws it to white."""
         if self.choices is None:
             return self.settings.changed(f0_excess=0.0)
-        return self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
+        known = self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
+        return known.changed(white=0.0) if self.skin_tells else known
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""

@@ -10,7 +10,8 @@ from pipeline import transforms
 from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
-from stages.inverse_rendering.ray_sampling import F32, PhotoView, factor_for
+from stages.inverse_rendering.albedo_level import FACE
+from stages.inverse_rendering.ray_sampling import F32, Bool, PhotoView, factor_for
 from stages.inverse_rendering.residuals import U8
 
 
@@ -38,6 +39,7 @@ def read_views(
                     np.array(c.distortion),
                     _clipped(capture, photos[i].clipped),
                     asked=_asked(masks, alphas[i].asked),
+                    skin=_skin(masks, alphas[i].labels),
                 ),
                 side,
             )
@@ -65,7 +67,8 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
     clipped = None if view.clipped is None else shrink_whole(view.clipped, f)
     rgb, alpha = shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)
     asked = None if view.asked is None else shrink_whole(view.asked, f)
-    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, K=K)
+    skin = None if view.skin is None else shrink_whole(view.skin.astype(np.float32), f) == 1
+    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, skin=skin, K=K)
 
 
 def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
@@ -74,6 +77,14 @@ def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
 
 def _asked(masks: Located[MaskSet], file: FileRef | None) -> F32 | None:
     return None if file is None else read_alpha(masks.path(file))
+
+
+def _skin(masks: Located[MaskSet], file: FileRef | None) -> Bool | None:
+    """Pixels with the label face, which excludes the eyes."""
+    names = masks.artifact.label_names
+    if file is None or FACE not in names:
+        return None
+    return np.asarray(read_encoded(masks.path(file))[..., 0] == names.index(FACE), np.bool_)
 
 
 def camera_only(c: Camera) -> PhotoView:

@@ -38,7 +38,7 @@ class PhotoView:
     K: (3, 3) pixels; world_from_cam: (4, 4); distortion: k1 k2 p1 p2 k3. clipped: (H, W) clipped share of each pixel,
     None if none is clipped. doubtful: (H, W) where the mask contradicts the other views; these pixels are not fitted;
     None if nowhere. asked: (H, W) in [0, 1], below 1 where the subject is beyond its extent; only 1 is fitted; None if
-    all pixels count.
+    all pixels count. skin: (H, W) bare skin of the face, None if unknown.
     """
 
     index: int
@@ -50,6 +50,7 @@ class PhotoView:
     clipped: F32 | None = None
     doubtful: Bool | None = None
     asked: F32 | None = None
+    skin: Bool | None = None
 
     @property
     def size(self) -> tuple[int, int]:

@@ -42,7 +42,9 @@ def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
     seen = np.concatenate([np.arange(100) < 30, np.ones(300, bool), np.zeros(50, bool)])
     albedo = np.where((region == 0)[:, None], 0.02, 0.6) * np.ones((450, 3))
     albedo[~seen] = 9.0  # means nothing
-    found = region_colours(albedo, region, seen)
+    cosine = np.where(seen, 0.9, 0.0)
+    cosine[:18], albedo[:18] = 0.5, 0.8  # at the outline the wall shines through, on more than half of what is seen
+    found = region_colours(albedo, region, cosine)
     np.testing.assert_allclose(found[region == 0], 0.02)
     np.testing.assert_allclose(found[region != 0], 0.6)
 

@@ -1,0 +1,162 @@
+"""Correction of the light's low bands by what skin tells: its albedo does not depend on the direction that it faces.
+
+    a(x) E(n) = kappa E'(n) + noise,   E' = E + E_0 sum_{lm} b_lm A_l Y_lm(n),   l = 1, 2
+
+for each colour, with a the fitted albedo of the face, E the irradiance of the fitted light, E_0 its mean over the face.
+kappa and kappa b are a linear least-squares problem, divided by E, with Huber weights (lips, brows, stubble). E' is the
+irradiance of the light with coefficients L_lm + E_0 b_lm, whose mean radiance over the sphere stays white. All of it is
+then scaled so that the mean irradiance of the face, and with it the level of its albedo, stays as it was.
+Without this, light of two colours, of a window and a lamp, colours the two sides of the albedo.
+
+Prior: b ~ N(0, std^2). A face is nearly mirror-symmetric, so that light from the side can't be mistaken for its
+colours: the terms odd in x have ODD_STD. The others, from above or from the front, also fit the skin's own pattern:
+their standard deviation is small where the lobe determined the light (light_estimate.py).
+
+Differs: not in the paper, whose losses draw the light to white and the albedo to evenness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from pipeline.fields.appearance import SpatialField
+from pipeline.fields.face import FaceModel
+from pipeline.fields.light import ShLight
+from pipeline.fields.shadowing import fibonacci
+from pipeline.images import shrink_whole
+from pipeline.maths import sh
+from stages.inverse_rendering.albedo_level import lobe_std
+from stages.inverse_rendering.observations import surface_hits
+from stages.inverse_rendering.ray_sampling import PhotoView, Rays, factor_for, image_rays
+
+F64 = npt.NDArray[np.float64]
+Fact = dict[str, str | float | bool]
+
+ORDER = 2  # of the correction: irradiance has hardly more bands
+SIDE = 256  # pixels at which skin is looked up
+POINTS, MIN_POINTS = 12_000, 500
+PATCHES = 50.0  # independent places on a face
+ODD_STD, EVEN_STD = 0.5, 0.3  # standard deviations of b; of the even terms, the largest
+TRUSTED = (
+    3.0  # the even terms' is TRUSTED lobe_std^2: .02 on a head whose lobe explains 45 %, .3 where it explains 25 %
+)
+LEVEL_STD = 10.0  # of kappa: free
+ROUNDS = 15
+HUBER, LEAST_NOISE = 1.5, 1e-3
+DARKEST, DIRECTIONS = 0.1, 512  # of the mean irradiance; directions in which the corrected one is at least as bright
+SEED = 31_337
+
+
+@dataclass(frozen=True, slots=True)
+class SkinLight:
+    """change: (9, 3) to be added to the light's first coefficients. explained: (3,) share of the variance of each
+    colour's albedo over the face that it explains."""
+
+    change: F64
+    explained: F64
+
+
+def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tuple[Tensor, Tensor]:
+    """x and unit n (N, 3) at about POINTS random pixels of skin in all photos; (0, 3) without labels."""
+    generator = np.random.default_rng(SEED)
+    each = max(POINTS // max(len(views), 1), 1)
+    found = [(torch.zeros(0, 3, device=device), torch.zeros(0, 3, device=device))]
+    for view in views:
+        if view.skin is None:
+            continue
+        factor = factor_for(view.size, SIDE)
+        skin = (shrink_whole(view.skin.astype(np.float32), factor) == 1).astype(np.uint8)
+        pixels = np.flatnonzero(cv2.erode(skin, np.ones((3, 3), np.uint8)))
+        chosen = torch.from_numpy(generator.permutation(pixels)[:each])
+        rays = image_rays(view, factor, device)
+        x, n, _ = surface_hits(model.geometry, Rays(rays.o[chosen], rays.d[chosen]), chosen)
+        found.append((x, n))
+    return torch.cat([x for x, _ in found]), torch.cat([n for _, n in found])
+
+
+def correction(albedo: F64, irradiance: F64, n: F64, even_std: float) -> SkinLight | None:
+    """The correction from albedo and irradiance (N, 3) at skin with unit normals n (N, 3), x to the person's left.
+    None if the points are too few or not finite, or have no light."""
+    if len(albedo) < MIN_POINTS or not (np.isfinite(albedo).all() and np.isfinite(irradiance).all()):
+        return None
+    basis, mirrored = irradiance_basis(n), irradiance_basis(n * [-1, 1, 1])
+    odd = np.abs(basis + mirrored).max(0) < np.abs(basis - mirrored).max(0)
+    std = np.where(odd, ODD_STD, even_std)
+    std[0] = LEVEL_STD
+    change, explained = np.zeros((basis.shape[1], 3)), np.zeros(3)
+    for c in range(3):
+        level, mean = float(np.median(albedo[:, c])), float(irradiance[:, c].mean())
+        if level <= 0 or (irradiance[:, c] <= 0).any():
+            return None
+        rows = basis * (mean / irradiance[:, c, None])
+        rows[:, 0] = 1
+        y = albedo[:, c] / level
+        solved = _robust(rows, y, std)
+        residual, spread = y - rows @ solved, float(((y - y.mean()) ** 2).sum())
+        explained[c] = 1 - float((residual**2).sum()) / max(spread, 1e-300)
+        b = solved / max(solved[0], 1e-3)
+        b[0] = 0
+        change[:, c] = mean * b
+    return SkinLight(change, explained)
+
+
+def irradiance_basis(n: F64) -> F64:
+    """A_l Y_lm (N, 9) at unit normals n (N, 3): E = irradiance_basis @ coefficients. [NeuFace eq. 14]"""
+    d = torch.from_numpy(np.asarray(n, np.float64))
+    return np.asarray((sh.sh_basis(d, ORDER) * sh.clamped_cosine(ORDER).to(d)).numpy(), np.float64)
+
+
+def _robust(rows: F64, y: F64, std: F64) -> F64:
+    """Maximum a posteriori of y = rows s + noise with Huber's weights. Noise counts as that of PATCHES observations."""
+    solved: F64 = np.zeros_like(std)
+    residual = y - np.median(y)
+    for _ in range(ROUNDS):
+        noise = max(1.4826 * float(np.median(np.abs(residual))), LEAST_NOISE)
+        weight = PATCHES / len(y) / noise**2 / np.maximum(np.abs(residual) / (HUBER * noise), 1)
+        solved[:] = np.linalg.solve(
+            (rows * weight[:, None]).T @ rows + np.diag(std**-2), (rows * weight[:, None]).T @ y
+        )
+        residual = y - rows @ solved
+    return solved
+
+
+def bright_enough(change: F64, irradiance: F64) -> float:
+    """The largest factor in [0, 1] of a change (N,) of the irradiance (N,) that leaves DARKEST of its mean in every
+    direction, or what there was, if that is less."""
+    floor = np.minimum(irradiance, DARKEST * irradiance.mean())
+    room = np.where(change < 0, (irradiance - floor) / np.maximum(-change, 1e-300), np.inf)
+    return float(np.clip(room.min(), 0, 1))
+
+
+def correct_light(model: FaceModel, views: Sequence[PhotoView], explained: float | None, device: str) -> Fact | None:
+    """Correct the light of a model by the skin in its photos; the facts for the report, None if nothing is changed.
+
+    explained: share of the view-dependent variance that the light's estimate explains, None without an estimate.
+    """
+    light, spatial = model.light, model.spatial
+    if not isinstance(light, ShLight) or not isinstance(spatial, SpatialField) or len(light.coefficients) < 9:
+        return None
+    x, n = skin_points(model, views, device)
+    with torch.no_grad():
+        albedo, irradiance = spatial(x)[0] if len(x) else x, light.irradiance(n)
+        even = EVEN_STD if explained is None else min(TRUSTED * lobe_std(explained) ** 2, EVEN_STD)
+        albedo, irradiance, n = (a.double().cpu() for a in (albedo, irradiance, n))
+        found = correction(albedo.numpy(), irradiance.numpy(), n.numpy(), even)
+        if found is None:
+            return None
+        around = fibonacci(DIRECTIONS)
+        before = light.irradiance(around.to(light.coefficients)).double().cpu().numpy()
+        basis = irradiance_basis(around.double().numpy())
+        share = min(bright_enough(basis @ found.change[:, c], before[:, c]) for c in range(3))
+        light.coefficients[: len(found.change)] += torch.from_numpy(share * found.change).to(light.coefficients)
+        # the level of the face's albedo stays what other sources say (albedo_level.py)
+        now = light.irradiance(n.to(light.coefficients)).mean()
+        light.coefficients.mul_(float(irradiance.mean()) / float(now))
+    return {"skin_explains": round(float(found.explained.mean()), 3)}

@@ -1,0 +1,151 @@
+"""Correction of the light by the skin: oracles are lights whose irradiance is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.meshes import F64
+from stages.inverse_rendering.skin_light import (
+    DARKEST,
+    EVEN_STD,
+    MIN_POINTS,
+    bright_enough,
+    correct_light,
+    correction,
+    irradiance_basis,
+    skin_points,
+)
+from tests.support.small_ball import trainer
+
+WHITE = np.array([3.0, 0, 0, 0, 0, 0, 0, 0, 0])
+WINDOW = np.array([0, 0.3, 0.4, 0.9, 0.2, 0, 0, 0.1, 0.2])  # from the left, above and in front
+KAPPA = np.array([0.5, 0.35, 0.28])
+
+
+def face(count: int = 4000, seed: int = 0) -> F64:
+    """Normals of a face: around +z."""
+    n = np.random.default_rng(seed).normal(size=(count, 3)) + [0, 0, 1.2]
+    n = n[n[:, 2] > 0]
+    return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True))
+
+
+def fitted(n: F64, true: F64, seen: F64) -> tuple[F64, F64]:
+    """Albedo that explains skin of colour KAPPA under the light `true` (9, 3) by the light `seen` (9, 3), and the
+    latter's irradiance."""
+    basis = irradiance_basis(n)
+    return KAPPA * (basis @ true) / (basis @ seen), basis @ seen
+
+
+def of_three(*colours: F64) -> F64:
+    return np.stack(colours, 1)
+
+
+def test_the_basis_gives_the_irradiance_by_quadrature() -> None:
+    """int L(w) max(n . w, 0) dw over a fine grid of the sphere."""
+    z = (np.arange(400) + 0.5) / 200 - 1
+    a = (np.arange(800) + 0.5) * 2 * np.pi / 800
+    s = np.sqrt(1 - z * z)[:, None]
+    w = np.stack([s * np.cos(a), s * np.sin(a), np.broadcast_to(z[:, None], (400, 800))], -1).reshape(-1, 3)
+    clamped = np.array([np.pi, *[2 * np.pi / 3] * 3, *[np.pi / 4] * 5])
+    radiance = irradiance_basis(w) / clamped @ (WHITE + WINDOW)
+    for n in face(5):
+        expected = (radiance * (w @ n).clip(0)).sum() * 4 * np.pi / len(w)
+        assert irradiance_basis(n[None]) @ (WHITE + WINDOW) == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_window_of_another_colour_is_found_from_white_light() -> None:
+    """Warm light from the left and cool light from the right, fitted as white: the albedo's sides have two colours."""
+    n = face()
+    true = of_three(WHITE + 1.2 * WINDOW, WHITE + 0.6 * WINDOW, WHITE - 0.3 * WINDOW)
+    albedo, irradiance = fitted(n, true, of_three(WHITE, WHITE, WHITE))
+    found = correction(albedo, irradiance, n, EVEN_STD)
+    assert found is not None and (found.explained > 0.99).all()
+    np.testing.assert_allclose(found.change[1:], (true - of_three(WHITE, WHITE, WHITE))[1:], atol=0.05)
+    np.testing.assert_array_equal(found.change[0], 0)  # the light stays white on the mean
+    corrected = albedo * irradiance / (irradiance + irradiance_basis(n) @ found.change)
+    assert corrected.std(0).max() < 0.01 * KAPPA.min()
+
+
+def test_a_known_light_is_corrected_from_the_side_only() -> None:
+    """A darker chin is the skin's own, where the lobe tells the light; a darker left side is not."""
+    n = face()
+    side, below = np.zeros(9), np.zeros(9)
+    side[3], below[1] = 0.6, 0.6
+    assert irradiance_basis(np.array([[1.0, 0, 0]])) @ side > 0.5 < irradiance_basis(np.array([[0, 1.0, 0]])) @ below
+    for extra, found_share in ((side, 1.0), (below, 0.0)):
+        true = of_three(*[WHITE + extra] * 3)
+        found = correction(*fitted(n, true, of_three(WHITE, WHITE, WHITE)), n, 1e-3)
+        assert found is not None
+        wanted = found_share * (true - of_three(WHITE, WHITE, WHITE))
+        np.testing.assert_allclose(irradiance_basis(n) @ (found.change - wanted), 0, atol=0.1)
+
+
+def test_lips_and_brows_do_not_turn_the_light() -> None:
+    n = face()
+    albedo, irradiance = fitted(n, of_three(WHITE, WHITE, WHITE), of_three(WHITE, WHITE, WHITE))
+    lips = (np.abs(n[:, 0] - 0.3) < 0.1) & (n[:, 1] < 0)
+    albedo[lips] *= [1.0, 0.4, 0.4]
+    found = correction(albedo, irradiance, n, EVEN_STD)
+    assert 0.01 < lips.mean() < 0.1 and found is not None and np.abs(found.change).max() < 0.05
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_the_change_scales_with_the_light(scale: float) -> None:
+    n = face()
+    white, true = of_three(WHITE, WHITE, WHITE), of_three(WHITE + WINDOW, WHITE, WHITE)
+    one = correction(*fitted(n, true, white), n, EVEN_STD)
+    many = correction(*fitted(n, scale * true, scale * white), n, EVEN_STD)
+    assert one is not None and many is not None
+    np.testing.assert_allclose(many.change, scale * one.change, rtol=1e-6, atol=1e-9 * scale)
+
+
+def test_nothing_is_corrected_without_skin_light_or_finite_values() -> None:
+    n = face()
+    albedo, irradiance = fitted(n, of_three(WHITE, WHITE, WHITE), of_three(WHITE, WHITE, WHITE))
+    few = MIN_POINTS - 1
+    assert correction(albedo[:few], irradiance[:few], n[:few], EVEN_STD) is None
+    assert correction(albedo, 0 * irradiance, n, EVEN_STD) is None
+    assert correction(0 * albedo, irradiance, n, EVEN_STD) is None
+    assert correction(albedo * np.where(np.arange(len(n))[:, None] == 7, np.nan, 1), irradiance, n, EVEN_STD) is None
+
+
+def test_the_light_is_nowhere_made_dark() -> None:
+    irradiance = np.array([1.0, 1.0, 1.0, 0.05])
+    assert bright_enough(np.array([0.5, 0.0, -0.1, 0.0]), irradiance) == 1
+    share = bright_enough(np.array([0.5, 0.0, -2.0, 0.0]), irradiance)
+    assert 1 - 2 * share == pytest.approx(DARKEST * irradiance.mean())
+    assert bright_enough(np.array([0.0, 0.0, 0.0, -0.1]), irradiance) == 0
+
+
+def test_the_fit_asks_the_skin_of_its_photos() -> None:
+    """The ball's colour is a (0.7 + 0.3 n_y): with an even albedo the light comes from above. Photos without skin leave
+    the light as it is. The level of the ball's albedo stays."""
+    fit = trainer()
+    model, light = fit.model, fit.model.light
+    before = light().detach().clone()
+    assert len(skin_points(model, fit.views, "cpu")[0]) == 0
+    assert correct_light(model, fit.views, None, "cpu") is None
+    assert torch.equal(light().detach(), before)
+    fit.views = [replace(v, skin=v.alpha > 0.99) for v in fit.views]
+    x, n = skin_points(model, fit.views, "cpu")
+    assert len(x) > MIN_POINTS and torch.allclose(n.norm(dim=-1), torch.ones(len(n)), atol=1e-4)
+    with torch.no_grad():  # an albedo with the shading that the light lacks
+        light.coefficients[3:] = 0
+    model.spatial.forward = (
+        lambda p: (  # type: ignore[method-assign]
+            (0.5 * (0.7 + 0.3 * torch.nn.functional.normalize(p, dim=-1)[:, 1:2])).expand(-1, 3),
+            None,
+            None,
+            None,
+        )
+    )
+    lit = light.irradiance(n).detach().mean()
+    facts = correct_light(model, fit.views, None, "cpu")
+    assert torch.allclose(light.irradiance(n).detach().mean(), lit, rtol=1e-3)
+    found = light().detach().mean(-1)
+    assert facts is not None and float(facts["skin_explains"]) > 0.9
+    assert float(found[1] / found[0]) == pytest.approx(0.371, abs=0.05)
