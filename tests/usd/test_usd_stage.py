@@ -52,6 +52,7 @@ def test_files_are_those_of_the_interface(exported) -> None:
         "asset/head.obj",
         "asset/head.mtl",
         "asset/thumbnails/default.png",
+        "asset/open_in_blender.py",
     } <= listed
     on_disk = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
     views = {f.path for v in asset.views for f in (v.exr, v.png)}

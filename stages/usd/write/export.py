@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from stages.usd.write.shading import Look
 from stages.usd.write.variants import HIGH_FILE, SCAN
 
 NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
+BLENDER = "open_in_blender.py"  # a script for the user, copied as it lies beside this module
 THUMBNAIL = "./thumbnails/default.png"  # rendered by the stage after the export
 
 
@@ -104,7 +106,8 @@ def export(
     write_exr(folder / "environment.exr", dome)
     figures = maps.figures | environment_figures(light, dome)
     (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
-    written += [folder / f for f in (*layers, "environment.exr", "light.json")]
+    shutil.copyfile(Path(__file__).with_name(BLENDER), folder / BLENDER)
+    written += [folder / f for f in (*layers, "environment.exr", "light.json", BLENDER)]
     check()
     light_mesh, light_rig, light_eyes = replace(mesh, paired=False), None, None  # viewers want triangles
     if head is not None:
