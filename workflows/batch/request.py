@@ -39,6 +39,7 @@ class BatchRequest(BaseModel):
     stage_limit: float | None = Field(6 * 3600.0, gt=0, description="time that one stage may take")
     force: bool = Field(False, description="go on to the fit although the photos, cameras or masks are unusable")
     strict: bool = Field(False, description="results that are only usable also count as refused: exit code 3")
+    pack: Literal["zip"] | None = Field(None, description="also write a zip of each asset, as in neuface run")
     attempts: int = Field(3, ge=1, le=20, description="attempts at a capture whose failure may pass")
     deployment: str = Field(DEPLOYMENT, description="flow/name of the deployment that runs one capture")
     chunk: int = Field(50, ge=1, le=200, description="runs on the server at a time that are not finished")
@@ -76,6 +77,7 @@ class BatchRequest(BaseModel):
             "stage_limit",
             "force",
             "strict",
+            "pack",
         }
         shared = self.model_dump(include=of_all)
         return RunRequest(

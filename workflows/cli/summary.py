@@ -45,6 +45,8 @@ def summary(record: Mapping[str, Any], out: Path, truth: Sequence[str] = ()) -> 
 def paths(record: Mapping[str, Any], out: Path) -> dict[str, Path]:
     """Where the asset, the report and the record of the run are; what was not made is left out."""
     found = {"asset": out / record["asset"]} if "asset" in record else {}
+    if "pack" in record:
+        found["zip"] = out / record["pack"]
     if PAGE in _published(record, out):
         found["report"] = out / PAGE
     return {**found, "run": out / "run.json"}

@@ -14,6 +14,7 @@ from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Done, versions
 from pipeline.errors import Cancelled, stage_error_from_os_error
 from workflows.run.owned import write_owned
+from workflows.run.pack import packed, write_pack
 from workflows.run.plan import Plan
 from workflows.run.published import is_record, note_published, published
 from workflows.run.replace import Replacement, drop, prepare, put, tidy
@@ -31,7 +32,8 @@ def publish(
     notify: Callable[[str], None] = lambda text: None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Copy asset/, report/ and reflectance/ to `plan.out` and write run.json beside them. Returns what run.json holds.
+    """Copy asset/, report/ and reflectance/ to `plan.out` and write run.json beside them, and the asset's zip if the
+    request has `pack`. Returns what run.json holds.
 
     All folders are complete before any replaces the one before it. Files of the user's own in them stay. One whose
     name is needed, or that was published and then edited, is renamed; `notify` is called, and run.json names it under
@@ -44,7 +46,8 @@ def publish(
     stages = {d.stage: d for d in done}
     record = run_record(plan, stages)
     try:
-        moved = _replace_folders(plan.out, stages, record["timing"], stopped)
+        moved = _replace_folders(plan, stages, record["timing"], stopped)
+        moved |= _pack(plan, stages, record, notify)
         if moved:
             record["moved_aside"] = moved
         aside = write_owned(plan.out, "run.json", json.dumps(record, indent=1), is_record)
@@ -56,16 +59,33 @@ def publish(
     return record
 
 
+def _pack(
+    plan: Plan, stages: Mapping[str, Done[Any]], record: dict[str, Any], notify: Callable[[str], None]
+) -> dict[str, str]:
+    """The zip, where it is asked for and there is an asset. Returns the user's file that had to move."""
+    if plan.request.pack is None:
+        return {}
+    if "usd" not in stages:
+        notify("no zip: this run ended before the asset")
+        return {}
+    name = stages["usd"].located.artifact.name
+    aside = write_pack(plan.out, name, asset_files(stages))
+    record["pack"] = f"{name}.zip"
+    return {record["pack"]: aside} if aside else {}
+
+
 def _replace_folders(
-    out: Path, stages: Mapping[str, Done[Any]], timing: Mapping[str, float], stopped: Callable[[], bool]
+    plan: Plan, stages: Mapping[str, Done[Any]], timing: Mapping[str, float], stopped: Callable[[], bool]
 ) -> dict[str, str]:
     """asset/, report/ and reflectance/, whichever the stages made. Returns the user's files that had to move: old
     path -> new."""
-    known, moved = published(out), dict[str, str]()
-    wanted = {"asset": asset_files(stages), "report": report_files(stages), "reflectance": reflectance_files(stages)}
+    out, known, moved = plan.out, published(plan.out), dict[str, str]()
+    assets = asset_files(stages)
+    wanted = {"asset": assets, "report": report_files(stages), "reflectance": reflectance_files(stages)}
+    zipped = [assets[p] for p in packed(assets)] if plan.request.pack else []
     for name in wanted:
         moved |= tidy(out, name, known)
-    check_room_for_copies(out, (p for copies in wanted.values() for p in copies.values()))
+    check_room_for_copies(out, (*(p for copies in wanted.values() for p in copies.values()), *zipped))
     made: list[Replacement] = []
     try:
         for name, copies in wanted.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -50,6 +50,9 @@ class RunRequest(BaseModel):
     )
     force: bool = Field(
         default=False, description="go on to the fit although the photos, cameras or masks are unusable"
+    )
+    pack: Literal["zip"] | None = Field(
+        default=None, description="also write OUT/NAME.zip with what other programs import of the asset"
     )
     strict: bool = Field(default=False, description="a result that is only usable also counts as refused: exit code 3")
 

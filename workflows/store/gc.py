@@ -23,7 +23,7 @@ from workflows.store.roots import Root, forget_root, roots
 
 DAY = 86400.0
 _KEY = re.compile(r"([0-9a-f]{64})(\.scratch|\.partial-[0-9a-f]+)?")
-_HALF = re.compile(r"\..+\.(partial|swap|old)-[0-9a-f]{8}|\.probe-[0-9a-f]{8}")  # what killed runs left in OUT
+_HALF = re.compile(r"\..+\.(partial|swap|old)-[0-9a-f]{8}(\.\w+)?|\.probe-[0-9a-f]{8}")  # what killed runs left in OUT
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def _tables(folder: Path) -> tuple[set[Path], set[Path]]:
 def _results(out: Path) -> tuple[set[Path], set[Path]]:
     """What runs left in a folder of results, and what is the user's there: foreign files, and edited ones."""
     known = published(out)
-    ours = {out / n for n in ("run.json", "truth.json") if is_ours(out / n, known.get(n, ()))}
+    ours = {out / n for n in known if "/" not in n and is_ours(out / n, known[n])}  # run.json, truth.json, the zip
     ours |= {p for p in (out / LIST, out / "run.json") if is_record(p) or (p.name == LIST and p.is_file())}
     ours |= {p for p in out.iterdir() if _HALF.fullmatch(p.name)}
     folders = (*FOLDERS, TRUTH)
