@@ -17,8 +17,12 @@ _MARK = b"ICC_PROFILE\0"
 
 def profile_name(data: bytes) -> str | None:
     """The profile's description; None if the JPEG or PNG file has none, or a damaged one."""
-    block = _profile(data)
-    if block is None or len(block) < HEADER + 4:
+    return description_of(_profile(data) or b"")
+
+
+def description_of(block: bytes) -> str | None:
+    """The description in an ICC profile's bytes; None if it has none, or is damaged."""
+    if len(block) < HEADER + 4:
         return None
     count = struct.unpack_from(">I", block, HEADER)[0]
     for i in range(min(count, 100)):

@@ -1,7 +1,7 @@
 """Checks one photo or mask and copies it.
 
-A photo's bytes are copied unchanged. Only a photo whose EXIF orientation is not 1 is rotated upright and written as
-PNG, because later stages read the stored pixels and ignore EXIF.
+A photo's bytes are copied unchanged. Only these are written as PNG: a photo whose EXIF orientation is not 1 is rotated
+upright, because later stages read the stored pixels and ignore EXIF; and HEIC and raw files are developed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, refuse_bombs
 from pipeline.sharpness import detail
 from stages.capture.colour_checker import Patches, find_chart
+from stages.capture.develop import Developed, develop
 from stages.capture.exif import Exif, read_exif
 from stages.capture.icc_profile import profile_name
 from stages.capture.integrity import fault_of
@@ -60,7 +61,7 @@ def turn_upright(image: Image, orientation: int) -> Image:
 def import_photo(
     path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False
 ) -> ImportedPhoto:
-    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated).
+    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated or developed).
 
     chart: search for a colour checker.
     declared: (width, height) from the camera's description, or None. If the stored pixels have this size, the given
@@ -68,8 +69,10 @@ def import_photo(
     Raises StageError if the file is incomplete, too small or large, not finite, or not of the declared size.
     """
     data = _read(path, ref)
-    image = _decode(path, data)
-    exif = read_exif(data)
+    developed = _developed(path, data)
+    image = _decode(path, data) if developed is None else developed.image
+    exif = read_exif(data) if developed is None else developed.exif
+    profile = profile_name(data) if developed is None else developed.profile
     h, w = image.shape[:2]
     upright = (h, w) if exif.orientation >= 5 else (w, h)
     turn = exif.orientation != 1 and (declared is None or (w, h) != declared == upright)
@@ -91,15 +94,15 @@ def import_photo(
             remedy="use the original photo, not a preview",
         )
     target.parent.mkdir(parents=True, exist_ok=True)
-    if turn:
+    if turn or developed is not None:
         target = target.with_suffix(".png")
-        image = turn_upright(image, exif.orientation)
+        image = turn_upright(image, exif.orientation) if turn else image
         _write_png(target, image)
     else:
         target.write_bytes(data)
     grey = small_grey(image)
     blank, ends = is_blank(grey), clipped(image)
-    return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile_name(data),
+    return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile,
                     _write_clipped(ends, target), mean_light(grey), find_chart(image) if chart else None,
                     None if blank else measure_photo(image, grey, ends))  # fmt: skip
 
@@ -154,7 +157,12 @@ def _read(path: Path, ref: FileRef) -> bytes:
     return path.read_bytes()
 
 
-def _decode(path: Path, data: bytes) -> Image:
+def _developed(path: Path, data: bytes) -> Developed | None:
+    _refuse_empty(path, data)
+    return develop(path, data)
+
+
+def _refuse_empty(path: Path, data: bytes) -> None:
     if not data:
         raise StageError(
             "the image is empty",
@@ -163,6 +171,10 @@ def _decode(path: Path, data: bytes) -> Image:
             limit="a complete image file",
             remedy="copy the file again from the camera, or take it out of the folder",
         )
+
+
+def _decode(path: Path, data: bytes) -> Image:
+    _refuse_empty(path, data)
     refuse_bombs(path, len(data))  # before `fault_of`, which decodes JPEG files
     fault = fault_of(data)
     if fault is not None:

@@ -16,7 +16,14 @@ from pipeline.capture_artifacts import CaptureKind, CaptureSource
 from pipeline.errors import StageError
 from pipeline.transforms import rows
 from stages.capture.readers import describe, facescape, find_reader, idr, transforms
-from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key
+from stages.capture.readers.described import (
+    HEIF_SUFFIXES,
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    Declared,
+    Described,
+    natural_key,
+)
 from stages.capture.readers.facescape_scale import metres_from_world
 from stages.capture.readers.olat import Pictures, pictures_of
 from stages.capture.readers.values import printable
@@ -54,7 +61,7 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
     found = find_reader(folder)
     if found is not None:
         return _described(folder, *found)
-    photos = _pictures(folder)
+    photos = _photos(folder)
     videos = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
     if not photos and len(videos) == 1:
         return _video(videos[0])
@@ -151,9 +158,19 @@ def _once(views: Sequence[Declared]) -> None:
             of[mark] = view.name
 
 
-def _pictures(folder: Path) -> list[Path]:
-    """Photos directly in the folder, in natural order. Raises StageError if one of them is no file."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES and not p.name.startswith(".")]
+def _photos(folder: Path) -> list[Path]:
+    """Photos directly in the folder, in natural order. Of files with one stem only the first kind is taken: a camera
+    writes a JPEG beside its raw file, and a phone an HEIC."""
+    found: list[Path] = []
+    for suffixes in (PHOTO_SUFFIXES, HEIF_SUFFIXES, RAW_SUFFIXES):
+        taken = {p.stem for p in found}
+        found += [p for p in _pictures(folder, suffixes) if p.stem not in taken]
+    return sorted(found, key=lambda p: natural_key(p.name))
+
+
+def _pictures(folder: Path, suffixes: Sequence[str] = PHOTO_SUFFIXES) -> list[Path]:
+    """Pictures directly in the folder, in natural order. Raises StageError if one of them is no file."""
+    found = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     for path in found:
         _is_readable_file(path)
     return sorted((p for p in found if p.is_file()), key=lambda p: natural_key(p.name))
@@ -185,7 +202,8 @@ def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: 
         )
     owners = {name: p for p in photos for name in (p.stem, p.name)}
     found: dict[Path, Path] = {}
-    for mask in _pictures(present[0]) if present else []:
+    listed = _photos if folders == PLATE_FOLDERS else _pictures  # a clean plate is a photo, a mask is drawn
+    for mask in listed(present[0]) if present else []:
         owner = owners.get(mask.stem)
         if owner is not None and owner in found:
             raise StageError(
@@ -219,7 +237,7 @@ def _none_named(folder: Path, description: Path, described: Described) -> StageE
 
 def _no_photos(folder: Path, videos: Sequence[Path]) -> StageError:
     foreign = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in FOREIGN_SUFFIXES)
-    deeper = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _pictures(p))
+    deeper = sorted(p.name for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".") and _photos(p))
     value, remedy = "none", "put the photos directly into this folder"
     if foreign:
         value, remedy = f"{len(foreign)} files such as {foreign[0]}", "convert them to JPEG, PNG, TIFF or EXR"
@@ -231,6 +249,6 @@ def _no_photos(folder: Path, videos: Sequence[Path]) -> StageError:
         "no photos in the capture folder",
         where=folder,
         value=value,
-        limit=f"at least {MIN_PHOTOS} of " + " ".join(s[1:] for s in PHOTO_SUFFIXES),
+        limit=f"at least {MIN_PHOTOS} of " + " ".join(s[1:] for s in (*PHOTO_SUFFIXES, *HEIF_SUFFIXES, *RAW_SUFFIXES)),
         remedy=remedy,
     )

@@ -89,7 +89,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     warnings = (
         selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
     )
-    warnings += made.partly_masked(views)
+    warnings += made.partly_masked(views) + made.mixed_kinds(candidates)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world, stage=stage,
                    left_out=tuple(selection.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip

@@ -11,6 +11,7 @@ from pipeline.capture_artifacts import CaptureSource, CaptureView, ColourChart
 from pipeline.contract import Context
 from stages.capture.candidates import Candidate
 from stages.capture.colour_correction import correct_colours, read_charts
+from stages.capture.develop import is_raw
 from stages.capture.exif import metres_from
 from stages.capture.icc_profile import is_srgb
 from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
@@ -137,6 +138,15 @@ def not_read(names: Sequence[str]) -> list[str]:
     some = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
     return [f"{len(names)} pictures are not used, because their format is not supported: {some}; convert them to JPEG, "
             "PNG, TIFF or EXR, or move them out of the folder"]  # fmt: skip
+
+
+def mixed_kinds(candidates: Sequence[Candidate]) -> list[str]:
+    """A warning if some photos are developed from raw files and others are not."""
+    raw = [c.name for c in candidates if is_raw(Path(c.name))]
+    if not 0 < len(raw) < len(candidates):
+        return []
+    return [f"{len(raw)} of {len(candidates)} photos are raw, such as {raw[0]}; the camera's own pictures have another "
+            "tone curve; give all photos as raw or none"]  # fmt: skip
 
 
 def partly_masked(views: list[CaptureView]) -> list[str]:

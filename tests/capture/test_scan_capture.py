@@ -80,9 +80,9 @@ def test_no_photos(tmp_path: Path) -> None:
 
 
 def test_photos_of_other_kinds_or_one_folder_down_are_named(tmp_path: Path) -> None:
-    (tmp_path / "a.HEIC").write_bytes(b"x")
-    assert "a.HEIC" in refused(tmp_path).value and "convert" in refused(tmp_path).remedy
-    (tmp_path / "a.HEIC").unlink()
+    (tmp_path / "a.WEBP").write_bytes(b"x")
+    assert "a.WEBP" in refused(tmp_path).value and "convert" in refused(tmp_path).remedy
+    (tmp_path / "a.WEBP").unlink()
     photos(tmp_path / "images", "a.jpg")
     assert "images/" in refused(tmp_path).remedy
 

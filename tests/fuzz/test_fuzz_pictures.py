@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 
 from pipeline.artifacts import FileRef
 from pipeline.errors import StageError
@@ -20,7 +20,8 @@ from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
 from stages.capture.photometry import exposures
 from stages.capture.readers.sizes import picture_size
 from tests.capture.test_capture_files import exif_jpeg, place_block
-from tests.support.fuzzing import bounded, fuzzed
+from tests.support.dng import write_dng
+from tests.support.fuzzing import CASES, bounded, fuzzed
 from tests.support.mutations import damaged, damages
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (70, 80, 3), np.uint8)
@@ -59,6 +60,22 @@ def test_damaged_photos(whole: dict[str, bytes], place: Path, suffix: str, how: 
     with bounded():
         values = read_linear(path)
         assert values.dtype == np.float32 and values.shape[2] == 3
+    with bounded():
+        found = import_photo(path, FileRef.of(place, path), place / "photos" / path.name, None)
+        assert min(found.width, found.height) >= 64 and np.isfinite(found.light)
+
+
+@pytest.mark.slow  # a process for each file
+@pytest.mark.parametrize("suffix", [".heic", ".dng"])
+@given(how=damages)
+@settings(fuzzed, max_examples=max(1, CASES // 10))
+def test_damaged_heic_and_raw_photos(place: Path, suffix: str, how: list) -> None:
+    path = place / f"photo{suffix}"
+    if suffix == ".dng":
+        write_dng(path, np.repeat(PICTURE[:, :, :1] / 300, 3, 2))
+    else:
+        path.write_bytes((Path(__file__).parents[1] / "capture/heic/plain.heic").read_bytes())
+    path.write_bytes(damaged(path.read_bytes(), how, in_head(how)))
     with bounded():
         found = import_photo(path, FileRef.of(place, path), place / "photos" / path.name, None)
         assert min(found.width, found.height) >= 64 and np.isfinite(found.light)

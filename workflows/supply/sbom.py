@@ -151,6 +151,8 @@ def page(pins: Sequence[Pinned]) -> str:
         "(`out/sbom.cdx.json`, CycloneDX 1.5). Made by `python -m workflows.supply.sbom --write`.",
         "",
         "pymeshlab is GPL-3: README, Licences, says what that means.",
+        "Wheels may hold libraries under other terms: pi-heif libheif and libde265 (LGPL-3), rawpy LibRaw (LGPL-2.1 or",
+        "CDDL-1.0), as shared libraries that can be exchanged.",
         "",
         "## Shipped in this repository",
         "| part | version | licence | files |",

@@ -18,6 +18,7 @@ from pipeline.transforms import F64, distort
 from stages.capture.readers.values import DIGITS, LONGEST_NAME, LONGEST_PATH, fault, printable
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".exr")
+HEIF_SUFFIXES, RAW_SUFFIXES = (".heic", ".heif", ".hif"), (".dng", ".cr2", ".nef", ".arw")  # photos without cameras
 PHOTO_FOLDERS = ("", "images", "image", "input", "photos", "rgb")
 LENS_LIMIT = 0.25  # pixels, largest error of the five-term approximation of a lens
 MAX_BYTES = 64_000_000  # of a cameras' file: cameras of about ten thousand photos; a larger file is something else
