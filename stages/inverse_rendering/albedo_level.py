@@ -13,7 +13,8 @@ eyes     g = SCLERA / (luminance of the whites of the eyes). Sclera is nearly th
          Left out for closed or hidden eyes.
 
 SCLERA is the value that the fit gives to open eyes if its level is right: 0.40 and 0.37 for two rendered persons with
-known albedo. It is below the sclera's own reflectance, because lids shade the eye by more than the fit models.
+known albedo; 0.52 and 0.51 if the light was corrected by their skin (skin_light.py), which changes the level that is
+right for the face. It is below the sclera's own reflectance, because lids shade the eye by more than the fit models.
 
 Differs: not in the paper, whose level follows from the white-light loss and the initial values.
 """
@@ -42,8 +43,9 @@ F64 = npt.NDArray[np.float64]
 Fact = dict[str, str | float | bool]
 
 FACE, EYES = "face", "eyes"  # names of the labels
-LOBE_STD, START_STD, EYES_STD = 0.06, 0.6, 0.2  # of ln g
-SCLERA = 0.39
+LOBE_STD, START_STD = 0.06, 0.6  # of ln g
+SCLERA, EYES_STD = 0.39, 0.2  # the latter of ln g
+CORRECTED_SCLERA, CORRECTED_STD = 0.51, 0.12  # the same if the light was corrected by the skin
 MIN_PIXELS = 200  # of the eyes, over all photos
 MOST_PIXELS = 20_000
 BRIGHTEST = 0.95  # quantile of the luminance between the lids: sclera
@@ -90,7 +92,8 @@ def set_level(
         return {"gain": 1.0, "why": "setting"}
     seen = labelled_albedos(model, table, views, labels, names)
     explained = light.get("explained")
-    found = decide(seen, None if wanted == AUTO else float(wanted), None if explained is None else float(explained))
+    given, known = (None if v is None or v == AUTO else float(v) for v in (wanted, explained))
+    found = decide(seen, given, known, corrected="skin_explains" in light)
     apply_gain(model.spatial, model.light, found.gain)
     return found.facts
 
@@ -147,11 +150,14 @@ def _array(colour: Tensor) -> F64:
     return np.asarray(colour.cpu().numpy(), np.float64)
 
 
-def decide(seen: LabelledAlbedos, wanted: float | None, explained: float | None) -> AlbedoLevel:
+def decide(
+    seen: LabelledAlbedos, wanted: float | None, explained: float | None, *, corrected: bool = False
+) -> AlbedoLevel:
     """The level from all sources.
 
     wanted: luminance of the face's albedo that was measured, None to decide. explained: share of the view-dependent
-    variance that the light's estimate explains, in (0, 1), None without an estimate.
+    variance that the light's estimate explains, in (0, 1), None without an estimate. corrected: whether the light was
+    corrected by the skin.
     """
     skin = float(np.median(seen.face @ LUMA)) if len(seen.face) >= MIN_PIXELS else None
     if wanted is not None:
@@ -163,7 +169,8 @@ def decide(seen: LabelledAlbedos, wanted: float | None, explained: float | None)
     total, weight, facts = 0.0, std**-2, dict[str, str | float | bool]()
     white = sclera(seen)
     if white is not None:
-        total, weight = EYES_STD**-2 * math.log(SCLERA / white), weight + EYES_STD**-2
+        usual, deviation = (CORRECTED_SCLERA, CORRECTED_STD) if corrected else (SCLERA, EYES_STD)
+        total, weight = deviation**-2 * math.log(usual / white), weight + deviation**-2
         facts["whites_of_the_eyes"] = round(white, 4)
         source += " and eyes"
     gain = math.exp(total / weight)

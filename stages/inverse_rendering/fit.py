@@ -37,7 +37,8 @@ UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
 KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
 SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
-SKIN_AT = (0.4, 0.5)  # shares of the fit at which the light is corrected by the skin: the albedo follows between
+SKIN_AT = 0.8  # share of the fit at which the light is corrected by the skin: the albedo is that of the light before
+SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
 
 
 @dataclass(slots=True)
@@ -49,7 +50,7 @@ class Trainer(TrainingLoop):
     prior: Start | None = None
     level: int = 0
     shadows_solved: int = 0
-    skin_asked: int = 0
+    skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     validation: tuple[int, ...] = field(init=False)
 
@@ -124,21 +125,23 @@ class Trainer(TrainingLoop):
         if self.shadows_solved < due:
             self.model.solve_shadows()
             self.shadows_solved = due
-        due = sum(self.share() >= s for s in SKIN_AT) if self.settings.skin_light else 0
-        if self.choices is not None and self.skin_asked < due:
+        if self.settings.skin_light and self.choices is not None and not self.skin_asked and self.share() >= SKIN_AT:
             self.ask_skin(self.choices)
-            self.skin_asked = due
+            self.skin_asked = True
         return rate
 
     def ask_skin(self, choices: Choices) -> None:
         """Correct the light by the skin, if photos show a face."""
         light = choices.facts.get("light", {})
         explained = light.get("explained") if choices.light_known else None
-        found = correct_light(self.model, self.views, None if explained is None else float(explained), self.device)
+        rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
+        known = None if explained is None else float(explained)
+        found = correct_light(self.model, self.views, rays, known, self.device)
         if found is not None:
             self.skin_tells = True
             self.choices = replace(choices, facts=choices.facts | {"light": light | found})
-            self.optimiser.state.pop(next(self.model.light.parameters()), None)
+            for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
+                self.optimiser.state.pop(parameter, None)
 
     def set_rates(self) -> float:
         """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
@@ -171,7 +174,7 @@ class Trainer(TrainingLoop):
         _hashed(self.model).encoding.open_levels(opened)
         # the reflectance adapts to the new light, not the surface
         still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
-        still |= self.skin_tells and p < SKIN_AT[self.skin_asked - 1] + SETTLING
+        still |= self.skin_tells and p < SKIN_AT + SETTLING
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
     # ---------------------------------------------------------------- one step

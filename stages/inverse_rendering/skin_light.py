@@ -35,6 +35,7 @@ from pipeline.maths import sh
 from stages.inverse_rendering.albedo_level import lobe_std
 from stages.inverse_rendering.observations import surface_hits
 from stages.inverse_rendering.ray_sampling import PhotoView, Rays, factor_for, image_rays
+from stages.inverse_rendering.relight_model import change_light
 
 F64 = npt.NDArray[np.float64]
 Fact = dict[str, str | float | bool]
@@ -135,28 +136,39 @@ def bright_enough(change: F64, irradiance: F64) -> float:
     return float(np.clip(room.min(), 0, 1))
 
 
-def correct_light(model: FaceModel, views: Sequence[PhotoView], explained: float | None, device: str) -> Fact | None:
-    """Correct the light of a model by the skin in its photos; the facts for the report, None if nothing is changed.
+def correct_light(
+    model: FaceModel, views: Sequence[PhotoView], rays: Rays, explained: float | None, device: str
+) -> Fact | None:
+    """Correct the light of a model by the skin in its photos, and its reflectance so that the photos stay as they are;
+    the facts for the report, None if nothing is changed.
 
-    explained: share of the view-dependent variance that the light's estimate explains, None without an estimate.
+    rays: towards the whole subject. explained: share of the view-dependent variance that the light's estimate explains,
+    None without an estimate.
     """
     light, spatial = model.light, model.spatial
     if not isinstance(light, ShLight) or not isinstance(spatial, SpatialField) or len(light.coefficients) < 9:
         return None
-    x, n = skin_points(model, views, device)
+    skin, n = skin_points(model, views, device)
     with torch.no_grad():
-        albedo, irradiance = spatial(x)[0] if len(x) else x, light.irradiance(n)
+        albedo = spatial(skin)[0] if len(skin) else skin
+        irradiance = light.irradiance(n)
         even = EVEN_STD if explained is None else min(TRUSTED * lobe_std(explained) ** 2, EVEN_STD)
-        albedo, irradiance, n = (a.double().cpu() for a in (albedo, irradiance, n))
-        found = correction(albedo.numpy(), irradiance.numpy(), n.numpy(), even)
-        if found is None:
-            return None
+        a, e, normals = (np.asarray(t.double().cpu().numpy(), np.float64) for t in (albedo, irradiance, n))
+        found = correction(a, e, normals, even)
+    if found is None:
+        return None
+    x, facing, _ = surface_hits(model.geometry, rays, torch.arange(len(rays.d)))
+    error = change_light(model, spatial, x, facing, lambda: _apply(light, found, n, irradiance))
+    return {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
+
+
+def _apply(light: ShLight, found: SkinLight, n: Tensor, irradiance: Tensor) -> None:
+    """Add the correction to a light, with the irradiance (N, 3) of skin with normals n (N, 3) before."""
+    with torch.no_grad():
         around = fibonacci(DIRECTIONS)
         before = light.irradiance(around.to(light.coefficients)).double().cpu().numpy()
         basis = irradiance_basis(around.double().numpy())
         share = min(bright_enough(basis @ found.change[:, c], before[:, c]) for c in range(3))
         light.coefficients[: len(found.change)] += torch.from_numpy(share * found.change).to(light.coefficients)
         # the level of the face's albedo stays what other sources say (albedo_level.py)
-        now = light.irradiance(n.to(light.coefficients)).mean()
-        light.coefficients.mul_(float(irradiance.mean()) / float(now))
-    return {"skin_explains": round(float(found.explained.mean()), 3)}
+        light.coefficients.mul_(float(irradiance.mean()) / float(light.irradiance(n).mean()))

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from stages.inverse_rendering.albedo_level import (
+    CORRECTED_SCLERA,
+    CORRECTED_STD,
     EYES_STD,
     MIN_PIXELS,
     SCLERA,
@@ -66,6 +68,9 @@ def test_sources_are_weighted_by_their_variances() -> None:
     expected = math.exp((a * 0.0 + b * math.log(SCLERA / white)) / (a + b))
     found = decide(seen, None, e)
     assert found.gain == pytest.approx(expected) and found.log_std == pytest.approx((a + b) ** -0.5)
+    after = decide(seen, None, e, corrected=True)
+    b = CORRECTED_STD**-2
+    assert after.gain == pytest.approx(math.exp(b * math.log(CORRECTED_SCLERA / white) / (a + b)))
     sure = decide(seen, None, 0.95)
     assert abs(math.log(sure.gain)) < 0.01 and sure.log_std < 0.01
 
