@@ -102,6 +102,10 @@ def test_a_camera_at_the_end_of_the_world(facescape, gather) -> None:
     (lambda d: d.update(camera_model="OPENCV_FISHEYE", k1=1e14), "distortion is too large"),
     (lambda d: d.update(cx=True), "not a number"),
     (lambda d: d["frames"][0].update(file_path=["a"]), "not text"),
+    (lambda d: d["frames"][0].update(mask_path=False), "not text"),
+    (lambda d: d["frames"][0].update(mask_path=[]), "not text"),
+    (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "lens model is not supported"),
+    (lambda d: d.update(camera_model="SIMPLE_RADIAL_FISHEYE"), "lens model is not supported"),
 ])  # fmt: skip
 def test_bad_values_in_transforms(tmp_path: Path, change: Callable[[dict], object], says: str) -> None:
     data = transforms(tmp_path / "c")
@@ -155,6 +159,8 @@ def test_an_npz_that_is_none(tmp_path: Path, data: bytes) -> None:
     ("2.5</scale>", "1e-300</scale>", "no scale"),
     ("0 0 1 1 0 0 0 1 0", "0 0 9 1 0 0 0 1 0", "not orthonormal"),
     ('encoding="UTF-8"', 'encoding="klingon"', "can't be read"),
+    ("<camera id", '<camera enabled="no" id', "neither true nor false"),
+    ("<camera id", '<camera enabled="" id', "neither true nor false"),
 ])  # fmt: skip
 def test_bad_values_in_metashape(tmp_path: Path, old: str, new: str, says: str) -> None:
     metashape(tmp_path / "c", 0)

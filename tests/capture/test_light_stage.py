@@ -144,6 +144,22 @@ def test_integer_pictures_need_to_be_declared_linear(capture, gather) -> None:
         ({"lights": [{"index": i, "position": [0, 1], "intensity_rgb": [1, 1, 1]} for i in range(9)]}, "wrong length"),
         ({"lights": [{"index": 0, "position": [0, 0, 1], "direction": [0, 0, 2], "intensity_rgb": [1, 1, 1]}]}, "unit"),
         ({"lights": [{"index": 0, "position": [0, 0, float("nan")]}]}, "not finite"),
+        ({"encoding": "sRGB"}, "encoding of a light stage's pictures"),
+        ({"encoding": True}, "encoding of a light stage's pictures"),
+        (
+            {
+                "lights": [
+                    {
+                        "index": 0,
+                        "position": [0, 0, 1],
+                        "direction": [0, 0, 1],
+                        "intensity_rgb": [1, 1, 1],
+                        "frame": 2.5,
+                    }
+                ]
+            },
+            "not a whole number",
+        ),
     ],
 )
 def test_bad_calibration_is_named(capture, gather, change, what) -> None:

@@ -13,10 +13,12 @@ from hypothesis import given
 
 from stages.capture.readers import describe, find_reader
 from stages.capture.readers.cameras import FARTHEST, FOCAL
+from stages.capture.readers.olat import LIGHTS, read_lights
 from stages.capture.scan import scan_capture
 from tests.capture.test_capture_readers import CAMS, SIZE, F, colmap, metashape, pictures, realityscan, transforms
 from tests.support.facescape_tree import write_tree
 from tests.support.fuzzing import bounded, fuzzed, halved
+from tests.support.light_stage import make_stage, write_lights
 from tests.support.mutations import as_json, damaged, damages, nonsense, replaced, reworded, swaps
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
@@ -156,3 +158,34 @@ def test_nonsense_in_the_scale_dictionary(tree: Path, how: list) -> None:
     with bounded():
         found = scan_capture(tree / "1" / "1_neutral").artifact.metres_from_world
         assert found is None or np.isfinite(found).all()
+
+
+@pytest.fixture(scope="module")
+def lights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, bytes]:
+    """lights.json of ten calibrated lights, and its bytes."""
+    folder = tmp_path_factory.mktemp("lights")
+    write_lights(folder, make_stage(lights=10), encoding="linear")
+    return folder / LIGHTS, (folder / LIGHTS).read_bytes()
+
+
+def check_lights(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+    with bounded():
+        for light in read_lights(path).lights.values():
+            values = np.array([*light.position, *light.axis, *light.intensity])
+            assert np.isfinite(values).all() and abs(np.linalg.norm(light.axis) - 1) < 1e-6
+            light.model_dump_json().encode()
+
+
+@given(how=nonsense)
+@halved
+def test_nonsense_in_the_lights_of_a_light_stage(lights: tuple[Path, bytes], how: list) -> None:
+    path, whole = lights
+    check_lights(path, as_json(replaced(json.loads(whole), how)))
+
+
+@given(how=damages)
+@halved
+def test_damaged_lights_of_a_light_stage(lights: tuple[Path, bytes], how: list) -> None:
+    path, whole = lights
+    check_lights(path, damaged(whole, how))

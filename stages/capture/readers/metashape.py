@@ -65,7 +65,7 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
     for index, label, camera in zip(indices_of(labels), labels, cameras, strict=True):
         photo, where = find_photo(folder, label), f"{files[0].name}, camera {printable(label)}"
         pose = camera.find("transform")
-        if camera.get("enabled", "true") in ("false", "0") or pose is None:
+        if not _enabled(camera.get("enabled", "true"), where) or pose is None:
             left_out.append(f"{printable(label)}: {'not aligned' if pose is None else 'disabled'} in {files[0].name}")
         elif photo is None:
             left_out.append(f"{printable(label)}: its photo is missing")
@@ -82,6 +82,14 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             given = given_camera(K, inverse_rigid(moved), d, where, size)
             views.append(Declared(index, photo.name, photo, given, size, f"sensor {camera.get('sensor_id')}"))
     return Described(tuple(views), tuple(left_out), tuple(n.split(":")[0] for n in left_out), tuple(warnings))
+
+
+def _enabled(text: str, where: str) -> bool:
+    """XML's boolean. Raises StageError for other words."""
+    if text.strip().lower() not in ("true", "1", "false", "0"):
+        raise fault("a flag is neither true nor false", f"{where}, enabled", printable(text), "true, false, 1 or 0",
+                    REMEDY)  # fmt: skip
+    return text.strip().lower() in ("true", "1")
 
 
 def _chunk(path: Path) -> ElementTree.Element:

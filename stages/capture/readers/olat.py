@@ -131,7 +131,17 @@ def read_lights(path: Path) -> Lamps:
         notes.append(f"light {index} is twice in lights.json")
     if len(lights) < FEWEST:
         raise _too_few(path, len(lights), notes)
-    return Lamps(lights, content.get("encoding") == "linear", tuple(notes))
+    return Lamps(lights, _is_linear(content), tuple(notes))
+
+
+def _is_linear(content: Mapping[str, Any]) -> bool:
+    """Whether `encoding` declares integer files as linear. Raises StageError for another word: the pictures would be
+    read as something that they are not."""
+    found = content.get("encoding")
+    if found is None or found == "linear":
+        return found is not None
+    raise fault("the encoding of a light stage's pictures is not supported", f"{LIGHTS}, encoding", shown(found),
+                '"linear", or none for float files', "export linear EXR, and remove the key")  # fmt: skip
 
 
 def _light(entry: Any, place: int, content: Mapping[str, Any], notes: list[str]) -> StageLight | None:
@@ -149,6 +159,9 @@ def _light(entry: Any, place: int, content: Mapping[str, Any], notes: list[str])
         notes.append(f"light {index} has {what} in {LIGHTS}")
         return None
     frame = number(entry.get("frame", place), f"{where}, frame")
+    if frame != round(frame):
+        raise fault("a light's frame is not a whole number", f"{where}, frame", frame, "a whole number",
+                    "number the pictures in the order in which they were taken")  # fmt: skip
     return StageLight(index=index, position=position, axis=axis, intensity=intensity, frame=round(frame))
 
 

@@ -29,6 +29,17 @@ from stages.capture.readers.sizes import picture_size
 from stages.capture.readers.values import fault, flag, label, number, pixels, printable, table
 
 NAMES = ("transforms.json", "transforms_train.json")
+MODELS = (
+    "",
+    "PERSPECTIVE",
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "FULL_OPENCV",
+    "OPENCV_FISHEYE",
+)  # fmt: skip  (the coefficients that a model lacks are 0 or not written)
 Lenses = dict[object, tuple[F64, F64]]  # approximations of lenses by all their parameters: most frames share one lens
 REMEDY = "copy the file again, or remove it to solve the cameras from the photos"
 
@@ -54,7 +65,8 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
             continue
         where = f"{files[0].name}, {printable(name)}"
         size = _size(data | frame, photo, where)
-        mask = find_photo(folder, label(frame["mask_path"], where)) if frame.get("mask_path") else None
+        named = frame.get("mask_path")
+        mask = None if named in (None, "") else find_photo(folder, label(named, f"{where}, mask_path"))
         camera = _camera(data | frame, size, where, approximated)
         views.append(Declared(index, photo.name, photo, camera, size, mask=mask))
     absent = tuple(note.split(":")[0] for note in left_out)
@@ -89,7 +101,7 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, approx
     K = checked_frame(checked_K(K, where), size, where)
     d = np.array([_number(values, k, 0.0, where) for k in ("k1", "k2", "p1", "p2", "k3")])
     higher = np.array([_number(values, k, 0.0, where) for k in ("k4", "k5", "k6")])
-    model = label(values.get("camera_model", ""), f"{where}, camera_model")
+    model = _model(values, where)
     checked_lens(K, d, size, where)
     checked_lens(K, np.array([*higher[:2], 0, 0, higher[2]]), size, where)
     fisheye = flag(values.get("is_fisheye", False), f"{where}, is_fisheye") or model == "OPENCV_FISHEYE"
@@ -100,6 +112,17 @@ def _camera(values: Mapping[str, Any], size: tuple[int, int], where: str, approx
             approximated[key] = _approximation(fisheye, K, d, higher, size, where)
         K, d = approximated[key]
     return given_camera(K, inverse_rigid(world_from_cam), d, where, size)
+
+
+def _model(values: Mapping[str, Any], where: str) -> str:
+    """The lens model in capital letters, "" if none is named. Raises StageError for one whose pictures these equations
+    do not describe."""
+    found = label(values.get("camera_model", ""), f"{where}, camera_model").upper()
+    if found not in MODELS:
+        raise fault("the lens model is not supported", f"{where}, camera_model", printable(found),
+                    ", ".join(m for m in MODELS if m),
+                    "undistort the photos, or remove the file to solve the cameras from the photos")  # fmt: skip
+    return found
 
 
 def _approximation(
