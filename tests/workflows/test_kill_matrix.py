@@ -1,0 +1,70 @@
+"""The moments of benchmarks/kill_matrix.py: what killed runs left does not count, and a missed moment comes again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import kill_matrix
+from benchmarks.kill_matrix import PUBLISHING, RETRIES, Cell, Moment, left_in, moments, strike_in_time, under_way
+from stages.registry import REGISTRY
+
+
+def partial_of(out: Path, stage: str, key: str = "a") -> Path:
+    folder = out / ".store" / stage / f"{key}.partial-0"
+    folder.mkdir(parents=True)
+    return folder
+
+
+def test_a_partial_folder_of_a_killed_run_is_no_sign_of_this_one(tmp_path: Path) -> None:
+    partial_of(tmp_path, "uv")
+    old = left_in(tmp_path)
+    m = Moment("uv, 10%", 1.0, "uv", ("bake", "usd"))
+    assert not m.has_come(tmp_path, old) and m.has_come(tmp_path, set())
+    partial_of(tmp_path, "uv", "b")
+    assert m.has_come(tmp_path, old) and not m.is_over(tmp_path, old)
+    partial_of(tmp_path, "usd")
+    assert m.is_over(tmp_path, old)
+
+
+def test_results_that_are_published_are_told_from_stages(tmp_path: Path) -> None:
+    m = Moment("report, 60%", 1.0, "report")
+    (tmp_path / ".run.partial-0").mkdir()
+    assert not m.is_over(tmp_path, set()) and not under_way(tmp_path, (PUBLISHING,), set())
+    (tmp_path / ".asset.partial-0").mkdir()
+    assert m.is_over(tmp_path, set())
+    last = Moment(PUBLISHING, 0.0, PUBLISHING)
+    assert last.has_come(tmp_path, set()) and not last.is_over(tmp_path, set())
+
+
+def test_every_stage_has_its_moments_in_the_order_of_a_run() -> None:
+    found = list(moments({s.name: 10.0 for s in REGISTRY}))
+    stages = [m.stage for m in found if m.stage]
+    assert stages == [s.name for s in REGISTRY for _ in kill_matrix.SHARES] + [PUBLISHING]
+    assert {m.wait for m in found if m.stage == "uv"} == {1.0, 6.0}
+
+
+def test_a_stage_that_was_too_fast_is_made_again_and_the_signal_comes_sooner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits: list[float] = []
+
+    def missed_twice(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
+        assert not (out / ".store" / "uv").exists() or not waits
+        waits.append(moment.wait)
+        for stage in ("masks", "uv", "bake"):
+            (out / ".store" / stage / "key").mkdir(parents=True, exist_ok=True)
+        return Cell(None) if len(waits) < 3 else Cell(143)
+
+    monkeypatch.setattr(kill_matrix, "strike", missed_twice)
+    m = Moment("uv, 60%", 9.0, "uv", ("bake", "usd"))
+    assert strike_in_time(tmp_path, tmp_path, m, "TERM").code == 143
+    assert waits == [9.0, 3.0, 1.0] and (tmp_path / ".store/masks/key").is_dir()
+
+    monkeypatch.setattr(kill_matrix, "strike", lambda *_: waits.append(0.0) or Cell(None))
+    waits.clear()
+    assert strike_in_time(tmp_path, tmp_path, m, "TERM").code is None and len(waits) == 1 + RETRIES
+    waits.clear()
+    assert strike_in_time(tmp_path, tmp_path, Moment(PUBLISHING, 0.0, PUBLISHING), "TERM").code is None
+    assert len(waits) == 1  # there is nothing to make again
