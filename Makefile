@@ -7,7 +7,7 @@ export OMP_WAIT_POLICY ?= PASSIVE
 export DO_NOT_TRACK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lint format bench nightly lock sbom clean
+.PHONY: help setup demo test check lint format bench fuzz nightly lock sbom clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -64,6 +64,9 @@ $(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.lock
 
 sbom: $(VENV)/.ready ## a bill of materials of what is installed and shipped, in out/sbom.cdx.json
 	$(BIN)/python -m workflows.supply.sbom --out out/sbom.cdx.json
+
+fuzz: $(VENV)/.ready-dev ## an hour or more: 10,000 damaged files for every reader, counted; ONLY=cameras for some
+	$(BIN)/python -m benchmarks.fuzz_counts $(if $(ONLY),--only $(ONLY))
 
 nightly: $(VENV)/.ready-dev ## hours: 10,000 damaged files for every reader; every signal at every moment of a run
 	NEUFACE_FUZZ=10000 $(BIN)/python -m pytest -q tests/fuzz $(SPREAD)

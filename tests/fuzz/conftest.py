@@ -1,4 +1,7 @@
-"""Memory of the fuzz tests; time and number of their cases are in tests/support/fuzzing.py."""
+"""Memory of the fuzz tests, and a note of their answers for benchmarks/fuzz_counts.py.
+
+Time and number of their cases are in tests/support/fuzzing.py.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,8 @@ import resource
 from collections.abc import Iterator
 
 import pytest
+
+from tests.support.fuzzing import ANSWERS, READ, REFUSED
 
 MEGABYTES = 512  # by which a module's tests may raise the process's peak
 
@@ -17,3 +22,13 @@ def memory(request: pytest.FixtureRequest) -> Iterator[None]:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < most * 1024
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """The answers of each test, as properties of its entry in a JUnit file (`--junitxml`)."""
+    ANSWERS.clear()
+    try:
+        yield
+    finally:
+        item.user_properties += [(kind, ANSWERS[kind]) for kind in (READ, REFUSED)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,6 +13,8 @@ from hypothesis import HealthCheck, settings
 from pipeline.errors import StageError
 
 SECONDS = 2.0  # of processor time that one case may take
+READ, REFUSED = "read", "refused"  # a reader's answers
+ANSWERS: Counter[str] = Counter()  # of the test that runs; tests/fuzz/conftest.py notes and clears them
 CASES = int(os.environ.get("NEUFACE_FUZZ", "200"))
 
 settings.register_profile(
@@ -27,7 +30,9 @@ def bounded() -> Iterator[None]:
     start = time.thread_time()
     try:
         yield
+        ANSWERS[READ] += 1
     except StageError as e:
+        ANSWERS[REFUSED] += 1
         assert e.what and str(e.where) is not None and str(e.limit) and e.remedy
         assert len(str(e)) < 3000, "a message that nobody reads"
         str(e).encode()
