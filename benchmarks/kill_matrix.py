@@ -220,6 +220,14 @@ def survivors(mark: str) -> list[int]:
     return found
 
 
+def not_ignored() -> None:
+    """Children get the default action of every signal, also where this process was started to ignore one (`nohup`): an
+    ignored signal is inherited, and a run respects it. A handler of this process is not inherited."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
+
+
 def run_through(folder: Path, out: Path) -> dict[str, object]:
     """Let a run go to its end. Returns its run.json."""
     process = start(folder, out, uuid.uuid4().hex)
@@ -262,6 +270,7 @@ def main(arguments: Sequence[str]) -> int:
     p.add_argument("--write", action="store_true")
     given = p.parse_args(arguments)
     folder = given.folder.absolute()
+    not_ignored()
     write_demo_capture(folder / "capture", views=VIEWS, size=SIZE)
     if given.signals:
         whole = run_through(folder, folder / "whole")

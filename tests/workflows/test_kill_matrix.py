@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,3 +70,12 @@ def test_a_stage_that_was_too_fast_is_made_again_and_the_signal_comes_sooner(
     waits.clear()
     assert strike_in_time(tmp_path, tmp_path, Moment(PUBLISHING, 0.0, PUBLISHING), "TERM").code is None
     assert len(waits) == 1  # there is nothing to make again
+
+
+def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None:
+    child = "import signal; print(signal.getsignal(signal.SIGHUP) == signal.SIG_IGN)"
+    parent = "import signal, subprocess, sys; signal.signal(signal.SIGHUP, signal.SIG_IGN); from benchmarks import "
+    parent += f"kill_matrix; {{}}; subprocess.run([sys.executable, '-c', {child!r}], check=True)"
+    for call, ignored in (("kill_matrix.not_ignored()", "False"), ("pass", "True")):
+        command = [sys.executable, "-c", parent.format(call)]
+        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == ignored
