@@ -1,6 +1,7 @@
 """The stage contract: a stage is a pure function from artifacts and a config to an artifact.
 
-`key` is a hash of content (stage, version, config, the inputs' manifests), never of paths or times. `execute` looks up
+`key` is a hash of content (stage, version, config, the inputs' manifests) and of the number of threads where results
+depend on it, never of paths or times. `execute` looks up
 the key in the store. If it is missing, it runs the stage in a partial folder and completes the result by one rename.
 """
 
@@ -24,6 +25,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
+from pipeline import threads
 from pipeline.artifacts import Artifact, FileRef, Located
 from pipeline.errors import Cancelled, NeufaceError, stage_error_from_os_error
 from pipeline.store import Store
@@ -107,7 +109,8 @@ class Stage(Generic[I, C, O]):
     """A step of the pipeline. Increase `version` when the meaning of its output changes.
 
     variants: further classes of settings, by the value of the setting `preset` that selects them; each extends
-    `config`, and is only imported when it is selected or listed.
+    `config`, and is only imported when it is selected or listed. any_threads: the result has the same bytes with any
+    number of threads; else the number is part of the key.
     """
 
     name: str
@@ -117,6 +120,7 @@ class Stage(Generic[I, C, O]):
     output: type[O]
     run: Callable[[I, C, Context], O]
     variants: Mapping[str, Callable[[], type[C]]] = field(default_factory=dict)
+    any_threads: bool = False
 
     def config_for(self, preset: object) -> type[C]:
         """The class of the settings for a value of `preset`; `config` if no variant has that name."""
@@ -148,6 +152,8 @@ def key(stage: Stage[I, C, O], inputs: I, config: C) -> str:
     """Content key, 64 hex digits."""
     named = {f.name: getattr(inputs, f.name).artifact.digest() for f in dataclasses.fields(inputs)}  # type: ignore[arg-type]
     parts = {"stage": stage.name, "version": stage.version, "config": config.model_dump(mode="json"), "inputs": named}
+    if not stage.any_threads:
+        parts["threads"] = threads.in_use()
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
@@ -183,6 +189,7 @@ def execute(
                 "seconds": round(time.perf_counter() - start, 3),
                 "peak_memory_mb": peak_memory_mb(),
                 "device": device,
+                "threads": threads.in_use(),
                 "config": config.model_dump(mode="json"),
                 "versions": versions(),
             }

@@ -13,3 +13,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # load of the machine and the alignment of arrays.
 os.environ.setdefault("MKL_DYNAMIC", "FALSE")
 os.environ.setdefault("MKL_CBWR", "AUTO")
+
+# What sets the number of threads of PyTorch (OpenMP), of compiled loops, and of the matrix library.
+NAMES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def in_use() -> list[str]:
+    """The number of threads that each of NAMES asks for: its text, or this process's number of cores where it is unset.
+
+    Sums in several threads are added in another order than in one, so that their last digits differ.
+    """
+    cores = str(len(os.sched_getaffinity(0)))
+    return [os.environ.get(name) or cores for name in NAMES]

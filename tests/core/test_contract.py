@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from pipeline import threads
 from pipeline.artifacts import Located
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, DiskError, StageError
@@ -56,9 +58,33 @@ def test_key_is_the_digest_of_what_it_names(photos: Path) -> None:
     process and another machine find too."""
     plain = {
         "stage": FIRST.name, "version": FIRST.version, "config": json.loads(Config().model_dump_json()),
-        "inputs": {"source": source(photos).artifact.digest()},
+        "inputs": {"source": source(photos).artifact.digest()}, "threads": threads.in_use(),
     }  # fmt: skip
     assert base_key(photos) == hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+@pytest.mark.parametrize("name", threads.NAMES)
+def test_key_sees_the_number_of_threads_where_bytes_depend_on_it(
+    photos: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Sums in another order have other last digits: a result of two threads is not that of one."""
+    inputs, alike = FirstInputs(source(photos)), dataclasses.replace(FIRST, any_threads=True)
+    found = []
+    for number in ("1", "2", "1"):
+        monkeypatch.setenv(name, number)
+        found.append((key(FIRST, inputs, Config()), key(alike, inputs, Config())))
+    assert found[0] == found[2] and found[0][0] != found[1][0]
+    assert found[0][1] == found[1][1] != found[0][0]
+
+
+def test_the_number_of_threads_is_that_of_the_cores_where_nothing_sets_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in threads.NAMES:
+        monkeypatch.delenv(name, raising=False)
+    cores = str(len(os.sched_getaffinity(0)))
+    assert threads.in_use() == [cores] * 3
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "")
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    assert threads.in_use() == ["7", cores, cores]
 
 
 def test_key_ignores_where_and_when(photos: Path, tmp_path: Path) -> None:

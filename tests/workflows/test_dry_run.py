@@ -47,6 +47,19 @@ def test_what_is_new_what_is_reused_and_what_changed(photos: Path, capsys: pytes
     assert rows["second"].endswith("input changed: first")
 
 
+def test_another_number_of_threads_is_named(
+    photos: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    neuface(photos)
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    rows, _ = planned(photos, capsys)
+    assert rows["first"].endswith("number of threads changed: 2 -> 1")
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    rows, _ = planned(photos, capsys)
+    assert all(row.startswith("reused ") for row in rows.values())
+
+
 def test_what_left_the_store_and_what_is_damaged(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import shutil
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline import threads
 from pipeline.verdict import Level
 from workflows.batch.failures import Failure
 from workflows.batch.loop import Ended
@@ -184,7 +185,7 @@ def _environment(slots: int) -> dict[str, str]:
     environment["PYTHONPATH"] = os.pathsep.join(p for p in (here, environment.get("PYTHONPATH", "")) if p)
     if slots > 1:
         each = str(max(1, len(os.sched_getaffinity(0)) // slots))
-        for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"):
+        for name in threads.NAMES:
             environment.setdefault(name, each)
     return environment
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline import threads
 from pipeline.contract import Stage
 from pipeline.store import RUN, Store, read_object
 from stages.registry import SOURCE
@@ -43,6 +44,8 @@ def _reason(plan: Plan, stage: Stage[Any, Any, Any], step: Step, before: str | N
         return f"setting changed: {settings}" + resumes
     if inputs:
         return f"input changed: {', '.join(inputs)}"
+    if (known := _threads_changed(plan, stage, before)) is not None:
+        return f"number of threads changed: {known}" + resumes
     if not plan.store.folder(stage.name, before).is_dir():
         return "no longer in the store" + resumes
     if SOURCE in names:
@@ -69,6 +72,14 @@ def _settings_changed(plan: Plan, stage: Stage[Any, Any, Any], before: str) -> s
     changed = [f"{stage.name}.{n} {old.get(n)} -> {new[n]}" for n in new if n in old and old[n] != new[n]]
     more = len(changed) - SETTINGS_SHOWN
     return ", ".join(changed[:SETTINGS_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def _threads_changed(plan: Plan, stage: Stage[Any, Any, Any], before: str) -> str | None:
+    """ "2 -> 1"; None if it did not change, is not known, or makes no difference to this stage."""
+    old, now = read_object(plan.store.folder(stage.name, before) / RUN).get("threads"), threads.in_use()
+    if stage.any_threads or not isinstance(old, list) or old == now:
+        return None
+    return next((f"{a} -> {b}" for a, b in zip(old, now, strict=False) if a != b), "")
 
 
 def _has_checkpoint(store: Store, stage: str, key: str) -> bool:
