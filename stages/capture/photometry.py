@@ -38,17 +38,22 @@ def mean_light(grey: npt.NDArray[np.uint8]) -> float:
     return float(table[grey].mean())
 
 
-def exposures(written: Sequence[float | None], light: Sequence[float]) -> list[float] | None:
+def exposures(
+    written: Sequence[float | None], light: Sequence[float], fitted: Sequence[bool] | None = None
+) -> list[float] | None:
     """e_n of each photo, if all have it in their metadata and the pixels confirm it; else None.
+
+    fitted: the photos that are asked, and whose median is 1 (None: all): pixels of held-out photos decide nothing.
 
     The pixels confirm it if b_n / e_n vary less than b_n. After a raw converter that equalised the photos, or with a
     flash that lit all of them alike, e_n has no meaning.
     """
-    known = [e for e in written if e is not None]
-    if len(known) < len(written) or not known or max(known) <= EQUAL * min(known):
+    asked = np.ones(len(written), bool) if fitted is None else np.array(fitted, bool)
+    known = np.array([e for e in written if e is not None])
+    if len(known) < len(written) or not asked.any() or known[asked].max() <= EQUAL * known[asked].min():
         return None
-    found = np.array(known) / float(np.quantile(known, 0.5, method="nearest"))
+    found = known / float(np.quantile(known[asked], 0.5, method="nearest"))
     if not 1 / FARTHEST <= found.min() <= found.max() <= FARTHEST:
         return None
-    b = np.log(np.maximum(light, 1e-6))
-    return [float(e) for e in found] if np.std(b - np.log(found)) < np.std(b) else None
+    b, e = np.log(np.maximum(light, 1e-6))[asked], np.log(found)[asked]
+    return [float(f) for f in found] if np.std(b - e) < np.std(b) else None

@@ -72,7 +72,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
     views = made.with_exposures(made.with_places(views, photos), photos, selection.warnings)
     views, chart = made.with_chart(views, photos, selection.warnings, config.colour_checker == "on", context)
-    drift = any(p.exif.white_balance == "auto" for p in photos) or any(v.exposure != 1 for v in views)
+    drift = made.colours_drift(views, photos)
     seen = [Photo(v.name, v.camera_group, v.width, v.height, v.exposure, v.holdout, p.look)
             for v, p in zip(views, photos, strict=True) if p.look is not None]  # fmt: skip
     useless = [c.name for c, v in zip(candidates, views, strict=True) if c.mask is not None and v.mask is None]
@@ -117,4 +117,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=6, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)
+STAGE = Stage(name="capture", version=7, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)

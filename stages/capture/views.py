@@ -71,8 +71,9 @@ def with_places(views: list[CaptureView], photos: list[ImportedPhoto]) -> list[C
 
 
 def with_exposures(views: list[CaptureView], photos: list[ImportedPhoto], warnings: list[str]) -> list[CaptureView]:
-    """The views with their exposures, if all photos have them in EXIF and the pixels confirm them."""
-    found = exposures([p.exif.exposure for p in photos], [p.light for p in photos])
+    """The views with their exposures, if all have them in EXIF and the pixels of the fitted photos confirm them."""
+    fitted = [not v.holdout for v in views]
+    found = exposures([p.exif.exposure for p in photos], [p.light for p in photos], fitted)
     if found is None:
         return views
     warnings.append(f"exposures differ by a factor of {max(found) / min(found):.3g}; this is corrected by the photos' "
@@ -83,8 +84,13 @@ def with_exposures(views: list[CaptureView], photos: list[ImportedPhoto], warnin
 def with_chart(
     views: list[CaptureView], photos: list[ImportedPhoto], warnings: list[str], wanted: bool, context: Context
 ) -> tuple[list[CaptureView], ColourChart | None]:
-    """The views after colour correction, and the colour checker's result; unchanged views and None without one."""
-    reading = read_charts(views, [p.chart for p in photos], wanted)
+    """The views after colour correction, and the colour checker's result; unchanged views and None without one. A
+    checker in a held-out photo is not used: that photo is there to be predicted."""
+    unused = [v.name for v, p in zip(views, photos, strict=True) if v.holdout and p.chart is not None]
+    if unused:
+        warnings.append(f"the colour checker in {', '.join(unused[:NAMED])} is not used, because these photos are held "
+                        "out")  # fmt: skip
+    reading = read_charts(views, [None if v.holdout else p.chart for v, p in zip(views, photos, strict=True)], wanted)
     warnings += reading.warnings
     if reading.chart is None:
         return views, None
@@ -94,6 +100,12 @@ def with_chart(
         context.progress(done, len(views), f"correcting the colours of {name}")
 
     return correct_colours(reading.chart, views, context.workdir, tick), reading.chart
+
+
+def colours_drift(views: Sequence[CaptureView], photos: Sequence[ImportedPhoto]) -> bool:
+    """Whether the camera changed exposure or white balance between the photos of the fit."""
+    fitted = [(v, p) for v, p in zip(views, photos, strict=True) if not v.holdout]
+    return any(p.exif.white_balance == "auto" or v.exposure != 1 for v, p in fitted)
 
 
 def _plate(

@@ -176,6 +176,18 @@ def test_all_photos_come_to_the_charts_white(tmp_path: Path, gather) -> None:
     assert sorted(p.name for p in (found.folder / "photos").iterdir()) == [f"{i}_{i}.png" for i in range(4)]
 
 
+def test_a_chart_in_a_held_out_photo_is_not_used(tmp_path: Path, gather) -> None:
+    for i in range(4):
+        write(tmp_path / f"{i}.png", SCENE if i < 2 else NOISE @ CAMERA.T, seed=i)
+    one = gather(tmp_path, holdout="names:0.png", drop_blurred=False).artifact
+    assert one.chart is not None and one.chart.photos == ("1.png",)
+    assert any("the colour checker in 0.png is not used" in w for w in one.warnings)
+    write(tmp_path / "1.png", NOISE @ CAMERA.T, seed=8)
+    assert gather(tmp_path, holdout="names:0.png", drop_blurred=False).artifact.chart is None
+    with pytest.raises(StageError, match="no colour checker is found"):
+        gather(tmp_path, holdout="names:0.png", drop_blurred=False, colour_checker="on")
+
+
 def test_off_on_and_without_one_nothing_changes(tmp_path: Path, gather) -> None:
     for i in range(3):
         write(tmp_path / f"{i}.png", SCENE if i == 0 else NOISE @ CAMERA.T, seed=i)

@@ -53,6 +53,16 @@ def test_exposures_where_the_photos_bear_them_out() -> None:
     assert exposures([], []) is None and exposures([1.0, 2.0], [0.0, 0.0]) is None
 
 
+def test_pixels_of_held_out_photos_decide_nothing() -> None:
+    e, fitted = [1.0, 2.0, 4.0, 2.0, 1.0, 64.0], [True] * 5 + [False]
+    right = [0.01, 0.02, 0.04, 0.02, 0.01]
+    assert exposures(e, [*right, 1e-6], fitted) == exposures(e, [*right, 1.0], fitted) == [0.5, 1, 2, 1, 0.5, 32]
+    assert exposures(e, [*right, 1e-6]) is None  # if it were asked
+    assert exposures(e, [0.02, 0.02, 0.02, 0.02, 0.02, 0.6], fitted) is None
+    assert exposures([1.0, 1.0, 2.0], [0.1, 0.1, 0.2], [True, True, False]) is None  # nothing to tell it by
+    assert exposures([1.0, 2.0], [0.1, 0.2], [False, False]) is None
+
+
 def photos(folder: Path, believed: bool) -> None:
     for i, iso in enumerate((100, 200, 400, 200)):
         light = RADIANCE * (iso / 200 if believed else 1)
@@ -73,6 +83,17 @@ def test_exif_is_where_the_calibration_starts(tmp_path: Path, gather, believed: 
     assert views[0].clipped is None and views[3].clipped is not None
     ends = read_alpha(found.path(views[3].clipped))
     assert ends.shape == (160, 200) and ends[:3, :14].all() and not ends[8:].any()
+
+
+def test_a_held_out_photo_alone_is_no_drift(tmp_path: Path, gather) -> None:
+    """The white balance of these photos is automatic; that of the others is not said."""
+    photos(tmp_path, True)
+    for i in (1, 2, 3):
+        image = np.round(srgb_from_linear(RADIANCE.clip(0, 1)) * 255).astype(np.uint8)
+        (tmp_path / f"{i}.jpg").unlink()
+        cv2.imwrite(str(tmp_path / f"{i}.png"), np.roll(image, i, 1)[..., ::-1])
+    assert gather(tmp_path).artifact.colours_drift
+    assert not gather(tmp_path, holdout="names:0.jpg").artifact.colours_drift
 
 
 def test_the_fit_starts_from_one_exposure_and_takes_clipped_pixels_as_limits(tmp_path: Path, gather) -> None:
