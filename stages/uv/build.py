@@ -69,12 +69,13 @@ def build(
     step(0, 4, "decimating")
     ways = {"adaptive": decimate.decimated, "uniform": remeshed, "quads": quadded}
     mesh = ways[config.remesh](dense, config.target_faces)
+    step(0, 4, "decimating")
     proxy = decimate.decimated(mesh, config.proxy_faces)
     with ThreadPoolExecutor(1) as beside:  # the distances between the meshes do not depend on the charts
         away = beside.submit(_away, dense, mesh, proxy)
         step(1, 4, "unwrapping")
         front = front_of(mesh, landmarks)
-        charts = unwrap(mesh, config, front, texel)
+        charts = unwrap(mesh, config, front, texel, lambda: step(1, 4, "unwrapping"))
         step(2, 4, "measuring charts")
         quality = measure(mesh, charts, None if front is None else front.face)
         step(3, 4, "measuring the decimation")

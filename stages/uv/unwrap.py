@@ -8,6 +8,7 @@ hundreds of fragments. Its mirrored charts are flipped.
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -35,12 +36,19 @@ ITERATIONS = 1  # rounds in which xatlas grows charts from better seeds: more ar
 MANY_CHARTS = 150  # from this number on xatlas packs: our own packer is slow for many charts
 
 
-def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float | None = None) -> Charts:
+def unwrap(
+    mesh: Mesh,
+    config: Config,
+    front: Front | None = None,
+    texel: float | None = None,
+    check: Callable[[], None] = lambda: None,
+) -> Charts:
     """Charts over the mesh, none mirrored, packed with padding into [0, 1]^2 or into tiles (pipeline.tiles).
 
     A mesh that needs MANY_CHARTS or more stays in one tile. front: the face, whose charts are larger. texel: largest
     mean edge of a texel on the surface (up to the factor COARSER), in the mesh's unit, with config.tile_size texels
-    along a tile's side; only as many tiles are filled as this needs. None: config.tiles are filled.
+    along a tile's side; only as many tiles are filled as this needs. None: config.tiles are filled. check: called
+    between the parts of the work; what it raises ends it.
 
     Raises:
         StageError: xatlas fails, or leaves faces without a chart.
@@ -51,17 +59,21 @@ def unwrap(mesh: Mesh, config: Config, front: Front | None = None, texel: float 
     padding = config.padding / config.texture_size
     tiling = Tiling(most_tiles(config, texel), None if texel is None else 1 / (COARSER * texel * config.tile_size))
     quads = config.remesh == "quads"
+    check()
     own = unwrapped(scaled, points, padding, tiling.in_units_of(span / UNIT), front, quads=quads)
+    check()
     if own is not None:
         return _with_texels(own, mesh, config, tiling, front)
     log.info("uv: the mesh can't be cut into a few discs; cutting further")
     found = in_pieces(scaled, points, quads=quads)
+    check()
     if found is not None:
         uvs, faces, _ = found
         even = evened(uvs, faces, meshes.areas(mesh.vertices, mesh.faces))
     else:
         log.info("uv: too many pieces are needed; using xatlas")
         even, faces = _flat(*_cut(points, mesh.faces, config), mesh, config)
+        check()
     return _with_texels(_placed(even, faces, mesh, config, tiling, front), mesh, config, tiling, front)
 
 

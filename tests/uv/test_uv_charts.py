@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from pipeline import meshes
+from pipeline.errors import Cancelled
 from pipeline.meshes import Charts, Mesh
 from stages.surface.build import build as surface_build
 from stages.usd.render.render import _square, _triangle
@@ -55,6 +56,27 @@ ZOO = {
     "thin plate": thin_plate,
     "noisy": noisy,
 }
+
+
+@pytest.mark.parametrize("way", ["own", "pieces", "xatlas"])
+def test_a_signal_ends_the_unwrapping_between_its_parts(monkeypatch: pytest.MonkeyPatch, way: str) -> None:
+    """The last look-up before the charts are placed says stop: nothing after it begins."""
+    calls: list[str] = []
+
+    def check() -> None:
+        calls.append("check")
+        if len(calls) == {"own": 2, "pieces": 3, "xatlas": 4}[way]:
+            raise Cancelled("stopped")
+
+    mesh = ZOO["sphere"]()
+    monkeypatch.setattr(unwrap, "unwrapped", lambda *a, **k: object() if way == "own" else None)
+    monkeypatch.setattr(unwrap, "in_pieces", lambda *a, **k: (None, None, None) if way == "pieces" else None)
+    monkeypatch.setattr(unwrap, "_cut", lambda *a: (None, None))
+    monkeypatch.setattr(unwrap, "_flat", lambda *a: (None, None))
+    for later in ("_with_texels", "_placed", "evened"):
+        monkeypatch.setattr(unwrap, later, lambda *a: pytest.fail("it went on"))
+    with pytest.raises(Cancelled):
+        unwrap.unwrap(mesh, Config(), check=check)
 
 
 @pytest.mark.slow
