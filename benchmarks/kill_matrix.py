@@ -5,8 +5,9 @@
 FOLDER gets a small demo capture, one run that nothing disturbs, and a run for each signal. That run is started again
 and again into the same folder, and the signal comes each time at the next moment: during the imports, a share of the
 way through each stage, and while results are published. At the end it goes through undisturbed, and must have the bytes
-of the first run. Columns of earlier calls with the same FOLDER are kept; `--signals` alone makes their table. TWICE
-is SIGTERM and, half a second later, SIGTERM again.
+of the first run. Columns of earlier calls with the same FOLDER are kept; `--signals` alone makes their table.
+`--write` puts them into docs/benchmarks/signals.json, and makes the page's table of it. TWICE is SIGTERM and, half a
+second later, SIGTERM again.
 
 A cell has the exit code and the seconds until the process was gone; "done": the moment did not come, the stage
 was faster, also when it was made again with the signal sooner. A fault is in words, and makes the exit code 1.
@@ -28,15 +29,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from benchmarks.generated import print_or_write
 from pipeline.demo.capture import write_demo_capture
 from stages.registry import REGISTRY
+from workflows.bench.captures import commit
 from workflows.run import host_info
 from workflows.run.run_lock import is_held
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "benchmarks" / "signals.md"
+PAGE, RECORD = ROOT / "docs/benchmarks/signals.md", ROOT / "docs/benchmarks/signals.json"
 BEGIN, END = "<!-- made by benchmarks/kill_matrix.py -->", "<!-- end -->"
 SIGNALS = ("INT", "TERM", "HUP", "KILL", "TWICE")
 AT_ONCE = {"KILL", "TWICE"}
@@ -52,7 +55,7 @@ VIEWS, SIZE = 16, 96
 MARK = "NEUFACE_KILL_MATRIX"
 PUBLISHING = "publishing"
 RETRIES = 3
-LAST, SAME = "then undisturbed", "the same bytes"
+LAST, SAME, NOT_COMPARED = "then undisturbed", "the same bytes", "not compared"
 PATIENCE = 1800.0  # seconds until a run counts as hanging
 LIMIT = 60.0  # seconds from the first signal to the end
 TRACES = re.compile(r"Traceback|\*\*\* |Exception ignored|Segmentation fault|Aborted")
@@ -91,12 +94,24 @@ class Cell:
     seconds: float = 0.0
     faults: list[str] = field(default_factory=list)
 
+    def is_fault(self) -> bool:
+        """Whether something is wrong with it."""
+        return any(f not in (SAME, NOT_COMPARED) for f in self.faults)
+
     def __str__(self) -> str:
         if self.faults:
             return "; ".join(self.faults)
         if self.code is None:
             return "done"
         return f"{self.code if self.code >= 0 else 128 - self.code}, {self.seconds:.1f} s"
+
+
+@dataclass(frozen=True)
+class Column:
+    """One signal at all moments. made: how."""
+
+    made: str
+    cells: dict[str, Cell]
 
 
 def command(folder: Path, out: Path) -> list[str]:
@@ -242,24 +257,40 @@ def column(folder: Path, name: str, whole: dict[str, object]) -> dict[str, Cell]
     """One signal at all moments, and whether the run that is left alone afterwards has the same bytes."""
     out = folder / f"{name}-{uuid.uuid4().hex[:8]}"
     timing = {n: float(s) for n, s in whole["timing"].items()}  # type: ignore[attr-defined]
-    cells = {}
+    cells: dict[str, Cell] = {}
     for moment in moments(timing):
         cells[moment.name] = strike_in_time(folder, out, moment, name)
         print(f"{name:5} {moment.name:28} {cells[moment.name]}", flush=True)
     same = run_through(folder, out)["asset_hash"] == whole["asset_hash"]
     cells[LAST] = Cell(0, 0.0, [SAME if same else "OTHER BYTES"])
-    (folder / f"{name}.json").write_text(json.dumps({n: asdict(c) for n, c in cells.items()}))
-    return cells
+    (folder / f"{name}.json").write_text(json.dumps(asdict(Column(made(), cells)), indent=1) + "\n")
 
 
-def table(cells: dict[str, dict[str, Cell]]) -> str:
-    """Markdown: a row for each moment, a column for each signal."""
-    heads = [n if n == "TWICE" else f"SIG{n}" for n in cells]
-    rows = [f"| moment | {' | '.join(heads)} |", "|---" * (len(cells) + 1) + "|"]
-    for moment in next(iter(cells.values())):
-        rows.append(f"| {moment} | {' | '.join(str(c[moment]) for c in cells.values())} |")
-    about = f"{host_info.describe(host_info.machine())}; {VIEWS} photos of {SIZE} px, one thread, `{' '.join(SMALL)}`"
-    return "\n".join([BEGIN, about, "", *rows, END])
+def made() -> str:
+    """On what machine, of which commit, with which capture and settings."""
+    machine = host_info.describe(host_info.machine())
+    return f"{machine}; commit {commit()}; {VIEWS} photos of {SIZE} px, one thread, `{' '.join(SMALL)}`"
+
+
+def column_in(content: dict[str, Any]) -> Column:
+    """A column as its JSON has it."""
+    return Column(content["made"], {moment: Cell(**c) for moment, c in content["cells"].items()})
+
+
+def recorded() -> dict[str, Column]:
+    """The columns of the page, by the signal's name."""
+    return {name: column_in(c) for name, c in json.loads(RECORD.read_text()).items()}
+
+
+def table(columns: dict[str, Column]) -> str:
+    """Markdown: a row for each moment, a column for each signal; below, how each column was made."""
+    heads = [n if n == "TWICE" else f"SIG{n}" for n in columns]
+    rows = [f"| moment | {' | '.join(heads)} |", "|---" * (len(columns) + 1) + "|"]
+    longest = max(columns.values(), key=lambda c: len(c.cells))
+    for moment in longest.cells:
+        rows.append(f"| {moment} | {' | '.join(str(c.cells.get(moment, '-')) for c in columns.values())} |")
+    notes = [f"- {head}: {c.made}" for head, c in zip(heads, columns.values(), strict=True)]
+    return "\n".join([BEGIN, *rows, "", *notes, END])
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -276,11 +307,14 @@ def main(arguments: Sequence[str]) -> int:
         whole = run_through(folder, folder / "whole")
         for name in given.signals:
             column(folder, name, whole)
-    known = {n: json.loads((folder / f"{n}.json").read_text()) for n in SIGNALS if (folder / f"{n}.json").is_file()}
-    cells = {n: {moment: Cell(**c) for moment, c in rows.items()} for n, rows in known.items()}
-    print_or_write(["--write"] if given.write else [], PAGE, table(cells))
-    faults = [f for c in cells.values() for cell in c.values() for f in cell.faults if f != SAME]
-    return 1 if faults else 0
+    files = {n: folder / f"{n}.json" for n in SIGNALS}
+    found = {n: column_in(json.loads(f.read_text())) for n, f in files.items() if f.is_file()}
+    if given.write:
+        merged = {**recorded(), **found}
+        found = {n: merged[n] for n in SIGNALS if n in merged}
+        RECORD.write_text(json.dumps({n: asdict(c) for n, c in found.items()}, indent=1) + "\n")
+    print_or_write(["--write"] if given.write else [], PAGE, table(found))
+    return 1 if any(cell.is_fault() for c in found.values() for cell in c.cells.values()) else 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,100 @@
+"""Tables of docs/benchmarks are those of the JSON files beside them, and figures of the README are too."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import kill_matrix
+from workflows.bench import speed, tradeoff
+from workflows.bench.captures import read_table
+from workflows.bench.captures_table import markdown
+from workflows.bench.tradeoff_measure import Measured
+from workflows.bench.tradeoff_plot import plot
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "benchmarks"
+
+
+def content(name: str) -> Any:
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
+def points() -> dict[str, Measured]:
+    return {name: Measured(**point) for name, point in content("tradeoff")["points"].items()}
+
+
+def tradeoff_page() -> str:
+    found = content("tradeoff")
+    return "\n".join(tradeoff.report(found["machine"], found["budget"], points())) + "\n"
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "captures.md": lambda: markdown(read_table(FOLDER / "captures.json")),
+    "speed.md": lambda: "\n".join(speed.report(content("speed"))) + "\n",
+    "tradeoff.md": tradeoff_page,
+    "tradeoff.svg": lambda: plot({k: (m.seconds, m.psnr) for k, m in points().items()}, tradeoff.front(points())),
+}
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_the_page_is_made_of_its_record(name: str) -> None:
+    """A figure that was changed by hand on one side alone is found, and a table that the code would write otherwise."""
+    assert (FOLDER / name).read_text() == PAGES[name]()
+
+
+def test_the_table_of_signals_is_made_of_its_record_and_has_no_fault() -> None:
+    """Made by: python -m benchmarks.kill_matrix FOLDER --write"""
+    columns = kill_matrix.recorded()
+    assert kill_matrix.table(columns) in kill_matrix.PAGE.read_text()
+    assert {"INT", "TERM", "HUP", "KILL"} <= set(columns)
+    assert not [(n, m) for n, c in columns.items() for m, cell in c.cells.items() if cell.is_fault()]
+
+
+# ------------------------------------------------------------------ the README
+README = FOLDER.parents[1] / "README.md"
+
+
+def row_of(text: str, start: str) -> list[str]:
+    """The cells of the one row of a table that starts with this."""
+    (found,) = [line for line in text.splitlines() if line.startswith(f"| {start}")]
+    return [cell.strip() for cell in found.strip("|").split("|")]
+
+
+def test_figures_of_the_readme_are_those_of_the_captures() -> None:
+    """The draft's row, and each figure of the sentences below the table."""
+    text = README.read_text()
+    rows = content("captures")["rows"]
+    figures = {name: row["figures"] for name, row in rows.items()}
+    said = " ".join(text.split())
+    names = ["one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
+    assert row_of(text, "draft |")[2] == f"{figures['head_a']['asset_psnr']:.1f}"
+    assert f"captures.md` has {names[len(rows) - 1]} captures" in said
+    assert f"his face within {figures['person_e']['depth_median_mm']:.1f} mm (median)" in said
+    for name, level, sentence in (
+        ("selfie_man", "usable", "from the front is {level}, at {psnr} dB."),
+        ("selfie_woman", "usable", "in front of a bright wall has {psnr} dB"),
+        ("person_e", "usable", "A rendered man in a rig is {level},"),
+        ("skull_studio", "unusable", "A skull in a studio is {level}."),
+    ):
+        assert rows[name]["verdict"]["level"] == level
+        assert sentence.format(level=level, psnr=f"{figures[name]['asset_psnr']:.1f}") in said, name
+
+
+@pytest.mark.parametrize(
+    ("readme", "benchmarks"),
+    [
+        ("`--budget 10m` | 9", "the same | `--budget 10m`"),
+        ("studio, at twice the resolution", "the same, scored at 1024 px, the others at 512 | studio"),
+        ("film, at twice the resolution", "the same, scored at 1024 px | film"),
+        ("draft, photos alone without cameras", "the same photos alone, cameras solved | draft"),
+    ],
+)
+def test_rows_that_have_no_record_agree_on_both_pages(readme: str, benchmarks: str) -> None:
+    """PSNR of the asset, and the median distance, of runs that were made before figures were kept as JSON."""
+    ours = row_of(README.read_text(), readme)
+    theirs = row_of((FOLDER.parent / "benchmarks.md").read_text(), benchmarks)
+    assert ours[2] == theirs[4] and ours[3] == theirs[5].partition("/")[0].strip()
