@@ -53,7 +53,8 @@ def test_unseen_places_have_the_mouth_s_colours(tmp_path: Path) -> None:
 def test_the_bake_takes_them(tmp_path: Path) -> None:
     registered, mesh = head_and_mesh(tmp_path)
     field, inside = AnalyticField(sphere(0.08)), inside_of(registered, mesh)
-    known, plain = (_known(field, mesh, (), Occluder(mesh), m, lambda done, total: None) for m in (inside, None))
+    around = np.ones(len(mesh.vertices), np.float32)
+    known, plain = (_known(field, mesh, (), Occluder(mesh), m, None, around) for m in (inside, None))
     inner = np.setdiff1d(mesh.faces[128:160], mesh.faces[:128])
     assert known.albedo[inner].max() < 0.11 and np.abs(known.albedo - plain.albedo)[mesh.faces[:64]].min() == 0
     assert areas(mesh.vertices, mesh.faces).min() > 0

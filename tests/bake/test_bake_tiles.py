@@ -91,7 +91,7 @@ def test_every_tile_holds_its_part_of_the_surface(
         x = (mesh.vertices[mesh.faces[hits.face]] * hits.weights[..., None]).sum(1).astype(np.float64)
         x *= RADIUS / np.linalg.norm(x, axis=1, keepdims=True)
         image = read_exr(written[0] / f"textures/albedo.{1001 + t}.exr")[0].reshape(-1, 3)[hits.texel]
-        seen = np.abs(x[:, 2]) > 0.03  # else the albedo is continued from what is seen
+        seen = np.abs(x[:, 2]) > 0.045  # else no view sees it well, and the albedo follows what is around
         assert np.abs(image[seen] - linear_albedo(x[seen])).max() < 2e-3
 
 
