@@ -61,6 +61,8 @@ def test_pixels_of_held_out_photos_decide_nothing() -> None:
     assert exposures(e, [0.02, 0.02, 0.02, 0.02, 0.02, 0.6], fitted) is None
     assert exposures([1.0, 1.0, 2.0], [0.1, 0.1, 0.2], [True, True, False]) is None  # nothing to tell it by
     assert exposures([1.0, 2.0], [0.1, 0.2], [False, False]) is None
+    many = exposures([1.0, 2.0, 4.0, 64, 64, 64, 64], [0.1, 0.2, 0.4, 1, 1, 1, 1], [True] * 3 + [False] * 4)
+    assert many == [0.5, 1, 2, 32, 32, 32, 32]  # the median is that of the fitted ones
 
 
 def photos(folder: Path, believed: bool) -> None:
