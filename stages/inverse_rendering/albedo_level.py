@@ -13,8 +13,9 @@ eyes     g = SCLERA / (luminance of the whites of the eyes). Sclera is nearly th
          Left out for closed or hidden eyes.
 
 SCLERA is the value that the fit gives to open eyes if its level is right: 0.40 and 0.37 for two rendered persons with
-known albedo; 0.52 and 0.51 if the light was corrected by their skin (skin_light.py), which changes the level that is
-right for the face. It is below the sclera's own reflectance, because lids shade the eye by more than the fit models.
+known albedo. If the light was corrected by the skin (skin_light.py), which changes the level that is right for the
+face, it is 0.52 and 0.51, and 0.43 for one of them with darkened skin; the constant is their geometric mean. It is
+below the sclera's own reflectance, because lids shade the eye by more than the fit models.
 
 Differs: not in the paper, whose level follows from the white-light loss and the initial values.
 """
@@ -45,7 +46,7 @@ Fact = dict[str, str | float | bool]
 FACE, EYES = "face", "eyes"  # names of the labels
 LOBE_STD, START_STD = 0.06, 0.6  # of ln g
 SCLERA, EYES_STD = 0.39, 0.2  # the latter of ln g
-CORRECTED_SCLERA, CORRECTED_STD = 0.51, 0.12  # the same if the light was corrected by the skin
+CORRECTED_SCLERA, CORRECTED_STD = 0.49, 0.12  # the same if the light was corrected by the skin
 MIN_PIXELS = 200  # of the eyes, over all photos
 MOST_PIXELS = 20_000
 BRIGHTEST = 0.95  # quantile of the luminance between the lids: sclera

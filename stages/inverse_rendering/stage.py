@@ -118,7 +118,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=19,
+    version=20,
     inputs=Inputs,
     config=Config,
     output=FittedFace,
