@@ -51,7 +51,8 @@ class CaptureView(Artifact):
 
     place_m: east, north and up in metres, relative to the capture's first photo with a GPS position. clipped: mask
     (255) of the pixels at the end of the file's range, whose value is only a lower bound. exposure: relative to the
-    median photo of the capture, from EXIF; linear values are proportional to it; 1 if unknown.
+    median photo of the capture, from EXIF; linear values are proportional to it; 1 if unknown. flash: whether a flash
+    fired, None if the metadata do not say it.
     """
 
     index: int
@@ -67,6 +68,7 @@ class CaptureView(Artifact):
     place_m: tuple[float, float, float] | None = None
     clipped: FileRef | None = None
     exposure: float = 1.0
+    flash: bool | None = None
     holdout: bool = False
 
 

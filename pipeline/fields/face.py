@@ -17,14 +17,18 @@ from pipeline.errors import StageError
 from pipeline.fields import build
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.calibration import Calibration
-from pipeline.fields.parts import Geometry, Shaded, Skin
+from pipeline.fields.light import ShLight
+from pipeline.fields.parts import Geometry, Light, Shaded, Skin
 from pipeline.fields.protocol import F32, Material
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.fields.spec import FaceSpec
+from pipeline.lighting.moving import MovingLight
 from pipeline.maths import brdf
+from pipeline.maths.light_frame import WORLD, Stations, Turn, turn_of
 from pipeline.maths.sdf import unit
 
 FORMAT = 1
+AMBIENT_ORDER, AMBIENT_SHARE = 3, 0.05  # of the still light beside a moving one; of its strength, at the start
 CHUNK = 131_072
 
 
@@ -46,24 +50,33 @@ class FaceModel(nn.Module):
         self.basis = system.integral(spec)
         self.light = system.light(spec)
         self.shading = system.shading(spec, self.basis, self.light)
+        self.ambient: Light | None = None  # the still part of a light that moves with the camera
+        if spec.light_frame != WORLD:
+            self.ambient = ShLight(AMBIENT_ORDER, AMBIENT_SHARE * spec.light_start)
+            self.ambient_shading = system.shading(spec, self.basis, self.ambient)
         self.rendering = system.rendering(spec)
         self.calibration = Calibration(spec.views)
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
         self.uniform_albedo = False  # one albedo for all points, while the light is estimated
         self.register_buffer("beta", torch.tensor(geometry.cell))
 
-    def shade(self, x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
-        """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]."""
+    def shade(self, x: Tensor, n: Tensor, wo: Tensor, stations: Stations | None = None) -> Shaded:
+        """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]. stations: the cameras,
+        for a light that moves with them."""
+        turn = None
+        if self.spec.light_frame != WORLD:
+            assert stations is not None, "a light that moves with the camera needs the cameras"
+            turn = turn_of(self.spec.light_frame, stations, x, wo, self.spec.light_distance)
         albedo, rho, c, inv_kappa = self.spatial(x)
         if self.uniform_albedo:
             albedo = albedo.detach().median(0).values.expand_as(albedo)
         if not self.spec.specular:
-            diffuse = self._diffuse(albedo, x, n)
+            diffuse = self._diffuse(albedo, x, n, turn)
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa, torch.zeros_like(rho))
         skin = Skin(albedo, rho, c, inv_kappa)
         base = self.shading.diffuse_albedo(skin)
-        diffuse = self._diffuse(base, x, n)
-        specular = self.shading.specular(skin, x, n, wo)
+        diffuse = self._diffuse(base, x, n, turn)
+        specular = self._specular(skin, x, n, wo, turn)
         straight = torch.zeros_like(rho)
         if self.has_bases:  # B depends on n . wo only, which is 1 for all points
             straight = rho * (c * self.shading.bases(n[:1], n[:1])).sum(-1)
@@ -74,10 +87,20 @@ class FaceModel(nn.Module):
         """Whether the specular term has bases of the angles only, so that it has an F0."""
         return (self.spec.shading, self.spec.integral, self.spec.basis_inputs) == ("neural", "low_rank", "cosine")
 
-    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor) -> Tensor:
+    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor, turn: Turn | None) -> Tensor:
         """L_d (N, 3), including shadows if they are modelled."""
+        if turn is not None and self.ambient is not None:
+            arriving = turn.strength * self.light.irradiance(turn(n)) + self.ambient.irradiance(n)
+            return brdf.lambertian(albedo, arriving)
         open_light = brdf.lambertian(albedo, self.light.irradiance(n))
         return open_light if self.shadowing is None else open_light * self.shadowing(x)
+
+    def _specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor, turn: Turn | None) -> Tensor:
+        """L_s (N, 3)."""
+        if turn is None:
+            return self.shading.specular(skin, x, n, wo)
+        moving = turn.strength * self.shading.specular(skin, x, turn(n), turn(wo))
+        return moving + self.ambient_shading.specular(skin, x, n, wo)
 
     def solve_shadows(self) -> None:
         """Update the shadows for the present surface, albedo and light."""
@@ -139,8 +162,20 @@ class FittedField:
 
     @property
     def light(self) -> F32:
-        """((L + 1)^2, 3) coefficients."""
-        return np.asarray(self.model.light().detach().cpu().numpy(), np.float32)
+        """((L + 1)^2, 3) coefficients; of a light that moves, those of its still stand-in."""
+        moving = self.moving_light
+        return self._light(self.model.light) if moving is None else moving.still()
+
+    @property
+    def moving_light(self) -> MovingLight | None:
+        """The light that moves with the camera, if it does."""
+        spec, ambient = self.model.spec, self.model.ambient
+        if ambient is None:
+            return None
+        return MovingLight(spec.light_frame, spec.light_distance, self._light(self.model.light), self._light(ambient))
+
+    def _light(self, part: Light) -> F32:
+        return np.asarray(part().detach().cpu().numpy(), np.float32)
 
     @property
     def colour_responses(self) -> F32 | None:

@@ -12,6 +12,8 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.lighting.moving import MovingLight
+
 F32 = npt.NDArray[np.float32]
 
 
@@ -49,7 +51,13 @@ class Field(Protocol):
 
     @property
     def light(self) -> F32:
-        """(121, 3) real orthonormal SH coefficients of the captured light, index l(l+1)+m."""
+        """(121, 3) real orthonormal SH coefficients of the captured light, index l(l+1)+m; of a light that moves, those
+        of its still stand-in."""
+        ...
+
+    @property
+    def moving_light(self) -> MovingLight | None:
+        """The light that moves with the camera, if it does."""
         ...
 
     @property

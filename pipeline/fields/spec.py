@@ -32,6 +32,8 @@ class FaceSpec:
     specular: bool = True
     shadows: bool = False
     calibrated: bool = False
+    light_frame: str = "world"  # where the light stands still: pipeline.maths.light_frame
+    light_distance: float = 1.0  # of the camera at which a flash has the light's strength
     hash_levels: int = 10
     hash_log2_size: int = 17
     coarse: float = 0.03

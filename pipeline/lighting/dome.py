@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.errors import StageError
+from pipeline.lighting.moving import MovingLight, from_stored
 from pipeline.maths import sh
 from pipeline.maths.latlong import latlong_directions, latlong_weights
 
@@ -28,6 +29,14 @@ CONVENTION = (
     "(Y_00 = 0.28209, Y_1m = 0.48860 * (y, z, x)), with the polar axis along z of the asset coordinates (right-handed, "
     "Y up, metres). d is a unit vector from the surface towards the light. The raw sum may be slightly negative; "
     "environment.exr is the positive picture with the same harmonics up to order 4."
+)
+
+MOVING = (
+    "The light stands still relative to the camera, not to the subject; the coefficients above are those while the "
+    "camera is in front of the face. frame camera: coefficients in the camera's axes (x right, y down, z forward). "
+    "frame flash: z is the ray from the camera to the point, x the camera's x axis made perpendicular to it, and the "
+    "radiance is times (distance / distance of the point from the camera)^2, metres. ambient: the part that stands "
+    "still in the asset's coordinates, added to it."
 )
 
 
@@ -104,8 +113,8 @@ def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:
     return out.astype(np.float32)
 
 
-def light_json(light: F32, attenuation: str) -> str:
-    """JSON of the raw coefficients, with their definition."""
+def light_json(light: F32, attenuation: str, moving: MovingLight | None = None) -> str:
+    """JSON of the raw coefficients, with their definition. moving: the light itself, if `light` is its stand-in."""
     rows = [[float(f"{x:.9g}") for x in row] for row in np.asarray(light, np.float64)]
     content = {
         "order": int(np.sqrt(len(light))) - 1,
@@ -114,7 +123,20 @@ def light_json(light: F32, attenuation: str) -> str:
         "colour_space": "linear Rec.709",
         "coefficients": rows,
     }
+    if moving is not None:
+        content["moving"] = {"meaning": MOVING, **moving.stored()}
     return json.dumps(content, indent=1) + "\n"
+
+
+def read_moving(path: Path) -> MovingLight | None:
+    """The light of light.json that moves with the camera; None if the light stands still, as in files of another kind.
+    StageError if it is damaged."""
+    if path.suffix != ".json":
+        return None
+    try:
+        return from_stored(json.loads(path.read_text()).get("moving"))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+        raise _bad_light(path, e) from e
 
 
 def read_light(path: Path) -> F32:

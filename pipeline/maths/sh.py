@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -111,6 +113,24 @@ def irradiance(c: Tensor, n: Tensor) -> Tensor:
 def radiance(c: Tensor, d: Tensor) -> Tensor:
     """L(d) = sum_lm c_lm Y_lm(d): (N, 3). [NeuFace eq. 2]"""
     return sh_basis(d, order_of(c)) @ c
+
+
+def rotated(c: npt.NDArray[np.float64], axes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Coefficients ((L + 1)^2, K) of L'(d) = L(R^T d), a light c ((L + 1)^2, K) whose frame has the columns of R (3, 3)
+    as its axes. Exact up to rounding (1e-12), because rotations do not mix bands: least squares over more directions
+    than coefficients."""
+    order = order_of(torch.from_numpy(c))
+    d = spiral(2 * len(c) + 8)
+    now, then = (sh_basis(torch.from_numpy(np.ascontiguousarray(x)), order).numpy() for x in (d, d @ axes))
+    return np.asarray(np.linalg.lstsq(now, then @ c, rcond=None)[0], np.float64)
+
+
+def spiral(number: int) -> npt.NDArray[np.float64]:
+    """(number, 3) directions that are spread evenly over the sphere."""
+    z = 1 - (2 * np.arange(number) + 1) / number
+    turn = np.pi * (1 + 5**0.5) * np.arange(number)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], 1)
 
 
 @full_precision

@@ -25,6 +25,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.fields.protocol import Field
+from pipeline.lighting.moving import Standpoint
 from pipeline.maths import brdf, sh
 from pipeline.meshes import F32, F64, Mesh
 from stages.bake import detail_kernels as kernels
@@ -60,11 +61,13 @@ def joined(parts: Sequence[Points]) -> Points:
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """Data for the fine band. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices."""
+    """Data for the fine band. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices; relative (views, V, 3):
+    the light of each photo over the still one, (0, 0, 3) under a still light."""
 
     photos: Photos
     gloss: F32
     low: F32
+    relative: F32
 
     def added(self, p: Points) -> tuple[F32, F32]:
         """(N, 3) detail to add to the albedo, and (N,) weight: 1 for one sharp photo from straight ahead."""
@@ -72,7 +75,7 @@ class Detail:
         photos = self.photos
         kernels.fine(
             photos.cameras, photos.pixels, photos.depth, photos.clipped, p.x, p.n, p.corner, p.weights,
-            self.gloss, self.low, p.albedo, p.shade, mean, support,
+            self.gloss, self.low, self.relative, p.albedo, p.shade, mean, support,
         )  # fmt: skip
         weight, spread = support.T
         trust = weight / (weight + HALF_WEIGHT) / (1 + (spread / DISAGREEMENT) ** 2)
@@ -83,7 +86,7 @@ def prepare(
     field: Field, mesh: Mesh, sparse: Points, photos: Photos, attenuation: str, step: Callable[[int, int], None]
 ) -> Detail:
     """Compute the low bands, from points about as dense as the vertices."""
-    gloss = _gloss(field, mesh, photos, attenuation)
+    gloss, relative = _gloss(field, mesh, photos, attenuation), relative_light(field, mesh, photos.cameras[:, :30])
     x = mesh.vertices.astype(np.float64)[mesh.faces]
     edge = float(np.linalg.norm(x[:, 1] - x[:, 0], axis=1).mean())
     smooth = Smoother(mesh, max(WIDTH, EDGES * edge))
@@ -91,29 +94,52 @@ def prepare(
     for v in range(len(gloss)):
         step(v, len(gloss))
         values, cosines = np.zeros((len(sparse.x), 3), np.float32), np.zeros(len(sparse.x), np.float32)
+        lit = sparse.shade
+        if len(relative):
+            lit = lit * np.einsum("nc,ncd->nd", sparse.weights, relative[v][sparse.corner])
         kernels.residual(
             photos.cameras[v], photos.pixels, photos.depth, photos.clipped, sparse.x, sparse.n, sparse.corner,
-            sparse.weights, gloss[v], sparse.albedo, sparse.shade, values, cosines,
+            sparse.weights, gloss[v], sparse.albedo, lit, values, cosines,
         )  # fmt: skip
         sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
         kernels.splat(sparse.corner, sparse.weights, values, cosines**2, sums, total)
         low[v] = smooth.mean(sums / np.maximum(total, 1e-9)[:, None], total)
-    return Detail(photos, gloss, low)
+    return Detail(photos, gloss, low, relative)
 
 
-def shade(light: F32, normals: F64, ratio: F32) -> F32:
+def relative_light(field: Field, mesh: Mesh, cameras: F64) -> F32:
+    """(views, V, 3) irradiance in each photo over that of the still stand-in, for a light that moves; else (0, 0, 3).
+    cameras (views, 30) as in detail_kernels."""
+    moving = field.moving_light
+    if moving is None:
+        return np.zeros((0, 0, 3), np.float32)
+    alike = np.ones((len(mesh.vertices), 3), np.float32)
+    still, n = shade(field.light, mesh.normals, alike), np.ascontiguousarray(mesh.normals, np.float32)
+    out = np.empty((len(cameras), len(n), 3), np.float32)
+    for v, camera in enumerate(cameras):
+        eye = Standpoint(camera[27:30], camera[:12].reshape(3, 4)[:, :3].T)
+        out[v] = lit_at_least(moving.irradiance(mesh.vertices, n, eye), field.light) / still
+    return out
+
+
+def lit_at_least(e: F32, light: F32) -> F32:
+    """(N, 3) irradiance over pi, not below MIN_LIGHT of its mean over all normals: darker places do not determine the
+    albedo. That mean is pi times that of the radiance, c_00 Y_00."""
+    floor = MIN_LIGHT * float(light[0].mean()) / np.sqrt(4 * np.pi)
+    return np.asarray(np.maximum(e / np.pi, max(floor, 1e-6)), np.float32)
+
+
+def shade(light: F32, normals: F64 | F32, ratio: F32) -> F32:
     """(N, 3) S for normals (N, 3) and irradiance ratio (N, 3). Its lower limit avoids amplified noise in the dark."""
     coefficients = torch.from_numpy(np.asarray(light, np.float32))
     e = sh.irradiance(coefficients, torch.from_numpy(np.ascontiguousarray(normals, np.float32))).numpy()
-    # the mean of E over all normals is pi times that of the radiance, c_00 Y_00
-    floor = MIN_LIGHT * float(light[0].mean()) / np.sqrt(4 * np.pi)
-    return np.asarray(np.maximum(e * ratio / np.pi, max(floor, 1e-6)), np.float32)
+    return lit_at_least(e * ratio, light)
 
 
 def _gloss(field: Field, mesh: Mesh, photos: Photos, attenuation: str) -> F32:
     """(views, V, 3) g_v = rho c . B(wo, n) L(w_r). [NeuFace eq. 12]"""
     material = field.material(mesh.vertices)
-    light = torch.from_numpy(np.asarray(field.light, np.float32))
+    light, moving = torch.from_numpy(np.asarray(field.light, np.float32)), field.moving_light
     out = np.zeros((len(photos.cameras), len(mesh.vertices), 3), np.float32)
     for v, centre in enumerate(photos.cameras[:, 27:30]):
         away = centre - mesh.vertices
@@ -121,7 +147,12 @@ def _gloss(field: Field, mesh: Mesh, photos: Photos, attenuation: str) -> F32:
         rows = np.flatnonzero((wo * mesh.normals).sum(1) > 0)
         n, w = mesh.normals[rows], wo[rows]
         bound = material.rho[rows] * (material.coefficients[rows] * field.basis(w, n)).sum(1)
-        mirror = brdf.reflect(torch.from_numpy(w), torch.from_numpy(n))
-        incident = brdf.light_integral(mirror, torch.from_numpy(material.inv_kappa[rows]), light, attenuation)
-        out[v, rows] = bound[:, None] * incident.numpy()
+        width = material.inv_kappa[rows]
+        if moving is None:
+            mirror = brdf.reflect(torch.from_numpy(w), torch.from_numpy(n))
+            incident = brdf.light_integral(mirror, torch.from_numpy(width), light, attenuation).numpy()
+        else:
+            eye = Standpoint(centre, photos.cameras[v, :12].reshape(3, 4)[:, :3].T)
+            incident = moving.reflected(mesh.vertices[rows], n, width, eye, attenuation)
+        out[v, rows] = bound[:, None] * incident
     return out

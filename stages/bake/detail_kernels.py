@@ -125,10 +125,11 @@ def residual(camera, pixels, depth, clipped, x, n, corner, weights, gloss, albed
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, relative, albedo, shade, out, support):
     """The finest band at N points: robust mean over photos of their albedo minus the field's, without their low band.
 
     gloss, low (views, V, 3): specular radiance, and the low band of the photo's residual, at the mesh's vertices.
+    relative (views, V, 3): the photo's light over that of `shade`; (0, 0, 3) if it is the same in all photos.
     Writes out (N, 3), and support (N, 2): the sum of the weights (1 for one sharp photo from straight ahead), and the
     root mean square difference of the photos from their mean.
     """
@@ -136,12 +137,12 @@ def fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, alb
         rows = slice(block * BLOCK, min((block + 1) * BLOCK, len(x)))
         _fine(
             cameras, pixels, depth, clipped, x[rows], n[rows], corner[rows], weights[rows], gloss, low,
-            albedo[rows], shade[rows], out[rows], support[rows],
+            relative, albedo[rows], shade[rows], out[rows], support[rows],
         )  # fmt: skip
 
 
 @njit(error_model="numpy", cache=True)
-def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, albedo, shade, out, support):
+def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, relative, albedo, shade, out, support):
     """A block of `fine`. It is a function of its own because the bodies of parallel loops compile slowly."""
     values, chosen, found = np.empty((MAX_PHOTOS, 3)), np.empty(MAX_PHOTOS), np.empty(3)
     views, places = np.empty(MAX_PHOTOS, np.int64), np.empty((MAX_PHOTOS, 2))
@@ -171,11 +172,16 @@ def _fine(cameras, pixels, depth, clipped, x, n, corner, weights, gloss, low, al
             v = views[j]
             _colour(cameras[v], pixels, places[j, 0], places[j, 1], found)
             for k in range(3):
-                g, b = 0.0, 0.0
+                g, b, lit = 0.0, 0.0, shade[i, k]
                 for c in range(3):
                     g += weights[i, c] * gloss[v, corner[i, c], k]
                     b += weights[i, c] * low[v, corner[i, c], k]
-                values[j, k] = (found[k] - g) / shade[i, k] - albedo[i, k] - b
+                if len(relative) > 0:
+                    lit = 0.0
+                    for c in range(3):
+                        lit += weights[i, c] * relative[v, corner[i, c], k]
+                    lit *= shade[i, k]
+                values[j, k] = (found[k] - g) / lit - albedo[i, k] - b
                 if abs(values[j, k]) > OUTLIER:  # a highlight, or something in front of the head
                     chosen[j] = 0.0
             total += chosen[j]

@@ -19,10 +19,12 @@ from pipeline.eyes.iris import angle_from
 from pipeline.eyes.picture import REACH, Sights, directions_at, looked_up, places_of, plane, sights
 from pipeline.fields.protocol import Field
 from pipeline.head_artifacts import FittedEye, RegisteredHead
+from pipeline.lighting.moving import Standpoint
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh
 from pipeline.registration.head import load_head, of_triangles
+from pipeline.transforms import matrix
 from pipeline.visibility import FittedPhoto, Occluder
-from stages.bake.detail import shade
+from stages.bake.detail import lit_at_least, shade
 
 SIDE = 256  # pixels of an eye's picture: 0.12 mm
 FADE = 0.0008  # metres
@@ -74,20 +76,24 @@ def painted_eyes(
     occluder = Occluder(Mesh(mesh.vertices, mesh.normals, lids))
     eyes = tuple(eye_of(one) for one in stored)
     seen = (sights(eye, views, occluder, SIDE) for eye in eyes)
-    pictures = tuple(painted(eye, s, field, responses) for eye, s in zip(eyes, seen, strict=True))
+    pictures = tuple(painted(eye, s, field, responses, views) for eye, s in zip(eyes, seen, strict=True))
     return Eyes(of_vertex, eyes, pictures)
 
 
-def painted(eye: Eye, seen: Sights, field: Field, responses: F64) -> F32:
-    """(SIDE, SIDE, 3) albedo of an eye."""
-    side = seen.side
+def painted(eye: Eye, seen: Sights, field: Field, responses: F64, views: Sequence[FittedPhoto] = ()) -> F32:
+    """(SIDE, SIDE, 3) albedo of an eye. views: the photos, which a light that moves needs."""
+    side, moving = seen.side, field.moving_light
+    directions = directions_at(plane(side).reshape(-1, 2))
+    x, n = eye.points(directions).astype(np.float32), (directions @ eye.axes).astype(np.float32)
+    ratio = np.asarray(field.irradiance_ratio(x), np.float32)
+    lit = shade(field.light, n, ratio).reshape(side, side, 3)
     plain = np.empty_like(seen.colour)
     for i, view in enumerate(seen.views):
         plain[i] = seen.colour[i] @ np.linalg.inv(responses[view]).T.astype(np.float32)
+        if moving is not None:
+            station = Standpoint.of(matrix(views[view].camera.world_from_cam))
+            plain[i] *= lit / lit_at_least(moving.irradiance(x, n, station), field.light).reshape(lit.shape)
     shown, weight = Sights(plain, seen.weight, seen.pixels, seen.views, side).combined()
-    directions = directions_at(plane(side).reshape(-1, 2))
-    ratio = np.asarray(field.irradiance_ratio(eye.points(directions).astype(np.float32)), np.float32)
-    lit = shade(field.light, directions @ eye.axes, ratio).reshape(side, side, 3)
     return completed(shown / lit, weight > 0, eye)
 
 

@@ -1,6 +1,6 @@
 """A minimal EXIF reader: the TIFF tags that the pipeline uses.
 
-These are orientation, focal length, make, model, lens, exposure, white balance and GPS position. A file with damaged or
+These are orientation, focal length, make, model, lens, exposure, white balance, flash and GPS position. A file with damaged or
 no metadata gives an empty `Exif`, never an error: metadata is optional. Source: EXIF 2.32 (CIPA DC-008), TIFF 6.0.
 """
 
@@ -17,7 +17,7 @@ MAKE, MODEL, ORIENTATION, EXIF_IFD = 0x10F, 0x110, 0x112, 0x8769
 FOCAL_MM, FOCAL_35MM, PIXEL_X, LENS = 0x920A, 0xA405, 0xA002, 0xA434
 PLANE_X_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 GPS_IFD, LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT = 0x8825, 1, 2, 3, 4, 5, 6
-EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE = 0x829A, 0x829D, 0x8827, 0xA403
+EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE, FLASH = 0x829A, 0x829D, 0x8827, 0xA403, 0x9209
 WHITE_BALANCES: dict[tuple[float, ...], str] = {(0,): "auto", (1,): "manual"}
 EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
@@ -47,6 +47,7 @@ _WANTED = {
     F_NUMBER,
     ISO,
     WHITE_BALANCE,
+    FLASH,
     273,
     279,
     324,
@@ -59,7 +60,7 @@ class Exif:
     """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
 
     exposure: seconds x ISO / f-number^2, to which the linear value of a grey is proportional; None if one is missing.
-    white_balance: auto, manual, or "" if unknown. place: degrees north, degrees east, metres up.
+    white_balance: auto, manual, or "" if unknown. flash: whether a flash fired, None if unknown. place: degrees north, degrees east, metres up.
     """
 
     orientation: int = 1
@@ -70,6 +71,7 @@ class Exif:
     recorded_width: int | None = None
     exposure: float | None = None
     white_balance: str = ""
+    flash: bool | None = None
     place: tuple[float, float, float] | None = None
 
     def focal_px(self, width: int, height: int) -> float | None:
@@ -106,6 +108,7 @@ def read_exif(data: bytes) -> Exif:
         recorded_width=int(width) if width else None,
         exposure=_exposure(tags),
         white_balance=WHITE_BALANCES.get(_values_of(tags, WHITE_BALANCE)[:1], ""),
+        flash=_fired(_values_of(tags, FLASH)),
         place=_place(_ifd(block, int(_values_of(tags, GPS_IFD)[0])) if _values_of(tags, GPS_IFD) else {}),
     )
 
@@ -121,6 +124,12 @@ def metres_from(place: tuple[float, float, float], origin: tuple[float, float, f
     east = EARTH_M / w * math.cos(lat) * math.radians(around)
     north = EARTH_M * (1 - eccentricity) / w**3 * math.radians(place[0] - origin[0])
     return east, north, place[2] - origin[2]
+
+
+def _fired(value: tuple[float, ...]) -> bool | None:
+    """Bit 0 of the tag Flash."""
+    known = len(value) == 1 and math.isfinite(value[0]) and 0 <= value[0] < 256
+    return bool(int(value[0]) & 1) if known else None
 
 
 def _exposure(tags: Tags) -> float | None:

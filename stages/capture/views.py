@@ -57,6 +57,7 @@ def view_of(
         camera_group=_group(photo.width, photo.height, candidate.serial, photo.exif.body,
                             photo.exif.focal_mm or photo.exif.focal_35mm),
         clipped=context.file(photo.clipped) if photo.clipped else None,
+        flash=photo.exif.flash,
         holdout=held,
     )  # fmt: skip
 

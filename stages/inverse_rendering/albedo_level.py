@@ -139,7 +139,7 @@ def _shown(model: FaceModel, table: PixelTable, x: Tensor, n: Tensor, pixels: Te
     out."""
     with torch.no_grad():
         batch = table.at(pixels)
-        shaded = model.shade(x, n, -batch.rays.d)
+        shaded = model.shade(x, n, -batch.rays.d, batch.rays.stations)
         colour = linear_from_srgb(batch.target)
         if model.spec.calibrated:
             colour = torch.linalg.solve(model.calibration()[batch.view], colour)

@@ -101,6 +101,12 @@ class Config(StageConfig):
         description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo",
     )
+    light_frame: Literal["auto", "world", "camera", "flash"] = Field(
+        default=AUTO,
+        description="where the light stands still; world: in the room, with the subject; camera: relative to the "
+        "camera, while the subject turns; flash: a lamp on the camera, whose light falls off with the distance; auto: "
+        "by cross-validation before the fit and by the photos' metadata",
+    )
     skin_light: bool = Field(
         default=True,
         description="correct the low bands of the light during the fit so that the albedo of the face does not depend "

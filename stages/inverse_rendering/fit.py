@@ -10,12 +10,15 @@ import torch
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
+from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import (
     SELECTION_AT,
     Choices,
     apply_light,
+    facts_of,
+    given_model,
     prior_surface,
     restored,
     select_model,
@@ -89,9 +92,20 @@ class Trainer(TrainingLoop):
         """Whether the surface is frozen at the prior."""
         return self.settings.refine_geometry == "off" or (self.choices is not None and not self.choices.refine_geometry)
 
+    @property
+    def light_moves(self) -> bool:
+        """Whether the light moves relative to the subject."""
+        return self.model.spec.light_frame != WORLD
+
     def select_model(self) -> None:
-        """Select the model by cross-validation, and remove the other parts."""
+        """Select the model by cross-validation, and remove the other parts. Under a light that moves, a point's mean
+        over the views is not its diffuse radiance, on which the comparison rests: everything is kept."""
         assert self.table is not None
+        if self.light_moves:
+            given = given_model(self.settings, calibrated=self.model.spec.calibrated)
+            self.choices = replace(given, facts=facts_of(given, self.settings, "the light moves with the camera"))
+            self.table.exclude(())
+            return
         choices, estimate = select_model(self)
         self.take(choices)
         for parameter in apply_light(self.model, estimate) if estimate is not None else ():
@@ -125,7 +139,8 @@ class Trainer(TrainingLoop):
         if self.shadows_solved < due:
             self.model.solve_shadows()
             self.shadows_solved = due
-        if self.settings.skin_light and self.choices is not None and not self.skin_asked and self.share() >= SKIN_AT:
+        skin_due = self.settings.skin_light and not self.light_moves and self.share() >= SKIN_AT
+        if skin_due and self.choices is not None and not self.skin_asked:
             self.ask_skin(self.choices)
             self.skin_asked = True
         return rate
@@ -157,7 +172,7 @@ class Trainer(TrainingLoop):
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
-        interlude = UNIFORM_FROM <= p < s.uniform_albedo_until
+        interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not self.light_moves
         light_known = self.choices is not None and self.choices.light_known
         self.model.uniform_albedo = interlude and not light_known
         for group in self.optimiser.param_groups:
@@ -173,7 +188,7 @@ class Trainer(TrainingLoop):
         opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
         _hashed(self.model).encoding.open_levels(opened)
         # the reflectance adapts to the new light, not the surface
-        still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
+        still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING and not self.light_moves
         still |= self.skin_tells and p < SKIN_AT + SETTLING
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
@@ -204,8 +219,10 @@ class Trainer(TrainingLoop):
 
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
-        later, there is no sparse-albedo prior, which would move albedo into the lobe. If skin tells the light's colour,
-        nothing draws it to white."""
+        later, there is no sparse-albedo prior, which would move albedo into the lobe; nor if the light moves, which
+        shows albedo and light apart. If skin tells the light's colour, nothing draws it to white."""
+        if self.light_moves:
+            return self.settings.changed(albedo_sparsity=0.0)
         if self.choices is None:
             return self.settings.changed(f0_excess=0.0)
         known = self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
@@ -255,6 +272,8 @@ def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
         {"params": list(model.light.parameters()), "start": settings.lr_light},
         {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
     ]
+    if model.ambient is not None:
+        groups.append({"params": list(model.ambient.parameters()), "start": settings.lr_light})
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,14 +11,16 @@ import torch
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.spec import FaceSpec
+from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import own_parts, pretrain_basis
+from stages.inverse_rendering.moving_light import LightFrame, first_light
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
 
 # Fields of FaceSpec that are computed from settings, or that only the paper's model has with that meaning.
-DERIVED = {"rank", "light_order", "specular", "hash_fine", "prior"}
+DERIVED = {"rank", "light_order", "specular", "hash_fine", "prior", "light_frame"}
 ALBEDO_START = 0.4  # mean over the channels; their ratios are those of the photos
 
 
@@ -29,18 +31,33 @@ def new_trainer(
     calibrated: bool,
     device: str,
     prior: Start | None = None,
+    lit: LightFrame | None = None,
 ) -> Trainer:
-    """A new trainer: geometry from `start`, a uniform white light, a uniform albedo. prior: the surface with which
-    refined geometry is compared, if stereo has already moved `start`."""
+    """A new trainer: geometry from `start`, a uniform white light or the moving one of `lit`, a uniform albedo. prior:
+    the surface with which refined geometry is compared, if stereo has already moved `start`."""
     torch.manual_seed(settings.seed)
-    model = grid_model(views, start, settings, calibrated, device)
+    model = grid_model(views, start, settings, calibrated, device, lit)
+    if lit is not None and lit.flux is not None:
+        light = own_parts(model)[2]
+        with torch.no_grad():
+            first = torch.from_numpy(first_light(lit.flux, model.spec.light_order)).to(light.coefficients)
+            light.coefficients.copy_(model.spec.light_start * first[:, None].expand_as(light.coefficients))
     pretrain_basis(own_parts(model)[1])
     return trainer_of(model, views, start, settings, device, prior)
 
 
-def grid_model(views: list[PhotoView], start: Start, settings: Config, calibrated: bool, device: str) -> FaceModel:
+def grid_model(
+    views: list[PhotoView],
+    start: Start,
+    settings: Config,
+    calibrated: bool,
+    device: str,
+    lit: LightFrame | None = None,
+) -> FaceModel:
     """A new model on a grid of `start`, on the CPU. device: where the photos are read."""
     spec = spec_for(views, start, settings, calibrated, device)
+    if lit is not None and lit.frame != WORLD:  # what shades the subject from one side moves as well
+        spec = replace(spec, light_frame=lit.frame, light_distance=lit.distance, shadows=False)
     values = torch.from_numpy(start.values.copy())  # a copy, because the start may also be the prior
     grid = GridSdf(values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
     return FaceModel(spec, grid)

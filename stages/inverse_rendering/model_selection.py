@@ -108,7 +108,7 @@ def given_model(s: Config, *, calibrated: bool) -> Choices:
         {},
     )
     why = f"fewer than {MIN_VIEWS} views: no validation views" if s.has_open_parts else "setting"
-    return replace(given, facts=_facts(given, s, why))
+    return replace(given, facts=facts_of(given, s, why))
 
 
 def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
@@ -130,7 +130,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
         if s.refine_geometry == AUTO and fit.prior is not None:
             out = _judge_refinement(out, fit, found, shots)
     elif fit.validation:
-        out = replace(given, facts=_facts(given, s, "too few points are visible in enough views"))
+        out = replace(given, facts=facts_of(given, s, "too few points are visible in enough views"))
     estimate = None
     if wanted and out.specular:
         estimate = light_from_lobe(seen, min(out.light_order, MAX_ESTIMATE_ORDER), gain, model.spec.attenuation)
@@ -182,12 +182,12 @@ def _exact_rays(fit: Fit, seed: int) -> Rays:
     """Rays of random subject pixels that are not clipped: points in highlights would be over-represented."""
     batch = _table(fit).draw(RAYS, 0.0, seed)
     exact = ~(batch.bound > 0).any(-1)
-    return Rays(batch.rays.o[exact], batch.rays.d[exact])
+    return batch.rays[exact]
 
 
 def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceModel) -> Choices:
     """Select lobe, calibration, order and rank, in an order in which each uses the previous results."""
-    full, facts = model.spec.light_order, _facts(given, s, "not tested")
+    full, facts = model.spec.light_order, facts_of(given, s, "not tested")
     most = _best_order(t, full) if given.specular else None
     one, gains = cross_validation.alike(t), cross_validation.solve_response(t, most, gain=True)
     offsets = cross_validation.solve_response(t, most, gain=False)
@@ -293,7 +293,7 @@ def strongest(model: FaceModel, t: ValidationSamples, k: int) -> tuple[int, ...]
     return tuple(sorted(int(j) for j in np.argsort(-share, kind="stable")[:k]))
 
 
-def _facts(c: Choices, s: Config, why: str) -> Facts:
+def facts_of(c: Choices, s: Config, why: str) -> Facts:
     """The facts if nothing was tested."""
     return {
         "specular": {"modelled": c.specular, "why": "setting" if s.specular != AUTO else why},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,7 @@ from pipeline.artifacts import CameraSet, HeldOutView, Matrix
 from pipeline.capture_artifacts import Capture
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
-from pipeline.fields.face import FaceModel
+from pipeline.fields.face import FaceModel, FittedField
 from pipeline.images import write_exr, write_png_from_linear
 from pipeline.transforms import rows
 from stages.inverse_rendering.footprint import Footprint
@@ -25,20 +26,20 @@ F32 = npt.NDArray[np.float32]
 
 
 def write_light(model: FaceModel, context: Context) -> None:
-    """Write light.json: SH coefficients and their conventions."""
-    coefficients = model.light().detach().cpu().double().numpy().round(7).tolist()
-    (context.workdir / "light.json").write_text(
-        json.dumps(
-            {
-                "order": model.spec.light_order,
-                "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
-                "frame": "asset coordinates, +Y up, direction towards the light",
-                "colour": "linear Rec.709 radiance",
-                "coefficients": coefficients,
-            },
-            indent=1,
-        )
-    )
+    """Write light.json: SH coefficients and their conventions. Of a light that moves, those of its still stand-in, and
+    the light itself as `moving`."""
+    field = FittedField(model)
+    moving = field.moving_light
+    content: dict[str, Any] = {
+        "order": model.spec.light_order,
+        "basis": "real orthonormal SH, no Condon-Shortley phase, index l(l+1)+m",
+        "frame": "asset coordinates, +Y up, direction towards the light",
+        "colour": "linear Rec.709 radiance",
+        "coefficients": field.light.astype(np.float64).round(7).tolist(),
+    }
+    if moving is not None:
+        content["moving"] = moving.stored()
+    (context.workdir / "light.json").write_text(json.dumps(content, indent=1))
 
 
 def held_out_responses(model: FaceModel, capture: Capture, fitted: Sequence[int]) -> dict[int, Matrix]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from pipeline import transforms
 from pipeline.colour import srgb_from_linear
 from pipeline.images import shrink_whole
+from pipeline.maths.light_frame import Stations
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -60,10 +61,22 @@ class PhotoView:
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """N rays: origins and unit directions (N, 3)."""
+    """N rays: origins and unit directions (N, 3). axes: (N, 3, 3) of their cameras, columns right, down and forward;
+    only a light that moves with the camera needs them."""
 
     o: Tensor
     d: Tensor
+    axes: Tensor | None = None
+
+    def __getitem__(self, chosen: Tensor | slice) -> Rays:
+        """The chosen rays."""
+        axes = None if self.axes is None else self.axes[chosen].contiguous()
+        return Rays(self.o[chosen].contiguous(), self.d[chosen].contiguous(), axes)
+
+    @property
+    def stations(self) -> Stations | None:
+        """The rays' cameras, for a light that moves with them."""
+        return None if self.axes is None else Stations(self.o, self.axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +179,7 @@ class PixelTable:
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
         d = torch.einsum("nij,nj->ni", self.R[view], local)
-        return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True))
+        return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True), self.R[view])
 
 
 def _pixels_of(view: PhotoView, n: int, factor: int) -> tuple[npt.NDArray[Any], ...]:
@@ -212,4 +225,4 @@ def image_rays(view: PhotoView, factor: int, device: str) -> Rays:
     R = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32)).to(device)
     d = torch.cat([xy, torch.ones_like(xy[:, :1])], -1) @ R.T
     o = torch.from_numpy(view.world_from_cam[:3, 3].astype(np.float32)).to(device).expand_as(d)
-    return Rays(o, d / d.norm(dim=-1, keepdim=True))
+    return Rays(o, d / d.norm(dim=-1, keepdim=True), R.expand(len(d), 3, 3))

@@ -78,14 +78,18 @@ def _half_width(model: FaceModel, x: Tensor, d: Tensor) -> Tensor:
 
 def shade_shell(model: FaceModel, shell: Shell, rays: Rays, pick: Tensor) -> Shaded:
     """Radiance (K, 3) of the rays `pick` (K,), indices into the shell."""
-    wo = -rays.d[shell.kept[pick]]
+    seen = rays[shell.kept[pick]]
+    wo = -seen.d
 
     def samples() -> tuple[Tensor, Tensor, Tensor]:
         t, share = shell.t[pick], shell.share[pick]
-        x = rays.o[shell.kept[pick]][:, None] - t[..., None] * wo[:, None]
+        x = seen.o[:, None] - t[..., None] * wo[:, None]
         return x, unit(shell.gradient.reshape(-1, share.shape[1], 3)[pick]), share
 
-    return model.rendering.shade(model.shade, RayPoints(shell.x[pick], shell.n[pick], wo, samples))
+    def shade(x: Tensor, n: Tensor, wo: Tensor) -> Shaded:
+        return model.shade(x, n, wo, seen.stations)
+
+    return model.rendering.shade(shade, RayPoints(shell.x[pick], shell.n[pick], wo, samples))
 
 
 def solid_behind(model: FaceModel, shell: Shell, rays: Rays) -> Tensor:
@@ -113,10 +117,7 @@ def _covered(model: FaceModel, o: Tensor, d: Tensor, near: Tensor, far: Tensor) 
 
 def render_rays(model: FaceModel, rays: Rays, samples: int, chunk: int = 65_536) -> tuple[Tensor, Tensor]:
     """Premultiplied linear colour (N, 3) and opacity (N,) of any number of rays, without gradients."""
-    parts = [
-        _render_chunk(model, Rays(rays.o[i : i + chunk], rays.d[i : i + chunk]), samples)
-        for i in range(0, len(rays.d), chunk)
-    ]
+    parts = [_render_chunk(model, rays[i : i + chunk], samples) for i in range(0, len(rays.d), chunk)]
     return torch.cat([p[0] for p in parts]), torch.cat([p[1] for p in parts])
 
 
@@ -126,7 +127,7 @@ def _render_chunk(model: FaceModel, rays: Rays, samples: int) -> tuple[Tensor, T
     index, start = torch.arange(len(rays.d), device=rays.d.device), None
     with torch.no_grad():
         for _ in range(LAYERS):
-            part = Rays(rays.o[index], rays.d[index])
+            part = rays[index]
             shell = sample_shell(model, part, samples, None, None, start)
             if not len(shell.kept):
                 break

@@ -77,7 +77,7 @@ def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tu
         pixels = np.flatnonzero(cv2.erode(skin, np.ones((3, 3), np.uint8)))
         chosen = torch.from_numpy(generator.permutation(pixels)[:each])
         rays = image_rays(view, factor, device)
-        x, n, _ = surface_hits(model.geometry, Rays(rays.o[chosen], rays.d[chosen]), chosen)
+        x, n, _ = surface_hits(model.geometry, rays[chosen], chosen)
         found.append((x, n))
     return torch.cat([x for x, _ in found]), torch.cat([n for _, n in found])
 

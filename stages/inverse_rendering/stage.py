@@ -35,6 +35,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
+    from stages.inverse_rendering.moving_light import light_frame
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.systems import first_surface, trainer_for
@@ -72,7 +73,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
     start = chosen.start
     own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
-    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior)
+    lit = None
+    if settings.preset not in COMPARED:
+        fired = [v.flash is True for v in inputs.capture.artifact.views if v.index in set(usable)]
+        lit = light_frame(views, start, settings.light_frame, context.device, sum(fired) / len(fired))
+    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, lit)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -87,6 +92,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
     )
     facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level}
+    if lit is not None:
+        facts["light_frame"] = lit.facts()
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
     fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts)
     return FittedFace(
@@ -118,7 +125,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=20,
+    version=21,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

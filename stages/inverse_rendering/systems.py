@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pipeline.fields.face import FaceModel
     from stages.inverse_rendering.config import Config
     from stages.inverse_rendering.initial_geometry import F32, Start
+    from stages.inverse_rendering.moving_light import LightFrame
     from stages.inverse_rendering.paper.config import PaperConfig
     from stages.inverse_rendering.ray_sampling import PhotoView, Rays
     from stages.inverse_rendering.training_loop import TrainingLoop
@@ -47,13 +48,20 @@ def of_the_paper(settings: Config) -> PaperConfig:
 
 
 def trainer_for(
-    views: list[PhotoView], start: Start, settings: Config, calibrated: bool, device: str, prior: Start
+    views: list[PhotoView],
+    start: Start,
+    settings: Config,
+    calibrated: bool,
+    device: str,
+    prior: Start,
+    lit: LightFrame | None,
 ) -> TrainingLoop:
-    """A new trainer for these settings. prior: the surface with which refined geometry is compared."""
+    """A new trainer for these settings. prior: the surface with which refined geometry is compared. lit: where the
+    light stands still, None for a still light."""
     if settings.preset not in COMPARED:
         from stages.inverse_rendering.initialise import new_trainer
 
-        return new_trainer(views, start, settings, calibrated, device, prior)
+        return new_trainer(views, start, settings, calibrated, device, prior, lit)
     paper = of_the_paper(settings)
     if paper.method == "fast":
         from stages.inverse_rendering.paper.comparison import new_compared_trainer

@@ -12,7 +12,7 @@ from pipeline.artifacts import Camera
 from pipeline.fields.face import FaceModel
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.load_views import camera_only
-from stages.inverse_rendering.ray_sampling import Rays, factor_for, image_rays
+from stages.inverse_rendering.ray_sampling import factor_for, image_rays
 from stages.inverse_rendering.render import render_rays
 
 MIN_TRAINING = 0.25  # share of the stage's seconds that training always gets
@@ -39,7 +39,7 @@ def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Confi
     pixels = sum((c.width // f) * (c.height // f) for c, f in zip(held, factors, strict=True))
     rays = image_rays(camera_only(held[0]), factors[0], device)
     every = slice(None, None, max(len(rays.o) // TRIED, 1))
-    some = Rays(rays.o[every].contiguous(), rays.d[every].contiguous())
+    some = rays[every]
     taken = []
     for _ in range(2):  # the first call includes one-time loading
         clock = Clock()

@@ -268,7 +268,8 @@ def test_clipped_pixels_have_no_say(scene: Scene, tmp_path: Path) -> None:
             photos.cameras[0], photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
             np.ones_like(nothing), np.zeros_like(nothing), cosines,
         )  # fmt: skip
-        found = detail.Detail(photos, np.zeros((1, len(x), 3), np.float32), np.zeros((1, len(x), 3), np.float32))
+        empty = np.zeros((1, len(x), 3), np.float32)
+        found = detail.Detail(photos, empty, empty, np.zeros((0, 0, 3), np.float32))
         given = detail.Points(x, n, zero, nothing, nothing, np.ones_like(nothing))
         support = found.added(replace(given, albedo=np.full_like(nothing, 0.3)))[1]
         assert np.array_equal(support > 0, cosines > 0)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import pipeline.maths
-from pipeline.maths import brdf, correlation, cubemap, density, ggx_width, losses, sdf, sh, split_sum, vmf
+from pipeline.maths import brdf, correlation, cubemap, density, ggx_width, light_frame, losses, sdf, sh, split_sum, vmf
 
 
 def draw(*shape: int, seed: int = 0, low: float = 0.1, high: float = 0.9) -> torch.Tensor:
@@ -91,6 +91,15 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
         (draw(5, 3), draw(5, seed=1, low=0.2, high=0.8), draw(5, seed=2, low=0.2, high=0.8)),
     ),
     "ggx_width.gauge_alpha": (ggx_width.gauge_alpha, (draw(5),)),
+    "light_frame.lamp_axes": (lambda wo: light_frame.lamp_axes(torch.eye(3).double().expand(4, 3, 3), wo), (unit(4),)),
+    "light_frame.turn_of": (
+        lambda x, wo: (
+            light_frame.turn_of(
+                "flash", light_frame.Stations(2 + 0 * x, torch.eye(3).double().expand(4, 3, 3)), x, wo, 0.7
+            ).strength
+        ),
+        (draw(4, 3), unit(4)),
+    ),
     "vmf.attenuation_phong": (lambda s: vmf.attenuation_phong(s, 6), (draw(5),)),
     "vmf.attenuation_exponential": (lambda s: vmf.attenuation_exponential(s, 6), (draw(5),)),
     "vmf.attenuation_exact": (lambda s: vmf.attenuation_exact(s, 6), (draw(5),)),
@@ -98,7 +107,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
 WITHOUT = {
     "density": set(),
     "sdf": {"locate", "neighbour_offsets"},  # indices
-    "sh": {"count", "order_of", "clamped_cosine", "band_selector"},  # constants
+    "sh": {"count", "order_of", "clamped_cosine", "band_selector", "rotated", "spiral"},  # constants; numpy
     "tracing": {"box_interval", "sphere_interval", "sphere_trace", "aggressive_trace"},  # searches, without gradients
     "cubemap": {"texel_directions", "solid_angles", "padded"},
     "split_sum": {"table"},

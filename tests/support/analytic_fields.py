@@ -128,6 +128,10 @@ class AnalyticField:
         return out
 
     @property
+    def moving_light(self) -> None:
+        """None: the light stands still."""
+
+    @property
     def colour_responses(self) -> None:
         """None: every photo shows the true colours."""
 

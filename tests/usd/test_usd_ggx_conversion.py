@@ -57,12 +57,14 @@ def test_a_ggx_lobe_has_no_residual_and_another_has_its_own() -> None:
 
 
 def test_where_there_is_no_lobe_nothing_is_left_over() -> None:
-    """A dull surface, and beside it a lobe as faint as a ten-thousandth, which counts."""
-    strength = np.array([[0.0, 1e-4]], np.float32)
+    """A dull surface; beside it a lobe as faint as a ten-thousandth under a layer with a rim, which counts; and without
+    a layer, where all of the lobe is lost and no rim is added."""
+    strength = np.array([[0.0, 1e-4, 1e-4]], np.float32)
     shape = strength.shape
-    s, f0 = np.full(shape, 0.1, np.float32), np.zeros(shape, np.float32)
+    s, f0 = np.full(shape, 0.1, np.float32), np.array([[0.0, 1e-9, 0.0]], np.float32)
     fit = lobe_fit(strength[..., None], s, f0, np.ones((8, 1), np.float32), np.ones(shape, bool))
     assert fit.residual[0, 0] == 0 and fit.residual[0, 1] > 10
+    assert fit.residual[0, 2] == pytest.approx(1, abs=1e-6)
 
 
 def test_a_lobe_counts_by_what_it_reflects() -> None:
@@ -74,7 +76,7 @@ def test_a_lobe_counts_by_what_it_reflects() -> None:
     basis = (2 * (0.03 * a + b))[:, None].astype(np.float32)
     strength = np.full((1, 101), 1e-5, np.float32)
     strength[0, 0] = 1
-    s, f0 = np.full(strength.shape, 1 / 12, np.float32), np.zeros(strength.shape, np.float32)
+    s, f0 = np.full(strength.shape, 1 / 12, np.float32), np.full(strength.shape, 1e-9, np.float32)
     f0[0, 0] = 0.03
     covered = np.ones(strength.shape, bool)
     fit = lobe_fit(strength[..., None], s, f0, basis, covered)

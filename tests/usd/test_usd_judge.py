@@ -82,7 +82,7 @@ def test_the_asset_is_compared_with_the_model() -> None:
     assert judge.against_model([]) == ()
 
 
-@pytest.mark.parametrize("residual, level", [(0.0, "good"), (0.94, "good"), (2.02, "usable"), (3.5, "unusable")])
+@pytest.mark.parametrize("residual, level", [(0.0, "good"), (0.94, "good"), (2.02, "usable"), (109.6, "usable")])
 def test_lobes_that_no_shader_shows_are_told(residual: float, level: str) -> None:
     (found,) = judge.lobe({"ggx_residual": residual})
     assert found.level == level and f"{residual:.0%}" in found.said

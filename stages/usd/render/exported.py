@@ -17,7 +17,8 @@ from pipeline import tiles
 from pipeline.camera import PinholeCamera
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
-from pipeline.lighting.dome import read_light
+from pipeline.lighting.dome import read_light, read_moving
+from pipeline.lighting.moving import MovingLight
 from pipeline.meshes import fans, vertex_normals
 from pipeline.transforms import apply
 from stages.usd.render.map_lookup import bilinear
@@ -38,7 +39,8 @@ class ExportedAsset:
     albedo * occlusion = fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
     normal (H, W, 3) unit, tangent space, +y along v; basis (N, k) = B_j at n.v = (i + 0.5) / N;
     light ((L + 1)^2, 3). neuface_albedo (H, W, 3), f0, roughness (H, W, 1): None in an asset whose standard material
-    was not fitted; albedo is then NeuFace's.
+    was not fitted; albedo is then NeuFace's. moving: the captured light, if it moves with the camera; `light` is then
+    its still stand-in.
     """
 
     mesh: UvSurface
@@ -54,6 +56,7 @@ class ExportedAsset:
     neuface_albedo: F32 | None = None
     f0: F32 | None = None
     roughness: F32 | None = None
+    moving: MovingLight | None = None
 
 
 def load_exported(root: Path) -> ExportedAsset:
@@ -89,6 +92,7 @@ def load_exported(root: Path) -> ExportedAsset:
         _occlusion(folder, name, count),
         count,
         *_fitted(folder, name, count),
+        moving=read_moving(light_file),
     )
 
 

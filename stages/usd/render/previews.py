@@ -84,8 +84,8 @@ def render_held_out(
 
 def captured(renderer: Renderer, root: Path, check: Callable[[], None] = lambda: None) -> Light | None:
     """The captured light as other programs see it, the exported dome on the standard material; None, the model's closed
-    form, for an asset whose standard material was not fitted."""
-    if renderer.asset.f0 is None:
+    form, for an asset whose standard material was not fitted, or whose light moves with the camera."""
+    if renderer.asset.f0 is None or renderer.asset.moving is not None:
         return None
     dome = root.parent / "environment.exr"
     return StandardLight(renderer, read_linear(dome), dome.name, check=check)

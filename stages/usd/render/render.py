@@ -17,6 +17,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.camera import PinholeCamera
+from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.maths import brdf
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
@@ -92,6 +93,24 @@ class Harmonics:
         return np.asarray(colour.numpy(), np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class Carried:
+    """The same under a light that moves with the camera, for one camera."""
+
+    light: MovingLight
+    eye: Standpoint
+
+    def shade(self, renderer: Renderer, points: Points) -> F64:
+        """(M, 3) radiance. [NeuFace eq. 12] + [NeuFace eq. 16]"""
+        asset, n = renderer.asset, points.normal.astype(np.float32)
+        x = np.einsum("nic,ni->nc", asset.mesh.vertices[points.corner], points.weights).astype(np.float32)
+        albedo = renderer.at(renderer.fitted_albedo, points.uv)
+        diffuse = albedo / np.pi * self.light.irradiance(x, n, self.eye).clip(min=0)
+        s = renderer.at(asset.inv_kappa, points.uv)[:, 0].clip(min=0)
+        incident = self.light.reflected(x, n, s, self.eye, asset.attenuation)
+        return np.asarray(diffuse + renderer.strength(points)[:, None] * incident, np.float64)
+
+
 class Renderer:
     """Renders one asset; `render` may be called for any number of views and lights."""
 
@@ -121,6 +140,9 @@ class Renderer:
         and on the silhouette the mean over a triangle filter, as soft as in a photo. `light`: SH coefficients in place
         of the captured ones, or any Light. `plain`: grey diffuse surface, to show only the shape.
         """
+        moving = self.asset.moving
+        if light is None and moving is not None:
+            light = Carried(moving, Standpoint.of(view.world_from_cam))
         if light is None or isinstance(light, np.ndarray):
             light = Harmonics(self.asset.light if light is None else light, plain)
         h, w = view.height // factor, view.width // factor

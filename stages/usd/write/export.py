@@ -17,7 +17,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
-from pipeline.lighting.dome import environment, environment_figures, light_json, read_light
+from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
 from stages.usd.config import Config
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
@@ -25,6 +25,7 @@ from stages.usd.write.gltf import write_glb
 from stages.usd.write.lookdev import lookdev_layer
 from stages.usd.write.maps import Maps, write_maps
 from stages.usd.write.mesh import UvSurface, half_gap, read_mesh, tile_count, uv_fault, with_uvs_from, without_overlap
+from stages.usd.write.moving_light import write_domes
 from stages.usd.write.obj import write_obj
 from stages.usd.write.package import bounded_png, write_package
 from stages.usd.write.shading import Look
@@ -65,10 +66,12 @@ def export(
     high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
     check()
-    light = read_light(face.path(face.artifact.light))
+    fitted_light = face.path(face.artifact.light)
+    light, moving = read_light(fitted_light), read_moving(fitted_light)
     maps = write_maps(
         bake, mesh, light, name, folder, check,
-        divide=config.divide_shadows, acescg=config.acescg, heights=None if head is None else head.heights,
+        divide=config.divide_shadows and moving is None, acescg=config.acescg,
+        heights=None if head is None else head.heights,
     )  # fmt: skip
     written, look = maps.written, maps.look
     scan = _scan(uv, bake, light, config, folder, check)
@@ -96,7 +99,7 @@ def export(
             component.payload_layer(name, head or mesh, proxy, look, None if scan is None else (scan[0], scan[1].look)),
             "usdc",
         ),
-        "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius), "usda"),
+        "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius, moving), "usda"),
     }
     if high is not None:
         layers[HIGH_FILE] = (component.high_layer(high, look), "usdc")
@@ -104,10 +107,11 @@ def export(
         write_layer(layer, folder / file, form)
     dome = environment(light, config.environment_width)
     write_exr(folder / "environment.exr", dome)
+    domes = [] if moving is None else write_domes(moving, folder, config.environment_width)
     figures = maps.figures | environment_figures(light, dome)
-    (folder / "light.json").write_text(light_json(light, face.artifact.attenuation))
+    (folder / "light.json").write_text(light_json(light, face.artifact.attenuation, moving))
     shutil.copyfile(Path(__file__).with_name(BLENDER), folder / BLENDER)
-    written += [folder / f for f in (*layers, "environment.exr", "light.json", BLENDER)]
+    written += [folder / f for f in (*layers, "environment.exr", "light.json", BLENDER)] + domes
     check()
     light_mesh, light_rig, light_eyes = replace(mesh, paired=False), None, None  # viewers want triangles
     if head is not None:

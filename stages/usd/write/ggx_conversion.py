@@ -4,7 +4,8 @@ Symbols
     c           n.v
     s           1 / kappa
     F(c)        sum_j rho c_j B_j(c): reflectance of the fitted lobe under constant light
-    R(c)        reflectance of a GGX lobe of F0 and alpha(kappa) under it: F0 a(c, alpha) + b(c, alpha)
+    R(c)        reflectance of a GGX lobe of F0 and alpha(kappa) under it: F0 a(c, alpha) + b(c, alpha); 0 without a
+                layer, which is where F0 is 0
 
 A dielectric layer in a shader reflects `tint` R(c), with the R of its own index of refraction. So the tint that gives
 exactly F is sum_j rho c_j B_j(c) / R(c, alpha(s)): linear in the coefficients, with a table over (c, s).
@@ -107,6 +108,7 @@ def lobe_fit(coefficients: F32, inv_kappa: F32, f0: F32, basis: F32, covered: Ma
         fitted = coefficients[y, x].astype(np.float64) @ at
         alpha = ggx_width.best_fit_alpha(1 / np.maximum(inv_kappa[y, x].astype(np.float64), 1e-9))
         ggx = f0[y, x, None].astype(np.float64) * _rows_at(a, table_alpha, alpha) + _rows_at(b, table_alpha, alpha)
+        ggx[f0[y, x] <= 0] = 0.0  # no layer, so no rim either
         error = ((fitted - ggx) ** 2 * weights).sum(1)
         scale = (fitted**2 * weights).sum(1)
         errors, powers = errors + float(error.sum()), powers + float(scale.sum())

@@ -10,8 +10,10 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdRender
 
 from pipeline.artifacts import Camera
+from pipeline.lighting.moving import MovingLight
 from pipeline.transforms import USD_CAM_FROM_OPENCV_CAM, matrix
 from stages.usd.write.component import detached
+from stages.usd.write.moving_light import add_moving_light
 
 MAIN_CAMERA = "main_cam"
 SENSOR_WIDTH = (
@@ -19,8 +21,15 @@ SENSOR_WIDTH = (
 )
 
 
-def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int], radius: float) -> Sdf.Layer:
-    """The layer. `radius`: of the region of interest around the origin, for the clipping ranges."""
+def lookdev_layer(
+    name: str,
+    cameras: tuple[Camera, ...],
+    holdout: frozenset[int],
+    radius: float,
+    moving: MovingLight | None = None,
+) -> Sdf.Layer:
+    """The layer. `radius`: of the region of interest around the origin, for the clipping ranges. moving: the light, if
+    it moves with the camera."""
     stage = Usd.Stage.CreateInMemory()
     layer = stage.GetRootLayer()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -40,6 +49,8 @@ def lookdev_layer(name: str, cameras: tuple[Camera, ...], holdout: frozenset[int
     for camera in cameras:
         _camera(stage, f"/{name}/lookdev/cameras/view_{camera.index}", camera, camera.index in holdout, radius)
     _shown_first(stage, name, cameras, holdout)
+    if moving is not None:
+        add_moving_light(stage, f"/{name}/lookdev", moving, cameras)
     out = detached(stage)
     out.subLayerPaths.append(f"./{name}.usd")  # not before: a stage would search it in the working folder
     return out
