@@ -34,6 +34,7 @@ CONVENTION = (
 MOVING = (
     "The light stands still relative to the camera, not to the subject; the coefficients above are those while the "
     "camera is in front of the face. frame camera: coefficients in the camera's axes (x right, y down, z forward). "
+    "frame turntable: in these axes without the camera's tilt: y along -Y, z level. "
     "frame flash: z is the ray from the camera to the point, x the camera's x axis made perpendicular to it, and the "
     "radiance is times (distance / distance of the point from the camera)^2, metres. ambient: the part that stands "
     "still in the asset's coordinates, added to it."

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from pipeline.maths import brdf, sh
-from pipeline.maths.light_frame import CAMERA, FLASH, Stations, turn_of
+from pipeline.maths.light_frame import MOVING, Stations, turn_of
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -48,7 +48,8 @@ class Standpoint:
 
 @dataclass(frozen=True, slots=True)
 class MovingLight:
-    """frame: `camera` or `flash`; distance: d_0, of a flash; coefficients ((L + 1)^2, 3) of L_c, ambient of L_a."""
+    """frame: one of light_frame.MOVING; distance: d_0, of a flash; coefficients ((L + 1)^2, 3) of L_c, ambient of
+    L_a."""
 
     frame: str
     distance: float
@@ -103,7 +104,7 @@ def from_stored(stored: Mapping[str, Any] | None) -> MovingLight | None:
         if c.ndim != 2 or c.shape[1] != 3 or int(np.sqrt(len(c))) ** 2 != len(c) or not np.isfinite(c).all():
             raise ValueError(f"coefficients of shape {c.shape}")
     distance = float(stored["distance"])
-    if stored["frame"] not in (CAMERA, FLASH) or not (np.isfinite(distance) and distance > 0):
+    if stored["frame"] not in MOVING or not (np.isfinite(distance) and distance > 0):
         raise ValueError(f"frame {stored['frame']!r}, distance {distance}")
     return MovingLight(str(stored["frame"]), distance, coefficients, ambient)
 

@@ -5,7 +5,9 @@ stands still relative to the camera. Normals and directions are then turned into
 harmonics are evaluated; nothing else of the rendering equation changes.
 
     world    the subject's own coordinates: a still subject in a still light
-    camera   the camera's axes: a subject on a turntable. All points of a photo have the same frame
+    turntable  a subject that turns about +Y while camera and room stand still: the camera's axes without its tilt, so
+             that the camera may be raised between rounds. z is level and points forward, y points down
+    camera   the camera's axes: lamps that are far away and fixed to the camera
     flash    a lamp beside the lens: the frame's z axis is the ray from the camera to the point, x is the camera's x
              axis made perpendicular to it. So the lamp has the same direction at every point, also close to the camera,
              and its light falls off with the squared distance from the camera
@@ -18,17 +20,15 @@ Source: co-located light as in IRON [Zhang et al. 2022] and Nam et al. [2018], h
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pipeline.maths.sdf import unit
 
-Frame = Literal["world", "camera", "flash"]
-WORLD: Frame = "world"
-CAMERA: Frame = "camera"
-FLASH: Frame = "flash"
+WORLD, TURNTABLE, CAMERA, FLASH = "world", "turntable", "camera", "flash"
+MOVING = (TURNTABLE, CAMERA, FLASH)
+NEARLY_LEVEL = 1e-3  # share of the picture's upward direction in that of a camera that looks straight down
 NEAREST = 0.05  # of d_0: smallest distance, against the pole of the falloff
 
 
@@ -60,10 +60,22 @@ class Turn:
 
 def turn_of(frame: str, stations: Stations, x: Tensor, wo: Tensor, distance: float) -> Turn:
     """The frame of a moving light at points x with unit wo, (N, 3) each. distance: d_0 > 0, for `flash`."""
-    if frame == CAMERA:
-        return Turn(stations.axes, torch.ones_like(x[:, :1]))
+    if frame != FLASH:
+        axes = stations.axes if frame == CAMERA else level_axes(stations.axes)
+        return Turn(axes, torch.ones_like(x[:, :1]))
     away = (x - stations.eye).norm(dim=-1, keepdim=True).clamp(min=NEAREST * distance)
     return Turn(lamp_axes(stations.axes, wo), (distance / away) ** 2)
+
+
+def level_axes(axes: Tensor) -> Tensor:
+    """(N, 3, 3) frames of `turntable`: columns x = y cross z, y = (0, -1, 0), z level. axes (N, 3, 3) of the cameras.
+
+    z is the level part of the forward axis; straight down, where it has none, that of the picture's upward direction.
+    """
+    z = axes[..., 2] + NEARLY_LEVEL * axes[..., 1:2, 2] * axes[..., 1]
+    z = unit(z * z.new_tensor([1.0, 0.0, 1.0]))
+    y = z.new_tensor([0.0, -1.0, 0.0]).expand_as(z)
+    return torch.stack([torch.linalg.cross(y, z), y, z], -1)
 
 
 def lamp_axes(axes: Tensor, wo: Tensor) -> Tensor:

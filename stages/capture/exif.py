@@ -1,7 +1,8 @@
 """A minimal EXIF reader: the TIFF tags that the pipeline uses.
 
-These are orientation, focal length, make, model, lens, exposure, white balance, flash and GPS position. A file with damaged or
-no metadata gives an empty `Exif`, never an error: metadata is optional. Source: EXIF 2.32 (CIPA DC-008), TIFF 6.0.
+These are orientation, focal length, make, model, lens, exposure, white balance, flash and GPS position. A file with
+damaged or no metadata gives an empty `Exif`, never an error: metadata is optional. Source: EXIF 2.32 (CIPA DC-008),
+TIFF 6.0.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Exif:
     """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
 
     exposure: seconds x ISO / f-number^2, to which the linear value of a grey is proportional; None if one is missing.
-    white_balance: auto, manual, or "" if unknown. flash: whether a flash fired, None if unknown. place: degrees north, degrees east, metres up.
+    white_balance: auto, manual, or "" if unknown. flash: whether a flash fired, None if unknown. place: degrees north,
+    degrees east, metres up.
     """
 
     orientation: int = 1

@@ -101,11 +101,11 @@ class Config(StageConfig):
         description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo",
     )
-    light_frame: Literal["auto", "world", "camera", "flash"] = Field(
+    light_frame: Literal["auto", "world", "turntable", "camera", "flash"] = Field(
         default=AUTO,
-        description="where the light stands still; world: in the room, with the subject; camera: relative to the "
-        "camera, while the subject turns; flash: a lamp on the camera, whose light falls off with the distance; auto: "
-        "by cross-validation before the fit and by the photos' metadata",
+        description="where the light stands still; world: in the room, with the subject; turntable: in the room, in "
+        "which the subject turns; camera: relative to the camera; flash: a lamp on the camera, whose light falls off "
+        "with the distance; auto: by cross-validation before the fit and by the photos' metadata",
     )
     skin_light: bool = Field(
         default=True,

@@ -1,8 +1,8 @@
 """Does the light stand still relative to the subject, or relative to the camera? Decided before the fit, on the initial
 geometry, by photos that had no vote.
 
-    world            c_pv = g_v D_p
-    camera, flash    c_pv = g_v a_p s_pv E(R_pv^T n_p)
+    world                       c_pv = g_v D_p
+    turntable, camera, flash    c_pv = g_v a_p s_pv E(R_pv^T n_p)
 
 Symbols: c_pv colour (mean of the channels) of point p in view v; g_v gain of a view; D_p the point's radiance; a_p its
 albedo; E(n) = sum_k f_k max(n . w_k, 0) the irradiance of LAMPS lamps with flux f_k >= 0 in the light's frame R_pv;
@@ -27,7 +27,7 @@ import torch
 from scipy.optimize import nnls
 
 from pipeline.maths import sh
-from pipeline.maths.light_frame import CAMERA, FLASH, WORLD, Stations, turn_of
+from pipeline.maths.light_frame import FLASH, MOVING, TURNTABLE, WORLD, Stations, turn_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.observations import Observations, observe, pictures
 from stages.inverse_rendering.ray_sampling import PhotoView
@@ -81,21 +81,20 @@ def decide(seen: Observations, views: list[PhotoView], wanted: str, flashed: flo
     """The same, from observations."""
     stations, distance = _stations(seen, views)
     parts = _divided(seen)
-    frames: tuple[str, ...] = (WORLD, CAMERA, FLASH)
-    found = {f: _solve(seen, parts, _lit(f, seen, stations, distance)) for f in frames}
+    found = {f: _solve(seen, parts, _lit(f, seen, stations, distance)) for f in (WORLD, *MOVING)}
     errors = {f: e for f, (e, _) in found.items()}
     frame, why = wanted, "setting"
     if wanted == "auto":
-        frame, why = _chosen(errors, flashed > MOST)
+        frame, why = chosen_frame(errors, flashed > MOST)
     return LightFrame(frame, errors, found[frame][1] if frame != WORLD else None, distance, why)
 
 
-def _chosen(errors: dict[str, float], flashed: bool) -> tuple[str, str]:
+def chosen_frame(errors: dict[str, float], flashed: bool) -> tuple[str, str]:
     """The frame, and the reason. flashed: whether the metadata say that a flash fired."""
     if not all(np.isfinite(e) for e in errors.values()):
         return (FLASH, "metadata") if flashed else (WORLD, "too few views to compare")
-    moving = min((CAMERA, FLASH), key=lambda f: errors[f])
-    limit = FLASHED if flashed else CLEARLY
+    moving = min(MOVING, key=lambda f: errors[f])
+    limit = FLASHED if flashed and moving != TURNTABLE else CLEARLY
     return moving if errors[moving] < limit * errors[WORLD] else WORLD, "cross-validation"
 
 

@@ -175,6 +175,14 @@ def test_exposure_white_balance_and_place(order: str) -> None:
     assert read_exif(exif_jpeg(place_block(order, iso=0))).exposure is None
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("value, fired", [(0x00, False), (0x01, True), (0x10, False), (0x19, True), (0xFFFF, None)])
+def test_a_flash_that_fired_is_bit_0(order: str, value: int, fired: bool | None) -> None:
+    block = tiff_block(order, [], [(0x9209, 3, 1, struct.pack(order + "H", value))], [])
+    assert read_exif(exif_jpeg(block)).flash is fired
+    assert read_exif(exif_jpeg(camera_block(order))).flash is None
+
+
 def test_metres_from_a_place_agree_with_the_ellipsoid() -> None:
     """Oracle: both places in the earth's own axes, turned to east, north and up at the first."""
 

@@ -14,9 +14,9 @@ from support.small_ball import RADIUS, SIDE, SMALL, ball_start, ball_view, hooks
 from pipeline import transforms
 from pipeline.colour import srgb_from_linear
 from pipeline.maths import sh
-from pipeline.maths.light_frame import CAMERA, FLASH, WORLD
+from pipeline.maths.light_frame import CAMERA, FLASH, TURNTABLE, WORLD, level_axes
 from stages.inverse_rendering.initialise import new_trainer
-from stages.inverse_rendering.moving_light import LAMPS, decide, first_light, light_frame
+from stages.inverse_rendering.moving_light import LAMPS, chosen_frame, decide, first_light, light_frame
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.training_loop import run_fit
@@ -47,6 +47,11 @@ def turning(n: np.ndarray, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return 0.3 + 0.7 * np.maximum(n @ (pose[:3, :3] @ unit(np.array([0.8, -0.6, -0.4]))), 0)
 
 
+def on_a_turntable(n: np.ndarray, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    frame = level_axes(torch.from_numpy(pose[None, :3, :3].copy()))[0].numpy()
+    return 0.3 + 0.7 * np.maximum(n @ (frame @ unit(np.array([0.8, -0.6, -0.4]))), 0)
+
+
 def flash(n: np.ndarray, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
     lamp = pose[:3, 3] + 0.05 * pose[:3, :3] @ np.array([0, -1, 0])
     away = lamp - x
@@ -75,11 +80,14 @@ def found(views: list[PhotoView], wanted: str = "auto", flashed: float = 0.0) ->
 
 
 @pytest.mark.parametrize("gain", [lambda i: 1.0, lambda i: 1.4 ** ((-1) ** i)], ids=["one exposure", "auto exposure"])
-@pytest.mark.parametrize("arrives, frame", [(still, WORLD), (turning, CAMERA), (flash, FLASH)])
+@pytest.mark.parametrize(
+    "arrives, frame", [(still, WORLD), (on_a_turntable, TURNTABLE), (turning, CAMERA), (flash, FLASH)]
+)
 def test_the_light_s_frame_is_found(arrives: Arrives, frame: str, gain: Callable[[int], float]) -> None:
     result = found(photos(arrives, gain))
     assert result.frame == frame and result.why == "cross-validation"
-    assert result.errors[frame] == min(result.errors.values())
+    # a ball of one round hardly tells a still light's nearest rivals apart; the others are far behind
+    assert result.errors[frame] < 1.1 * min(result.errors.values())
     assert result.facts()["frame"] == frame
     assert (result.flux is None) == (frame == WORLD)
 
@@ -97,7 +105,16 @@ def test_metadata_lower_the_threshold_but_do_not_decide_alone() -> None:
     seen_dim = [replace(v, rgb=0.5 * v.rgb + 0.5 * w.rgb) for v, w in zip(views, photos(flash), strict=True)]
     plain, told = (found(seen_dim, flashed=f) for f in (0.0, 1.0))
     assert plain.errors == told.errors
-    assert (told.frame == WORLD) == (min(told.errors, key=told.errors.__getitem__) == WORLD)
+    assert plain.frame == chosen_frame(plain.errors, flashed=False)[0]
+    assert told.frame == chosen_frame(told.errors, flashed=True)[0]
+
+
+def test_what_the_metadata_are_worth() -> None:
+    """A moving light must be clearly better, or at all where a flash fired."""
+    errors = {WORLD: 1.0, TURNTABLE: 0.97, CAMERA: 0.95, FLASH: 0.9}
+    assert chosen_frame(errors, flashed=False)[0] == WORLD and chosen_frame(errors, flashed=True)[0] == FLASH
+    assert chosen_frame(errors | {CAMERA: 0.5}, flashed=False)[0] == CAMERA
+    assert chosen_frame(errors | {WORLD: 0.8}, flashed=True)[0] == WORLD
 
 
 def test_few_photos_stay_in_a_still_light_unless_the_metadata_say_flash() -> None:

@@ -92,6 +92,7 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     ),
     "ggx_width.gauge_alpha": (ggx_width.gauge_alpha, (draw(5),)),
     "light_frame.lamp_axes": (lambda wo: light_frame.lamp_axes(torch.eye(3).double().expand(4, 3, 3), wo), (unit(4),)),
+    "light_frame.level_axes": (lambda x: light_frame.level_axes(x.reshape(4, 3, 3)), (draw(4, 9, seed=3),)),
     "light_frame.turn_of": (
         lambda x, wo: (
             light_frame.turn_of(

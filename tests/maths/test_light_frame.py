@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pipeline.maths import sh
-from pipeline.maths.light_frame import CAMERA, FLASH, NEAREST, Stations, lamp_axes, turn_of
+from pipeline.maths.light_frame import CAMERA, FLASH, NEAREST, TURNTABLE, Stations, lamp_axes, level_axes, turn_of
 
 RNG = np.random.default_rng(3)
 
@@ -61,6 +61,36 @@ def test_on_the_optical_axis_the_lamp_s_frame_is_the_camera_s() -> None:
     eye, axes = cameras(4)
     a, wo = tensors(axes, towards(np.zeros((4, 3)), eye))
     np.testing.assert_allclose(lamp_axes(a, wo).numpy(), axes, atol=1e-6)
+
+
+def test_a_turntable_s_frame_turns_with_the_subject_alone() -> None:
+    """The subject turns by any angle about its vertical, the camera is raised or lowered: a lamp of the room keeps its
+    direction in the frame."""
+    lamp = np.array([0.4, 0.5, 0.7])
+    found = []
+    for azimuth in (0.0, 40.0, 170.0, -100.0):
+        turned = Rotation.from_euler("y", azimuth, degrees=True)
+        for elevation in (-50.0, 0.0, 30.0, 80.0):
+            tilt = np.diag([1.0, -1.0, -1.0]) @ Rotation.from_euler("x", -elevation, degrees=True).as_matrix()
+            (axes,) = tensors((turned.as_matrix() @ tilt)[None])
+            frame = level_axes(axes)[0].numpy()
+            np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-6)
+            assert np.linalg.det(frame) > 0.99
+            found.append(frame.T @ turned.apply(lamp))  # the room turns with the camera around the subject
+    np.testing.assert_allclose(found, np.tile(found[0], (len(found), 1)), atol=1e-6)
+    # in front and level: x to the picture's right, y down, z away from the camera
+    np.testing.assert_allclose(found[0], lamp * [1, -1, -1], atol=1e-6)
+
+
+def test_a_camera_that_looks_straight_down_has_a_level_frame() -> None:
+    """By the picture's upward direction."""
+    axes = np.array([[[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]]).transpose(0, 2, 1)  # columns right, down, forward
+    axes[0, :, 1], axes[0, :, 2] = [0, 0, 1.0], [0, -1.0, 0]
+    (a,) = tensors(axes)
+    np.testing.assert_allclose(level_axes(a)[0, :, 2].numpy(), [0, 0, -1], atol=1e-6)
+    eye, _ = cameras(1)
+    turn = turn_of(TURNTABLE, Stations(torch.from_numpy(eye), a), 0 * torch.from_numpy(eye), a[:, :, 0], 1.0)
+    assert (turn.strength == 1).all()
 
 
 def test_extremes_stay_finite() -> None:

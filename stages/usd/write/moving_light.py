@@ -20,7 +20,7 @@ from pipeline.images import write_exr
 from pipeline.lighting.dome import environment
 from pipeline.lighting.moving import MovingLight
 from pipeline.maths import sh
-from pipeline.maths.light_frame import FLASH
+from pipeline.maths.light_frame import FLASH, TURNTABLE, level_axes
 from pipeline.transforms import matrix
 
 F64 = npt.NDArray[np.float64]
@@ -82,7 +82,10 @@ def _carried(stage: Usd.Stage, path: str, moving: MovingLight, cameras: tuple[Ca
     local[:3, :3], local[:3, 3] = axes, place
     op = UsdGeom.Xformable(prim).AddTransformOp()
     for frame, camera in enumerate(cameras, 1):
-        pose = matrix(camera.world_from_cam) @ local
+        pose = matrix(camera.world_from_cam)
+        if moving.frame == TURNTABLE:
+            pose[:3, :3] = level_axes(torch.from_numpy(pose[None, :3, :3].copy()))[0].numpy()
+        pose = pose @ local
         op.Set(Gf.Matrix4d(*pose.T.ravel().tolist()), Usd.TimeCode(frame))
         prim.SetCustomDataByKey(f"photos:frame_{frame}", camera.name)
 
