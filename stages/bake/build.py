@@ -109,7 +109,7 @@ class Baker:
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
         self.material_figures: dict[str, float] = {}
-        if fit_standard and self._found is not None and field.moving_light is None:  # it needs one still dome
+        if fit_standard and self._found is not None:
             step(0, 1, "standard material")
             seen = self._known.unseen < 0.5
             fitted = standard_material(

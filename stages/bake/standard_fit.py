@@ -6,7 +6,7 @@ The radiance of observation j at vertex p, by the reference renderer (pipeline/l
 
 Symbols
     a       albedo of the field; r its correction, so that base colour = r a
-    S       irradiance over pi under the exported dome, traced on the mesh
+    S       irradiance over pi under the exported dome, traced on the mesh; of a light that moves, in each photo
     A, B    specular radiance of F0 = 1 without, and of the rim with Schlick's factor, for one width alpha
     R       share that the layer keeps from the base
     w       weight of an observation: robust, by the residual of the field's own prediction, and less at grazing angles
@@ -67,6 +67,16 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
+class Lit:
+    """What arrives at M observations: lobes (M, K, 2, 3) for F0 = 1 and the rim, for each of ALPHAS; shade (M, 3): S.
+    received (V, 3): S at the vertices, of the still light or its stand-in."""
+
+    lobes: F32
+    shade: F64
+    received: F64
+
+
+@dataclass(frozen=True, slots=True)
 class Fitted:
     """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,); received (V, 3): S. figures: for the
     report. plausible: false if the only material is none that exists."""
@@ -91,12 +101,13 @@ class _Sums:
 
 
 def fit(
-    mesh: Mesh, normals: F64, at: standard.Arrivals, albedo: F64, seen: Seen, skin: Mask,
+    mesh: Mesh, normals: F64, at: standard.Arrivals | Lit, albedo: F64, seen: Seen, skin: Mask,
     check: Callable[[], None] = lambda: None,
 ) -> Fitted:  # fmt: skip
-    """Fit everything. normals, albedo (V, 3) of the field at the vertices; skin (V,): where the prior of skin holds."""
+    """Fit everything. normals, albedo (V, 3) of the field at the vertices; at: a still light as it arrives at them, or
+    what arrives at the observations; skin (V,): where the prior of skin holds."""
     w = _weights(normals, seen)
-    lit = standard.lobes(at, seen.vertex, normals[seen.vertex], seen.wo, ALPHAS)
+    lit = at if isinstance(at, Lit) else under_dome(at, normals, seen)
     check()
     sums = _sums(normals, seen, w, lit, len(normals))
     often = np.bincount(seen.vertex[w > 0], minlength=len(normals)) >= MIN_VIEWS
@@ -119,12 +130,19 @@ def fit(
     # groups meet without a step
     f0, roughness = near(np.stack([f0, rough], 1)).T
     f0 = np.where(near(layered[:, None])[:, 0] > 0.01, f0, 0.0).clip(0, 1)
-    correction = _correction(mesh, normals, at, albedo, seen, w, lit, f0, roughness, edge)
+    correction = _correction(mesh, normals, albedo, seen, w, lit, f0, roughness, edge)
     return Fitted(
         correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
-        (at.irradiance / np.pi).astype(np.float32),
+        lit.received.astype(np.float32),
         {k: round(v, 5) for k, v in figures.items()}, bool(skin.any()) or "gloss_rest_refused_f0" not in figures,
     )  # fmt: skip
+
+
+def under_dome(at: standard.Arrivals, normals: F64, seen: Seen) -> Lit:
+    """What arrives at the observations under a still light."""
+    received = np.asarray(at.irradiance / np.pi, np.float64)
+    lobes = standard.lobes(at, seen.vertex, normals[seen.vertex], seen.wo, ALPHAS)
+    return Lit(lobes, received[seen.vertex], received)
 
 
 def _weights(normals: F64, seen: Seen) -> F64:
@@ -136,22 +154,26 @@ def _weights(normals: F64, seen: Seen) -> F64:
     return np.asarray(robust * ((cosine - GRAZING) / (FACING - GRAZING)).clip(0, 1))
 
 
-def _sums(normals: F64, seen: Seen, w: F64, lit: F32, count: int) -> _Sums:
+def _sums(normals: F64, seen: Seen, w: F64, lit: Lit, count: int) -> _Sums:
     cosine, v = (normals[seen.vertex] * seen.wo).sum(1), seen.vertex
     h, g, q = (np.zeros((count, len(ALPHAS))) for _ in range(3))
 
     def total(values: F64) -> F64:
         return np.stack([np.bincount(v, values[:, i], count) for i in range(values.shape[1])], 1)
 
+    def without_base(z: F64, t: F64) -> F64:
+        """z (M, 3) less its best multiple of t (M, 3) at each vertex."""
+        norm = np.maximum(total(w[:, None] * t * t), 1e-12)
+        return np.asarray(z - (total(w[:, None] * z * t) / norm)[v] * t)
+
+    shade = np.maximum(lit.shade / max(float(lit.shade.mean()), 1e-12), 1e-6) if len(v) else lit.shade
     for k, alpha in enumerate(ALPHAS):
-        t = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), alpha))
-        x, y = lit[:, k, 0].astype(np.float64), seen.colour - lit[:, k, 1]
-        norm = np.maximum(np.bincount(v, w * t * t, count), 1e-12)[:, None]
-        x, y = (z - (total(z * (w * t)[:, None]) / norm)[v] * t[:, None] for z in (x, y))
+        kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), alpha))
+        t = kept[:, None] * shade
+        x, y = (without_base(z, t) for z in (lit.lobes[:, k, 0].astype(np.float64), seen.colour - lit.lobes[:, k, 1]))
         for out, product in ((h, x * x), (g, x * y), (q, y * y)):
             out[:, k] = np.bincount(v, w * product.sum(1), count)
-    norm = np.maximum(np.bincount(v, w, count), 1e-12)[:, None]
-    y = seen.colour - (total(seen.colour * w[:, None]) / norm)[v]
+    y = without_base(seen.colour, shade)
     bare, weight = (np.asarray(np.bincount(v, z, count), np.float64) for z in (w * (y * y).sum(1), w))
     return _Sums(h, g, q, bare, weight)
 
@@ -201,8 +223,7 @@ def _lowest(x: F64, cost: F64) -> float:
 
 
 def _correction(
-    mesh: Mesh, normals: F64, at: standard.Arrivals, albedo: F64, seen: Seen, w: F64, lit: F32, f0: F64,
-    roughness: F64, edge: float,
+    mesh: Mesh, normals: F64, albedo: F64, seen: Seen, w: F64, lit: Lit, f0: F64, roughness: F64, edge: float,
 ) -> F64:  # fmt: skip
     """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R); 1 where nothing is seen."""
     v = seen.vertex
@@ -211,9 +232,9 @@ def _correction(
     k = np.abs(ALPHAS[None] - alpha[:, None]).argmin(1)[v]
     layered = (f0[v] > 0)[:, None]
     rows = np.arange(len(v))
-    specular = np.where(layered, f0[v, None] * lit[rows, k, 0] + lit[rows, k, 1], 0.0)
+    specular = np.where(layered, f0[v, None] * lit.lobes[rows, k, 0] + lit.lobes[rows, k, 1], 0.0)
     kept = 1 - standard.layer(cosine, f0[v], alpha[v])
-    m = (albedo * at.irradiance / np.pi)[v] * kept[:, None]
+    m = albedo[v] * lit.shade * kept[:, None]
     above, below = (
         np.stack([np.bincount(v, w * z[:, i], len(normals)) for i in range(3)], 1).astype(np.float64)
         for z in (m * (seen.colour - specular), m * m)

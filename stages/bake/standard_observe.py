@@ -10,8 +10,10 @@ import numpy as np
 from pipeline.fields.protocol import Field
 from pipeline.lighting.dome import environment
 from pipeline.lighting.median_cut import lamps
-from pipeline.lighting.standard import COUNT, arrivals
-from pipeline.meshes import F64, Mask, Mesh, unit
+from pipeline.lighting.moving import MovingLight, Standpoint
+from pipeline.lighting.moving_standard import MovingLamps
+from pipeline.lighting.standard import COUNT, Arrivals, arrivals
+from pipeline.meshes import F32, F64, Indices, Mask, Mesh, unit
 from pipeline.transforms import inverse_rigid, matrix, project
 from pipeline.visibility import FittedPhoto
 from stages.bake import detail_kernels as kernels
@@ -31,12 +33,38 @@ def standard_material(
     """The fitted material at the vertices. skin_code: label of skin in the photos, -1 for none; seen (V,)."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
-    lit = lamps(environment(field.light, DOME_WIDTH), COUNT)
-    at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
-    observations, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
+    observations, view, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
+    moving = field.moving_light
+    at: standard_fit.Lit | Arrivals
+    if moving is None:
+        lit = lamps(environment(field.light, DOME_WIDTH), COUNT)
+        at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
+    else:
+        poses = [matrix(v.camera.world_from_cam) for v in views]
+        at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
     out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check)
     correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
     return replace(out, correction=correction)
+
+
+def carried(
+    light: MovingLight, stand_in: F32, mesh: Mesh, normals: F64, seen: standard_fit.Seen, view: Indices,
+    poses: Sequence[F64], check: Callable[[], None],
+) -> standard_fit.Lit:  # fmt: skip
+    """What arrives under a light that moves with the camera. stand_in: the still one; view (M,): number of each
+    observation's photo; poses (4, 4) of the photos."""
+    moving = MovingLamps(light)
+    lobes = np.empty((len(view), len(standard_fit.ALPHAS), 2, 3), np.float32)
+    lit = np.empty((len(view), 3))
+    for number, pose in enumerate(poses):
+        check()
+        rows = np.flatnonzero(view == number)
+        x, n = mesh.vertices[seen.vertex[rows]], normals[seen.vertex[rows]].astype(np.float32)
+        eye = Standpoint.of(pose)
+        lobes[rows] = moving.lobes(x, n, eye, standard_fit.ALPHAS)
+        lit[rows] = moving.irradiance(x, n, eye) / np.pi
+    still = shade(stand_in, normals, np.ones((len(normals), 3), np.float32)).astype(np.float64)
+    return standard_fit.Lit(lobes, lit, still)
 
 
 def field_normals(field: Field, mesh: Mesh) -> F64:
@@ -48,7 +76,8 @@ def field_normals(field: Field, mesh: Mesh) -> F64:
 
 def _observed(
     field: Field, mesh: Mesh, normals: F64, albedo: F64, views: Sequence[FittedPhoto], skin_code: int, found: Detail
-) -> tuple[standard_fit.Seen, Mask]:
+) -> tuple[standard_fit.Seen, Indices, Mask]:
+    """The observations, the number of each one's photo, and where the vertices are skin."""
     photos, x = found.photos, mesh.vertices.astype(np.float64)
     colour, cosines = np.zeros((len(views), len(x), 3)), np.zeros((len(views), len(x)))
     kernels.observed(photos.cameras, photos.pixels, photos.depth, photos.clipped, x, normals, colour, cosines)
@@ -56,8 +85,10 @@ def _observed(
     view, vertex = np.nonzero(cosines > 0)
     away = photos.cameras[view, 27:30] - x[vertex]
     wo = away / np.linalg.norm(away, axis=1, keepdims=True)
-    predicted = base[vertex] + found.gloss[view, vertex]
-    return standard_fit.Seen(vertex, wo, colour[view, vertex], predicted), _skin(views, x, cosines, skin_code)
+    own = found.relative[view, vertex] if len(found.relative) else 1.0
+    predicted = base[vertex] * own + found.gloss[view, vertex]
+    observations = standard_fit.Seen(vertex, wo, colour[view, vertex], predicted)
+    return observations, view, _skin(views, x, cosines, skin_code)
 
 
 def _skin(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask:

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from support.synthetic_asset import ball
 
 from pipeline.lighting import standard
 from pipeline.lighting.median_cut import lamps
+from pipeline.lighting.moving import MovingLight, Standpoint
+from pipeline.lighting.moving_standard import MovingLamps
+from pipeline.maths import sh
 from pipeline.maths.latlong import latlong_directions
+from pipeline.maths.light_frame import FLASH
 from pipeline.meshes import Mesh
+from pipeline.transforms import rigid
 from stages.bake import standard_fit as fits
+from stages.bake.standard_observe import carried
 
 RADIUS = 0.1
 
@@ -95,3 +102,40 @@ def test_without_photos_the_prior_is_all() -> None:
         found = fits.fit(mesh, n, at, albedo, none, np.full(len(albedo), skin))
         np.testing.assert_allclose(found.f0, wanted, rtol=1e-3)
         np.testing.assert_allclose(found.correction, 1, rtol=1e-3)
+
+
+def test_an_objects_material_is_found_under_a_flash() -> None:
+    """Photos by a lamp beside the lens: each has its own irradiance, so that what arrives is given by observation."""
+    made = ball(40, 20, height=1.0)
+    x = made["vertices"] / np.linalg.norm(made["vertices"], axis=1).max() * RADIUS
+    n = (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float64)
+    mesh = Mesh(x.astype(np.float32), n.astype(np.float32), made["faces"])
+    degree = np.sqrt(np.arange(121)).astype(int)
+    d = torch.tensor([[0.0, -0.15, -1.0]], dtype=torch.float64)
+    c = sh.sh_basis(d / d.norm(), 10).numpy()[0] * np.exp(-degree * (degree + 1) * 0.03)
+    light = MovingLight(FLASH, 0.8, np.repeat(c[:, None], 3, 1).astype(np.float32), np.full((1, 3), 0.1, np.float32))
+    lamps_ = MovingLamps(light)
+    albedo = np.full((len(n), 3), [0.4, 0.3, 0.2]) * (1 + 0.3 * np.sin(60 * x[:, :1]))
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    parts, poses = [], []
+    for k, a in enumerate(turn):
+        centre = np.array([np.sin(a), 0.4 * np.sin(3 * a), np.cos(a)])
+        z = -centre / np.linalg.norm(centre)
+        right = np.cross(z, [0, 1.0, 0])
+        right /= np.linalg.norm(right)
+        poses.append(rigid(np.stack([right, np.cross(z, right), z], 1), centre))
+        wo = centre - x
+        wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+        rows = np.flatnonzero((n * wo).sum(1) > 0.25)
+        f0, rough = (np.full(len(rows), v, np.float32) for v in (0.05, 0.45))
+        base = (1.1 * albedo[rows]).astype(np.float32)
+        shown = lamps_.radiance(mesh.vertices[rows], mesh.normals[rows], Standpoint.of(poses[-1]), base, f0, rough)
+        parts.append((rows, wo[rows], shown, np.full(len(rows), k)))
+    vertex, wo, colour, view = (np.concatenate([p[i] for p in parts]) for i in range(4))
+    seen = fits.Seen(vertex, wo, colour, colour)
+    lit = carried(light, light.still(), mesh, n, seen, view, poses, lambda: None)
+    found = fits.fit(mesh, n, lit, albedo, seen, np.zeros(len(n), bool))
+    well = np.abs(n[:, 1]) < 0.5
+    assert np.median(found.f0[well]) == pytest.approx(0.05, rel=0.15)
+    assert np.median(found.roughness) == pytest.approx(0.45, abs=0.06)
+    assert np.median(found.correction[well]) == pytest.approx(1.1, rel=0.03)

@@ -83,8 +83,8 @@ def render_held_out(
 
 
 def captured(renderer: Renderer, root: Path, check: Callable[[], None] = lambda: None) -> Light | None:
-    """The captured light as other programs see it, the exported dome on the standard material; None, the model's closed
-    form, for an asset whose standard material was not fitted, or whose light moves with the camera."""
+    """The captured light as other programs see it, the exported dome on the standard material; None, what the
+    renderer has itself, for an asset whose standard material was not fitted, or whose light moves with the camera."""
     if renderer.asset.f0 is None or renderer.asset.moving is not None:
         return None
     dome = root.parent / "environment.exr"

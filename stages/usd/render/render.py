@@ -18,10 +18,12 @@ import torch
 
 from pipeline.camera import PinholeCamera
 from pipeline.lighting.moving import MovingLight, Standpoint
+from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.maths import brdf
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
+from stages.usd.render.carried import Carried, StandardCarried
 from stages.usd.render.exported import ExportedAsset
 from stages.usd.render.map_lookup import bilinear, lookup
 
@@ -93,24 +95,6 @@ class Harmonics:
         return np.asarray(colour.numpy(), np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class Carried:
-    """The same under a light that moves with the camera, for one camera."""
-
-    light: MovingLight
-    eye: Standpoint
-
-    def shade(self, renderer: Renderer, points: Points) -> F64:
-        """(M, 3) radiance. [NeuFace eq. 12] + [NeuFace eq. 16]"""
-        asset, n = renderer.asset, points.normal.astype(np.float32)
-        x = np.einsum("nic,ni->nc", asset.mesh.vertices[points.corner], points.weights).astype(np.float32)
-        albedo = renderer.at(renderer.fitted_albedo, points.uv)
-        diffuse = albedo / np.pi * self.light.irradiance(x, n, self.eye).clip(min=0)
-        s = renderer.at(asset.inv_kappa, points.uv)[:, 0].clip(min=0)
-        incident = self.light.reflected(x, n, s, self.eye, asset.attenuation)
-        return np.asarray(diffuse + renderer.strength(points)[:, None] * incident, np.float64)
-
-
 class Renderer:
     """Renders one asset; `render` may be called for any number of views and lights."""
 
@@ -123,6 +107,7 @@ class Renderer:
         self._normals = mesh.normals[mesh.faces].astype(np.float32)
         self._uvs = mesh.uvs[mesh.uv_faces].astype(np.float32)
         own = asset.albedo if asset.neuface_albedo is None else asset.neuface_albedo
+        self._lamps: MovingLamps | None = None
         self.fitted_albedo = own if asset.occlusion is None else own * asset.occlusion
 
     def render(
@@ -140,9 +125,8 @@ class Renderer:
         and on the silhouette the mean over a triangle filter, as soft as in a photo. `light`: SH coefficients in place
         of the captured ones, or any Light. `plain`: grey diffuse surface, to show only the shape.
         """
-        moving = self.asset.moving
-        if light is None and moving is not None:
-            light = Carried(moving, Standpoint.of(view.world_from_cam))
+        if light is None and self.asset.moving is not None and not plain:
+            light = self._carried(self.asset.moving, view)
         if light is None or isinstance(light, np.ndarray):
             light = Harmonics(self.asset.light if light is None else light, plain)
         h, w = view.height // factor, view.width // factor
@@ -153,6 +137,15 @@ class Renderer:
             edge = np.flatnonzero(_borders(out[:, 3].reshape(h, w)).ravel())
             out[edge] = self._pixels(view, edge, w, factor, _triangle(EDGE_SAMPLES, EDGE_REACH), light)
         return out.reshape(h, w, 4)
+
+    def _carried(self, moving: MovingLight, view: PinholeCamera) -> Light:
+        """The captured light of a camera with which it moves."""
+        eye = Standpoint.of(view.world_from_cam)
+        if self.asset.f0 is None:
+            return Carried(moving, eye)
+        if self._lamps is None:
+            self._lamps = MovingLamps(moving)
+        return StandardCarried(self._lamps, eye)
 
     def _reached(self, view: PinholeCamera, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
         """Pixels in the mesh's bounding rectangle; all pixels if part of the mesh is beside or behind the camera."""
