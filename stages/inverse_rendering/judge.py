@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.artifacts import MaskSet
 from pipeline.capture_artifacts import Capture
+from pipeline.maths.light_frame import FLASH, TURNTABLE, WORLD
 from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
 from stages.inverse_rendering.config import PRIORS
@@ -43,6 +44,9 @@ START = Limits(0.05, 0.15, lower=False)
 AGREE = Limits(0.12, 0.35, lower=False)
 # Ratio of what the specular term explains to the remaining error, as in model_selection.py; 0: it explains nothing.
 SPECULAR = Limits(MIN_SPECULAR, 0.0)
+# Error of a light that moves over a still one's, where it was chosen: .64 for a skull under a flash, .64 for a head on
+# a turntable; people in a still light have .97. Never good, because shadows are not modelled then.
+MOVES = Limits(0.0, 1.0, lower=False)
 ALWAYS = Limits(0.0, 0.0)
 MAX_NAMED = 12
 
@@ -156,7 +160,27 @@ def fell(f: Fitted) -> list[Finding]:
 
 def choices(f: Fitted) -> list[Finding]:
     """The checks of the model selection's figures."""
-    return [*_photos_agree(f), *_specular(f), *_colours(f)]
+    return [*_light_moves(f), *_photos_agree(f), *_specular(f), *_colours(f)]
+
+
+def _light_moves(f: Fitted) -> list[Finding]:
+    """Whether the light moved with the camera, by the photos. The value is the error of that model over a still
+    light's."""
+    fact = f.facts.get("light_frame", {})
+    frame = str(fact.get("frame", WORLD))
+    still, own = (_number(f.facts, "light_frame", f"error_{name}") for name in (WORLD, frame))
+    if frame == WORLD or fact.get("why") == "setting" or still is None or own is None:
+        return []
+    what = {FLASH: "a flash on the camera", TURNTABLE: "the subject turns while the room stands still"}
+    message = (
+        f"the light moves with the camera ({what.get(frame, 'lamps fixed to it')}): this explains the photos with "
+        f"{own / max(still, 1e-9):.2f} times the error of a still light"
+    )
+    remedy = (
+        "nothing to do if that is so, but shadows of the subject on itself are not modelled then; else set "
+        "inverse_rendering.light_frame=world"
+    )
+    return [judged("light_moves", own / max(still, 1e-9), MOVES, message, remedy)]
 
 
 def _photos_agree(f: Fitted) -> list[Finding]:

@@ -27,7 +27,7 @@ import torch
 from scipy.optimize import nnls
 
 from pipeline.maths import sh
-from pipeline.maths.light_frame import FLASH, MOVING, TURNTABLE, WORLD, Stations, turn_of
+from pipeline.maths.light_frame import CAMERA, FLASH, MOVING, TURNTABLE, WORLD, Stations, turn_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.observations import Observations, observe, pictures
 from stages.inverse_rendering.ray_sampling import PhotoView
@@ -45,6 +45,7 @@ ROUNDS = 12
 CLEARLY = 0.8  # of the still light's error: a moving light must be better than that
 FLASHED = 1.0  # the same where more than MOST of the photos say that a flash fired
 MOST = 0.5
+NEARLY = 1.05  # of the error: a turntable is chosen before lamps on the camera up to that
 RIDGE = 1e-6  # of the mean eigenvalue
 
 
@@ -94,6 +95,8 @@ def chosen_frame(errors: dict[str, float], flashed: bool) -> tuple[str, str]:
     if not all(np.isfinite(e) for e in errors.values()):
         return (FLASH, "metadata") if flashed else (WORLD, "too few views to compare")
     moving = min(MOVING, key=lambda f: errors[f])
+    if moving == CAMERA and errors[TURNTABLE] < NEARLY * errors[CAMERA]:
+        moving = TURNTABLE  # far more common than distant lamps on the camera
     limit = FLASHED if flashed and moving != TURNTABLE else CLEARLY
     return moving if errors[moving] < limit * errors[WORLD] else WORLD, "cross-validation"
 

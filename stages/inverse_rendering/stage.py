@@ -125,7 +125,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=21,
+    version=22,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -291,3 +291,14 @@ def test_nothing_in_the_photos(ball: Trainer) -> None:
     table = SimpleNamespace(**vars(new_trainer(ball.views, ball_start(), SMALL, False, "cpu").pixels))
     table.inside = table.inside[:0]
     assert view_errors(ball.model, table, empty, 64, 8) == ()  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("frame, words", [("flash", "flash"), ("turntable", "turns"), ("camera", "lamps")])
+def test_a_light_that_moves_is_told(frame: str, words: str) -> None:
+    facts = {"light_frame": {"frame": frame, "why": "cross-validation", "error_world": 0.4, f"error_{frame}": 0.2}}
+    found = only(sound(facts=facts), "light_moves")
+    assert found.level == "usable" and found.value == pytest.approx(0.5) and words in found.said
+    still = {"light_frame": {"frame": "world", "why": "cross-validation", "error_world": 0.1, "error_flash": 0.2}}
+    given = {"light_frame": facts["light_frame"] | {"why": "setting"}}
+    for other in (still, given, {}):
+        assert "light_moves" not in {f.check for f in findings(sound(facts=other))}

@@ -114,6 +114,7 @@ def test_what_the_metadata_are_worth() -> None:
     errors = {WORLD: 1.0, TURNTABLE: 0.97, CAMERA: 0.95, FLASH: 0.9}
     assert chosen_frame(errors, flashed=False)[0] == WORLD and chosen_frame(errors, flashed=True)[0] == FLASH
     assert chosen_frame(errors | {CAMERA: 0.5}, flashed=False)[0] == CAMERA
+    assert chosen_frame(errors | {CAMERA: 0.5, TURNTABLE: 0.51}, flashed=False)[0] == TURNTABLE  # the common case
     assert chosen_frame(errors | {WORLD: 0.8}, flashed=True)[0] == WORLD
 
 
