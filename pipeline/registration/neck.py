@@ -23,31 +23,42 @@ HELD, FREE = 0.02, 0.055  # metres of the template; the face begins 51 mm from t
 
 def neck_share(template: Template) -> F64:
     """(V,) share of its expressions that each vertex makes; 1 everywhere if the template has no open neck."""
-    away = from_border(template)
+    return share_of(template.vertices, template.quads[template.parts[SKIN]], _neck_quads(template))
+
+
+def share_of(vertices: F64, skin: Indices, neck: Indices) -> F64:
+    """The same for vertices (V, 3) in metres of the template, with quads (Q, 4) of the skin and of the neck."""
+    away = _away(vertices, skin, neck)
     step = np.clip((away - HELD) / (FREE - HELD), 0, 1)
     return np.asarray(step * step * (3 - 2 * step))
 
 
 def from_border(template: Template) -> F64:
     """(V,) metres along edges of the skin from the neck's border; infinite without a border, and beside the skin."""
-    count = len(template.vertices)
-    edges, border = _skin_edges(template), neck_border(template)
-    if not len(border):
-        return np.full(count, np.inf)
-    length = np.linalg.norm(template.vertices[edges.ends[:, 0]] - template.vertices[edges.ends[:, 1]], axis=1)
-    graph = coo_array((length, (edges.ends[:, 0], edges.ends[:, 1])), shape=(count, count)).tocsr()
-    return np.asarray(dijkstra(graph, directed=False, indices=border, min_only=True), np.float64)
+    return _away(template.vertices, template.quads[template.parts[SKIN]], _neck_quads(template))
 
 
 def neck_border(template: Template) -> Indices:
     """(n,) vertices of open edges of the skin that belong to the neck."""
-    if NECK not in template.regions:
-        return np.zeros(0, np.int64)
-    edges = _skin_edges(template)
+    skin = template.quads[template.parts[SKIN]]
+    return _border(edges_of(skin, len(template.vertices)), _neck_quads(template))
+
+
+def _away(vertices: F64, skin: Indices, neck: Indices) -> F64:
+    count, edges = len(vertices), edges_of(skin, len(vertices))
+    border = _border(edges, neck)
+    if not len(border):
+        return np.full(count, np.inf)
+    length = np.linalg.norm(vertices[edges.ends[:, 0]] - vertices[edges.ends[:, 1]], axis=1)
+    graph = coo_array((length, (edges.ends[:, 0], edges.ends[:, 1])), shape=(count, count)).tocsr()
+    return np.asarray(dijkstra(graph, directed=False, indices=border, min_only=True), np.float64)
+
+
+def _border(edges: Edges, neck: Indices) -> Indices:
     open_ = edges.ends[edges.border]
-    neck = np.isin(open_, template.quads[template.regions[NECK]]).all(1)
-    return np.asarray(np.unique(open_[neck]), np.int64)
+    return np.asarray(np.unique(open_[np.isin(open_, neck).all(1)]), np.int64)
 
 
-def _skin_edges(template: Template) -> Edges:
-    return edges_of(template.quads[template.parts[SKIN]], len(template.vertices))
+def _neck_quads(template: Template) -> Indices:
+    own = template.regions.get(NECK, np.zeros(0, np.int64))
+    return np.asarray(template.quads[own], np.int64)
