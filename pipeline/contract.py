@@ -47,6 +47,10 @@ class StageConfig(BaseModel):
             name for name, field in cls.model_fields.items() if not any(isinstance(m, FilledIn) for m in field.metadata)
         )
 
+    def made_from(self) -> dict[str, Path]:
+        """Folders that settings name and that the result is made from, by setting: they enter the lineage."""
+        return {}
+
     def changed(self, **values: object) -> Self:
         """A copy with other values, like dataclasses.replace: the values are not compared with the limits.
 
@@ -175,7 +179,8 @@ def execute(
     """
     k = key(stage, inputs, config)
     with store.lock(stage.name, k), _disk_faults(store.root):
-        store.trace(stage.name, k, {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)})  # type: ignore[arg-type]
+        read = {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)}  # type: ignore[arg-type]
+        store.trace(stage.name, k, read | config.made_from())
         found = store.load(stage.name, k, stage.output)
         if found is not None:
             log.info("%s: reused %s", stage.name, k[:12])

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator
+from pathlib import Path
+from typing import Any
 
+from pydantic import Field, field_validator, model_validator
+
+from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
-from pipeline.units import Pixels
+from pipeline.errors import UsageError
+from pipeline.units import ContentHash, Pixels
 from stages.usd.naming import check_name
 
 
@@ -25,6 +30,13 @@ class Config(StageConfig):
         description="write the template's expressions (blend shapes, morph targets) and the joints of jaw and eyes, "
         "where the mesh is the template's",
     )
+    measured: str = Field(
+        "",
+        description="npz file of measured expressions of this head, written beside the template's; neuface batch "
+        "--neutral makes it and sets this",
+        exclude=True,
+    )
+    measured_digest: ContentHash = Field("", description="sha256 of the file in measured, set automatically")
     divide_shadows: bool = Field(
         True, description="divide the shadows and interreflections of the captured light out of the albedo"
     )
@@ -38,7 +50,31 @@ class Config(StageConfig):
     )
     preview_size: Pixels = Field(512, ge=64, le=4096, description="side of the preview pictures")
 
+    def made_from(self) -> dict[str, Path]:
+        """The artifact of the measured expressions."""
+        return {"measured": Path(self.measured).parent} if self.measured else {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_digest(cls, given: Any) -> Any:
+        if not isinstance(given, dict) or not given.get("measured"):
+            return given
+        return given | {"measured_digest": _digest(Path(str(given["measured"])))}
+
     @field_validator("name")
     @classmethod
     def _valid(cls, name: str) -> str:
         return check_name(name)  # a UsageError of its own, before the first stage
+
+
+def _digest(path: Path) -> str:
+    try:
+        return sha256_of(path)
+    except OSError as e:
+        raise UsageError(
+            "there is no such file of measured expressions",
+            where="usd.measured",
+            value=f"{path}: {e.strerror}",
+            limit="a file that neuface batch --neutral wrote",
+            remedy="run neuface batch --neutral again, or leave usd.measured out",
+        ) from e

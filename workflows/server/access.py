@@ -19,7 +19,11 @@ from stages.presets import parse_sets
 ROOTS = "NEUFACE_ROOTS"  # folders below which runs from a server may read and write, like PATH
 SERVER_LOGIN, CLIENT_LOGIN = "PREFECT_SERVER_API_AUTH_STRING", "PREFECT_API_AUTH_STRING"
 ORIGINS, CSRF = "PREFECT_SERVER_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CSRF_PROTECTION_ENABLED"
-FILE_SETTINGS = {"masks": ("model", "hair_model"), "inverse_rendering": ("prior_file",)}  # settings that name a file
+FILE_SETTINGS = {
+    "masks": ("model", "hair_model"),
+    "inverse_rendering": ("prior_file",),
+    "usd": ("measured",),
+}  # settings that name a file
 
 
 # ------------------------------------------------------------------ the server

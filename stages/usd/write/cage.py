@@ -8,6 +8,7 @@ follows is beside the head (hair, clothes) and stays triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
@@ -18,6 +19,7 @@ from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
 from pipeline.registration.head import Head, kept_quads, load_head
+from pipeline.registration.measured import load_shapes, with_shapes
 from pipeline.registration.rig import load_rig
 from pipeline.registration.subdivision import limit, subdivided
 from stages.usd.write.eyes import eye_quads
@@ -58,9 +60,11 @@ class TemplateMesh:
     coarse_eyes: Mask | None = None
 
 
-def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool) -> TemplateMesh:
+def template_mesh(
+    registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool, measured: str = ""
+) -> TemplateMesh:
     """What the asset shows of the registered head, and the rest of the textured mesh; with its rig if asked for and
-    there is one."""
+    there is one. measured: file of further expressions; none if empty."""
     ref = registered.artifact.head
     assert ref is not None, "the uv stage made its mesh from the head"
     head = load_head(registered.path(ref))
@@ -77,6 +81,8 @@ def template_mesh(registered: Located[RegisteredHead], textured: UvSurface, *, r
     if found is None or not rigged:
         return made
     rig = load_rig(registered.path(found))
+    if measured:
+        rig = with_shapes(rig, load_shapes(Path(measured)), Path(measured))
     return replace(made, rig=mesh_rig(rig).of_vertices(cage.rows), coarse_rig=mesh_rig(rig, points))
 
 

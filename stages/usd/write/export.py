@@ -61,8 +61,11 @@ def export(
     """Write all files except the thumbnail, which is rendered from them."""
     name = config.name
     mesh = read_mesh(uv.path(uv.artifact.mesh), paired=uv.artifact.quads > 0)
-    head = template_mesh(template, mesh, rigged=config.expressions) if uv.artifact.of_template else None
-    proxy, notes = _proxy(uv, mesh) if config.proxy else (None, [])
+    head, notes = None, _not_written(template, uv, config)
+    if uv.artifact.of_template:
+        head = template_mesh(template, mesh, rigged=config.expressions, measured=config.measured)
+    proxy, left_out = _proxy(uv, mesh) if config.proxy else (None, [])
+    notes += left_out
     high, left_out = _high(surface, mesh) if config.high else (None, [])
     notes += left_out
     check()
@@ -174,6 +177,13 @@ def _scan(
     baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
     made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
     return mesh, made
+
+
+def _not_written(template: Located[RegisteredHead], uv: Located[UvMesh], config: Config) -> list[str]:
+    """A note if measured expressions have no place in this asset."""
+    if not config.measured or (uv.artifact.of_template and template.artifact.rig is not None and config.expressions):
+        return []
+    return ["the measured expressions were left out: the mesh has no expressions of the template"]
 
 
 def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
