@@ -20,7 +20,8 @@ import cv2
 import numpy as np
 
 from pipeline.colour import srgb_from_linear
-from pipeline.meshes import F32, F64, Indices, Mask
+from pipeline.meshes import F32, F64, Indices, Mask, triangles_of
+from pipeline.raster import in_texels, rasterise
 from pipeline.registration.head import Head
 from pipeline.registration.procrustes import generalised
 from pipeline.registration.still import counted, evidence, outside
@@ -90,9 +91,9 @@ def region_scatter(shape: Shape, head: Head, regions: tuple[str, ...]) -> dict[s
 
 # ------------------------------------------------------------------ the texture
 def landmark_discs(template: Template, size: int) -> dict[str, Mask]:
-    """Texels (size, size) of tile 1001 near the landmarks of each group; groups that the template lacks are left out.
-    Row 0 is v = 1."""
-    place = _uv_of(template)
+    """Texels (size, size) of tile 1001 near the landmarks of each group, of the skin and not of the holes of mouth and
+    eyes; groups that the template lacks are left out. Row 0 is v = 1."""
+    place, skin = _uv_of(template), _skin_texels(template, size)
     y, x = np.mgrid[:size, :size] + 0.5
     out = {}
     for group, region in GROUPS.items():
@@ -103,9 +104,20 @@ def landmark_discs(template: Template, size: int) -> dict[str, Mask]:
         mask = np.zeros((size, size), np.bool_)
         for u, v in points[np.isfinite(points).all(1) & (points[:, 0] < 1)]:
             mask |= (x - u * size) ** 2 + (y - (1 - v) * size) ** 2 <= (DISC * size) ** 2
+        mask &= skin
         if mask.any():
             out[group] = mask
     return out
+
+
+def _skin_texels(template: Template, size: int) -> Mask:
+    """(size, size) texels of tile 1001 whose centre lies on the skin."""
+    corners = template.uvs[template.uv_quads[template.parts[SKIN]]]
+    own = triangles_of(np.arange(4 * len(corners)).reshape(-1, 4)[(corners[..., 0] <= 1).all(1)])
+    hits = rasterise(in_texels(corners.reshape(-1, 2)[own], size), size, 0, size, reach=1e-6)
+    out = np.zeros(size * size, np.bool_)
+    out[hits.texel] = True
+    return out.reshape(size, size)
 
 
 def _uv_of(template: Template) -> F64:

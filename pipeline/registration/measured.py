@@ -14,24 +14,23 @@ h l / (2 REACH)^2 over a vertex's edges, with which u falls as exp(-distance / R
        min over u:   sum e/(1 - e) |u - (d - p)|^2 + u . L u + sum m (1 - e) |u|^2
 
 So what neither or only one of the captures shows is the combination of the transferred expressions, with the smooth
-rest of what is seen beside it; without expressions of the template it is that rest alone. Eyes, teeth and tongue move
-as the combination says, lashes not at all. Near the border of the neck nothing moves, as with every expression, and
-what is still by its weight stays so: there two heads differ by the registrations' scatter.
+rest of what is seen beside it; without expressions of the template it is that rest alone. Teeth and tongue move as the
+combination says; eyes not at all, since skin that slid along a face looks like a gaze; lashes neither. Near the border
+of the neck nothing moves, as with every expression, and what is still by its weight stays so: there two heads differ by
+the registrations' scatter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 
-from pipeline.errors import StageError
 from pipeline.meshes import F64, Indices, Mask
-from pipeline.registration.expressions import LEAST
+from pipeline.registration.followers import BENDING, ROUND
 from pipeline.registration.head import Head
 from pipeline.registration.neck import NECK, share_of
 from pipeline.registration.procrustes import Aligned, on_planes, robust
@@ -45,7 +44,6 @@ REACH = 0.03  # metres of the template within which what is seen fades into the 
 RIDGE = 1e-4  # of the mean diagonal of the combination's equations
 NOISE = 1e-4  # metres of the template: residuals of the alignment below this are noise
 HARD = 1e-3  # of 1 - e: a place with full evidence has this much freedom
-PREFIX = "measured_"  # of the names of the blend shapes
 # limits of a usable expression
 LEAST_SEEN = 0.3  # share of the moving skin that both captures show
 MOST_APART = 0.002  # metres of the template: spread of the still parts across the surface after the alignment
@@ -90,7 +88,7 @@ def measured(
     carried = np.tensordot(share, basis, 1) if len(share) else np.zeros_like(difference)
     offsets = carried.copy()
     offsets[skin] += faded(neutral, difference - carried, seen, skin, unit)[skin]
-    offsets[_lashes(neutral, parts)] = 0.0
+    offsets[_resting(neutral, parts)] = 0.0
     share_here = (1 - rigid) * share_of(
         neutral.vertices / unit, neutral.quads[_quads_of(neutral.part, parts, SKIN)],
         neutral.quads[_quads_of(neutral.region, regions, NECK)],
@@ -198,99 +196,13 @@ def _skin(head: Head, parts: tuple[str, ...]) -> Mask:
     return out
 
 
-def _lashes(head: Head, parts: tuple[str, ...]) -> Mask:
+def _resting(head: Head, parts: tuple[str, ...]) -> Mask:
+    """(V,) vertices of eyes and lashes."""
     out = np.zeros(len(head.vertices), np.bool_)
-    for name in (n for n in parts if n.startswith("lashes")):
+    for name in (n for n in parts if n.startswith((ROUND, BENDING))):
         out[head.quads[_quads_of(head.part, parts, name)]] = True
     return out & ~_skin(head, parts)
 
 
 def _quads_of(index: Indices, names: tuple[str, ...], name: str) -> Mask:
     return np.asarray(index == (names.index(name) if name in names else -2))
-
-
-# ------------------------------------------------------------------ its file
-def sparse(names: tuple[str, ...], offsets: list[F64], unit: float) -> Expressions:
-    """The shapes of these names from offsets (V, 3) each, without what does not move. unit: world units per metre of
-    the template."""
-    rows = [np.flatnonzero(np.linalg.norm(o, axis=1) > LEAST * unit) for o in offsets]
-    starts = np.cumsum([0, *(len(r) for r in rows)])
-    moved = [o[r] for o, r in zip(offsets, rows, strict=True)]
-    none = np.zeros(0, np.int64)
-    return Expressions(
-        names, starts.astype(np.int64), np.concatenate([none, *rows]).astype(np.int64),
-        np.concatenate([np.zeros((0, 3)), *moved]),
-    )  # fmt: skip
-
-
-def save_shapes(path: Path, shapes: Expressions) -> None:
-    """Write the npz."""
-    np.savez(
-        path, names=np.array(shapes.names, np.str_), starts=shapes.starts, vertices=shapes.vertices.astype(np.int32),
-        offsets=shapes.offsets.astype(np.float32),
-    )  # fmt: skip
-
-
-def load_shapes(path: Path) -> Expressions:
-    """The shapes of an npz that `save_shapes` wrote.
-
-    Raises:
-        StageError: it is none.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            starts, rows = z["starts"].astype(np.int64), z["vertices"].astype(np.int64)
-            found = Expressions(tuple(str(n) for n in z["names"]), starts, rows, z["offsets"].astype(np.float64))
-    except (OSError, ValueError, KeyError, EOFError, TypeError) as e:
-        raise _no_shapes(path, f"{type(e).__name__}: {e}") from e
-    fault = _fault(found)
-    if fault:
-        raise _no_shapes(path, fault)
-    return found
-
-
-def with_shapes(rig: Rig, shapes: Expressions, path: Path) -> Rig:
-    """The rig with further shapes after its own. path: their file, for the error.
-
-    Raises:
-        StageError: they are of another topology, or have a name that the rig has.
-    """
-    own = rig.expressions
-    twice = set(own.names) & set(shapes.names)
-    if twice:
-        raise _no_shapes(path, f"a second shape {min(twice)}")
-    if len(shapes.vertices) and shapes.vertices.max() >= len(rig.weights):
-        raise _no_shapes(path, f"vertex {shapes.vertices.max()} of {len(rig.weights)}")
-    return replace(rig, expressions=Expressions(
-        own.names + shapes.names, np.concatenate([own.starts, own.starts[-1] + shapes.starts[1:]]),
-        np.concatenate([own.vertices, shapes.vertices]), np.concatenate([own.offsets, shapes.offsets]),
-    ))  # fmt: skip
-
-
-def _fault(e: Expressions) -> str:
-    count = len(e.vertices)
-    if (
-        e.starts.shape != (len(e.names) + 1,)
-        or e.starts[0] != 0
-        or e.starts[-1] != count
-        or (np.diff(e.starts) < 0).any()
-    ):
-        return "rows that do not belong to the names"
-    if e.vertices.shape != (count,) or e.offsets.shape != (count, 3) or not np.isfinite(e.offsets).all():
-        return "offsets that are not three finite numbers a vertex"
-    if count and e.vertices.min() < 0:
-        return f"vertex {e.vertices.min()}"
-    names = set(e.names)
-    if len(names) != len(e.names) or not all(n.startswith(PREFIX) and n.isidentifier() and n.isascii() for n in names):
-        return f"names other than {PREFIX}NAME, or one name twice"
-    return ""
-
-
-def _no_shapes(path: Path, value: str) -> StageError:
-    return StageError(
-        "these are no measured expressions of this head",
-        where=path,
-        value=value,
-        limit="a file that neuface batch --neutral wrote for it",
-        remedy="run neuface batch --neutral again, or leave usd.measured out",
-    )

@@ -27,6 +27,7 @@ from pipeline.meshes import F64
 from pipeline.transforms import apply, scale_of, similarity
 
 ROUNDS = 60  # of the robust weights, at most
+STEADY = 1e-6  # change of the mean of many shapes, relative to its size, that ends the rounds
 SETTLED = 1e-9  # change of a residual, relative to the shape's size, that ends the rounds
 TO_DEVIATION = 1.4826  # median of |residual| to the standard deviation of a normal distribution
 TANGENT = 0.03  # weight of a distance along the surface over one across it
@@ -156,7 +157,7 @@ def generalised(shapes: F64, weights: F64, *, scaled: bool, least: float) -> Mea
         home = weighted(after, apply(matrices[0], shapes[0]), weights[0], scaled=False)
         moved = np.abs(apply(home, after) - mean).max()
         matrices, mean = home @ matrices, apply(home, after)
-        if moved < SETTLED * size:
+        if moved < STEADY * size:
             break
     first = _rigid_part(matrices[0])
     return Mean(first @ matrices, apply(first, mean), counts)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
+from pipeline.registration.shapes import load_shapes, save_shapes, sparse
 from pipeline.template.load import load_template
 from tests.support.fuzzing import bounded, fuzzed, halved
 from tests.support.mutations import as_json, damaged, damages, nonsense, replaced, reworded, swaps
@@ -89,3 +90,44 @@ def test_nonsense_in_arrays(arrays_folder: Path, how: list[Any]) -> None:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     check(arrays_folder, {"mesh.npz": stream.getvalue()})
+
+
+# ------------------------------------------------------------------ measured expressions
+def shapes() -> dict[str, np.ndarray]:
+    stream = io.BytesIO()
+    save_shapes(stream, sparse(("measured_a", "measured_b"), [0.01 * np.ones((4, 3)), np.zeros((4, 3))], 1.0))  # type: ignore[arg-type]
+    stream.seek(0)
+    with np.load(stream) as z:
+        return {k: z[k] for k in z.files}
+
+
+def check_shapes(folder: Path, data: bytes) -> None:
+    (folder / "m.npz").write_bytes(data)
+    with bounded():
+        e = load_shapes(folder / "m.npz")
+        assert np.isfinite(e.offsets).all() and len(e.vertices) == len(e.offsets) == e.starts[-1]
+        assert all(n.isidentifier() for n in e.names) and (np.diff(e.starts) >= 0).all()
+
+
+@given(how=damages)
+@halved
+def test_damaged_measured_expressions(arrays_folder: Path, how: list[Any]) -> None:
+    stream = io.BytesIO()
+    np.savez(stream, **shapes())  # type: ignore[arg-type]
+    check_shapes(arrays_folder, damaged(stream.getvalue(), how))
+
+
+@given(how=nonsense)
+@halved
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_nonsense_in_measured_expressions(arrays_folder: Path, how: list[Any]) -> None:
+    arrays: dict[str, Any] = shapes()
+    for where, value in how:
+        name = list(arrays)[int(where * len(arrays))]
+        try:
+            arrays[name] = np.array(value) if isinstance(value, list | str) else arrays[name] * value
+        except (TypeError, ValueError, OverflowError):
+            arrays[name] = np.array([value], object)
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    check_shapes(arrays_folder, stream.getvalue())

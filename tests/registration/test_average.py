@@ -185,6 +185,8 @@ def test_discs_lie_on_eyes_lips_and_brows_of_the_layout() -> None:
     for mask in discs.values():
         assert mask[:, : SIZE // 2].any() and mask[:, SIZE // 2 :].any() and mask.mean() < 0.1
         assert abs(np.nonzero(mask)[1].mean() - SIZE / 2) < 0.02 * SIZE
+    y, x = np.nonzero(discs["lips"])
+    assert not discs["lips"][int(y.mean()), SIZE // 2]  # the opening of the mouth is a hole of the layout
 
 
 def test_lightness_is_srgb() -> None:

@@ -16,7 +16,7 @@ from pipeline.artifacts import Artifact, FileRef
 from pipeline.contract import Context, Stage, execute
 from pipeline.errors import StageError, UsageError
 from pipeline.registration.head import load_head
-from pipeline.registration.measured import save_shapes, sparse
+from pipeline.registration.shapes import save_shapes, sparse
 from pipeline.store import LINEAGE, Store, lineage
 from stages.usd.check.validate import validate
 from stages.usd.config import Config

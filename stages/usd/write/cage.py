@@ -19,8 +19,8 @@ from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
 from pipeline.registration.head import Head, kept_quads, load_head
-from pipeline.registration.measured import load_shapes, with_shapes
 from pipeline.registration.rig import load_rig
+from pipeline.registration.shapes import load_shapes, with_shapes
 from pipeline.registration.subdivision import limit, subdivided
 from stages.usd.write.eyes import eye_quads
 from stages.usd.write.mesh import UvSurface
