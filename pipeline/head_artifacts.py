@@ -1,4 +1,5 @@
-"""The artifacts of a registered head template: the head on the fitted surface, and its eyes.
+"""The artifacts of a registered head template: the head on the fitted surface, and its eyes; and what a batch makes of
+several: a person's measured expressions, and the average head.
 
 They are manifests as in pipeline/artifacts.py.
 """
@@ -53,3 +54,31 @@ class RegisteredHead(Artifact):
     quality: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+
+class MeasuredShapes(Artifact):
+    """A person's expressions on the neutral head, from captures of their own.
+
+    file: npz of pipeline.registration.measured; None if there is no usable expression. shapes: names in it, with the
+    figures of each (pipeline.registration.measured.Measured). left_out: why others are no shape, by name.
+    """
+
+    file: FileRef | None = None
+    shapes: dict[str, dict[str, float]] = {}
+    left_out: dict[str, str] = {}
+
+
+class AverageHead(Artifact):
+    """The mean of registered heads and of their albedo. files: average.obj with its material and textures, and a
+    picture. heads: how many. metric: all units are metres. deviation_mm: by region (median and 95 % over its places of
+    the root of the summed variances). sharpness: of the mean albedo near landmarks, by group and of "all"; 1: the maps
+    agree. size_deviation: standard deviation of the heads' log sizes.
+    """
+
+    files: tuple[FileRef, ...]
+    heads: int
+    metric: bool
+    texture_size: int
+    size_deviation: float
+    deviation_mm: dict[str, dict[str, float]]
+    sharpness: dict[str, float] = {}

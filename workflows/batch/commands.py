@@ -22,6 +22,7 @@ def add_commands(commands_of: Any) -> None:
     batch = commands_of.add_parser("batch", help="many captures, each a run of its own; run it again to resume")
     add_request_options(batch, BatchRequest, without=ON_A_SERVER)
     batch.add_argument("--workers", type=int, default=1, metavar="N", help="captures at a time here (%(default)s)")
+    batch.add_argument("--dry-run", action="store_true", help="say what would run, and run nothing")
     server = batch.add_argument_group("on a Prefect server with a pool of workers")
     server.add_argument("--server", action="store_true", help="submit a run for each capture to $PREFECT_API_URL")
     add_request_options(server, BatchRequest, only=ON_A_SERVER)
@@ -61,6 +62,11 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
     from workflows.batch.loop import run_batch
 
     request = request_from(options, BatchRequest)
+    if options.dry_run:
+        from workflows.batch.preview import preview
+
+        print("\n".join(preview(request)))
+        return 0
     stop = threading.Event()
     try:
         if options.server:

@@ -17,6 +17,7 @@ from typing import Protocol
 from pipeline.errors import Cancelled, StageError
 from pipeline.verdict import Level
 from workflows.batch import captures
+from workflows.batch.after import check_parts, make_average, to_measure
 from workflows.batch.captures import Item
 from workflows.batch.failures import Failure, back_off, smaller
 from workflows.batch.page import write_page
@@ -79,29 +80,61 @@ def run_batch(
     Raises:
         StageError: no captures, folders that can't be written. UsageError: a wrong request. Cancelled: Ctrl-C.
     """
-    items = captures.find(Path(request.root), request.subjects, request.expressions)
-    out, store, state = Path(request.out).absolute(), request.store_path, BatchState(request.folder)
-    _not_inside(out, Path(request.root))
-    for item in {str(i.own): i for i in items}.values():  # a wrong setting is reported once, not by each capture
-        check_settings(request.run_request(item.capture, item.name, (), item.own))
+    items, store, state = checked(request), request.store_path, BatchState(request.folder)
     with exclusive_run(store, request.folder, stopped, notify):
-        works = [_prepared(i, state, request) for i in items]
+        works = [prepared(i, state, request) for i in items]
+        for work in works:
+            if work.item.fault is not None:
+                state.write(work.entry)
         summary = Summary([w.entry for w in works])
         notify(f"{len(items)} captures, {len(items) - summary.failed} of them done before")
         page = _Page(lambda: write_page(request, summary))
         try:
             _loop(works, request, runner, state, summary, stopped, notify, page)
+            _after(works, request, runner, state, summary, stopped, notify, page)
         finally:
             page.last()
         return summary
 
 
-def _prepared(item: Item, state: BatchState, request: BatchRequest) -> Work:
-    """What is known of a capture, less what is no longer true of it."""
+def _after(
+    works: list[Work],
+    request: BatchRequest,
+    runner: Runner,
+    state: BatchState,
+    summary: Summary,
+    stopped: Callable[[], bool],
+    notify: Callable[[str], None],
+    page: _Page,
+) -> None:
+    """What is made of the captures together; not while captures wait for room on the disk."""
+    pairs = [(w.item, w.entry) for w in works]
+    if request.neutral is not None and summary.held is None:
+        again = {e.name for e in to_measure(pairs, request, summary, stopped, notify)}
+        _loop([w for w in works if w.item.name in again], request, runner, state, summary, stopped, notify, page)
+    if request.average and summary.held is None:
+        make_average(pairs, request, summary, stopped, notify)
+
+
+def checked(request: BatchRequest) -> list[Item]:
+    """The captures of a request whose folders and settings fit together. Nothing is written.
+
+    Raises:
+        StageError: no captures, or results among them. UsageError: a wrong request.
+    """
+    items = captures.find(Path(request.root), request.subjects, request.expressions)
+    _not_inside(Path(request.out).absolute(), Path(request.root))
+    for item in {str(i.own): i for i in items}.values():  # a wrong setting is reported once, not by each capture
+        check_settings(request.run_request(item.capture, item.name, (), item.own))
+    check_parts(request, items)
+    return items
+
+
+def prepared(item: Item, state: BatchState, request: BatchRequest) -> Work:
+    """What is known of a capture, less what is no longer true of it. Nothing is written."""
     entry = state.read(item)
     if item.fault is not None:
         entry.state, entry.fault = "failed", Failure(kind="capture", message=item.fault)
-        state.write(entry)
         return Work(item, entry)
     now = fingerprint(request.run_request(item.capture, item.name, (), item.own))
     if entry.fingerprint != now:
@@ -110,6 +143,9 @@ def _prepared(item: Item, state: BatchState, request: BatchRequest) -> Work:
         entry.state = "waiting"
     elif entry.state == "failed":
         entry.state, entry.fault, entry.earlier = "waiting", None, ()
+    if entry.measured and (request.neutral is None or not Path(entry.measured).is_file()):
+        entry.measured = ""  # not asked for any more, or purged: the asset is written without
+        entry.state = "waiting" if entry.state in ENDED else entry.state
     return Work(item, entry)
 
 
@@ -157,7 +193,8 @@ def _start(work: Work, request: BatchRequest, runner: Runner, state: BatchState)
         entry.attempt += 1
     entry.state, entry.fault, entry.level = "submitted", None, None
     state.write(entry)  # before it is submitted: a batch that dies here submits the same key again
-    runner.start(entry, request.run_request(work.item.capture, work.item.name, entry.sets, work.item.own))
+    sets = (*entry.sets, f"usd.measured={entry.measured}") if entry.measured else entry.sets
+    runner.start(entry, request.run_request(work.item.capture, work.item.name, sets, work.item.own))
 
 
 def _settle(work: Work, ended: Ended, request: BatchRequest, state: BatchState, notify: Callable[[str], None]) -> None:

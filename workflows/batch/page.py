@@ -39,13 +39,14 @@ ODD = 3.5  # robust z-score from which a figure is called odd (Iglewicz and Hoag
 MAD = 0.6745  # quartile of the normal distribution: makes a median of deviations comparable to a standard deviation
 ENOUGH = 5  # captures below which outliers are not marked
 TABLES = ("summary.json", "summary.csv", "index.html")
+AVERAGE, RECORD = "average", "average.json"  # folder in OUT, and what says whose heads it holds (average.py)
 FIRST_LINE = 300  # characters of a fault that the table shows
 
 
 @dataclass(slots=True)
 class Row:
     """One capture in the table. level: how good its result is; reason: the worst of why. odd: how far the oddest figure
-    is from the others'; odd_in: which."""
+    is from the others'; odd_in: which. measured: of a batch with --neutral, what became of the expression."""
 
     name: str
     state: str
@@ -59,23 +60,46 @@ class Row:
     odd_in: str = ""
     thumbnail: str = ""
     report: str = ""
+    measured: str = ""
 
 
 def write_page(request: BatchRequest, summary: Summary) -> None:
     """Write the three files into OUT/batch. A file of the user's in the way is renamed to NAME.yours-N."""
     rows = ranked([_row(e, Path(request.out).absolute()) for e in summary.entries])
+    notes = measured_notes(summary)
+    for row in rows:
+        row.measured = notes.get(row.name, "")
     content = {
         "counts": summary.counts(),
         "held": summary.held.message if summary.held else None,
         "levels": {x: sum(r.level == x for r in rows) for x in reversed(LEVELS)},
         "medians": _medians(rows),
         "captures": [asdict(r) for r in rows],
+        "measured": [m.model_dump(mode="json") for m in summary.measured],
+        "average": summary.average.model_dump(mode="json") if summary.average is not None else None,
     }
-    page = _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD)
+    page = _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD, of_average=AVERAGE)
     texts = {"summary.json": json.dumps(content, indent=1), "summary.csv": _csv(rows), "index.html": page}
     older = _of_an_older_batch(request.folder)
     for name, text in texts.items():
         write_owned(request.folder, name, text, lambda path: older)
+
+
+def measured_notes(summary: Summary) -> dict[str, str]:
+    """For each capture what became of its expression on the neutral; empty without --neutral."""
+    notes: dict[str, str] = {}
+    for m in summary.measured:
+        notes |= {capture: shape for shape, capture in m.shapes.items()}
+        notes |= {capture: f"left out: {why}" for capture, why in m.left_out.items()}
+        if m.neutral:
+            notes[m.neutral] = f"neutral: {m.reason}" if m.reason else f"neutral, with {len(m.shapes)} measured"
+    return notes
+
+
+def captures_in(out: Path) -> tuple[str, ...]:
+    """Names of the captures whose heads are in OUT/average."""
+    names = read_object(out / AVERAGE / RECORD).get("captures", ())
+    return tuple(str(n) for n in names) if isinstance(names, list) else ()
 
 
 def _of_an_older_batch(folder: Path) -> bool:
@@ -147,12 +171,28 @@ def _at(content: Mapping[str, Any], path: Sequence[str]) -> float | None:
 def _csv(rows: Sequence[Row]) -> str:
     stream = io.StringIO()
     table = csv.writer(stream)
-    table.writerow(["name", "state", "verdict", "attempts", *FIGURES, "warnings", "odd", "odd_in", "reason", "fault"])
+    table.writerow(
+        ["name", "state", "verdict", "attempts", *FIGURES, "warnings", "odd", "odd_in", "reason", "fault", "measured"]
+    )
     for r in rows:
         figures = [f"{r.figures[n]:.6g}" if n in r.figures else "" for n in FIGURES]
         fault = " ".join(r.fault.split())[:FIRST_LINE]
         reason = " ".join(r.reason.split())[:FIRST_LINE]
-        table.writerow([r.name, r.state, r.level, r.attempts, *figures, r.warnings, r.odd, r.odd_in, reason, fault])
+        table.writerow(
+            [
+                r.name,
+                r.state,
+                r.level,
+                r.attempts,
+                *figures,
+                r.warnings,
+                r.odd,
+                r.odd_in,
+                reason,
+                fault,
+                " ".join(r.measured.split()),
+            ]
+        )
     return stream.getvalue()
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from stages.presets import DEFAULT_PRESET
+from stages.presets import DEFAULT_PRESET, parse_sets
 from workflows.run.request import RunRequest
 
 PRIORITIES = ("high", "normal", "low")
@@ -23,6 +23,16 @@ class BatchRequest(BaseModel):
     out: str = Field(min_length=1, description="folder for the results: a folder for each capture, batch/index.html")
     subjects: str | None = Field(None, description="only these: 1-40 or 1,7,20-29; all by default")
     expressions: str | None = Field(None, description="only these numbers: 1,2; all by default")
+    neutral: str | None = Field(
+        None,
+        description="number or name of the neutral expression (1): each person's others become measured blend shapes "
+        "of its asset; needs uv.mesh=template, which is then the default",
+    )
+    average: bool = Field(
+        False,
+        description="also write OUT/average: the average head and texture of all captures (with --neutral: of the "
+        "neutrals); needs uv.mesh=template, which is then the default",
+    )
     preset: str = Field(DEFAULT_PRESET, description="speed against accuracy: draft, studio, film; or paper")
     holdout: str | None = Field(
         None, description="views that are not fitted but used for the metrics, as in neuface run; none by default"
@@ -80,6 +90,8 @@ class BatchRequest(BaseModel):
             "pack",
         }
         shared = self.model_dump(include=of_all)
+        if (self.neutral is not None or self.average) and not self._names_the_mesh():
+            shared["config"] = {**self.config, "uv": {**self.config.get("uv", {}), "mesh": "template"}}
         return RunRequest(
             **{**shared, **own},
             capture=str(capture),
@@ -89,6 +101,10 @@ class BatchRequest(BaseModel):
             store=str(self.store_path),
             fit_slots=self.fit_slots,
         )
+
+    def _names_the_mesh(self) -> bool:
+        """Whether a setting says what the asset is made of."""
+        return "mesh" in self.config.get("uv", {}) or "mesh" in parse_sets(self.sets).get("uv", {})
 
 
 def asset_name(name: str) -> str:

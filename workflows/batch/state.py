@@ -29,7 +29,8 @@ class Entry(BaseModel):
 
     attempt: counts every try, over all commands; it is in the key that keeps a server from running one try twice.
     level: how good the result is, where that is known.
-    sets: settings changed by earlier attempts (a smaller batch). fingerprint: of request and capture files.
+    sets: settings changed by earlier attempts (a smaller batch). fingerprint: of request and capture files. measured:
+    file of the measured expressions that the asset has, or is to get.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -44,6 +45,36 @@ class Entry(BaseModel):
     fault: Failure | None = None
     earlier: tuple[Failure, ...] = ()
     asset: RelativePath | None = None
+    measured: str = ""
+
+
+class Measured(BaseModel):
+    """What became of one person's expressions on the neutral. shapes: their names, each with its capture; left_out:
+    captures that are no shape, with the reason; file: of the shapes; reason: why there are none."""
+
+    model_config = ConfigDict(frozen=True)
+
+    subject: str
+    neutral: str = ""
+    shapes: dict[str, str] = {}
+    figures: dict[str, dict[str, float]] = {}
+    left_out: dict[str, str] = {}
+    file: str = ""
+    reason: str = ""
+
+
+class Averaged(BaseModel):
+    """What became of the average head. captures: those in it; left_out: the others, with the reason; reason: why there
+    is none. Figures as in pipeline.head_artifacts.AverageHead."""
+
+    model_config = ConfigDict(frozen=True)
+
+    captures: tuple[str, ...] = ()
+    left_out: dict[str, str] = {}
+    sharpness: dict[str, float] = {}
+    deviation_mm: dict[str, dict[str, float]] = {}
+    metric: bool = True
+    reason: str = ""
 
 
 @dataclass(slots=True)
@@ -52,6 +83,8 @@ class Summary:
 
     entries: list[Entry] = field(default_factory=list)
     held: Failure | None = None  # why captures were left waiting
+    measured: list[Measured] = field(default_factory=list)
+    average: Averaged | None = None
 
     @property
     def total(self) -> int:

@@ -32,6 +32,7 @@ METAVARS = {
     "from_stage": "STAGE",
     "subjects": "LIST",
     "expressions": "LIST",
+    "neutral": "EXPRESSION",
     "deployment": "F/N",
     "gpus": "N",
 }

@@ -14,7 +14,7 @@ from pathlib import Path
 from pipeline.store import LINEAGE, LOCKS, Store, lineage
 from stages.registry import SOURCE
 from workflows.batch.captures import RECORDS
-from workflows.batch.page import TABLES
+from workflows.batch.page import AVERAGE, TABLES, captures_in
 from workflows.batch.state import Entry
 from workflows.run.published import FOLDERS, LIST, TRUTH, is_ours, is_record, listed, published, split
 from workflows.run.room import size_of
@@ -22,6 +22,7 @@ from workflows.run.run_lock import lock_is_free
 from workflows.store.roots import Root, forget_root, roots
 
 DAY = 86400.0
+MEASURED = "measured"  # setting of usd, and folder in the store (workflows/batch/measure.py)
 _KEY = re.compile(r"([0-9a-f]{64})(\.scratch|\.partial-[0-9a-f]+)?")
 _HALF = re.compile(r"\..+\.(partial|swap|old)-[0-9a-f]{8}(\.\w+)?|\.probe-[0-9a-f]{8}")  # what killed runs left in OUT
 
@@ -43,6 +44,7 @@ def garbage(store: Store, older_than: float, now: float | None = None) -> list[P
     """
     now = time.time() if now is None else now
     needed = {(stage, key) for root in roots(store) for stage, key in root.keys.items()}
+    needed |= {origin for stage, key in needed for origin in _measured(store, stage, key)}
     limit = max(older_than, DAY) if _busy(store) else older_than
     found = []
     for stage, key, kind, path in pieces(store):
@@ -57,6 +59,14 @@ def garbage(store: Store, older_than: float, now: float | None = None) -> list[P
         elif (stage, key) not in needed:
             found.append(Piece(path, "no published folder was made from it", size_of(path)))
     return found
+
+
+def _measured(store: Store, stage: str, key: str) -> Iterator[tuple[str, str]]:
+    """The measured expressions (stage, key) that a result was made with: its settings name their file."""
+    for name in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(MEASURED, ()):
+        kind, _, own = name.partition("/")
+        if kind == MEASURED and _KEY.fullmatch(own):
+            yield kind, own
 
 
 def remove(store: Store, found: Iterable[Piece]) -> None:
@@ -118,6 +128,7 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
     paths, users = set(_made_from(photos, store)), set[Path]()
+    outs |= {r.out for r in _roots_of(out, store) if any(store.folder(*m) in paths for m in _shapes_of(r, store))}
     for o in (o for o in outs if o.is_dir()):
         ours, theirs = _results(o)
         users |= theirs
@@ -128,10 +139,26 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     if entries and (out / RECORDS).is_dir():  # the table names the subject; the next batch writes it anew
         ours, theirs = _tables(out / RECORDS)
         paths, users = paths | ours, users | theirs
+    if entries and any(e.name in captures_in(out) for _, e in entries):  # the next batch averages the others
+        ours, theirs = _average(out)
+        paths, users = paths | ours, users | theirs
     for o in outs:  # the throw-away server of a run keeps its parameters
         home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
         paths |= {home} if home.is_dir() else set()
     return Purge(out, tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+
+
+def _shapes_of(root: Root, store: Store) -> Iterator[tuple[str, str]]:
+    """The measured expressions that a published asset was made with: they may be from photos of other captures."""
+    for stage, key in root.keys.items():
+        yield from _measured(store, stage, key)
+
+
+def _average(out: Path) -> tuple[set[Path], set[Path]]:
+    """The average head of a batch, and files of the user's beside it."""
+    mine, users = split(out, AVERAGE, published(out))
+    ours = {out / AVERAGE / p for p in mine} if users else {p for p in (out / AVERAGE,) if p.is_dir()}
+    return ours, {out / AVERAGE / p for p in users}
 
 
 def _tables(folder: Path) -> tuple[set[Path], set[Path]]:
