@@ -52,10 +52,11 @@ MOST_SCALE = 0.06  # by how much two heads of known unit may differ in size
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """offsets (V, 3) on the neutral's cage, in its unit. figures: `still_mm` spread of the still parts across the
-    surface, `size` of the expression's head over the neutral's on them, `turn_degrees` and `shift_mm` of the motion,
+    """offsets (V, 3) on the neutral's cage, in its unit. refused: why it is no blend shape, or empty. figures:
+    `still_mm` spread of the still parts across the surface after the alignment, `size` of the expression's head over
+    the neutral's on them (`scale` that was applied, if a unit is unknown), `turn_degrees` and `shift_mm` of the motion,
     `seen` share of the moving skin that both show, `largest_mm` offset, `explained` share of the squared seen offsets
-    that the transferred expressions make. refused: why it is no blend shape, or empty."""
+    that the transferred expressions make."""
 
     offsets: F64
     figures: dict[str, float]
@@ -78,7 +79,7 @@ def measured(
     still = counted(rigid, seen)
     try:
         found = aligned(neutral, other, still, unit, scaled=not metric)
-        size = scale_of(aligned(neutral, other, still, unit, scaled=True).matrix) * (1.0 if metric else np.nan)
+        free = scale_of(aligned(neutral, other, still, unit, scaled=True).matrix) if metric else 1.0
     except ValueError as e:
         return Measured(np.zeros_like(neutral.vertices), {}, f"the heads can't be aligned: {e}")
     difference = apply(found.matrix, other.vertices) - neutral.vertices
@@ -95,7 +96,7 @@ def measured(
     )  # fmt: skip
     offsets *= share_here[:, None]
     figures = _figures(neutral, found, difference, carried, offsets, seen, rigid, regions, unit)
-    figures |= {"size": float(size)} if metric else {"scale": scale_of(found.matrix)}
+    figures |= {"size": 1 / free} if metric else {"scale": scale_of(found.matrix)}
     return Measured(offsets, {k: round(v, 5) for k, v in figures.items()}, refused(figures))
 
 
@@ -106,15 +107,15 @@ def refused(figures: dict[str, float]) -> str:
             f"both captures show only {100 * figures['seen']:.0f} % of the skin that expressions move "
             f"(at least {100 * LEAST_SEEN:.0f} %)"
         )
-    if figures["still_mm"] > 1000 * MOST_APART:
-        return (
-            f"scalp, ears and forehead of the two heads are {figures['still_mm']:.1f} mm apart after the alignment "
-            f"(at most {1000 * MOST_APART:.0f})"
-        )
     if abs(figures.get("size", 1.0) - 1) > MOST_SCALE:
         return (
             f"the head is {figures['size']:.2f} times as large as the neutral one (at most {100 * MOST_SCALE:.0f} % "
             "apart): is the unit of both captures metres?"
+        )
+    if figures["still_mm"] > 1000 * MOST_APART:
+        return (
+            f"scalp, ears and forehead of the two heads are {figures['still_mm']:.1f} mm apart after the alignment "
+            f"(at most {1000 * MOST_APART:.0f})"
         )
     return ""
 
