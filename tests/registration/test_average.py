@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.colour import srgb_from_linear
+from pipeline.registration import average
 from pipeline.registration.average import (
     GROUPS,
     MeanTexture,
@@ -185,8 +187,22 @@ def test_discs_lie_on_eyes_lips_and_brows_of_the_layout() -> None:
     for mask in discs.values():
         assert mask[:, : SIZE // 2].any() and mask[:, SIZE // 2 :].any() and mask.mean() < 0.1
         assert abs(np.nonzero(mask)[1].mean() - SIZE / 2) < 0.02 * SIZE
-    y, x = np.nonzero(discs["lips"])
-    assert not discs["lips"][int(y.mean()), SIZE // 2]  # the opening of the mouth is a hole of the layout
+
+
+def test_discs_leave_the_holes_of_the_layout_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Discs so wide that they reach into the openings, against OpenCV's polygons of the skin, a texel wider."""
+    monkeypatch.setattr(average, "DISC", 0.06)
+    t = template()
+    corners = t.uvs[t.uv_quads[t.parts["skin"]]]
+    corners = corners[(corners[..., 0] <= 1).all(1)]
+    texels = np.stack([corners[..., 0] * SIZE, (1 - corners[..., 1]) * SIZE], -1) - 0.5
+    skin = np.zeros((SIZE, SIZE), np.uint8)
+    for quad in np.round(16 * texels).astype(np.int32):
+        cv2.fillPoly(skin, [quad], 1, shift=4)
+    wide = cv2.dilate(skin, np.ones((3, 3), np.uint8)) > 0
+    assert not wide[:, SIZE // 2].all() and not wide.all()
+    for name, mask in landmark_discs(t, SIZE).items():
+        assert not (mask & ~wide).any(), name
 
 
 def test_lightness_is_srgb() -> None:

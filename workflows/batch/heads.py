@@ -13,6 +13,7 @@ from pipeline.head_artifacts import RegisteredHead
 from pipeline.store import Store, read_object
 from workflows.batch.state import Entry
 
+WHOLE = ("poses", "template")  # small: their files are compared with their hashes; a damaged picture is named when read
 KINDS: dict[str, type[Artifact]] = {"poses": CameraSet, "template": RegisteredHead, "uv": UvMesh, "bake": TextureSet}
 
 
@@ -28,7 +29,7 @@ class Found:
 
 
 def head_of(entry: Entry, out: Path, store: Store) -> Found | str:
-    """The head of a capture, or why it has none that can be used. Manifests are read, no file is hashed."""
+    """The head of a capture, or why it has none that can be used. A damaged one is removed from the store."""
     if entry.state == "failed":
         return f"its run failed: {_first_line(entry.fault.message if entry.fault else '')}"
     record = read_object(out / entry.name / "run.json")
@@ -42,7 +43,8 @@ def head_of(entry: Entry, out: Path, store: Store) -> Found | str:
     if "template" not in stages:
         return "its run ended before the head template"
     if template is None or poses is None:
-        return "the store has its registered head no more"
+        record_of = out / entry.name / "run.json"
+        return f"its head is gone from the store, or was damaged: remove {record_of} and run the batch again"
     if not template.artifact.registered:
         return f"the head template could not be registered: {template.artifact.reason}"
     of_head = bake if uv is not None and uv.artifact.of_template else None
@@ -50,6 +52,8 @@ def head_of(entry: Entry, out: Path, store: Store) -> Found | str:
 
 
 def _stored(store: Store, stage: str, key: str) -> Located[Any] | None:
+    if stage in WHOLE:
+        return store.load(stage, key, KINDS[stage])
     try:
         return Located(store.manifest(stage, key, KINDS[stage]), store.folder(stage, key))
     except (OSError, ValidationError):
