@@ -69,6 +69,8 @@ def test_paths_lie_below_the_allowed_folders(tmp_path: Path, monkeypatch: pytest
         {"root": "relative"},
         {"sets": ("masks.model=/etc/x.onnx",)},
         {"config": {"inverse_rendering": {"prior_file": "/etc/x"}}},
+        {"template": "/etc"},
+        {"sets": ("template.folder=/etc",)},
     ):
         with pytest.raises(UsageError, match="may not use this path"):
             access.check_folders({**good, **bad})
@@ -80,7 +82,7 @@ def test_every_setting_that_names_a_file_is_known() -> None:
         for stage in REGISTRY
         for config in stage.configs()
         for name, field in config.model_fields.items()
-        if field.annotation is str and any(w in (field.description or "") for w in (" file", "checkpoint"))
+        if field.annotation is str and any(w in (field.description or "") for w in (" file", "checkpoint", "folder"))
     }
     digests = {(s, n) for s, n in told if n.endswith(("_sha256", "_digest"))}
     others = {("usd", "name")}  # the name of a file inside the asset

@@ -22,8 +22,9 @@ ORIGINS, CSRF = "PREFECT_SERVER_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CSRF_PROT
 FILE_SETTINGS = {
     "masks": ("model", "hair_model"),
     "inverse_rendering": ("prior_file",),
+    "template": ("folder",),
     "usd": ("measured",),
-}  # settings that name a file
+}  # settings that name a file or a folder
 
 
 # ------------------------------------------------------------------ the server
@@ -93,7 +94,7 @@ def check_folders(asked: Mapping[str, Any]) -> None:
 
 
 def _named(asked: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
-    for name in ("capture", "root", "out", "store"):
+    for name in ("capture", "root", "out", "store", "template"):
         if asked.get(name):
             yield name, str(asked[name])
     tables = (asked.get("config") or {}, parse_sets(tuple(asked.get("sets") or ())))
