@@ -20,6 +20,7 @@ from pipeline.maths import sh
 from pipeline.maths.light_frame import CAMERA, FLASH
 from pipeline.transforms import rows
 from stages.usd.render.camera import orbit_camera
+from stages.usd.render.carried import Captured
 from stages.usd.render.render import Renderer
 from stages.usd.write.lookdev import lookdev_layer
 from stages.usd.write.moving_light import DIMMEST, add_moving_light, lamp, write_domes
@@ -44,7 +45,7 @@ def test_a_flash_lights_the_sphere_from_every_camera(azimuth: float) -> None:
     """a / pi max(n . wo, 0) (d_0 / d)^2 + a ambient, from any side: closed form on the sphere."""
     made = replace(asset(), moving=moving(FLASH, ambient=0.1))
     view = orbit_camera(RADIUS, azimuth, SIZE)
-    image = Renderer(made).render(view, samples=1)
+    image = Renderer(made).render(view, samples=1, light=Captured(made))
     n, _, inside = sphere_points(view, SIZE)
     away = view.world_from_cam[:3, 3] - RADIUS * n
     distance = np.linalg.norm(away, axis=-1)
@@ -61,7 +62,7 @@ def test_another_light_stays_where_it_is() -> None:
     even[0] = np.sqrt(4 * np.pi)
     a, b = (Renderer(x).render(view, samples=1, light=even) for x in (plain, carried))
     np.testing.assert_array_equal(a, b)
-    assert np.abs(Renderer(carried).render(view, samples=1) - a).max() > 0.05
+    assert np.abs(Renderer(carried).render(view, samples=1, light=Captured(carried)) - a).max() > 0.05
 
 
 def camera(index: int, centre: tuple[float, float, float]) -> Camera:

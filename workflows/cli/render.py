@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.camera import PinholeCamera
     from pipeline.images import F32
     from pipeline.transforms import F64
-    from stages.usd.render.render import Light, Renderer
+    from stages.usd.render.render import CarriedLight, Light, Renderer
 
 CAPTURED = "captured"
 TURNTABLE_SIDE = 1024  # pixels
@@ -103,7 +103,7 @@ def component_in(folder: Path) -> Path:
     )
 
 
-def light_named(name: str, renderer: Renderer, root: Path) -> Light | None:
+def light_named(name: str, renderer: Renderer, root: Path) -> Light | CarriedLight | None:
     """The light of --env for one asset in the folder root: None for the captured light, a made one, or a file's.
 
     Raises:

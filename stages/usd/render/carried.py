@@ -4,19 +4,32 @@ picture of one camera."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.camera import PinholeCamera
 from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.lighting.moving_standard import MovingLamps
-
-if TYPE_CHECKING:
-    from stages.usd.render.render import Points, Renderer
+from stages.usd.render.exported import ExportedAsset
+from stages.usd.render.render import Light, Points, Renderer
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
+
+
+class Captured:
+    """The captured light of an asset whose light moves: on its standard material if that was fitted, else the model."""
+
+    def __init__(self, asset: ExportedAsset) -> None:
+        assert asset.moving is not None
+        self._light = asset.moving
+        self._lamps = None if asset.f0 is None else MovingLamps(asset.moving)
+
+    def of(self, view: PinholeCamera) -> Light:
+        """That of one camera."""
+        eye = Standpoint.of(view.world_from_cam)
+        return Carried(self._light, eye) if self._lamps is None else StandardCarried(self._lamps, eye)
 
 
 @dataclass(frozen=True, slots=True)

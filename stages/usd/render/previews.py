@@ -17,8 +17,9 @@ from pipeline.contract import Context
 from pipeline.images import read_linear, write_exr, write_png
 from pipeline.transforms import matrix
 from stages.usd.render.camera import orbit_camera
+from stages.usd.render.carried import Captured
 from stages.usd.render.exported import load_exported
-from stages.usd.render.render import Light, Renderer
+from stages.usd.render.render import CarriedLight, Light, Renderer
 from stages.usd.render.standard_light import StandardLight
 
 F32 = npt.NDArray[np.float32]
@@ -45,7 +46,7 @@ class Scene:
     """The exported asset under the captured light: its rays and shadows are set up once for all pictures."""
 
     renderer: Renderer
-    light: Light | None
+    light: Light | CarriedLight | None
 
 
 def load_scene(root: Path, check: Callable[[], None]) -> Scene:
@@ -82,10 +83,12 @@ def render_held_out(
     return tuple(out)
 
 
-def captured(renderer: Renderer, root: Path, check: Callable[[], None] = lambda: None) -> Light | None:
-    """The captured light as other programs see it, the exported dome on the standard material; None, what the
-    renderer has itself, for an asset whose standard material was not fitted, or whose light moves with the camera."""
-    if renderer.asset.f0 is None or renderer.asset.moving is not None:
+def captured(renderer: Renderer, root: Path, check: Callable[[], None] = lambda: None) -> Light | CarriedLight | None:
+    """The captured light as other programs see it, the exported dome on the standard material, or a light that moves
+    with the camera; None, the model's closed form, for an asset whose standard material was not fitted."""
+    if renderer.asset.moving is not None:
+        return Captured(renderer.asset)
+    if renderer.asset.f0 is None:
         return None
     dome = root.parent / "environment.exr"
     return StandardLight(renderer, read_linear(dome), dome.name, check=check)

@@ -10,20 +10,17 @@ light (stages.usd.render.relight) both are traced.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from pipeline.camera import PinholeCamera
-from pipeline.lighting.moving import MovingLight, Standpoint
-from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.maths import brdf
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
-from stages.usd.render.carried import Carried, StandardCarried
 from stages.usd.render.exported import ExportedAsset
 from stages.usd.render.map_lookup import bilinear, lookup
 
@@ -74,6 +71,13 @@ class Light(Protocol):
     def shade(self, renderer: Renderer, points: Points) -> F64: ...
 
 
+@runtime_checkable
+class CarriedLight(Protocol):
+    """A light that moves with the camera: each picture has its own."""
+
+    def of(self, view: PinholeCamera) -> Light: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Harmonics:
     """The model's closed form. coefficients ((L + 1)^2, 3); `plain`: grey diffuse surface, to show only the shape."""
@@ -107,7 +111,6 @@ class Renderer:
         self._normals = mesh.normals[mesh.faces].astype(np.float32)
         self._uvs = mesh.uvs[mesh.uv_faces].astype(np.float32)
         own = asset.albedo if asset.neuface_albedo is None else asset.neuface_albedo
-        self._lamps: MovingLamps | None = None
         self.fitted_albedo = own if asset.occlusion is None else own * asset.occlusion
 
     def render(
@@ -116,7 +119,7 @@ class Renderer:
         *,
         factor: int = 1,
         samples: int = 2,
-        light: F32 | Light | None = None,
+        light: F32 | Light | CarriedLight | None = None,
         plain: bool = False,
     ) -> F32:
         """(height / factor, width / factor, 4) linear Rec.709 RGBA, premultiplied.
@@ -125,8 +128,8 @@ class Renderer:
         and on the silhouette the mean over a triangle filter, as soft as in a photo. `light`: SH coefficients in place
         of the captured ones, or any Light. `plain`: grey diffuse surface, to show only the shape.
         """
-        if light is None and self.asset.moving is not None and not plain:
-            light = self._carried(self.asset.moving, view)
+        if isinstance(light, CarriedLight):
+            light = light.of(view)
         if light is None or isinstance(light, np.ndarray):
             light = Harmonics(self.asset.light if light is None else light, plain)
         h, w = view.height // factor, view.width // factor
@@ -137,15 +140,6 @@ class Renderer:
             edge = np.flatnonzero(_borders(out[:, 3].reshape(h, w)).ravel())
             out[edge] = self._pixels(view, edge, w, factor, _triangle(EDGE_SAMPLES, EDGE_REACH), light)
         return out.reshape(h, w, 4)
-
-    def _carried(self, moving: MovingLight, view: PinholeCamera) -> Light:
-        """The captured light of a camera with which it moves."""
-        eye = Standpoint.of(view.world_from_cam)
-        if self.asset.f0 is None:
-            return Carried(moving, eye)
-        if self._lamps is None:
-            self._lamps = MovingLamps(moving)
-        return StandardCarried(self._lamps, eye)
 
     def _reached(self, view: PinholeCamera, width: int, height: int, factor: int) -> npt.NDArray[np.int64]:
         """Pixels in the mesh's bounding rectangle; all pixels if part of the mesh is beside or behind the camera."""
