@@ -53,13 +53,15 @@ RIDGE = 1e-6  # of the mean eigenvalue
 class LightFrame:
     """Where the light stands still (pipeline.maths.light_frame); errors of the models as shares of the mean radiance,
     NaN where nothing could be compared. flux (LAMPS,): of a moving light, for a mean irradiance of 1 over the
-    observations; None of a still one. distance: d_0, the median distance of the points from their cameras."""
+    observations; None of a still one. spread: standard deviation of the photos' gains g_v under the chosen light, whose
+    mean is 1. distance: d_0, the median distance of the points from their cameras."""
 
     frame: str
     errors: dict[str, float]
     flux: F64 | None
     distance: float
     why: str
+    spread: float = 0.0
 
     def facts(self) -> dict[str, str | float | bool]:
         """For the report."""
@@ -83,11 +85,12 @@ def decide(seen: Observations, views: list[PhotoView], wanted: str, flashed: flo
     stations, distance = _stations(seen, views)
     parts = _divided(seen)
     found = {f: _solve(seen, parts, _lit(f, seen, stations, distance)) for f in (WORLD, *MOVING)}
-    errors = {f: e for f, (e, _) in found.items()}
+    errors = {f: one.error for f, one in found.items()}
     frame, why = wanted, "setting"
     if wanted == "auto":
         frame, why = chosen_frame(errors, flashed > MOST)
-    return LightFrame(frame, errors, found[frame][1] if frame != WORLD else None, distance, why)
+    own = found[frame]
+    return LightFrame(frame, errors, own.flux if frame != WORLD else None, distance, why, own.spread)
 
 
 def chosen_frame(errors: dict[str, float], flashed: bool) -> tuple[str, str]:
@@ -135,11 +138,19 @@ def _divided(seen: Observations) -> _Parts:
     return _Parts(keep & ~held, keep & held & ~odd, keep & held & odd)
 
 
-def _solve(seen: Observations, parts: _Parts, lit: F64) -> tuple[float, F64]:
-    """Error of a model on the validation views, and the flux of its lamps."""
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """A model's error on the validation views, the flux of its lamps, and the spread of the gains."""
+
+    error: float
+    flux: F64
+    spread: float
+
+
+def _solve(seen: Observations, parts: _Parts, lit: F64) -> _Solved:
     flux = np.ones(lit.shape[1])
     if len(np.unique(seen.view)) < MIN_VIEWS or parts.test.sum() < MIN_TEST or parts.tune.sum() < MIN_TEST:
-        return float("nan"), flux / max(float(lit.sum()) / max(len(lit), 1), 1e-12)
+        return _Solved(float("nan"), flux / max(float(lit.sum()) / max(len(lit), 1), 1e-12), 0.0)
     c = seen.colour.mean(1)
     c = c / max(float(c.mean()), 1e-12)
     point, view, rows = seen.point, seen.view, parts.train
@@ -153,7 +164,7 @@ def _solve(seen: Observations, parts: _Parts, lit: F64) -> tuple[float, F64]:
     shown = albedo[point] * (lit @ flux)
     own = _ratio(view[parts.tune], shown[parts.tune], c[parts.tune], len(gain))
     left = (c - own[view] * shown)[parts.test]
-    return float(np.sqrt(np.mean(left**2))), flux
+    return _Solved(float(np.sqrt(np.mean(left**2))), flux, float(gain[np.unique(view[rows])].std()))
 
 
 def _positive(m: F64, y: F64) -> F64:

@@ -30,7 +30,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from pipeline.faces.landmarks3d import load_landmarks
     from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
-    from stages.inverse_rendering.exposure import exposures_differ
+    from stages.inverse_rendering.exposure import DRIFT, exposures_differ
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
@@ -72,11 +72,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     landmarks = None if ref is None else load_landmarks(inputs.masks.path(ref))
     chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
     start = chosen.start
-    own_colours = calibrated(inputs, usable, config, lambda: exposures_differ(views, start, context.device))
     lit = None
     if settings.preset not in COMPARED:
         fired = [v.flash is True for v in inputs.capture.artifact.views if v.index in set(usable)]
         lit = light_frame(views, start, settings.light_frame, context.device, sum(fired) / len(fired))
+    moving = None if lit is None or lit.flux is None else lit.spread > DRIFT
+    own_colours = calibrated(
+        inputs, usable, config, lambda: exposures_differ(views, start, context.device) if moving is None else moving
+    )
     trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, lit)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]

@@ -90,6 +90,9 @@ def test_the_light_s_frame_is_found(arrives: Arrives, frame: str, gain: Callable
     assert result.errors[frame] < 1.1 * min(result.errors.values())
     assert result.facts()["frame"] == frame
     assert (result.flux is None) == (frame == WORLD)
+    gains = [gain(i) for i in range(24)]
+    # the light is no exposure: photos of one exposure have one gain under any light
+    assert result.spread == pytest.approx(np.std(gains) / np.mean(gains), abs=0.09)
 
 
 def test_a_lamp_above_the_lens_is_found_there() -> None:
