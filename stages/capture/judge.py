@@ -25,6 +25,8 @@ MANY_CLIPPED, STOPS = 0.03, 1.5  # a photo is listed beyond: share of its centre
 
 # the fit needs 3; renders of 16 views without the held-out ones (13) still give a complete head
 PHOTOS = Limits(12, 8)
+# a light stage has few cameras and many lights; seven and eight of them, with given poses, gave a complete head
+STAGE_PHOTOS = Limits(6, 3)
 # pixels of the shorter edge: demo captures of 128 still have a face; below 64 a photo is refused
 EDGE = Limits(120, 64)
 # shares of photos
@@ -63,10 +65,13 @@ class Photo:
     look: PhotoFigures
 
 
-def judge(photos: Sequence[Photo], left_out: Sequence[str], passed_over: Sequence[str]) -> tuple[Finding, ...]:
-    """All findings of a capture. left_out: names of the photos left out. passed_over: of files in other formats."""
+def judge(
+    photos: Sequence[Photo], left_out: Sequence[str], passed_over: Sequence[str], *, light_stage: bool = False
+) -> tuple[Finding, ...]:
+    """All findings of a capture. left_out: names of the photos left out. passed_over: of files in other formats.
+    light_stage: the photos are those of a light stage under all lights; light_stage_checks.py judges its lights."""
     return (
-        _count(photos),
+        _count(photos, light_stage),
         _left_out(len(photos), left_out),
         _formats(len(photos) + len(left_out), passed_over),
         _size(photos),
@@ -92,10 +97,15 @@ def given_masks(masked: int, useless: Sequence[str]) -> list[Finding]:
                    views=useless)]  # fmt: skip
 
 
-def _count(photos: Sequence[Photo]) -> Finding:
+def _count(photos: Sequence[Photo], light_stage: bool) -> Finding:
     fitted = sum(not p.holdout for p in photos)
-    return judged("photos", fitted, PHOTOS, f"{fitted} photos are used in the fit",
-                  "take 30 to 60 photos all around the subject, 15 degrees apart or less", unit="photos")  # fmt: skip
+    said = f"{fitted} photos are used in the fit" + (", each under all lights of the stage" if light_stage else "")
+    remedy = (
+        "use more cameras, or hold out fewer"
+        if light_stage
+        else "take 30 to 60 photos all around the subject, 15 degrees apart or less"
+    )
+    return judged("photos", fitted, STAGE_PHOTOS if light_stage else PHOTOS, said, remedy, unit="photos")
 
 
 def _left_out(kept: int, names: Sequence[str]) -> Finding:

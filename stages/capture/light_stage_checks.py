@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.capture_artifacts import StageLight
 from pipeline.colour import LUMA
 from pipeline.images import F32
+from pipeline.maths.latlong import latlong_directions, latlong_weights
 from pipeline.transforms import F64
 from pipeline.verdict import Finding, Limits, judged
 
@@ -27,12 +28,16 @@ SIDE = 24  # pixels of a thumbnail
 NEAREST = 4  # lights that predict another
 FAILED = 0.1  # of its prediction: a light that shows less did not flash
 BETTER = 0.35  # an exchange is believed if it reduces the squared error of both pictures to this share
+GRID, FARTHEST = (180, 90), 0.9  # directions all around, of a lat-long grid; the share of them that has a light near
 BLACK = 1e-4  # of the brightest thumbnail: a picture with less shows nothing
 
 # shares of pictures; what is missing leaves a gap in the directions only
 MISSING = Limits(0.02, 0.3, lower=False)
 SATURATED = Limits(0.0, 0.2, lower=False)
 LIGHTS_OUT = Limits(0.0, 0.25, lower=False)
+# degrees to the nearest light, 90 % of all directions have less: 15 with 84 lights all around, 22 with 42, 32 with 21,
+# 51 with 11
+DIRECTIONS = Limits(25.0, 45.0, lower=False)
 # sum of single pictures against the picture under all lights: their exponent less 1, or their ratio above 1
 LINEAR = Limits(0.12, 0.25, lower=False)
 # change of the brightness from the first to the last frame
@@ -199,10 +204,26 @@ def _summed(found: Sequences) -> tuple[F64, F64, F64]:
     return np.concatenate(whole), np.concatenate(total), np.concatenate(later)
 
 
+def gap(directions: F64) -> float:
+    """Degrees: the share FARTHEST of all directions is at most so far from the nearest of the lights (N, 3), unit
+    directions; 180 without lights."""
+    from scipy.spatial import cKDTree
+
+    if not len(directions):
+        return 180.0
+    around, solid = latlong_directions(*GRID).reshape(-1, 3), np.repeat(latlong_weights(*GRID), GRID[0])
+    chord = np.asarray(cKDTree(directions).query(around)[0], np.float64)
+    angle = np.degrees(2 * np.arcsin(np.minimum(chord / 2, 1)))
+    order = np.argsort(angle, kind="stable")
+    return float(np.interp(FARTHEST * 4 * np.pi, np.cumsum(solid[order]), angle[order]))
+
+
 def judge(
     found: Sequences, missing: Sequence[str], saturated: Sequence[str], wrong: Mapping[int, str], lights: int
 ) -> tuple[Finding, ...]:
     """All findings. missing, saturated: names CAMERA/LIGHT of pictures; wrong: lights left out; lights: calibrated."""
+    shown = sorted({n for _, n in found.singles} - set(wrong))
+    far = gap(-np.array([found.lights[n].axis for n in shown], np.float64).reshape(-1, 3))
     pictures = max(1, len(found.singles) + len(missing))
     (power, ratio), change = additive(found), drift(found)
     off = max(abs(power - 1), ratio - 1) if np.isfinite(power) else 0.0
@@ -217,6 +238,9 @@ def judge(
                f"{len(wrong)} of {lights} lights failed, have another light's pictures or one file twice, and are left "
                "out", "compare the pictures' order with lights.json, and take these again",
                views=[f"light {n}" for n in sorted(wrong)]),
+        judged("stage_directions", far, DIRECTIONS,
+               f"{len(shown)} lights: nine of ten directions around are within {far:.0f} degrees of one",
+               "use more lights, and spread them all around", unit="degrees"),
         judged("stage_linear", off, LINEAR,
                f"the sum of the single pictures is {ratio:.2f} times the picture under all lights, and grows as its "
                f"power {power:.2f}"

@@ -84,7 +84,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
         found = import_stage(source, views, context)
         stage, views = found.stage, found.views
         selection.warnings.extend(found.warnings)
-    findings = (*judge(seen, [n for n in selection.absent if n not in described], source.artifact.passed_over),
+    absent = [n for n in selection.absent if n not in described]
+    findings = (*judge(seen, absent, source.artifact.passed_over, light_stage=stage is not None),
                 *given_masks(masked, useless), *(found.findings if stage else ()))  # fmt: skip
     warnings = (
         selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)

@@ -52,7 +52,8 @@ def build(
     mesh, charts = meshes.load(path), meshes.load_charts(path)
     points, caster = points_of(mesh, charts, config.size), RayCaster(mesh.vertices, mesh.faces)
     cameras = [c for c in poses.artifact.cameras if c.index in {f.camera for f in stage.frames}]
-    fitted_cameras = [c for c in cameras if c.index != config.camera]
+    kept_out = {config.camera, *(v.index for v in capture.artifact.views if v.holdout)}
+    fitted_cameras = [c for c in cameras if c.index not in kept_out]
     _enough(len(fitted_cameras), 1, "cameras")
     six, pivot = _tracked(capture, stage, points, fitted_cameras, caster, config, step)
     at = {f: moves.motion_matrix(v, pivot) for f, v in six.items()}
@@ -69,7 +70,8 @@ def build(
     save(field, context.workdir / FOLDER, record)
     figures = _figures(field, parts, points, pairs, six)
     shots = _pictures(capture, stage, whole)
-    figures |= _scored(field, whole, shots, fitted, left_out, step)
+    unseen = [n for n, c in enumerate(cameras) if c.index in kept_out]
+    figures |= _scored(field, whole, shots, fitted, left_out, unseen, step)
     files = sorted(p.relative_to(context.workdir) for p in (context.workdir / FOLDER).iterdir())
     return ReflectanceField(
         present=True,
@@ -77,7 +79,7 @@ def build(
         size=config.size,
         lights=len(fitted),
         left_out=tuple(whole.index[i] for i in left_out),
-        cameras=tuple(c.index for c in cameras if c.index == config.camera),
+        cameras=tuple(c.index for c in cameras if c.index in kept_out),
         alphas=field.alphas,
         motion=motion,
         figures=figures,
@@ -192,15 +194,19 @@ def _scored(
     pictures: dict[tuple[int, int], Path],
     fitted: Sequence[int],
     left_out: Sequence[int],
+    unseen: Sequence[int],
     step: Step,
 ) -> dict[str, float]:
+    """Figures of the left-out lights; unseen: places of the cameras that were left out too."""
     wanted = [(c, i) for i in left_out for c in range(len(rig.cameras)) if (c, i) in pictures]
     if not wanted:
         return {}
     tops = [float(np.quantile(read_linear(pictures[key]).max(2), BRIGHT)) for key in wanted]
     gain = LEVEL / max(float(np.quantile(tops, 0.75)), 1e-9)
     found = score(field, rig, pictures, fitted, wanted, gain, lambda d, n: step(d, n, "predicting left-out lights"))
+    other = [s.field for s in found if s.camera in unseen]
     return {
+        **({"left_out_camera_psnr": decibels(other)} if other else {}),
         "left_out_psnr": decibels([s.field for s in found]),
         "blend_psnr": decibels([s.blend for s in found]),
         "left_out_angle": round(float(np.mean([s.angle for s in found])), 2),

@@ -12,7 +12,7 @@ import pytest
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_linear, write_exr, write_png
-from stages.capture.light_stage_checks import Sequences, Single, additive, brightness, drift, exchanged
+from stages.capture.light_stage_checks import Sequences, Single, additive, brightness, drift, exchanged, gap
 from stages.capture.scan import scan_capture
 from tests.support.light_stage import DISTANCE, SIZE, Stage, make_stage, photograph, write_lights, write_stage
 from tests.support.spread import made_once
@@ -58,7 +58,38 @@ def test_a_light_stage_is_read_with_cameras_lights_and_levels(capture, gather) -
     np.testing.assert_allclose(view, read.stage.gain * read_linear(folder / "full_on" / "0.exr"), atol=1e-3)
     assert 0.8 < np.quantile(view[view > 0.05], 0.995) < 1.2  # in a photo's range
     stages = [f for f in read.findings if f.check.startswith("stage_")]
-    assert len(stages) == 5 and all(f.level == "good" for f in stages)
+    assert len(stages) == 6 and all(f.level == "good" for f in stages)
+
+
+def test_a_stage_is_judged_by_its_lights_and_not_by_the_number_of_photos(capture, gather) -> None:
+    """Three cameras are few, but as many as the fit needs; a rig of photos alone needs eight."""
+    folder, stage = capture
+    found = next(f for f in gather(folder).artifact.findings if f.check == "photos")
+    assert found.level == "usable" and "each under all lights" in found.said
+    assert level(gather(folder, holdout="none").artifact, "stage_directions") == "good"
+    few = [n for n, p in enumerate(stage.positions) if p[2] > 0.5 * DISTANCE]  # all in front
+    for path in folder.glob("olat/*/*.exr"):
+        if int(path.stem) not in few:
+            path.unlink()
+    assert level(gather(folder).artifact, "stage_directions") == "unusable"
+    plain = folder.parent / "plain"
+    shutil.copytree(folder / "full_on", plain)
+    shutil.copy(folder / "params.json", plain)
+    assert level(gather(plain).artifact, "photos") == "unusable"
+
+
+@pytest.mark.parametrize(
+    ("directions", "expected"),
+    [
+        ([[0, 0, 1]], np.degrees(np.arccos(-0.8))),  # a cap of nine tenths of the sphere: 1 - cos = 1.8
+        ([[0, 1, 0], [0, -1, 0]], np.degrees(np.arccos(0.1))),
+        ([[1, 0, 0], [-1, 0, 0]], np.degrees(np.arccos(0.1))),
+        ([], 180.0),
+    ],
+)
+def test_the_gap_between_lights(directions: list, expected: float) -> None:
+    """Oracle: caps around the lights, by hand."""
+    assert gap(np.array(directions, float).reshape(-1, 3)) == pytest.approx(expected, abs=1.5)
 
 
 def test_every_file_counts_for_the_key(capture) -> None:

@@ -14,7 +14,7 @@ from pipeline.artifacts import CameraSet, Located, UvMesh
 from pipeline.camera import PinholeCamera
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.images import read_linear
+from pipeline.images import read_linear, write_exr
 from pipeline.transforms import rows
 from stages.capture import stage as capture_stage
 from stages.capture.scan import scan_capture
@@ -195,6 +195,28 @@ def test_the_stage_on_a_ball(ball: stage.Inputs, tmp_path: Path) -> None:
     truth = photograph(made, 1, n, 0.03)
     inside = shown[..., 3] > 0.99
     assert np.sqrt(np.mean((shown[..., :3] - truth)[inside] ** 2)) < 0.025  # .0202; the highlight is no GGX lobe
+
+
+def test_a_held_out_camera_is_no_part_of_the_field(ball: stage.Inputs, tmp_path: Path) -> None:
+    """The field is the same with its pictures all black, and what it predicts for that camera is told."""
+    views = [v.model_copy(update={"holdout": v.index == 1}) for v in ball.capture.artifact.views]
+    held = ball.capture.artifact.model_copy(update={"views": tuple(views)})
+    copy = tmp_path / "capture"
+    shutil.copytree(ball.capture.folder, copy)
+    found, texels = [], []
+    for name in ("as it is", "black"):
+        inputs = stage.Inputs(Located(held, copy), ball.poses, ball.uv)
+        work = tmp_path / name
+        work.mkdir()
+        found.append(stage.run(inputs, stage.Config(size=64), Context(work, work / "scratch")))
+        texels.append(load(work / "reflectance").arrays)
+        for frame in held.stage.frames:
+            if frame.camera == 1:
+                write_exr(copy / frame.image.path, np.zeros((SIZE, SIZE, 3), np.float32))
+    assert found[0].cameras == (1,) and found[0].figures["left_out_camera_psnr"] > 24
+    assert found[1].figures["left_out_camera_psnr"] < found[0].figures["left_out_camera_psnr"]
+    for name, values in texels[0].items():
+        np.testing.assert_array_equal(values, texels[1][name])
 
 
 def test_two_runs_are_equal(ball: stage.Inputs, tmp_path: Path) -> None:

@@ -102,10 +102,9 @@ def row_of(capture: Found, given: argparse.Namespace, out: Path, made: dict[str,
         ended = {"exit_code": None, "how": SKIPPED, "error": capture.skipped, "stage": "", "wall": 0.0}
         return row | {"ended": ended, "verdict": verdict_of(None), "seconds": {}, "figures": {}}
     folder = (out / capture.name).absolute()
-    photos = captures.gathered(capture, (out / "gathered" / capture.name).absolute())
     arguments = [
         "run",
-        str(photos),
+        str(capture.capture),
         "--out",
         str(folder),
         "--store",

@@ -15,7 +15,7 @@ from workflows.batch.captures import natural
 PROJECT = Path(__file__).resolve().parents[2]
 DEFAULT_ROOT = PROJECT.parent / "shared" / "captures"  # beside the project
 PHOTOS = "images"
-LIGHT_STAGE = ("lights.json", "olat")  # photos with one light at a time: not a format of this version
+LIGHT_STAGE = ("lights.json", "olat")  # photos with one light at a time
 ALL_ON, CAMERAS = "full_on", "params.json"  # of a light stage: the photos with all lights on, and their cameras
 NO_ALL_ON = f"light stage without photos in {ALL_ON}/ or without {CAMERAS}"
 NO_PHOTOS = "no photos and no cameras that are understood"
@@ -32,15 +32,13 @@ HELD_OUT_ELSE = "every:8:3"
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A capture. folder: all of it, with its truth; capture: what a run is given; skipped: why it can't be run;
-    beside: a file that a run needs beside its photos, which is elsewhere (see gathered)."""
+    """A capture. folder: all of it, with its truth; capture: what a run is given; skipped: why it can't be run."""
 
     name: str
     folder: Path
     capture: Path
     holdout: str
     skipped: str = ""
-    beside: Path | None = None
 
 
 def root_of(given: str | None) -> Path:
@@ -76,37 +74,12 @@ def find(root: Path, only: Sequence[str] = (), holdout: str | None = None) -> li
 def _found(folder: Path, holdout: str | None) -> Found:
     rule = holdout or HELD_OUT.get(folder.name, HELD_OUT_ELSE)
     if all((folder / n).exists() for n in LIGHT_STAGE):
-        photos, cameras = folder / ALL_ON, folder / CAMERAS
-        if not (cameras.is_file() and _readable(photos)):
-            return Found(folder.name, folder, folder, rule, NO_ALL_ON)
-        return Found(folder.name, folder, photos, rule, beside=cameras)
+        whole = (folder / CAMERAS).is_file() and _readable(folder / ALL_ON)
+        return Found(folder.name, folder, folder, rule, "" if whole else NO_ALL_ON)
     for place in (folder, folder / PHOTOS):
         if _readable(place):
             return Found(folder.name, folder, place, rule)
     return Found(folder.name, folder, folder, rule, NO_PHOTOS)
-
-
-def gathered(capture: Found, place: Path) -> Path:
-    """What a run is given: the capture's own folder, or one at `place` with links to photos and cameras that lie apart.
-
-    Raises UsageError if `place` holds anything but links.
-    """
-    if capture.beside is None:
-        return capture.capture
-    place.mkdir(parents=True, exist_ok=True)
-    if others := sorted(p.name for p in place.iterdir() if not p.is_symlink()):
-        raise UsageError(
-            "a folder for links to photos holds other files",
-            where=place,
-            value=", ".join(others[:3]),
-            limit="links alone",
-            remedy="move these files away, or choose another --out",
-        )
-    for old in place.iterdir():
-        old.unlink()
-    for file in (capture.beside, *sorted(p for p in capture.capture.iterdir() if p.is_file())):
-        (place / file.name).symlink_to(file.resolve())
-    return place
 
 
 def _readable(folder: Path) -> bool:
