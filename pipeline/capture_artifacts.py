@@ -130,13 +130,15 @@ class LightStage(Artifact):
     """Pictures under one light at a time, and how they were lit. The capture's views are the pictures under all lights.
 
     frames: under single lights; tracking: under all lights, at later times. gain: the views' values are those of the
-    files times gain (their files are too bright for a photo's range); frames and tracking are as in the files.
+    files times gain (their files are too bright for a photo's range); frames and tracking are as in the files. share:
+    of the light in the views that the lights account for; the rest is of lights that failed or are not calibrated.
     """
 
     lights: tuple[StageLight, ...]
     frames: tuple[StageFrame, ...]
     tracking: tuple[StageFrame, ...] = ()
     gain: float = 1.0
+    share: float = 1.0
 
 
 class Capture(Artifact):

@@ -64,11 +64,13 @@ def configs_for(
     name: str | None = None,
     seed: int | None = None,
     template: str | None = None,
+    light: str | None = None,
     registry: Iterable[Stage[Any, Any, Any]] | None = None,
     planned: Settings | None = None,
 ) -> dict[str, StageConfig]:
     """The validated settings of every stage, by the stage's name. planned: settings chosen for a time budget; they
-    override the preset. template: folder of another head template, from which the asset is made.
+    override the preset. template: folder of another head template, from which the asset is made. light: file of the
+    photos' light, which is then not estimated.
 
     Raises:
         UsageError: unknown preset, stage or setting, or a value outside its limits. The message lists what is allowed.
@@ -78,7 +80,8 @@ def configs_for(
     merged: dict[str, dict[str, Any]] = {n: {} for n in stages}
     of_stage = {s: _last(s, "preset", (PRESETS[preset], planned or {}, config_file or {}, sets)) for s in stages}
     classes = {name: stage.config_for(of_stage[name]) for name, stage in stages.items()}
-    for source in (PRESETS[preset], planned or {}, _shared(stages, holdout, name, seed), _of_template(template)):
+    shared = (_shared(stages, holdout, name, seed), _of_template(template), _of_light(light))
+    for source in (PRESETS[preset], planned or {}, *shared):
         for stage, own in source.items():
             if stage in merged:
                 merged[stage].update(own)
@@ -144,6 +147,11 @@ def _of_template(folder: str | None) -> Settings:
     if folder is None:
         return {}
     return {"template": {"folder": str(Path(folder).absolute())}, "uv": {"mesh": "template"}}
+
+
+def _of_light(path: str | None) -> Settings:
+    """The settings that a given light means."""
+    return {} if path is None else {"inverse_rendering": {"light_file": str(Path(path).absolute())}}
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:

@@ -14,7 +14,7 @@ from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import F32, read_encoded, write_exr
 from pipeline.verdict import Finding
-from stages.capture.light_stage_checks import Sequences, Single, judge, suspicious, thumbnail
+from stages.capture.light_stage_checks import Sequences, Single, accounted, judge, suspicious, thumbnail
 from stages.capture.readers.olat import FEWEST, LIGHTS, Lamps, pictures_of, read_lights
 
 BRIGHTEST, LEVEL = 0.99, 0.9  # this quantile of the subject's values becomes this value in the views
@@ -59,7 +59,9 @@ def import_stage(source: Located[CaptureSource], views: Sequence[CaptureView], c
         singles[key].copy.unlink()
     tracking = _tracking(source, {k: p for k, p in found.tracking.items() if k[0] in sizes}, lamps, sizes, context)
     gain = _gain(context.workdir, views)
-    stage = LightStage(lights=tuple(lamps.lights[n] for n in used), frames=tuple(frames), tracking=tracking, gain=gain)
+    share = accounted(Sequences(lamps.lights, {k: singles[k] for k in kept}, full))
+    lights = tuple(lamps.lights[n] for n in used)
+    stage = LightStage(lights=lights, frames=tuple(frames), tracking=tracking, gain=gain, share=share)
     missing = sorted(f"{c}/{n}" for c in sizes for n in lamps.lights if (c, n) not in found.single)
     findings = judge(sequences, missing, sorted(f"{c}/{n}" for c, n in saturated), wrong, len(lamps.lights))
     return Imported(stage, _levelled(context, views, gain), findings, _told(notes))

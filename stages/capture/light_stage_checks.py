@@ -175,6 +175,12 @@ def additive(found: Sequences) -> tuple[float, float]:
     return float(slope), float(np.exp(np.median(ly - lx)))
 
 
+def accounted(found: Sequences) -> float:
+    """Share of the picture under all lights that the single pictures add up to, at most 1; 1 if it can't be told."""
+    ratio = additive(found)[1]
+    return round(min(max(ratio, 0.05), 1.0), 4) if np.isfinite(ratio) else 1.0
+
+
 def drift(found: Sequences) -> float:
     """Relative change of the lights' brightness from the first to the last frame.
 

@@ -6,12 +6,14 @@ unit. Weights are those of the terms of [NeuFace eq. 20].
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Final, Literal
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
-from pipeline.units import Cells, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
+from pipeline.units import Cells, ContentHash, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
 
 AUTO: Final = "auto"  # decided by cross-validation during the fit (stages.inverse_rendering.cross_validation)
 MAX_RANK, MAX_ORDER = 3, 10  # values until the model selection: the paper's
@@ -96,10 +98,22 @@ class Config(StageConfig):
     light_order: Annotated[int, Field(ge=0, le=10)] | Literal["auto"] = Field(
         default=AUTO, description="order of the light's spherical harmonics [NeuFace eq. 2]; auto: by cross-validation"
     )
-    light_from: Literal["lobe", "uniform_albedo"] = Field(
-        default="lobe",
-        description="light estimation during the fit; lobe: from view-dependent residuals, in closed form; "
-        "uniform_albedo: by optimisation with a uniform albedo",
+    light_from: Literal["auto", "lobe", "uniform_albedo", "stage"] = Field(
+        default=AUTO,
+        description="source of the light; lobe: estimated from view-dependent residuals, in closed form; "
+        "uniform_albedo: by optimisation with a uniform albedo; stage: the lamps of a light stage, as distant lights; "
+        "auto: light_file if it is given, else lobe",
+    )
+    light_file: str = Field(
+        default="",
+        description="lat-long .exr or .hdr file of the light, measured: it is not estimated; --light sets it",
+        exclude=True,
+    )
+    light_digest: ContentHash = Field(default="", description="sha256 of light_file, set automatically")
+    light_scale: Annotated[float, Field(gt=0, le=1e6)] | Literal["auto"] = Field(
+        default=AUTO,
+        description="factor from the radiance in light_file to the photos' linear values; auto: unknown, the level of "
+        "the albedo decides it",
     )
     light_frame: Literal["auto", "world", "turntable", "camera", "flash"] = Field(
         default=AUTO,
@@ -209,6 +223,20 @@ class Config(StageConfig):
         preset = given.get("preset", cls.model_fields["preset"].default)
         return {**cls.presets.get(str(preset), {}), **given}
 
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_digest(cls, given: Any) -> Any:
+        path = Path(str(given["light_file"])) if isinstance(given, dict) and given.get("light_file") else None
+        return given if path is None else given | {"light_digest": sha256_of(path) if path.is_file() else ""}
+
+    @model_validator(mode="after")
+    def _one_light(self) -> Self:
+        if self.light_file and self.light_from != AUTO:
+            raise ValueError("light_file is the light: light_from must be auto beside it")
+        if (self.light_file or self.light_from == "stage") and self.light_frame not in (AUTO, "world"):
+            raise ValueError("a given light stands still: light_frame must be auto or world beside it")
+        return self
+
     @field_validator("specular", "refine_geometry", mode="before")
     @classmethod
     def _switch(cls, value: Any) -> Any:
@@ -222,7 +250,7 @@ class Config(StageConfig):
     @property
     def estimates_light(self) -> bool:
         """Whether the light is estimated from view-dependent residuals."""
-        return self.light_from == "lobe"
+        return self.light_from in (AUTO, "lobe") and not self.light_file
 
     @property
     def has_open_parts(self) -> bool:

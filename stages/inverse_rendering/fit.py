@@ -46,11 +46,13 @@ SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
 
 @dataclass(slots=True)
 class Trainer(TrainingLoop):
-    """The state of a running fit. prior: the surface with which refined geometry is compared."""
+    """The state of a running fit. prior: the surface with which refined geometry is compared. light_given: where the
+    light comes from, if it is known before the fit: then it never changes."""
 
     counted: ClassVar[tuple[str, ...]] = (*TrainingLoop.counted, "shadows_solved", "skin_asked", "skin_tells")
 
     prior: Start | None = None
+    light_given: str = ""
     level: int = 0
     shadows_solved: int = 0
     skin_asked: bool = False
@@ -139,8 +141,9 @@ class Trainer(TrainingLoop):
         if self.shadows_solved < due:
             self.model.solve_shadows()
             self.shadows_solved = due
-        skin_due = self.settings.skin_light and not self.light_moves and self.share() >= SKIN_AT
-        if skin_due and self.choices is not None and not self.skin_asked:
+        still_light = not self.light_moves and not self.light_given
+        asked = self.settings.skin_light and still_light and self.share() >= SKIN_AT
+        if asked and self.choices is not None and not self.skin_asked:
             self.ask_skin(self.choices)
             self.skin_asked = True
         return rate
@@ -165,15 +168,16 @@ class Trainer(TrainingLoop):
         learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
 
         Between UNIFORM_FROM and `uniform_albedo_until`, a light that is known from the lobe (light_estimate.py) is
-        frozen together with the surface, and the reflectance adapts to it; later it has a low rate. If the lobe does
-        not determine the light, everything except the light is frozen, and the albedo is uniform: the light, which was
-        uniform at the start, explains the shading that was in the albedo before. Earlier, the surface is still wrong.
+        frozen together with the surface, and the reflectance adapts to it; later it has a low rate. A given light is
+        frozen throughout. If the lobe does not determine the light, everything except the light is frozen, and the
+        albedo is uniform: the light, which was uniform at the start, explains the shading that was in the albedo
+        before. Earlier, the surface is still wrong.
         """
         s, p = self.settings, self.share()
         decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
         warm = min((self.step + 1) / 50, 1.0)
         interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not self.light_moves
-        light_known = self.choices is not None and self.choices.light_known
+        light_known = self.light_given != "" or (self.choices is not None and self.choices.light_known)
         self.model.uniform_albedo = interlude and not light_known
         for group in self.optimiser.param_groups:
             light = group["params"][0] is next(self.model.light.parameters())
@@ -181,14 +185,15 @@ class Trainer(TrainingLoop):
             if interlude and not light_known:
                 group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
             elif light and (light_known or self.skin_tells):
-                group["lr"] *= 0.0 if interlude else KNOWN_LIGHT_RATE
+                group["lr"] *= 0.0 if interlude or self.light_given else KNOWN_LIGHT_RATE
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
         opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
         _hashed(self.model).encoding.open_levels(opened)
         # the reflectance adapts to the new light, not the surface
-        still = UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING and not self.light_moves
+        settles = not self.light_given and not self.light_moves
+        still = settles and UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
         still |= self.skin_tells and p < SKIN_AT + SETTLING
         return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
 
@@ -220,9 +225,12 @@ class Trainer(TrainingLoop):
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
         later, there is no sparse-albedo prior, which would move albedo into the lobe; nor if the light moves, which
-        shows albedo and light apart. If skin tells the light's colour, nothing draws it to white."""
+        shows albedo and light apart. If skin tells the light's colour, or the light is given, nothing draws it to
+        white."""
         if self.light_moves:
             return self.settings.changed(albedo_sparsity=0.0)
+        if self.light_given:
+            return self.settings.changed(albedo_sparsity=0.0, white=0.0)
         if self.choices is None:
             return self.settings.changed(f0_excess=0.0)
         known = self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings

@@ -12,8 +12,10 @@ from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths.light_frame import WORLD
+from pipeline.maths.sh import count
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
+from stages.inverse_rendering.given_light import GivenLight
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import own_parts, pretrain_basis
 from stages.inverse_rendering.moving_light import LightFrame, first_light
@@ -31,19 +33,22 @@ def new_trainer(
     calibrated: bool,
     device: str,
     prior: Start | None = None,
+    light: GivenLight | None = None,
     lit: LightFrame | None = None,
 ) -> Trainer:
-    """A new trainer: geometry from `start`, a uniform white light or the moving one of `lit`, a uniform albedo. prior:
-    the surface with which refined geometry is compared, if stereo has already moved `start`."""
+    """A new trainer: geometry from `start`, a uniform white light, the given one or the moving one of `lit`, a uniform
+    albedo. prior: the surface with which refined geometry is compared, if stereo has already moved `start`."""
     torch.manual_seed(settings.seed)
-    model = grid_model(views, start, settings, calibrated, device, lit)
+    model = grid_model(views, start, settings, calibrated, device, light, lit)
     if lit is not None and lit.flux is not None:
-        light = own_parts(model)[2]
+        part = own_parts(model)[2]
         with torch.no_grad():
-            first = torch.from_numpy(first_light(lit.flux, model.spec.light_order)).to(light.coefficients)
-            light.coefficients.copy_(model.spec.light_start * first[:, None].expand_as(light.coefficients))
+            first = torch.from_numpy(first_light(lit.flux, model.spec.light_order)).to(part.coefficients)
+            part.coefficients.copy_(model.spec.light_start * first[:, None].expand_as(part.coefficients))
     pretrain_basis(own_parts(model)[1])
-    return trainer_of(model, views, start, settings, device, prior)
+    found = trainer_of(model, views, start, settings, device, prior)
+    found.light_given = light.source if light else ""
+    return found
 
 
 def grid_model(
@@ -52,6 +57,7 @@ def grid_model(
     settings: Config,
     calibrated: bool,
     device: str,
+    light: GivenLight | None = None,
     lit: LightFrame | None = None,
 ) -> FaceModel:
     """A new model on a grid of `start`, on the CPU. device: where the photos are read."""
@@ -60,7 +66,25 @@ def grid_model(
         spec = replace(spec, light_frame=lit.frame, light_distance=lit.distance, shadows=False)
     values = torch.from_numpy(start.values.copy())  # a copy, because the start may also be the prior
     grid = GridSdf(values, torch.from_numpy(start.lo.astype(np.float32)), start.cell)
-    return FaceModel(spec, grid)
+    if light is None:
+        return FaceModel(spec, grid)
+    coefficients, albedo = put(light, spec)
+    model = FaceModel(replace(spec, albedo_start=albedo), grid)
+    with torch.no_grad():
+        own_parts(model)[2].coefficients.copy_(torch.from_numpy(coefficients))
+    return model
+
+
+def put(light: GivenLight, spec: FaceSpec) -> tuple[npt.NDArray[np.float64], tuple[float, float, float]]:
+    """Coefficients (K, 3) of a given light in the photos' unit, and the albedo at which the subject has the photos'
+    mean colour under its mean radiance. Without a scale it is as bright as the uniform light of other fits."""
+    c = light.coefficients[: count(spec.light_order)]
+    mean = c[0] / np.sqrt(4 * np.pi)  # of the radiance over the sphere
+    if not light.scaled:
+        factor = spec.light_start / max(float(mean.mean()), 1e-12)
+        c, mean = c * factor, mean * factor
+    colour = np.array(spec.albedo_start) * spec.light_start
+    return c, _triple(np.clip(colour / np.maximum(mean, 1e-12), 0.02, 0.95))
 
 
 def trainer_of(

@@ -15,7 +15,7 @@ from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
 from stages.inverse_rendering.config import PRIORS
 from stages.inverse_rendering.cross_validation import more
-from stages.inverse_rendering.model_selection import MIN_SPECULAR, Facts
+from stages.inverse_rendering.model_selection import GIVEN, MIN_SPECULAR, Facts
 from stages.inverse_rendering.residuals import ViewError, decibels
 
 # Drafts of measured captures, all subject pixels of the fitted photos, the photos' noise subtracted: scanned head
@@ -160,7 +160,7 @@ def fell(f: Fitted) -> list[Finding]:
 
 def choices(f: Fitted) -> list[Finding]:
     """The checks of the model selection's figures."""
-    return [*_light_moves(f), *_photos_agree(f), *_specular(f), *_colours(f)]
+    return [*_light_moves(f), *_photos_agree(f), *_specular(f), *_colours(f), *_light(f)]
 
 
 def _light_moves(f: Fitted) -> list[Finding]:
@@ -226,6 +226,16 @@ def _colours(f: Fitted) -> list[Finding]:
     value = max(more(without, with_it), 0.0)
     message = f"a colour matrix for each photo explains {value:.1%} of their mean radiance: it is "
     return [judged("calibration", value, ALWAYS, message + ("fitted" if fact.get("modelled") else "not used"), "")]
+
+
+def _light(f: Fitted) -> list[Finding]:
+    """That the light was given, if it was. Whether it is right shows in the error of the fitted photos."""
+    fact = f.facts.get("light", {})
+    if fact.get("why") != GIVEN:
+        return []
+    return [
+        judged("light_given", 1.0, ALWAYS, f"the light is given ({fact.get('from', '')}) and was not estimated", "")
+    ]
 
 
 def _worst(f: Fitted, of: Sequence[ViewError]) -> tuple[str, ...]:

@@ -44,11 +44,13 @@ MAX_REST = 0.75  # of the lobe's size: with a larger remaining error, the rank c
 SILHOUETTE = 0.01  # share of the validation views' rays: allowed excess of the prior's silhouette error
 
 SELECTED = "cross-validation"  # reason of a decision, in the report
+GIVEN = "given"  # the light's: it was measured
 Facts = dict[str, dict[str, str | float | bool]]
 
 
 class Fit(Protocol):
-    """The parts of a running fit that the model selection reads. validation: positions of the validation views."""
+    """The parts of a running fit that the model selection reads. validation: positions of the validation views.
+    light_given: source of a light that is known before the fit, else empty."""
 
     views: list[PhotoView]
     settings: Config
@@ -58,12 +60,13 @@ class Fit(Protocol):
     level: int
     table: PixelTable | None
     validation: tuple[int, ...]
+    light_given: str
 
 
 @dataclass(frozen=True, slots=True)
 class Choices:
     """The selected model. columns: the bases that are kept. facts: the figures of each decision, for the report.
-    light_known: the light is known from view-dependent residuals (light_estimate.py)."""
+    light_known: the light is known from view-dependent residuals (light_estimate.py), or was given."""
 
     specular: bool
     light_order: int
@@ -112,12 +115,13 @@ def given_model(s: Config, *, calibrated: bool) -> Choices:
 
 
 def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
-    """Select the model on the validation views, and estimate the light from view-dependent residuals."""
+    """Select the model on the validation views, and estimate the light from view-dependent residuals, unless it is
+    given."""
     s, model = fit.settings, fit.model
     out = given = given_model(s, calibrated=model.spec.calibrated)
-    wanted = s.estimates_light and s.specular != "off"
+    wanted = s.estimates_light and s.specular != "off" and not fit.light_given
     if not fit.validation and not wanted:
-        return out, None
+        return (_with_given_light(out, fit.light_given) if fit.light_given else out), None
     shots = pictures(fit.views)
     rays = _exact_rays(fit, SEED + s.seed)
     seen = observe(model.geometry, shots, *surface_points(model.geometry, rays))
@@ -134,7 +138,15 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
     estimate = None
     if wanted and out.specular:
         estimate = light_from_lobe(seen, min(out.light_order, MAX_ESTIMATE_ORDER), gain, model.spec.attenuation)
+    if fit.light_given:
+        return _with_given_light(out, fit.light_given), None
     return _with_light_source(out, estimate), estimate
+
+
+def _with_given_light(c: Choices, source: str) -> Choices:
+    """The choices with the light that was given."""
+    light: dict[str, str | float | bool] = {**c.facts["light"], "from": source, "why": GIVEN}
+    return replace(c, light_known=True, facts={**c.facts, "light": light})
 
 
 def _with_light_source(c: Choices, estimate: LightEstimate | None) -> Choices:

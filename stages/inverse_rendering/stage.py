@@ -9,7 +9,7 @@ from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
-from stages.inverse_rendering.config import AUTO
+from stages.inverse_rendering.config import AUTO, MAX_ORDER
 from stages.inverse_rendering.config import Config as Config
 from stages.inverse_rendering.systems import COMPARED, paper_config
 
@@ -32,6 +32,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import DRIFT, exposures_differ
     from stages.inverse_rendering.footprint import footprint, supported
+    from stages.inverse_rendering.given_light import given_light
     from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
@@ -43,6 +44,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.training_loop import Hooks, run_fit
 
     clock, settings = Clock(), config
+    known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
+    if known is not None and settings.light_order == AUTO:
+        settings = settings.changed(light_order=MAX_ORDER)
     dropped = set(inputs.masks.artifact.dropped)
     held = {v.index for v in inputs.capture.artifact.views if v.holdout}
     usable = [c.index for c in inputs.poses.artifact.cameras if c.index not in held and c.index not in dropped]
@@ -73,14 +77,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
     start = chosen.start
     lit = None
-    if settings.preset not in COMPARED:
+    if settings.preset not in COMPARED and known is None:  # a given light stands still
         fired = [v.flash is True for v in inputs.capture.artifact.views if v.index in set(usable)]
         lit = light_frame(views, start, settings.light_frame, context.device, sum(fired) / len(fired))
     moving = None if lit is None or lit.flux is None else lit.spread > DRIFT
     own_colours = calibrated(
         inputs, usable, config, lambda: exposures_differ(views, start, context.device) if moving is None else moving
     )
-    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, lit)
+    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, known, lit)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -88,7 +92,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     light = trainer.choices.facts.get("light", {}) if trainer.choices else {}
-    level = set_level(model, trainer.pixels, views, labels, names, config.albedo_level, light)
+    wanted = "fitted" if known is not None and known.scaled and config.albedo_level == AUTO else config.albedo_level
+    level = set_level(model, trainer.pixels, views, labels, names, wanted, light)
+    if known is not None and wanted == "fitted":
+        level["why"] = "the light's level is given"
     model.save(context.workdir / "field.npz")
     write_light(model, context)
     held_out = predict_held_out(
@@ -128,7 +135,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=22,
+    version=23,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pipeline.artifacts import Camera, Extent
     from pipeline.fields.face import FaceModel
     from stages.inverse_rendering.config import Config
+    from stages.inverse_rendering.given_light import GivenLight
     from stages.inverse_rendering.initial_geometry import F32, Start
     from stages.inverse_rendering.moving_light import LightFrame
     from stages.inverse_rendering.paper.config import PaperConfig
@@ -54,14 +55,15 @@ def trainer_for(
     calibrated: bool,
     device: str,
     prior: Start,
-    lit: LightFrame | None,
+    light: GivenLight | None = None,
+    lit: LightFrame | None = None,
 ) -> TrainingLoop:
-    """A new trainer for these settings. prior: the surface with which refined geometry is compared. lit: where the
-    light stands still, None for a still light."""
+    """A new trainer for these settings. prior: the surface with which refined geometry is compared. light: if it is
+    known; of our own fit only, the others estimate it. lit: where the light stands still, None for a still light."""
     if settings.preset not in COMPARED:
         from stages.inverse_rendering.initialise import new_trainer
 
-        return new_trainer(views, start, settings, calibrated, device, prior, lit)
+        return new_trainer(views, start, settings, calibrated, device, prior, light, lit)
     paper = of_the_paper(settings)
     if paper.method == "fast":
         from stages.inverse_rendering.paper.comparison import new_compared_trainer

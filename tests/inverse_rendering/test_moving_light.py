@@ -172,7 +172,7 @@ def test_a_fit_under_a_flash_predicts_a_photo_that_it_did_not_see() -> None:
     psnr = {}
     for frame in ("auto", WORLD):
         lit = light_frame(views, ball_start(RADIUS), frame, "cpu")
-        t = new_trainer(views, ball_start(), SMALL.changed(shadows=False), False, "cpu", None, lit)
+        t = new_trainer(views, ball_start(), SMALL.changed(shadows=False), False, "cpu", lit=lit)
         model = run_fit(t, hooks())
         shown = predict_view(model, unseen, 1, 8, "cpu")[..., :3]
         inside = unseen.alpha > 0.99

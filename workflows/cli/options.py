@@ -28,6 +28,7 @@ METAVARS = {
     "store": "DIR",
     "holdout": "RULE",
     "template": "DIR",
+    "light": "FILE",
     "until": "STAGE",
     "from_stage": "STAGE",
     "subjects": "LIST",

@@ -47,6 +47,7 @@ def make_plan(request: RunRequest) -> Plan:
     chosen, anew = _choose(request.until, request.from_stage)
     configs = check_settings(request)
     _check_template(configs)
+    _check_light(configs)
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
@@ -97,6 +98,7 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
         name=request.name,
         seed=request.seed,
         template=request.template,
+        light=request.light,
         registry=registry.REGISTRY,
         planned=planned,
     )
@@ -109,6 +111,15 @@ def _check_template(configs: dict[str, StageConfig]) -> None:
         from pipeline.template.load import load_template
 
         load_template(Path(folder))
+
+
+def _check_light(configs: dict[str, StageConfig]) -> None:
+    """Read a given light before anything runs. StageError says what is wrong with it."""
+    path = getattr(configs.get(FIT), "light_file", "")
+    if path:
+        from pipeline.lighting.given import read_latlong
+
+        read_latlong(Path(path))
 
 
 def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:

@@ -33,6 +33,10 @@ class RunRequest(BaseModel):
         description="folder of another head template (docs/template.md); the asset is made from it, unless uv.mesh "
         "says otherwise",
     )
+    light: str | None = Field(
+        default=None,
+        description="lat-long .exr or .hdr of the photos' light, measured: it is not estimated (docs/captures.md)",
+    )
     device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(default=None, description="last stage to run")
     from_stage: str | None = Field(

@@ -21,7 +21,7 @@ SERVER_LOGIN, CLIENT_LOGIN = "PREFECT_SERVER_API_AUTH_STRING", "PREFECT_API_AUTH
 ORIGINS, CSRF = "PREFECT_SERVER_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CSRF_PROTECTION_ENABLED"
 FILE_SETTINGS = {
     "masks": ("model", "hair_model"),
-    "inverse_rendering": ("prior_file",),
+    "inverse_rendering": ("prior_file", "light_file"),
     "template": ("folder",),
     "usd": ("measured",),
 }  # settings that name a file or a folder
@@ -94,7 +94,7 @@ def check_folders(asked: Mapping[str, Any]) -> None:
 
 
 def _named(asked: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
-    for name in ("capture", "root", "out", "store", "template"):
+    for name in ("capture", "root", "out", "store", "template", "light"):
         if asked.get(name):
             yield name, str(asked[name])
     tables = (asked.get("config") or {}, parse_sets(tuple(asked.get("sets") or ())))

@@ -6,7 +6,7 @@ by those of a compared system. The names of the parts are those of pipeline.fiel
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -59,6 +59,12 @@ class PaperConfig(Config):
     the paper's values; comparison has the defaults, which are our own fit."""
 
     presets: ClassVar[dict[str, dict[str, Any]]] = PAPER_PRESETS
+
+    @model_validator(mode="after")
+    def _estimated_light(self) -> Self:
+        if self.light_file or self.light_from == "stage":
+            raise ValueError("these systems estimate the light: light_file and light_from=stage are not for them")
+        return self
 
     # The settings of our fit with further values: no function reads a value that its own class does not allow.
     preset: Literal["paper", "comparison"] = Field(  # type: ignore[assignment]
