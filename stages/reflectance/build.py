@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +19,14 @@ from pipeline.images import read_linear
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, matrix, rows
 from stages.reflectance import motion as moves
+from stages.reflectance.evidence import FOLDER as SHOWN
+from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
 from stages.reflectance.fill import harmonic
 from stages.reflectance.judge import judge
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.samples import Step, gather
-from stages.reflectance.score import decibels, score
+from stages.reflectance.score import Score, decibels, score
 from stages.reflectance.split import Fitted, chosen_widths, split
 from stages.reflectance.texels import Pairs, Points, arriving_of_all, known_surface, pairs_of, points_of
 
@@ -35,6 +38,14 @@ OFFSET = 3  # of the lights that are left out
 TRACKED = 20_000  # points of the surface that say how the head moved
 BRIGHT, LEVEL = 0.99, 0.9  # this quantile of a lit picture is shown as this value when pictures are compared
 FOLDER = "reflectance"
+
+
+@dataclass(frozen=True, slots=True)
+class _Predicted:
+    """Scores of the pictures under left-out lights, and the gain of the display that they are for."""
+
+    scores: tuple[Score, ...]
+    gain: float
 
 
 def build(
@@ -71,7 +82,13 @@ def build(
     figures = _figures(field, parts, points, pairs, six)
     shots = _pictures(capture, stage, whole)
     unseen = [n for n, c in enumerate(cameras) if c.index in kept_out]
-    figures |= _scored(field, whole, shots, fitted, left_out, unseen, step)
+    found = _predicted(field, whole, shots, fitted, left_out, step)
+    figures |= _scored(found, unseen)
+    seen = np.zeros(len(points.texel), np.bool_)
+    seen[pairs.texel[pairs.camera == 0]] = True
+    eye = matrix(fitted_cameras[0].world_from_cam)[:3, 3]
+    figures |= fewer_lamps(field, eye, seen, lambda d, n: step(d, n, "an environment by fewer lamps"))
+    shown = write_pictures(field, whole, shots, found.scores, found.gain, context.workdir / SHOWN)
     files = sorted(p.relative_to(context.workdir) for p in (context.workdir / FOLDER).iterdir())
     return ReflectanceField(
         present=True,
@@ -83,6 +100,8 @@ def build(
         alphas=field.alphas,
         motion=motion,
         figures=figures,
+        predicted=listed(found.scores, whole),
+        shown=tuple(context.file(p) for p in shown),
         findings=judge(figures),
     )
 
@@ -188,27 +207,32 @@ def _figures(field: Field, parts: Fitted, points: Points, pairs: Pairs, six: Map
     return {k: round(v, 5) for k, v in figures.items()}
 
 
-def _scored(
+def _predicted(
     field: Field,
     rig: Rig,
     pictures: dict[tuple[int, int], Path],
     fitted: Sequence[int],
     left_out: Sequence[int],
-    unseen: Sequence[int],
     step: Step,
-) -> dict[str, float]:
-    """Figures of the left-out lights; unseen: places of the cameras that were left out too."""
+) -> _Predicted:
     wanted = [(c, i) for i in left_out for c in range(len(rig.cameras)) if (c, i) in pictures]
     if not wanted:
-        return {}
+        return _Predicted((), 1.0)
     tops = [float(np.quantile(read_linear(pictures[key]).max(2), BRIGHT)) for key in wanted]
     gain = LEVEL / max(float(np.quantile(tops, 0.75)), 1e-9)
     found = score(field, rig, pictures, fitted, wanted, gain, lambda d, n: step(d, n, "predicting left-out lights"))
-    other = [s.field for s in found if s.camera in unseen]
+    return _Predicted(tuple(found), gain)
+
+
+def _scored(found: _Predicted, unseen: Sequence[int]) -> dict[str, float]:
+    """Figures of the left-out lights; unseen: places of the cameras that were left out too."""
+    if not found.scores:
+        return {}
+    other = [s.field for s in found.scores if s.camera in unseen]
     return {
         **({"left_out_camera_psnr": decibels(other)} if other else {}),
-        "left_out_psnr": decibels([s.field for s in found]),
-        "blend_psnr": decibels([s.blend for s in found]),
-        "left_out_angle": round(float(np.mean([s.angle for s in found])), 2),
-        "display_gain": round(gain, 5),
+        "left_out_psnr": decibels([s.field for s in found.scores]),
+        "blend_psnr": decibels([s.blend for s in found.scores]),
+        "left_out_angle": round(float(np.mean([s.angle for s in found.scores])), 2),
+        "display_gain": round(found.gain, 5),
     }

@@ -16,7 +16,8 @@ docs/reflectance.md says how to evaluate it.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,19 @@ class Field:
         number = np.full(size * size, -1)
         number[texel] = np.arange(len(texel))
         return np.asarray(number[nearest_known((number >= 0).reshape(size, size)).ravel()], np.int64)
+
+    def part(self, texels: npt.NDArray[np.int64]) -> Field:
+        """The field of some of its texels, given by their place, lit as they are in the whole: shadows are those of the
+        whole surface. Its texels alone can't be looked up in a picture."""
+        out = copy(self)
+        out.__dict__.pop("nearest", None)
+        p = self.points
+        out.points = replace(p, texel=p.texel[texels], face=p.face[texels], weights=p.weights[texels],
+                             position=p.position[texels], normal=p.normal[texels])  # fmt: skip
+        out.arrays = {name: values[texels] for name, values in self.arrays.items()}
+        out.albedo, out.lobes = self.albedo[texels], self.lobes[texels]
+        out.normal, out.known = self.normal[texels], self.known[texels]
+        return out
 
     def arrives(self, lamp: Lamp, rays: int = 3) -> F32:
         """(T,) share of a lamp's light that arrives: traced, with the corrections of the lights around it."""

@@ -25,13 +25,15 @@ FLOOR = 10**-9.9  # least error that is told: 99 dB
 @dataclass(frozen=True, slots=True)
 class Score:
     """Mean squared errors over covered pixels, display-encoded, one for each picture: of the field, of blending the
-    three nearest lights; angle to the nearest light of the fit, degrees; camera and light, places in the rig."""
+    three nearest lights; angle to the nearest light of the fit, degrees; camera and light, places in the rig; level:
+    mean of the truth there, encoded."""
 
     camera: int
     light: int
     field: float
     blend: float
     angle: float
+    level: float = 1.0
 
 
 def decibels(errors: Sequence[float]) -> float:
@@ -78,7 +80,7 @@ def score(
         counted = made[..., 3] > COVERED if mask is None else mask[c]
         blend, angle = blended(rig, pictures, fitted, c, i)
         errors = [float(np.mean((encoded(p, gain) - truth)[counted] ** 2)) for p in (made[..., :3], blend)]
-        out.append(Score(c, i, errors[0], errors[1], angle))
+        out.append(Score(c, i, errors[0], errors[1], angle, float(np.mean(truth[counted]))))
     return out
 
 

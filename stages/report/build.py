@@ -15,6 +15,7 @@ from stages.report.by_label import LabelErrors, pooled
 from stages.report.capture_figures import captured
 from stages.report.collect import Results
 from stages.report.compare import JudgedView
+from stages.report.light_stage import shown_field
 from stages.report.metrics import Scores, encoded, mean_scores
 from stages.report.page import Picture, Pictures, ViewRow, render_page
 from stages.report.pictures import (
@@ -135,6 +136,7 @@ def build_page(
             captured=captured(r, side // 2, outlines),
             verdict=verdict_shown(verdict, r, side // 2),
             viewer=viewer(r) if view else None,
+            field=shown_field(r.reflectance, side),
         ),
     )
 

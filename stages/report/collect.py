@@ -5,10 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureSet, UsdAsset, UvMesh
+from pipeline.artifacts import (
+    CameraSet,
+    FittedFace,
+    Located,
+    MaskSet,
+    ReflectanceField,
+    Surface,
+    TextureSet,
+    UsdAsset,
+    UvMesh,
+)
 from pipeline.capture_artifacts import Capture
 from pipeline.tiles import FIRST
 from stages.report.chart import chart_figures
+from stages.report.field_figures import field_figures
 
 
 class Started(Protocol):
@@ -31,6 +42,8 @@ class Results(Started, Protocol):
     def surface(self) -> Located[Surface]: ...
     @property
     def uv(self) -> Located[UvMesh]: ...
+    @property
+    def reflectance(self) -> Located[ReflectanceField]: ...
     @property
     def bake(self) -> Located[TextureSet]: ...
     @property
@@ -124,6 +137,7 @@ def figures(r: Results) -> dict[str, Any]:
             **{k: usd.stated.get(k, "not stated") for k in ("author", "license", "subjectConsent")},
             **usd.figures,
         },
+        "reflectance": field_figures(r.reflectance.artifact),
         "warnings": warnings(r),
     }
 
@@ -142,6 +156,6 @@ def warnings(r: Results) -> list[str]:
         out.append(
             f"masks: views not fitted, because their mask disagrees: {', '.join(map(str, r.masks.artifact.dropped))}"
         )
-    for name in ("inverse_rendering", "surface", "uv", "bake", "usd"):
+    for name in ("inverse_rendering", "surface", "uv", "reflectance", "bake", "usd"):
         out += [f"{name}: {w}" for w in getattr(r, name).artifact.warnings]
     return list(dict.fromkeys(out))

@@ -49,6 +49,7 @@ class Pictures:
     captured: object | None = None  # stages.report.capture_figures.Captured
     verdict: object | None = None  # stages.report.verdict.VerdictShown
     viewer: object | None = None  # stages.report.viewer.Viewer
+    field: object | None = None  # stages.report.light_stage.FieldShown
 
 
 def render_page(metrics: Mapping[str, Any], pictures: Pictures) -> str:

@@ -6,7 +6,18 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Report, Surface, TextureSet, UsdAsset, UvMesh
+from pipeline.artifacts import (
+    CameraSet,
+    FittedFace,
+    Located,
+    MaskSet,
+    ReflectanceField,
+    Report,
+    Surface,
+    TextureSet,
+    UsdAsset,
+    UvMesh,
+)
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 
@@ -25,6 +36,7 @@ class Inputs:
     inverse_rendering: Located[FittedFace]
     surface: Located[Surface]
     uv: Located[UvMesh]
+    reflectance: Located[ReflectanceField]
     bake: Located[TextureSet]
     usd: Located[UsdAsset]
 
@@ -64,4 +76,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Report:
     return Report(files=files, warnings=tuple(unjudged(inputs)), findings=findings)
 
 
-STAGE = Stage(name="report", version=12, inputs=Inputs, config=Config, output=Report, run=run)
+STAGE = Stage(name="report", version=13, inputs=Inputs, config=Config, output=Report, run=run)

@@ -14,11 +14,12 @@ from pipeline.artifacts import CameraSet, Located, UvMesh
 from pipeline.camera import PinholeCamera
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.images import read_linear, write_exr
+from pipeline.images import read_encoded, read_linear, write_exr
 from pipeline.transforms import rows
 from stages.capture import stage as capture_stage
 from stages.capture.scan import scan_capture
 from stages.reflectance import stage
+from stages.reflectance.evidence import fewer_lamps
 from stages.reflectance.field import Field, Lamp, centre_of, distant_lamp, load, save
 from stages.reflectance.fill import harmonic
 from stages.reflectance.relight import lamps_of, look_up, picture, under_lamps
@@ -187,6 +188,15 @@ def test_the_stage_on_a_ball(ball: stage.Inputs, tmp_path: Path) -> None:
     basis = json.loads((tmp_path / "reflectance" / "basis.json").read_text())
     assert len(basis["towards"]) == 36 and set(basis["left_out"]) == set(found.left_out)
     assert not list((tmp_path / "scratch").glob("samples*"))
+    scores = {(p.camera, p.light): p for p in found.predicted}
+    assert len(scores) == 24 and {n for _, n in scores} == set(found.left_out)
+    assert np.mean([p.psnr for p in found.predicted]) > np.mean([p.blend_psnr for p in found.predicted]) + 3
+    assert found.figures["quick_psnr"] > 25 and found.figures["full_lamps"] == 6 * found.figures["quick_lamps"]
+    best, median, worst = (scores[tuple(map(int, Path(f.path).stem.split("_")[1:]))].psnr for f in found.shown)
+    assert best > median > worst
+    truth, own = np.split(read_encoded(tmp_path / found.shown[0].path).astype(float) / 255, 2, axis=1)
+    assert truth.max() > 0.5  # not of a light behind the ball
+    assert abs(-10 * np.log10(np.mean((truth - own)[truth.max(2) > 0.02] ** 2)) - best) < 2  # of the covered pixels
     made = make_stage(4, 42)
     view = PinholeCamera(K, made.poses[1], SIZE, SIZE)
     n = found.left_out[1]
@@ -217,6 +227,16 @@ def test_a_held_out_camera_is_no_part_of_the_field(ball: stage.Inputs, tmp_path:
     assert found[1].figures["left_out_camera_psnr"] < found[0].figures["left_out_camera_psnr"]
     for name, values in texels[0].items():
         np.testing.assert_array_equal(values, texels[1][name])
+
+
+def test_a_part_of_a_field_is_lit_as_the_whole() -> None:
+    field, view = field_of(np.array([0.5, 0.4, 0.3]), 0.02), camera()
+    lamp = Lamp(np.array([0.3, 0.4, 1.2]), -np.array([0.3, 0.4, 1.2]) / 1.3, np.full(3, 4.0))
+    whole = field.radiance(lamp, view.eye, field.arrives(lamp))
+    texels = np.arange(5, len(whole), 7)
+    part = field.part(texels)
+    np.testing.assert_array_equal(part.radiance(lamp, view.eye, part.arrives(lamp)), whole[texels])
+    assert fewer_lamps(field, view.eye, np.zeros(len(whole), bool), lambda d, n: None) == {}
 
 
 def test_two_runs_are_equal(ball: stage.Inputs, tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
+    ReflectanceField,
     Surface,
     TextureSet,
     UsdAsset,
@@ -35,6 +36,7 @@ class SyntheticResults:
     inverse_rendering: Located[FittedFace]
     surface: Located[Surface]
     uv: Located[UvMesh]
+    reflectance: Located[ReflectanceField]
     bake: Located[TextureSet]
     usd: Located[UsdAsset]
 
@@ -56,6 +58,7 @@ def write_results(
         made.inverse_rendering,
         _surface(folder / "surface", made.uv),
         made.uv,
+        Located(ReflectanceField(present=False), folder),
         made.bake,
         _usd(folder / "usd", made, held_out if asset_views is None else asset_views, scale),
     )
