@@ -19,6 +19,7 @@ from pipeline.images import read_linear
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, matrix, rows
 from stages.reflectance import motion as moves
+from stages.reflectance.deform import REST, write_rest
 from stages.reflectance.evidence import FOLDER as SHOWN
 from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
@@ -79,6 +80,7 @@ def build(
     motion = {str(f): rows(m.round(9)) for f, m in sorted(at.items())}
     record = {"lights": rig.index, "left_out": [whole.index[i] for i in left_out], "motion": motion}
     save(field, context.workdir / FOLDER, record)
+    write_rest(context.workdir / FOLDER / REST, mesh, charts)
     figures = _figures(field, parts, points, pairs, six)
     shots = _pictures(capture, stage, whole)
     unseen = [n for n, c in enumerate(cameras) if c.index in kept_out]

@@ -58,7 +58,8 @@ def distant_lamp(towards: F64, irradiance: F64) -> Lamp:
 
 class Field:
     """A reflectance field in memory. Arrays over the T covered texels as in `split.Fitted`; known (T,): seen by a
-    camera; towards (L, 3): directions of the stage's lights; centre (3,): of the stage."""
+    camera; towards (L, 3): directions of the stage's lights; centre (3,): of the stage. turn (T, 3, 3): rotation of the
+    surface at each texel since the pictures were taken, None at rest (deform.py)."""
 
     def __init__(
         self,
@@ -77,6 +78,7 @@ class Field:
         normal = arrays["normal"].astype(np.float64)
         self.normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         self.known = arrays["coverage"][:, 0] > 0.5
+        self.turn: F64 | None = None
         self.order = int(np.sqrt(arrays["rest"].shape[1] // 3)) - 1
         self.whole = RayCaster(mesh.vertices, mesh.faces)
         self.blocker = RayCaster(mesh.vertices, known_surface(mesh, points, self.known))
@@ -100,13 +102,14 @@ class Field:
         out.arrays = {name: values[texels] for name, values in self.arrays.items()}
         out.albedo, out.lobes = self.albedo[texels], self.lobes[texels]
         out.normal, out.known = self.normal[texels], self.known[texels]
+        out.turn = None if self.turn is None else self.turn[texels]
         return out
 
     def arrives(self, lamp: Lamp, rays: int = 3) -> F32:
         """(T,) share of a lamp's light that arrives: traced, with the corrections of the lights around it."""
         target = lamp.position / np.linalg.norm(lamp.position) if lamp.distant else lamp.position
         traced = arriving(self.points, self.blocker, target, None if lamp.distant else lamp.axis, rays)
-        near = np.exp((self.towards @ self._direction(lamp) - 1) / (1 - np.cos(np.radians(KERNEL))))
+        near = np.exp((self._turned_back(lamp) @ self.towards.T - 1) / (1 - np.cos(np.radians(KERNEL))))
         trust = self.arrays["trust"].astype(np.float32) * near.astype(np.float32)
         change = (trust * self.arrays["shadow"].astype(np.float32)).sum(1) / (trust.sum(1) + UNKNOWN)
         share = np.clip(traced + change, 0, 1)
@@ -116,14 +119,21 @@ class Field:
         towards = lamp.position if lamp.distant else lamp.position - self.centre
         return np.asarray(towards / max(float(np.linalg.norm(towards)), 1e-12), np.float64)
 
+    def _turned_back(self, lamp: Lamp) -> F64:
+        """(T, 3) or (1, 3) direction towards a lamp as each texel would have seen it at rest."""
+        towards = self._direction(lamp)
+        return (
+            towards[None] if self.turn is None else np.asarray(np.einsum("tji,j->ti", self.turn, towards), np.float64)
+        )
+
     def radiance(self, lamp: Lamp, eye: F64, arrives: F32, *, rest: bool = True) -> F32:
         """(T, 3) radiance towards an eye (3,) under one lamp. arrives (T,): see `arrives`. rest: with the light that
         came by way of other skin."""
         from stages.reflectance.shade_kernels import shade
 
         terms = self.arrays["rest"].reshape(len(self.known), -1, 3)
-        basis = harmonics(self._direction(lamp)[None], self.order)[0]
-        extra = np.einsum("tkc,k->tc", terms.astype(np.float64), basis) if rest else np.zeros_like(self.albedo)
+        basis = np.broadcast_to(harmonics(self._turned_back(lamp), self.order), terms.shape[:2])
+        extra = np.einsum("tkc,tk->tc", terms.astype(np.float64), basis) if rest else np.zeros_like(self.albedo)
         out = np.empty((len(self.known), 3))
         shade(self.points.position, self.normal, lamp.position, lamp.axis, lamp.strength, eye, np.array(self.alphas),
               self.albedo, self.lobes, arrives.astype(np.float64), extra, out)  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,7 @@ import pytest
 from pipeline.errors import StageError, UsageError
 from pipeline.images import read_exr, write_exr
 from pipeline.transforms import rows
+from stages.reflectance.deform import write_rest
 from stages.reflectance.field import save
 from tests.reflectance.test_field import field_of
 from tests.support.light_stage import SIZE, make_stage, write_stage
@@ -67,6 +69,22 @@ def test_a_light_is_given_in_the_captures_world() -> None:
 def test_bad_lights_are_named(text: str) -> None:
     with pytest.raises(UsageError, match="a light"):
         lamp_from(text, np.eye(4), field_of(np.full(3, 0.5)))
+
+
+def test_a_deformed_mesh_is_lit_where_it_is(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Oracle: a ball that was moved to the side is seen there, as bright under a lamp that moved with it."""
+    field = field_of(np.array([0.5, 0.4, 0.3]))
+    mesh = run.parent / "moved.obj"
+    shift = np.array([0.04, 0, 0])
+    write_rest(mesh, replace(field.mesh, vertices=field.mesh.vertices + shift.astype(np.float32)), field.charts)
+    common = ["render", str(run), "--cameras", str(run.parent / "in" / "params.json"), "--views", "0"]
+    assert main([*common, "--light", "0,0,1.3,4,4,4", "--out", str(run.parent / "a")]) == 0
+    assert main([*common, "--light", "0,0,1.3,4,4,4", "--deform", str(mesh), "--out", str(run.parent / "b")]) == 0
+    a, b = (read_exr(run.parent / name / "0.exr")[0] for name in ("a", "b"))
+    middle = [float((x[..., 3].sum(0) @ np.arange(SIZE)) / x[..., 3].sum()) for x in (a, b)]
+    assert abs(middle[1] - middle[0]) > 8 and a[..., :3].max() == pytest.approx(b[..., :3].max(), rel=0.1)
+    assert main([*common, "--light", "0,0,1.3", "--deform", "no.obj", "--out", str(run.parent / "c")]) == 1
+    assert "deformed mesh can't be read" in capsys.readouterr().err and not (run.parent / "c").exists()
 
 
 def test_bad_requests_are_named(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -196,10 +196,12 @@ def render_command(options: argparse.Namespace, console: Console) -> int:
         width=options.width,
         samples=options.samples,
     )
-    if options.light or options.field:
+    if options.light or options.field or options.deform:
         from workflows.cli.relight import relit_pictures
 
-        for path, seconds in relit_pictures(request, tuple(options.light or ()), console.note, quick=options.quick):
+        mesh = Path(options.deform) if options.deform else None
+        lights = tuple(options.light or ())
+        for path, seconds in relit_pictures(request, lights, console.note, quick=options.quick, mesh=mesh):
             print(f"{path} ({seconds:.1f} s)")
         return 0
     for path, seconds in render_pictures(request, console.note):

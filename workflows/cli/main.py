@@ -109,6 +109,9 @@ def _render_options(render: argparse.ArgumentParser) -> None:
         "radiant intensity (1,1,1); several add up",
     )  # fmt: skip
     render.add_argument("--field", action="store_true", help="by the reflectance field, also without --light")
+    render.add_argument(
+        "--deform", metavar="FILE", help="by the reflectance field on this mesh: its rest.obj with moved vertices"
+    )
     render.add_argument("--quick", action="store_true", help="with --field and --env: fewer lamps for the environment")
     render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
     render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")

@@ -30,20 +30,27 @@ FOLDER = "reflectance"
 
 
 def relit_pictures(
-    request: RenderRequest, lights: Sequence[str], notify: Callable[[str], None] = lambda text: None, *, quick: bool
+    request: RenderRequest,
+    lights: Sequence[str],
+    notify: Callable[[str], None] = lambda text: None,
+    *,
+    quick: bool,
+    mesh: Path | None = None,
 ) -> Iterator[tuple[Path, float]]:
     """NAME.exr (linear RGBA, premultiplied) and NAME.png for each view; yields the EXR and its seconds, of which the
-    first includes the shadows of all lamps.
+    first includes the shadows of all lamps. mesh: OBJ of the field's mesh, deformed.
 
     Raises:
-        StageError: the run has no field, or a file can't be read. UsageError: a light or a view can't be read.
+        StageError: the run has no field, a file can't be read, or the mesh is not the field's. UsageError: a light or a
+            view can't be read.
     """
+    from stages.reflectance.deform import deformed
     from stages.reflectance.field import load
     from stages.reflectance.relight import look_up, picture, under_lamps
 
     start = time.perf_counter()
     folder = request.folder / FOLDER if (request.folder / FOLDER).is_dir() else request.folder
-    field = load(folder)
+    field = load(folder) if mesh is None else deformed(load(folder), mesh)
     views = _views(request)
     capture_from_asset = capture_from_asset_of(request.folder)
     lamps = [lamp_from(text, capture_from_asset, field) for text in lights]
