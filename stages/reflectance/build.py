@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +23,8 @@ from stages.reflectance.deform import REST, write_rest
 from stages.reflectance.evidence import FOLDER as SHOWN
 from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
-from stages.reflectance.fill import harmonic
 from stages.reflectance.judge import judge
+from stages.reflectance.paint import marked, read_masks, replaced
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.samples import Step, gather
 from stages.reflectance.score import Score, decibels, score
@@ -182,7 +182,9 @@ def _field(
     parts = split(points, pairs, table, rig, arrives, alphas, config.normal_prior, config.order, step)
     step(0, 1, "filling what no camera saw")
     flat = parts.rest.reshape(len(parts.rest), -1)
-    filled = harmonic(np.concatenate([parts.albedo, parts.lobes, flat], 1), pairs.seen, points.position)
+    marks = marked(read_masks(Path(config.paint)), points) if config.paint else np.zeros(len(flat), np.bool_)
+    filled = replaced(np.concatenate([parts.albedo, parts.lobes, flat], 1), marks, pairs.seen, points.position)
+    parts = _unmarked(parts, marks, points)
     arrays: dict[str, npt.NDArray[Any]] = {
         "albedo": filled[:, :3], "lobes": filled[:, 3:6], "normal": parts.normal, "rest": filled[:, 6:],
         "shadow": parts.shadow, "trust": parts.trust, "coverage": pairs.seen[:, None].astype(np.float32),
@@ -191,6 +193,17 @@ def _field(
     (context.scratch / "samples.done").unlink()
     (context.scratch / "samples.npy").unlink()
     return field, parts
+
+
+def _unmarked(parts: Fitted, marks: npt.NDArray[np.bool_], points: Points) -> Fitted:
+    """Normals and shadows of marked texels as around them."""
+    if not marks.any():
+        return parts
+    both = np.concatenate([parts.shadow, parts.trust], 1).astype(np.float32)
+    found = replaced(both, marks, np.ones_like(marks), points.position).astype(np.float16)
+    lights = parts.shadow.shape[1]
+    normal = np.where(marks[:, None], points.normal, parts.normal).astype(np.float32)
+    return replace(parts, normal=normal, shadow=found[:, :lights], trust=found[:, lights:])
 
 
 def _figures(field: Field, parts: Fitted, points: Points, pairs: Pairs, six: Mapping[int, F64]) -> dict[str, float]:

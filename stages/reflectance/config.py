@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from pipeline.contract import StageConfig
-from pipeline.units import Texels, Unit
+from pipeline.units import ContentHash, Texels, Unit
+from stages.reflectance.paint import digest
 
 
 class Config(StageConfig):
@@ -22,4 +24,18 @@ class Config(StageConfig):
         0.02, ge=0, le=100, description="weight of the surface's normal against the one that the pictures say"
     )
     order: int = Field(3, ge=0, le=5, description="order of the harmonics for light by way of other skin; 3: 16 terms")
+    paint: str = Field(
+        "",
+        description="folder of PNG files, white where the functions are replaced by those of the tissue around, in the "
+        "field's texture coordinates",
+        exclude=True,
+    )
+    paint_digest: ContentHash = Field(default="", description="sha256 of the masks in paint, set automatically")
     motion: bool = Field(True, description="measure how the head moved, from the tracking pictures")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_digest(cls, given: Any) -> Any:
+        if not isinstance(given, dict) or not given.get("paint"):
+            return given
+        return given | {"paint_digest": digest(Path(str(given["paint"])))}

@@ -48,6 +48,7 @@ def make_plan(request: RunRequest) -> Plan:
     configs = check_settings(request)
     _check_template(configs)
     _check_light(configs)
+    _check_paint(configs)
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
@@ -120,6 +121,15 @@ def _check_light(configs: dict[str, StageConfig]) -> None:
         from pipeline.lighting.given import read_latlong
 
         read_latlong(Path(path))
+
+
+def _check_paint(configs: dict[str, StageConfig]) -> None:
+    """Read painted masks before anything runs. StageError says what is wrong with them."""
+    folder = getattr(configs.get("reflectance"), "paint", "")
+    if folder:
+        from stages.reflectance.paint import read_masks
+
+        read_masks(Path(folder))
 
 
 def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:

@@ -22,6 +22,7 @@ ORIGINS, CSRF = "PREFECT_SERVER_CORS_ALLOWED_ORIGINS", "PREFECT_SERVER_CSRF_PROT
 FILE_SETTINGS = {
     "masks": ("model", "hair_model"),
     "inverse_rendering": ("prior_file", "light_file"),
+    "reflectance": ("paint",),
     "template": ("folder",),
     "usd": ("measured",),
 }  # settings that name a file or a folder
