@@ -12,11 +12,13 @@ from pipeline.colour import srgb_from_linear
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import grid_of
-from pipeline.maths import density, losses, microfacet
+from pipeline.maths import density, losses, microfacet, sh
 from pipeline.maths.sdf import unit
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.ray_sampling import WHOLE, Batch
 from stages.inverse_rendering.render import sample_shell, shade_shell, solid_behind
+
+HIDDEN_LIGHT, HIDDEN_DIRECTIONS, BEHIND = 1e-3, 400, 0.3  # weight; directions over the sphere; their least z
 
 
 @dataclass(slots=True)
@@ -72,6 +74,8 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
     out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, rays)
     out.add("white", settings.white * losses.white_light(model.light()).sum())
+    if model.ambient is not None:
+        out.add("hidden_light", HIDDEN_LIGHT * hidden_light(model.light(), model.spec.light_start))
     energy = losses.specular_energy(shaded.specular)
     out.add("specular_energy", settings.specular_energy * energy.mean(), energy, rays)
     uneven = losses.albedo_sparsity(shaded.albedo)
@@ -89,6 +93,14 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
         square = (srgb_from_linear(colour.clamp(0, 1)) - target) ** 2
         out.error = float((square * exact).sum() / exact.sum().clamp(min=1))
     return out
+
+
+def hidden_light(light: Tensor, usual: float) -> Tensor:
+    """Mean square of the radiance of a light ((L + 1)^2, 3) in its frame over the directions behind the subject, over
+    the square of a usual radiance: photos hardly show what comes from there, and exported shaders would show it as a
+    bright rim."""
+    d = torch.from_numpy(sh.spiral(HIDDEN_DIRECTIONS)).to(light)
+    return (sh.radiance(light, d[d[:, 2] > BEHIND]) ** 2).mean() / max(usual, 1e-12) ** 2
 
 
 def calibrated_colours(matrices: Tensor, view: Tensor, colour: Tensor) -> Tensor:

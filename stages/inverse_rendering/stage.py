@@ -135,7 +135,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=23,
+    version=24,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -166,6 +166,28 @@ def _no_observations() -> tuple[Any, list[PhotoView]]:
     return Observations(torch.zeros(0, 3), torch.zeros(0, 3), none, none, empty, empty), views
 
 
+def test_light_from_behind_costs_and_light_from_the_camera_does_not() -> None:
+    """Against the mean of the squares over a lat-long picture; a lamp at the lens rings, and costs a hundredth."""
+    from pipeline.maths.latlong import latlong_directions, latlong_weights
+    from stages.inverse_rendering.objective import BEHIND, hidden_light
+
+    degree = np.sqrt(np.arange(121)).astype(int)
+    cost = {}
+    for name, d in (("behind", [0.2, 0.1, 1.0]), ("lens", [0.0, -0.2, -1.0])):
+        at = torch.from_numpy(unit(np.array([d])))
+        c = sh.sh_basis(at, 10).T * torch.from_numpy(np.exp(-degree * (degree + 1) / 40))[:, None]
+        c = c.expand(121, 3).contiguous().requires_grad_()
+        cost[name] = float(hidden_light(c.detach(), 2.0))
+        w = latlong_directions(128, 64)
+        weights = np.broadcast_to(latlong_weights(128, 64), w.shape[:2]) * (w[..., 2] > BEHIND)
+        values = sh.radiance(c.detach(), torch.from_numpy(w.reshape(-1, 3))).numpy()[:, 0].reshape(w.shape[:2])
+        assert cost[name] == pytest.approx((weights * values**2).sum() / weights.sum() / 4, rel=0.03, abs=1e-6)
+        (gradient,) = torch.autograd.grad(hidden_light(c, 2.0), c)
+        assert gradient.isfinite().all()
+    assert cost["lens"] < 0.01 * cost["behind"]
+    assert float(hidden_light(torch.zeros(1, 3), 0.0)) == 0
+
+
 @pytest.mark.slow
 def test_a_fit_under_a_flash_predicts_a_photo_that_it_did_not_see() -> None:
     views, unseen = photos(flash), photo(UNSEEN / 2, flash)
