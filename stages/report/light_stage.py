@@ -87,10 +87,11 @@ def plot(found: Sequence[LeftOutPicture]) -> Markup:
         return Markup()
     values = [v for p in found for v in (p.psnr, p.blend_psnr)]
     low, high = 5 * np.floor(min(values) / 5), 5 * np.ceil(max(values) / 5 + 1e-9)
-    right = max(5 * np.ceil(max(p.angle for p in found) / 5), 5)
+    left = 5 * np.floor(min(p.angle for p in found) / 5)
+    right = max(5 * np.ceil(max(p.angle for p in found) / 5), left + 5)
 
     def x(angle: float) -> float:
-        return float(MARGIN + (WIDTH - 2 * MARGIN) * angle / right)
+        return float(MARGIN + (WIDTH - 2 * MARGIN) * (angle - left) / (right - left))
 
     def y(decibels: float) -> float:
         return float(HEIGHT - MARGIN - (HEIGHT - 2 * MARGIN) * (decibels - low) / max(high - low, 1))
@@ -104,7 +105,7 @@ def plot(found: Sequence[LeftOutPicture]) -> Markup:
     for v in np.arange(low, high + 1, 5):
         lines.append(f'<path d="M{MARGIN} {y(v):.1f}H{WIDTH - MARGIN}" stroke="#8886" fill="none"/>'
                      f'<text x="{MARGIN - 5}" y="{y(v) + 4:.1f}" text-anchor="end">{v:.0f}</text>')  # fmt: skip
-    for a in np.arange(0, right + 1, 5):
+    for a in np.arange(left, right + 1, 5):
         lines.append(f'<text x="{x(a):.1f}" y="{HEIGHT - MARGIN + 16}" text-anchor="middle">{a:.0f}</text>')
     lines.append(f'<text x="{WIDTH / 2:.0f}" y="{HEIGHT - 4}" text-anchor="middle">degrees to the nearest light</text>'
                  f'<text x="{MARGIN - 26}" y="{MARGIN - 14}">dB</text>')  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import StageError
+from pipeline.meshes import unit, vertex_normals
 from pipeline.ray_casting import RayCaster
 from stages.reflectance.deform import deformed, least_rotations, moved, nearest_rotations, vertex_rotations, write_rest
 from stages.reflectance.field import Field, Lamp
@@ -65,6 +67,12 @@ def test_normals_of_a_stretched_ball_are_an_ellipsoids() -> None:
     off = np.degrees(np.arccos(np.clip((made.normal * expected).sum(1), -1, 1)))
     assert np.median(off) < 1 and np.quantile(off, 0.99) < 4
     np.testing.assert_allclose(np.linalg.norm(made.normal, axis=1), 1, atol=1e-6)
+    before, after = (
+        unit((mesh.normals.astype(float)[mesh.faces[field.points.face]] * field.points.weights[..., None]).sum(1))
+        for mesh in (replace(field.mesh, normals=vertex_normals(field.mesh.vertices, field.mesh.faces)), made.mesh)
+    )  # what was the mesh's own normal is so again
+    assert made.turn is not None
+    np.testing.assert_allclose(np.einsum("tij,tj->ti", made.turn, before), after, atol=1e-6)
 
 
 def test_a_dent_is_in_the_shadow_of_its_wall() -> None:
