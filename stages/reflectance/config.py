@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,6 @@ from pydantic import Field, model_validator
 
 from pipeline.contract import StageConfig
 from pipeline.units import ContentHash, Texels, Unit
-from stages.reflectance.paint import digest
 
 
 class Config(StageConfig):
@@ -39,3 +39,18 @@ class Config(StageConfig):
         if not isinstance(given, dict) or not given.get("paint"):
             return given
         return given | {"paint_digest": digest(Path(str(given["paint"])))}
+
+
+def digest(folder: Path) -> str:
+    """sha256 of the names and bytes of a folder's painted masks; "" if there are none (paint.py then says so)."""
+    total, found = hashlib.sha256(), mask_files(folder)
+    for path in found:
+        total.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest() if found else ""
+
+
+def mask_files(folder: Path) -> list[Path]:
+    """The PNG files of a folder by name; none if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() == ".png" and p.name[0] != ".")

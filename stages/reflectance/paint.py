@@ -7,7 +7,6 @@ same texels, so that the place answers light as its surroundings do.
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ import numpy.typing as npt
 
 from pipeline.errors import StageError
 from pipeline.images import F32, read_encoded
+from stages.reflectance.config import mask_files
 from stages.reflectance.fill import harmonic
 from stages.reflectance.texels import Points
 
@@ -23,27 +23,13 @@ HALF = 0.5  # of the largest value: brighter pixels mark
 REMEDY = "paint white on black over albedo.exr of an earlier run with the same settings; save square 8-bit PNG files"
 
 
-def digest(folder: Path) -> str:
-    """sha256 of the names and bytes of a folder's masks; "" if there are none."""
-    total, found = hashlib.sha256(), _files(folder)
-    for path in found:
-        total.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest() if found else ""
-
-
-def _files(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() == ".png" and p.name[0] != ".")
-
-
 def read_masks(folder: Path) -> list[Marks]:
     """The masks (N, N) of a folder, each of its own size: true where it is painted.
 
     Raises:
         StageError: there is no mask, or one can't be read, is not square, or has no marked pixel.
     """
-    found = _files(folder)
+    found = mask_files(folder)
     if not found:
         what = "no PNG file" if folder.is_dir() else "no such folder"
         raise _refused("there are no painted masks", folder, what, "a folder with PNG files")
