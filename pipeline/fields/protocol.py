@@ -7,12 +7,13 @@ gradients.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.lighting.moving import MovingLight
+if TYPE_CHECKING:  # stages are listed without torch
+    from pipeline.lighting.moving import MovingLight
 
 F32 = npt.NDArray[np.float32]
 

@@ -117,7 +117,7 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "seed": 7, "device": "cpu", "until": "capture", "from_stage": "capture", "fit_slots": "gpus",
                 "sets": ["capture.min_views=3"], "config": {"capture": {"drop_blurred": False}},
                 "store": str(tmp_path / "store"), "stage_limit": 600.0, "budget": None,  # with a preset there is none
-                "force": True, "strict": True, "pack": "zip", "template": None,
+                "force": True, "strict": True, "pack": "zip", "template": None, "light": None,
             }  # fmt: skip
             submit(environment, "capture-to-asset/local", good, "--watch", cwd=tmp_path)
             many = {
@@ -125,6 +125,7 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "holdout": "every:5:2", "seed": 3, "device": "cuda", "until": "bake", "sets": ["bake.size=512"],
                 "config": {"uv": {"padding": 8}}, "store": "/runs/.store", "stage_limit": 60.0, "attempts": 5,
                 "force": True, "strict": True, "pack": "zip", "template": "/templates/studio",
+                "neutral": "1", "average": True,
                 "deployment": "capture-to-asset/docker", "chunk": 9, "priority": "low", "gpus": 8, "lost_after": 30.0,
             }  # fmt: skip
             submit(environment, "facescape-batch/batch-local", many, cwd=tmp_path)  # no worker takes it

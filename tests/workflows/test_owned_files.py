@@ -17,7 +17,6 @@ from pipeline.store import LINEAGE, LOCKS, Store
 from workflows.batch.page import TABLES, write_page
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import Summary
-from workflows.bench.captures_find import Found, gathered
 from workflows.cli.main import main
 from workflows.cli.render import _put, given_cameras
 from workflows.run import replace
@@ -207,20 +206,6 @@ def test_pictures_rendered_among_the_photos(tmp_path: Path) -> None:
 def test_cameras_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--cameras"):
         given_cameras(tmp_path / "params.json", tmp_path)
-
-
-def test_a_folder_of_links_with_something_else_in_it(tmp_path: Path) -> None:
-    photos, place = tmp_path / "c/full_on", tmp_path / "out/gathered/c"
-    photos.mkdir(parents=True)
-    (photos / "a.jpg").write_text("a")
-    (tmp_path / "c/params.json").write_text("{}")
-    capture = Found("c", tmp_path / "c", photos, "none", beside=tmp_path / "c/params.json")
-    for _ in range(2):
-        assert {p.name for p in gathered(capture, place).iterdir()} == {"a.jpg", "params.json"}
-    (place / "notes.txt").write_text("mine")
-    with pytest.raises(UsageError, match="links"):
-        gathered(capture, place)
-    assert (place / "notes.txt").read_text() == "mine"
 
 
 # ------------------------------------------------------------------ store
