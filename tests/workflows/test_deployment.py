@@ -125,7 +125,7 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "holdout": "every:5:2", "seed": 3, "device": "cuda", "until": "bake", "sets": ["bake.size=512"],
                 "config": {"uv": {"padding": 8}}, "store": "/runs/.store", "stage_limit": 60.0, "attempts": 5,
                 "force": True, "strict": True, "pack": "zip", "template": "/templates/studio",
-                "neutral": "1", "average": True,
+                "neutral": "1_neutral", "average": True,
                 "deployment": "capture-to-asset/docker", "chunk": 9, "priority": "low", "gpus": 8, "lost_after": 30.0,
             }  # fmt: skip
             submit(environment, "facescape-batch/batch-local", many, cwd=tmp_path)  # no worker takes it

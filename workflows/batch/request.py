@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
 
 from stages.presets import DEFAULT_PRESET, parse_sets
 from workflows.run.request import RunRequest
 
 PRIORITIES = ("high", "normal", "low")
 DEPLOYMENT = "capture-to-asset/local"
+
+# `prefect deployment run --param neutral=1` sends a number.
+NameOrNumber = Annotated[
+    str,
+    BeforeValidator(lambda v: str(v) if isinstance(v, int) and not isinstance(v, bool) else v),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "integer"}]}),
+]
 
 
 class BatchRequest(BaseModel):
@@ -23,7 +30,7 @@ class BatchRequest(BaseModel):
     out: str = Field(min_length=1, description="folder for the results: a folder for each capture, batch/index.html")
     subjects: str | None = Field(None, description="only these: 1-40 or 1,7,20-29; all by default")
     expressions: str | None = Field(None, description="only these numbers: 1,2; all by default")
-    neutral: str | None = Field(
+    neutral: NameOrNumber | None = Field(
         None,
         description="number or name of the neutral expression (1): each person's others become measured blend shapes "
         "of its asset; needs uv.mesh=template, which is then the default",
