@@ -14,6 +14,7 @@ import numpy.typing as npt
 import torch
 
 from pipeline.errors import StageError
+from pipeline.lighting.given import sh_of_latlong
 from pipeline.lighting.moving import MovingLight, from_stored
 from pipeline.maths import sh
 from pipeline.maths.latlong import latlong_directions, latlong_weights
@@ -104,14 +105,7 @@ def environment_figures(light: F32, image: F32) -> dict[str, float]:
 
 def light_from_environment(image: F32, order: int = sh.ORDER) -> F32:
     """((order + 1)^2, 3) coefficients of a lat-long picture (H, W, 3), by a sum over its pixels."""
-    height, width = image.shape[:2]
-    directions = latlong_directions(width, height)
-    weights = latlong_weights(width, height)
-    out = np.zeros((sh.count(order), 3))
-    for row in range(height):
-        basis = sh.sh_basis(torch.from_numpy(directions[row]), order).numpy()
-        out += weights[row] * basis.T @ image[row].astype(np.float64)
-    return out.astype(np.float32)
+    return sh_of_latlong(image, order, np.eye(3)).astype(np.float32)
 
 
 def light_json(light: F32, attenuation: str, moving: MovingLight | None = None) -> str:

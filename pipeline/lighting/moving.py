@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from pipeline.maths import brdf, sh
-from pipeline.maths.light_frame import MOVING, Stations, turn_of
+from pipeline.maths.light_frame import MOVING, Stations, Turn, turn_of
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -64,16 +64,14 @@ class MovingLight:
 
     def irradiance(self, x: F32, n: F32, eye: Standpoint) -> F32:
         """E (N, 3) at points x with unit normals n (N, 3) in a photo."""
-        at, normal, toward = self._towards(x, n, eye)
-        turn = turn_of(self.frame, eye.stations(len(at)), at, toward, self.distance)
+        normal, _, turn = self.turned(x, n, eye)
         moving = turn.strength * sh.irradiance(_tensor(self.coefficients), turn(normal))
         return np.asarray((moving + sh.irradiance(_tensor(self.ambient), normal)).numpy(), np.float32)
 
     def reflected(self, x: F32, n: F32, width: F32, eye: Standpoint, attenuation: str) -> F32:
         """(N, 3) radiance averaged over lobes of 1 / kappa = width (N,) around the mirror directions at x, n (N, 3).
         [NeuFace eq. 11]"""
-        at, normal, toward = self._towards(x, n, eye)
-        turn = turn_of(self.frame, eye.stations(len(at)), at, toward, self.distance)
+        normal, toward, turn = self.turned(x, n, eye)
         mirror, s = brdf.reflect(toward, normal), _tensor(width)
         moving = turn.strength * brdf.light_integral(turn(mirror), s, _tensor(self.coefficients), attenuation)
         still = brdf.light_integral(mirror, s, _tensor(self.ambient), attenuation)
@@ -88,11 +86,12 @@ class MovingLight:
             "ambient": _rows(self.ambient),
         }
 
-    @staticmethod
-    def _towards(x: F32, n: F32, eye: Standpoint) -> tuple[Tensor, Tensor, Tensor]:
+    def turned(self, x: F32, n: F32, eye: Standpoint) -> tuple[Tensor, Tensor, Turn]:
+        """n and the unit directions to the eye, (N, 3) each, and the turn into the light's frame at x (N, 3)."""
         at, normal = _tensor(x), _tensor(n)
         away = torch.from_numpy(np.asarray(eye.centre, np.float32)) - at
-        return at, normal, away / away.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+        toward = away / away.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+        return normal, toward, turn_of(self.frame, eye.stations(len(at)), at, toward, self.distance)
 
 
 def from_stored(stored: Mapping[str, Any] | None) -> MovingLight | None:

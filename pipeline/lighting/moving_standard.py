@@ -11,14 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from pipeline.lighting import ggx_kernels as kernels
 from pipeline.lighting import standard
 from pipeline.lighting.dome import environment
 from pipeline.lighting.median_cut import lamps
 from pipeline.lighting.moving import MovingLight, Standpoint
-from pipeline.maths.light_frame import turn_of
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -78,11 +76,8 @@ class MovingLamps:
 
     def _turned(self, x: F32, n: F32, eye: Standpoint) -> tuple[_Points, _Points]:
         """The points for the moving part and for the still one."""
-        at, normal = (torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in (x, n))
-        away = torch.from_numpy(np.asarray(eye.centre, np.float32)) - at
-        wo = away / away.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-        turn = turn_of(self.light.frame, eye.stations(len(at)), at, wo, self.light.distance)
-        still = _Points(normal.numpy(), wo.numpy(), np.ones((len(at), 1)))
+        normal, wo, turn = self.light.turned(x, n, eye)
+        still = _Points(normal.numpy(), wo.numpy(), np.ones((len(x), 1)))
         n_c, wo_c = (np.ascontiguousarray(turn(d).numpy()) for d in (normal, wo))
         return _Points(n_c, wo_c, turn.strength.double().numpy()), still
 

@@ -117,9 +117,13 @@ def relative_light(field: Field, mesh: Mesh, cameras: F64) -> F32:
     still, n = shade(field.light, mesh.normals, alike), np.ascontiguousarray(mesh.normals, np.float32)
     out = np.empty((len(cameras), len(n), 3), np.float32)
     for v, camera in enumerate(cameras):
-        eye = Standpoint(camera[27:30], camera[:12].reshape(3, 4)[:, :3].T)
-        out[v] = lit_at_least(moving.irradiance(mesh.vertices, n, eye), field.light) / still
+        out[v] = lit_at_least(moving.irradiance(mesh.vertices, n, _standpoint(camera)), field.light) / still
     return out
+
+
+def _standpoint(camera: F64) -> Standpoint:
+    """Of a row of detail_kernels."""
+    return Standpoint(camera[27:30], camera[:12].reshape(3, 4)[:, :3].T)
 
 
 def lit_at_least(e: F32, light: F32) -> F32:
@@ -152,7 +156,6 @@ def _gloss(field: Field, mesh: Mesh, photos: Photos, attenuation: str) -> F32:
             mirror = brdf.reflect(torch.from_numpy(w), torch.from_numpy(n))
             incident = brdf.light_integral(mirror, torch.from_numpy(width), light, attenuation).numpy()
         else:
-            eye = Standpoint(centre, photos.cameras[v, :12].reshape(3, 4)[:, :3].T)
-            incident = moving.reflected(mesh.vertices[rows], n, width, eye, attenuation)
+            incident = moving.reflected(mesh.vertices[rows], n, width, _standpoint(photos.cameras[v]), attenuation)
         out[v, rows] = bound[:, None] * incident
     return out

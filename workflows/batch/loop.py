@@ -11,6 +11,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -90,8 +91,10 @@ def run_batch(
         notify(f"{len(items)} captures, {len(items) - summary.failed} of them done before")
         page = _Page(lambda: write_page(request, summary))
         try:
-            _loop(works, request, runner, state, summary, stopped, notify, page)
-            _after(works, request, runner, state, summary, stopped, notify, page)
+            run = partial(_loop, request=request, runner=runner, state=state, summary=summary, stopped=stopped,
+                          notify=notify, page=page)  # fmt: skip
+            run(works)
+            _after(works, request, summary, stopped, notify, run)
         finally:
             page.last()
         return summary
@@ -100,18 +103,16 @@ def run_batch(
 def _after(
     works: list[Work],
     request: BatchRequest,
-    runner: Runner,
-    state: BatchState,
     summary: Summary,
     stopped: Callable[[], bool],
     notify: Callable[[str], None],
-    page: _Page,
+    run: Callable[[list[Work]], None],
 ) -> None:
-    """What is made of the captures together; not while captures wait for room on the disk."""
+    """What is made of the captures together; not while captures wait for room on the disk. run: runs some again."""
     pairs = [(w.item, w.entry) for w in works]
     if request.neutral is not None and summary.held is None:
         again = {e.name for e in to_measure(pairs, request, summary, stopped, notify)}
-        _loop([w for w in works if w.item.name in again], request, runner, state, summary, stopped, notify, page)
+        run([w for w in works if w.item.name in again])
     if request.average and summary.held is None:
         make_average(pairs, request, summary, stopped, notify)
 

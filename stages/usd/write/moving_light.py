@@ -18,6 +18,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux
 from pipeline.artifacts import Camera
 from pipeline.images import write_exr
 from pipeline.lighting.dome import environment
+from pipeline.lighting.moving import FRONT as UPRIGHT  # a dome has +Y up; a camera's y runs down, its z forward
 from pipeline.lighting.moving import MovingLight
 from pipeline.maths import sh
 from pipeline.maths.light_frame import FLASH, TURNTABLE, level_axes
@@ -29,14 +30,13 @@ FRONT, WITH_CAMERA = "front", "with_camera"
 AMBIENT_FILE, MOVING_FILE = "environment_ambient.exr", "environment_camera.exr"
 BULB = 0.01  # of the distance: radius of the sphere
 DIMMEST = 1e-6  # smallest irradiance of a flash that is written
-FACING = np.diag([1.0, -1.0, -1.0])  # a dome's picture is in axes with +Y up; the camera's y runs down, its z forward
 
 
 def write_domes(moving: MovingLight, folder: Path, width: int) -> list[Path]:
     """Write the pictures of the ambient part and, without a flash, of the moving part in the camera's axes."""
     pictures = {AMBIENT_FILE: moving.ambient}
     if moving.frame != FLASH:
-        pictures[MOVING_FILE] = sh.rotated(moving.coefficients.astype(np.float64), FACING).astype(np.float32)
+        pictures[MOVING_FILE] = sh.rotated(moving.coefficients.astype(np.float64), UPRIGHT).astype(np.float32)
     for name, light in pictures.items():
         write_exr(folder / name, environment(light, width))
     return [folder / name for name in pictures]
@@ -63,7 +63,7 @@ def add_moving_light(stage: Usd.Stage, scope: str, moving: MovingLight, cameras:
 
 def _carried(stage: Usd.Stage, path: str, moving: MovingLight, cameras: tuple[Camera, ...]) -> None:
     """The light, with one pose a photo."""
-    place, axes = np.zeros(3), FACING
+    place, axes = np.zeros(3), UPRIGHT
     if moving.frame == FLASH:
         bulb = UsdLux.SphereLight.Define(stage, path)
         place, strength, colour = lamp(moving)
