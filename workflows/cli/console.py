@@ -22,14 +22,14 @@ TICK = 1.0  # seconds after which a terminal is drawn again though a stage told 
 
 
 class Console:
-    """An Observer that writes to `stream` (stderr: stdout is for results), or JSON to stdout.
+    """An Observer that writes to `stream` (None: stderr as it is now; stdout is for results), or JSON to stdout.
 
     clock: seconds since any moment; a test passes its own.
     """
 
-    def __init__(self, stream: TextIO = sys.stderr, clock: Callable[[], float] = time.monotonic) -> None:
-        self.stream, self.clock = stream, clock
-        self.screen = Screen(stream) if can_redraw(stream) else None
+    def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        self.stream, self.clock = sys.stderr if stream is None else stream, clock
+        self.screen = Screen(self.stream) if can_redraw(self.stream) else None
         self.events: Events | None = None
         self.forecast = Forecast({}, clock())
         self.label, self.stage, self.said, self.last, self.warning = "", "", "", 0.0, ""
