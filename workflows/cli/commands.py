@@ -249,6 +249,16 @@ def turntable_command(options: argparse.Namespace, console: Console) -> int:
     return 0
 
 
+def expressions_command(options: argparse.Namespace, console: Console) -> int:
+    """neuface expressions"""
+    from workflows.cli.expressions import ExpressionsRequest, write_expressions
+
+    request = ExpressionsRequest(Path(options.folder), Path(options.out), tuple(options.only or ()))
+    written = list(write_expressions(request, console.note))
+    print(f"{written[0].parent}: {len(written)} files")
+    return 0
+
+
 def doctor_command(options: argparse.Namespace, console: Console) -> int:
     """neuface doctor"""
     from workflows.cli.doctor import examine

@@ -68,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     validate.set_defaults(run=commands.validate_command)
     _render_options(commands_of.add_parser("render", help="render the exported asset: photos' views, or a turntable"))
     _turntable_options(commands_of.add_parser("turntable", help="a film of one turn around the exported asset"))
+    _expressions_options(commands_of.add_parser("expressions", help="an OBJ for each expression of an asset"))
     for name, text, run in (
         ("report", "(re)build the report of a run", commands.report_command),
         ("view", "serve the report of a run to this machine's browser", commands.view_command),
@@ -128,6 +129,13 @@ def _turntable_options(turntable: argparse.ArgumentParser) -> None:
     turntable.add_argument("--frames", type=_at_least(1), default=120, help="pictures of the turn (%(default)s)")
     turntable.add_argument("--size", type=_at_least(16), default=1080, help="pixels along each side (%(default)s)")
     turntable.set_defaults(run=commands.turntable_command)
+
+
+def _expressions_options(expressions: argparse.ArgumentParser) -> None:
+    expressions.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
+    expressions.add_argument("--out", required=True, metavar="OUT", help="folder for the files")
+    expressions.add_argument("--only", action="append", metavar="NAME", help="this expression; may be repeated")
+    expressions.set_defaults(run=commands.expressions_command)
 
 
 def _unicode(options: argparse.Namespace) -> None:

@@ -70,15 +70,18 @@ def put_picture(folder: Path, name: str, rgba: Any, notify: Callable[[str], None
     from pipeline.images import write_exr
     from stages.usd.render.previews import write_rgba_png
 
-    _put(folder, f"{name}.exr", write_exr, rgba, notify)
-    _put(folder, f"{name}.png", write_rgba_png, rgba, notify)
+    put_file(folder, f"{name}.exr", write_exr, rgba, notify)
+    put_file(folder, f"{name}.png", write_rgba_png, rgba, notify)
     return folder / f"{name}.exr"
 
 
-def _put(folder: Path, name: str, write: Callable[[Path, Any], None], rgba: Any, notify: Callable[[str], None]) -> None:
+def put_file(
+    folder: Path, name: str, write: Callable[[Path, Any], None], content: Any, notify: Callable[[str], None]
+) -> None:
+    """Write folder/name by `write`; a foreign file of that name is kept aside, and `notify` is called."""
     made = partial_name(folder, name)
     try:
-        write(made, rgba)
+        write(made, content)
         aside = put_owned(folder, name, made)
         if aside is not None:
             notify(f"{folder / name} is yours: kept as {folder / aside}")
