@@ -28,6 +28,7 @@ from stages.report.pictures import (
     scaled_picture,
     to_bytes,
 )
+from stages.report.uv_layout import uv_layout
 from stages.report.verdict import verdict_shown
 from stages.report.viewer import viewer
 
@@ -177,7 +178,7 @@ def _maps(r: Results, side: int) -> list[Picture]:
             picture = scaled_picture(values, *limits) if limits else map_picture(values, texture.space)
             scale = f"; scale {limits[0]:g} to {limits[1]:g}" if limits else ""
             out.append(Picture(data_uri(picture, side), f"{name.replace('_', ' ')}, mean {texture.mean:.3g}{scale}"))
-    return out + _lobe_fit(r, side)
+    return [*out, *_lobe_fit(r, side), uv_layout(r, side)]
 
 
 def _lobe_fit(r: Results, side: int) -> list[Picture]:

@@ -26,6 +26,7 @@ from pipeline.maths import studio_lights
 from stages.report.collect import Results
 from stages.report.pictures import U8, png_uri, scale_colours
 from stages.report.viewer_cameras import cameras_shown
+from stages.report.viewer_marks import landmarks
 
 F32 = npt.NDArray[np.float32]
 MAP_SIDE = 1024  # texels of a map that only the view shows
@@ -43,6 +44,7 @@ MODULES = (  # in the order of their imports, by the name under which others imp
     ("./channels.js", "viewer/channels.js"),
     ("./lights.js", "viewer/lights.js"),
     ("./cameras.js", "viewer/cameras.js"),
+    ("./marks.js", "viewer/marks.js"),
     ("./main.js", "viewer/main.js"),
 )
 # Colours that differ for every kind of colour vision [Okabe and Ito 2008], after a grey for "none".
@@ -88,6 +90,7 @@ def _data(r: Results) -> dict[str, Any]:
         "scale": base64.b64encode(scale_colours().tobytes()).decode(),
         "lights": list(_lights(r)),
         "cameras": cameras_shown(r),
+        "landmarks": landmarks(r),
     }
 
 

@@ -24,6 +24,7 @@ FOLDERS = {
     "workflows/run": "### workflows/run/",
     "workflows/server": "### workflows/server/",
     "workflows/batch": "### workflows/batch/",
+    "workflows/compare": "### workflows/compare/",
     "workflows/store": "### workflows/store/",
     "workflows/bench": "### workflows/bench/",
     "workflows/evaluation": "### workflows/evaluation/",

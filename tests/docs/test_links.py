@@ -23,3 +23,10 @@ def test_the_index_lists_every_page() -> None:
     linked = set(LINK.findall((docs / "index.md").read_text()))
     there = {p.relative_to(docs).as_posix() for p in docs.rglob("*.md")} - {"index.md"}
     assert there - linked == set()
+
+
+def test_pictures_of_the_guide_are_small() -> None:
+    found = list((ROOT / "docs/pictures/photographing").glob("*"))
+    assert len(found) == 4 and all(p.suffix == ".jpg" and p.stat().st_size < 100_000 for p in found)
+    text = (ROOT / "docs/photographing.md").read_text()
+    assert all(f"pictures/photographing/{p.name}" in text for p in found)

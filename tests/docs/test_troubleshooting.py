@@ -34,6 +34,12 @@ def test_every_check_is_somewhere_on_the_page() -> None:
     assert {c for c in checks() if f"`{c}`" not in text} == set()
 
 
+def test_every_check_says_itself_what_to_do() -> None:
+    """The last column of the table is what a run prints after "What to do:"."""
+    rows = [r for r in (DOCS / "verdict.md").read_text().splitlines() if CHECK.match(r)]
+    assert len(rows) > 80 and [r for r in rows if len(r.strip(" |").rsplit("|", 1)[1].split()) < 2] == []
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_names_no_check_that_there_is_not(page: str) -> None:
     assert set(SNAKE.findall((DOCS / page).read_text())) - checks() - NOT_CHECKS == set()

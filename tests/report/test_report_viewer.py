@@ -32,14 +32,21 @@ SHOWN = ["look", "albedo", "f0", "roughness", "normal", "confidence", "coverage"
 
 
 def with_glb(results: SyntheticResults) -> SyntheticResults:
-    """The results with a glb that has one expression: the head grows by half."""
+    """The results with a glb that has one expression: the head grows by half; and with two landmarks."""
     usd, mesh = results.usd, read_mesh(results.uv.path(results.uv.artifact.mesh))
     look = Look("albedo.png", "roughness.png", "normal.png", 1.4, (0.5, 0.4, 0.3), f0="f0.exr")
     path = usd.folder / "asset/head.glb"
     write_glb(path, "head", mesh, look, results.bake.folder, {})
     path.write_bytes(with_expression(path.read_bytes()))
     files = (*usd.artifact.files, FileRef.of(usd.folder, "asset/head.glb"))
-    return replace(results, usd=Located(usd.artifact.model_copy(update={"files": files}), usd.folder))
+    masks = results.masks
+    np.savez(masks.folder / "landmarks.npz", xyz=[[0.0, 0.1, 0.09], [0.03, 0, 0.1], [np.nan] * 3])
+    marks = {"landmarks": FileRef.of(masks.folder, "landmarks.npz")}
+    return replace(
+        results,
+        usd=Located(usd.artifact.model_copy(update={"files": files}), usd.folder),
+        masks=Located(masks.artifact.model_copy(update=marks), masks.folder),
+    )
 
 
 def with_expression(glb: bytes) -> bytes:
@@ -96,6 +103,7 @@ def test_the_page_holds_the_asset_and_only_its_own_script_may_run(page: Path, re
     assert f"script-src 'sha256-{allowed}' blob:" in unescape(text) and "default-src 'none'" in text
     data = json.loads(island(text, "data"))
     assert [c["name"] for c in data["channels"]] == SHOWN
+    assert data["landmarks"] == [[0.0, 0.1, 0.09], [0.03, 0.0, 0.1]]
     assert [x["name"] for x in data["lights"]] == ["captured", "key", "overcast", "sunset"]
     assert {c["name"] for c in data["cameras"] if c["photo"]} >= {c["name"] for c in data["cameras"]
                                                                    if c["kind"] == "held out"}  # fmt: skip
@@ -253,6 +261,30 @@ def test_expressions_move_the_surface(opened: Tab) -> None:
                " e.dispatchEvent(new Event('input')); })()")  # fmt: skip
     assert opened.run("document.querySelector('#viewer-expressions label').textContent") == "jawOpen"
     assert changed(before, drawn(opened)) > 0.05
+
+
+def tick(page: Tab, control: str, on: bool) -> None:
+    page.run(f"(() => {{ const e = document.getElementById('viewer-{control}'); e.checked = {str(on).lower()};"
+             f" e.dispatchEvent(new Event('input')); }})()")  # fmt: skip
+
+
+@pytest.mark.slow
+def test_landmarks_and_the_turn(opened: Tab) -> None:
+    """Landmarks are dots on the picture; while it turns, pictures differ, and a photo's camera ends it."""
+    opened.run("document.getElementById('viewer-home').click()")
+    plain = drawn(opened)
+    tick(opened, "landmarks", True)
+    assert 1e-5 < changed(plain, drawn(opened)) < 0.02
+    tick(opened, "landmarks", False)
+    assert changed(plain, drawn(opened)) < 0.001
+    tick(opened, "turning", True)
+    first = drawn(opened)
+    assert changed(first, drawn(opened)) > 0.005
+    choose(opened, "camera", 0)
+    assert opened.run("document.getElementById('viewer-turning').checked") is False
+    choose(opened, "camera", "")
+    still = drawn(opened)
+    assert changed(still, drawn(opened)) < 0.001
 
 
 @pytest.mark.slow

@@ -1,4 +1,7 @@
-"""A picture of the average head: from the front, from three quarters and from the side, with its mean albedo."""
+"""A picture of the average head: from the front, from three quarters and from the side, with its mean albedo.
+
+`view` shows any textured mesh so: an even light from two sides, no specular part, no shadows.
+"""
 
 from __future__ import annotations
 
@@ -24,24 +27,24 @@ def picture(path: Path, mesh: Any, albedo: Mapping[int, F32]) -> None:
     """Write the PNG. mesh: stages.usd.write.mesh.UvSurface, metres, +Y up, +Z out of the face; albedo: linear, by
     tile."""
     caster = RayCaster(mesh.vertices, mesh.faces)
-    views = [_view(mesh, albedo, caster, np.radians(d)) for d in VIEWS]
+    views = [view(mesh, albedo, caster, np.radians(d), SIDE) for d in VIEWS]
     write_png_from_linear(path, np.concatenate(views, 1))
 
 
-def _view(mesh: Any, albedo: Mapping[int, F32], caster: RayCaster, angle: float) -> F32:
-    """(SIDE, SIDE, 3) linear; parallel rays."""
+def view(mesh: Any, albedo: Mapping[int, F32], caster: RayCaster, angle: float, side: int) -> F32:
+    """(side, side, 3) linear; parallel rays, from `angle` (radians from +Z towards +X)."""
     low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
     middle, half = 0.5 * (low + high), 0.54 * float((high - low).max())
     out = np.array([np.sin(angle), 0.0, np.cos(angle)])  # towards the viewer
     right = np.array([np.cos(angle), 0.0, -np.sin(angle)])
-    at = (np.arange(SIDE * SAMPLES) + 0.5) / (SIDE * SAMPLES) * 2 - 1
+    at = (np.arange(side * SAMPLES) + 0.5) / (side * SAMPLES) * 2 - 1
     x, y = np.meshgrid(at * half, -at * half)
     origins = middle + 3 * half * out + x.reshape(-1, 1) * right + y.reshape(-1, 1) * np.array([0.0, 1.0, 0.0])
     far, face = caster.hits(origins, np.broadcast_to(-out, origins.shape))
     colour = np.full((len(origins), 3), BACKGROUND)
     hit = np.flatnonzero(face >= 0)
     colour[hit] = _shaded(mesh, albedo, origins[hit] - far[hit, None] * out, face[hit])
-    return np.asarray(colour.reshape(SIDE, SAMPLES, SIDE, SAMPLES, 3).mean((1, 3)).clip(0, 1), np.float32)
+    return np.asarray(colour.reshape(side, SAMPLES, side, SAMPLES, 3).mean((1, 3)).clip(0, 1), np.float32)
 
 
 def _shaded(mesh: Any, albedo: Mapping[int, F32], points: F64, face: Any) -> F64:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import csv
+import hashlib
 import io
 import json
 import statistics
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -15,12 +18,15 @@ from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined, Template
+from markupsafe import Markup
 
 from pipeline.store import read_object
 from pipeline.verdict import LEVELS
 from workflows.batch.captures import natural
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import ENDED, Entry, Summary
+from workflows.batch.turn_picture import FILE as TURN
+from workflows.batch.turn_picture import write_turn
 from workflows.run.owned import write_owned
 from workflows.run.published import LIST
 from workflows.run.verdict import level_in
@@ -40,12 +46,14 @@ MAD = 0.6745  # quartile of the normal distribution: makes a median of deviation
 ENOUGH = 5  # captures below which outliers are not marked
 TABLES = ("summary.json", "summary.csv", "index.html")
 AVERAGE, RECORD = "average", "average.json"  # folder in OUT, and what says whose heads it holds (average.py)
+TURN_SECONDS = 3.0  # of one writing of the page that may go into new pictures
 FIRST_LINE = 300  # characters of a fault that the table shows
 
 
 @dataclass(slots=True)
 class Row:
-    """One capture in the table. level: how good its result is; reason: the worst of why. odd: how far the oddest figure
+    """One capture in the table. level: how good its result is; reason: the worst of why. turn: a
+    picture that turns. odd: how far the oddest figure
     is from the others'; odd_in: which. measured: of a batch with --neutral, what became of the expression."""
 
     name: str
@@ -59,13 +67,16 @@ class Row:
     odd: float = 0.0
     odd_in: str = ""
     thumbnail: str = ""
+    turn: str = ""
     report: str = ""
     measured: str = ""
 
 
 def write_page(request: BatchRequest, summary: Summary) -> None:
     """Write the three files into OUT/batch. A file of the user's in the way is renamed to NAME.yours-N."""
-    rows = ranked([_row(e, Path(request.out).absolute()) for e in summary.entries])
+    out = Path(request.out).absolute()
+    _turn_pictures([out / e.name for e in summary.entries if e.state in ENDED])
+    rows = ranked([_row(e, out) for e in summary.entries])
     notes = measured_notes(summary)
     for row in rows:
         row.measured = notes.get(row.name, "")
@@ -78,11 +89,21 @@ def write_page(request: BatchRequest, summary: Summary) -> None:
         "measured": [m.model_dump(mode="json") for m in summary.measured],
         "average": summary.average.model_dump(mode="json") if summary.average is not None else None,
     }
-    page = _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD, of_average=AVERAGE)
+    page = _template().render(**content, rows=rows, names=list(FIGURES), odd=ODD, of_average=AVERAGE, script=_script())
     texts = {"summary.json": json.dumps(content, indent=1), "summary.csv": _csv(rows), "index.html": page}
     older = _of_an_older_batch(request.folder)
     for name, text in texts.items():
         write_owned(request.folder, name, text, lambda path: older)
+
+
+def _turn_pictures(folders: Sequence[Path]) -> None:
+    """Make the pictures that turn where they are missing, for a few seconds: the next writing goes on."""
+    begin = time.monotonic()
+    for folder in folders:
+        if time.monotonic() - begin > TURN_SECONDS:
+            return
+        if (folder / "asset").is_dir() and (folder / "report").is_dir() and not (folder / TURN).is_file():
+            write_turn(folder)
 
 
 def measured_notes(summary: Summary) -> dict[str, str]:
@@ -156,6 +177,8 @@ def _row(entry: Entry, out: Path) -> Row:
     }
     if (folder / "asset/thumbnails/default.png").is_file():
         row.thumbnail = f"{link}/asset/thumbnails/default.png"
+    if (folder / TURN).is_file():
+        row.turn = f"{link}/{TURN}"
     if (folder / "report/index.html").is_file():
         row.report = f"{link}/report/index.html"
     return row
@@ -194,6 +217,14 @@ def _csv(rows: Sequence[Row]) -> str:
             ]
         )
     return stream.getvalue()
+
+
+@lru_cache
+def _script() -> dict[str, str]:
+    """The page's only script, and its hash for the security policy."""
+    text = (files("workflows") / "templates" / "batch.js").read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return {"text": Markup(text), "hash": f"sha256-{digest}"}
 
 
 @lru_cache

@@ -51,11 +51,20 @@ def _change(figure: Figure, old: Row, new: Row) -> str | None:
         return (
             f"{title} not measured before, {known} now" if before is None else f"{title} was {known}, not measured now"
         )
-    if abs(after - before) <= max(figure.absolute, figure.relative * abs(before)):
+    if _within(figure, before, after):
         return None
     a, b = figure.scale * before, figure.scale * after
     difference = ("+" if b > a else "-") + figure.form.format(abs(b - a))
     return f"{title} {figure.form.format(a)} -> {figure.form.format(b)} ({difference}){_said(figure.better * (b - a))}"
+
+
+def step_of(figure: Figure, before: float, after: float) -> float:
+    """By how much a figure got better, or worse (below 0); 0 within its tolerance."""
+    return 0.0 if _within(figure, before, after) else figure.better * (after - before)
+
+
+def _within(figure: Figure, before: float, after: float) -> bool:
+    return abs(after - before) <= max(figure.absolute, figure.relative * abs(before))
 
 
 def _said(step: float) -> str:

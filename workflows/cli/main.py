@@ -27,6 +27,7 @@ from workflows.cli import check, commands, settings
 from workflows.cli.console import Console
 from workflows.cli.options import add_request_options
 from workflows.cli.parsing import Parser
+from workflows.compare import command as compare
 from workflows.run.interrupt import Interrupted, as_exceptions, code_of
 from workflows.run.request import RunRequest
 from workflows.store import commands as store_commands
@@ -76,6 +77,7 @@ def parser() -> argparse.ArgumentParser:
         sub = commands_of.add_parser(name, help=text)
         sub.add_argument("folder", metavar="DIR", help="the --out of that run")
         sub.set_defaults(run=run)
+    compare.add_options(commands_of.add_parser("compare", help="two runs side by side: figures, settings, views, maps"))
     bench_commands.add_commands(commands_of.add_parser("bench", help="measurements that repeat"))
     batch_commands.add_commands(commands_of)
     store_commands.add_commands(

@@ -5,6 +5,7 @@ import { OrbitControls } from './OrbitControls.js';
 import { Channels } from './channels.js';
 import { Lights } from './lights.js';
 import { cameraAt, frameOf, frusta, lookThrough } from './cameras.js';
+import { landmarkDots, Turning } from './marks.js';
 
 const $ = (id) => document.getElementById(`viewer-${id}`);
 const STEP = Math.PI / 24; // radians per press of an arrow key
@@ -27,6 +28,9 @@ class Viewer {
     this.controls.addEventListener("change", () => this.draw());
     this.frusta = frusta(data.cameras, 0.25 * this.radius);
     this.scene.add(this.frusta);
+    this.landmarks = landmarkDots(data.landmarks, this.radius);
+    this.scene.add(this.landmarks);
+    this.turning = new Turning((angle) => this.turn(angle / STEP, 0));
     this.photo = null;
     const { clientWidth, clientHeight } = this.canvas.parentElement;
     this.view.aspect = clientWidth / clientHeight;
@@ -64,6 +68,8 @@ class Viewer {
   }
 
   through(camera) {
+    this.turning.set(false);
+    $("turning").checked = false;
     this.photo = camera;
     this.controls.enabled = false;
     this.draw();
@@ -212,6 +218,21 @@ function connectExpressions(viewer) {
   }
 }
 
+// Landmarks, if there are any, and the turn around the asset.
+function connectMarks(viewer, choose) {
+  $("landmarks").parentElement.hidden = viewer.data.landmarks.length === 0;
+  $("landmarks").addEventListener("input", () => {
+    viewer.landmarks.visible = $("landmarks").checked;
+    viewer.draw();
+  });
+  $("turning").addEventListener("input", () => {
+    const on = $("turning").checked;
+    if (on && viewer.photo) { $("camera").value = ""; choose(); }
+    viewer.turning.set(on);
+    $("turning").checked = on;
+  });
+}
+
 export async function start(data, glb) {
   const gltf = await new GLTFLoader().parseAsync(glb, "");
   const viewer = new Viewer(data, gltf);
@@ -219,6 +240,7 @@ export async function start(data, glb) {
   await connectLight(viewer);
   const choose = connectCameras(viewer);
   connectKeys(viewer, choose);
+  connectMarks(viewer, choose);
   connectExpressions(viewer);
   viewer.resize();
   $("status").hidden = true;

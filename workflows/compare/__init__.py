@@ -1,0 +1,1 @@
+"""`neuface compare`: two runs side by side."""
