@@ -39,6 +39,7 @@ REFINE_AT = (
     0.8,
 )  # shares of the fit at which poses are refined: the model is sharp enough, and has time left
 FEWEST_VIEWS = 3
+CONFIRMED = 0.25  # share of the photos whose motion must be confirmed: without any motion it is 0.16
 SMALLEST = 0.2  # pixels of the fit: root of S from which cameras are moved; a model's own errors tell motions below it
 
 
@@ -101,7 +102,7 @@ def weighed(found: Sequence[Registered], scales: Sequence[float], *, wanted: boo
     signal = max(signal, 0.0)
     factor = signal / max(signal + noise, 1e-12)
     motion = float(np.sqrt(signal))
-    enough = wanted or motion >= SMALLEST
+    enough = wanted or (motion >= SMALLEST and confirmed >= CONFIRMED * len(usable))
     return Evidence(motion, float(np.sqrt(noise)), factor if enough else 0.0, confirmed)
 
 

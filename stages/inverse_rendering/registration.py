@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from pipeline.maths.rigid_motion import after, motion_matrix, motion_slope
 from pipeline.transforms import apply, project, projection_slope
@@ -37,7 +38,8 @@ LEVELS = (4, 2, 1)  # blocks of the sight to a side, coarse to fine
 STEPS = (6, 4, 3)  # Gauss-Newton steps of each level
 SQUARE = 16  # blocks along a square of the chessboard
 ALIKE = 27.0  # A: residuals of a model are alike over about 5 x 5 blocks
-EXPECTED = 2.0  # d in blocks
+EXPECTED = 4.0  # d in blocks
+BLUR = 0.8  # blocks: cubic splines through a blurred photo keep its noise, so that a motion alone lowers no residual
 TUKEY = 4.0  # standard deviations from which a residual has no weight
 SMALLEST = 2e-3  # of s, sRGB: half a code of 8 bits
 FEWEST = 100  # blocks of a half: with fewer there is no motion
@@ -114,8 +116,9 @@ NOTHING = Registered(NONE, np.zeros((2, 6)), np.zeros((6, 6)), 0.0, float("inf")
 
 def register(pair: Pair) -> Registered:
     """Register a photo. A pair with too little to compare gives no motion."""
-    if not _finite(pair):
+    if not (np.isfinite(pair.cam_from_world).all() and np.isfinite(pair.K).all()):
         return NOTHING
+    pair = _without_nonsense(pair)
     levels = [_level(pair, side) for side in LEVELS]
     finest = levels[-1]
     if min(np.bincount(finest.half, minlength=2)) < FEWEST:
@@ -129,18 +132,22 @@ def register(pair: Pair) -> Registered:
     return Registered(halves.mean(0), halves, G, gain, error)
 
 
-def _finite(pair: Pair) -> bool:
-    return bool(np.isfinite(pair.cam_from_world).all() and np.isfinite(pair.K).all())
+def _without_nonsense(pair: Pair) -> Pair:
+    """Values that are not finite as 0, and not usable."""
+    good = pair.usable & np.isfinite(pair.photo) & np.isfinite(pair.model) & np.isfinite(pair.x).all(-1)
+    photo, model = (np.nan_to_num(k, posinf=0.0, neginf=0.0) for k in (pair.photo, pair.model))
+    return replace(pair, photo=photo, model=model, usable=good)
 
 
 # ------------------------------------------------------------------ levels
 @dataclass(frozen=True, slots=True)
 class _Level:
-    """N blocks of one size. photo (h, w) with its gradients right and down; at (N, 2) the blocks' places in it; x, m,
+    """N blocks of one size. spline (h, w): coefficients of the photo; right, down: its gradients; at (N, 2) the blocks'
+    places in it; x, m,
     gradient (N, 2): of the model there. half: (N,) colour of the chessboard. side: of a block, in blocks of the
     pair."""
 
-    photo: F32
+    spline: F64
     right: F32
     down: F32
     at: F64
@@ -154,21 +161,19 @@ class _Level:
 
 
 def _level(pair: Pair, side: int) -> _Level:
-    photo, model = _reduced(pair.photo, side), _reduced(pair.model, side)
+    photo, model = (cv2.GaussianBlur(_reduced(k, side), (0, 0), BLUR) for k in (pair.photo, pair.model))
     usable = _reduced(pair.usable.astype(np.float32), side) == 1
     x = _reduced(np.where(pair.usable[..., None], pair.x, 0.0), side)
-    inner = cv2.erode(usable.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
-    inner &= np.isfinite(photo) & np.isfinite(model) & np.isfinite(x).all(-1)
+    inner = cv2.erode(usable.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
     row, column = np.nonzero(inner)
     every = max(len(row) * side * side // MOST, 1) if side == LEVELS[-1] else 1
     row, column = row[::every], column[::every]
-    photo, model = np.nan_to_num(photo), np.nan_to_num(model)
     down, right = (np.asarray(g, np.float32) for g in np.gradient(photo))
     model_down, model_right = (g[row, column] for g in np.gradient(model))
     points = np.asarray(x[row, column], np.float64)
     height, width = (row * side // SQUARE).astype(np.int64), (column * side // SQUARE).astype(np.int64)
     return _Level(
-        photo, right, down,
+        ndimage.spline_filter(photo.astype(np.float64), mode="nearest"), right, down,
         np.stack([column, row], -1).astype(np.float64), points, model[row, column].astype(np.float64),
         np.stack([model_right, model_down], -1).astype(np.float64),
         (height + width) % 2, height * (1 + pair.photo.shape[1] // SQUARE) + width, pair.seen(points), side,
@@ -208,9 +213,9 @@ def _solve(pair: Pair, levels: Sequence[_Level], metric: F64, half: int) -> F64:
 def _colours(pair: Pair, level: _Level, xi: F64) -> tuple[F64, F64]:
     """Normal equations (6, 6), (6,) of the brightness for a further motion."""
     moved, at = _moved(pair, level, xi)
-    value, right, down = (_picked(p, at) for p in (level.photo, level.right, level.down))
-    r, s = _residual(value, level.m)
-    slope = 0.5 * (np.stack([right, down], -1) + level.gradient) / level.side
+    r, s = _residual(_value(level, at), level.m)
+    own = np.stack([_between(k, at) for k in (level.right, level.down)], -1)
+    slope = 0.5 * (own + level.gradient) / level.side
     rows = np.einsum("nk,nkj->nj", slope, pair.slope(moved))
     weighted = rows * (tukey(r / s) * level.side**2 / (s * s * ALIKE))[:, None]
     return weighted.T @ rows, weighted.T @ r
@@ -222,12 +227,16 @@ def _moved(pair: Pair, level: _Level, xi: F64) -> tuple[F64, F64]:
     return moved, level.at + (pair.seen(moved) - level.start) / level.side
 
 
-def _picked(image: F32, at: F64) -> F64:
+def _value(level: _Level, at: F64) -> F64:
+    """(N,) brightness of the photo at column and row (N, 2), by cubic splines."""
+    places = np.stack([at[:, 1], at[:, 0]])
+    return np.asarray(ndimage.map_coordinates(level.spline, places, order=3, mode="nearest", prefilter=False))
+
+
+def _between(image: F32, at: F64) -> F64:
     """(N,) bilinear values at column and row (N, 2), the first pixel's centre at 0."""
-    x, y = (np.ascontiguousarray(at[:, k], np.float32) for k in (0, 1))
-    shape = (-1, 1)
-    found = cv2.remap(image, x.reshape(shape), y.reshape(shape), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found[:, 0], np.float64)
+    x, y = (np.ascontiguousarray(at[:, k : k + 1], np.float32) for k in (0, 1))
+    return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0], np.float64)
 
 
 def _residual(value: F64, m: F64) -> tuple[F64, float]:
@@ -269,7 +278,7 @@ def _judged(pair: Pair, level: _Level, halves: F64) -> tuple[float, float]:
         part = _of(level, level.half == half)
         costs, s = [], 0.0
         for xi in (NONE, halves[1 - half]):
-            r, own = _residual(_picked(part.photo, _moved(pair, part, xi)[1]), part.m)
+            r, own = _residual(_value(part, _moved(pair, part, xi)[1]), part.m)
             s = s or own  # that of the start
             costs.append(tukey_cost(r / s))
         before.append(costs[0])

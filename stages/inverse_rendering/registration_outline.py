@@ -28,7 +28,8 @@ NEAR = 1.6  # blocks from the model's outline
 FAR = 12.0  # blocks: where the mask's outline is further away, they are not the same outline
 REACH = 6.0  # blocks from the outline to the surface point
 BORDER = 3  # blocks at the picture's edge, where a silhouette is cut
-LEAST, ALIKE = 0.5, 10.0  # smallest standard deviation in blocks; blocks along the outline whose residuals are alike
+LEAST, ALIKE = 0.5, 20.0  # smallest standard deviation in blocks; blocks along the outline whose residuals are alike
+FINER = 4  # of a block, where distances are measured: in whole blocks a small motion is no motion for robust weights
 TUKEY = 4.0  # standard deviations from which a residual has no weight
 FEWEST = 15  # blocks of a half
 
@@ -74,7 +75,7 @@ def outline_of(
 ) -> Outline | None:
     """The outline of a sight, None if there is none to compare. All (h, w): mask and opacity in [0, 1], x (h, w, 3)
     where `surface`, trusted where the mask may be compared. square: blocks along a square of the chessboard."""
-    model, photo = _distance(opacity > 0.5), _distance(mask > 0.5)
+    model, photo = _distance(opacity), _distance(mask)
     band = (np.abs(model) < NEAR) & (np.abs(photo) < FAR) & trusted
     band[:BORDER] = band[-BORDER:] = False
     band[:, :BORDER] = band[:, -BORDER:] = False
@@ -93,11 +94,14 @@ def outline_of(
     return Outline(points, camera.seen(points), n, e, half.astype(np.int64)) if len(points) else None
 
 
-def _distance(inside: Bool) -> F32:
-    """(h, w) signed distance to the outline in blocks, negative inside."""
-    own = inside.astype(np.uint8)
+def _distance(alpha: F32) -> F32:
+    """(h, w) signed distance to the outline, where alpha is a half, in blocks, negative inside."""
+    h, w = alpha.shape
+    finer = cv2.resize(alpha.astype(np.float32), (w * FINER, h * FINER), interpolation=cv2.INTER_LINEAR)
+    own = (finer > 0.5).astype(np.uint8)
     out, within = (cv2.distanceTransform(k, cv2.DIST_L2, 5) for k in (1 - own, own))
-    return np.asarray(out - within, np.float32)
+    signed = (out - within).reshape(h, FINER, w, FINER).mean((1, 3)) / FINER
+    return np.asarray(signed, np.float32)
 
 
 def _nearest(surface: Bool) -> tuple[I64, I64]:

@@ -24,7 +24,7 @@ Bool = npt.NDArray[np.bool_]
 SIDE = 0.5  # of the fit's image side: the sight's. Registration is accurate to a small part of a pixel
 AROUND = 13  # blocks: the model is rendered this far around the mask
 STEEP = 6.0  # depth difference between neighbours, in blocks, that marks a depth edge
-OPAQUE = 0.99  # least opacity of a surface
+OPAQUE = 0.5  # least opacity of a surface: early in the fit it is soft
 CHUNK = 65_536
 
 
