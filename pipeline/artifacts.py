@@ -201,8 +201,28 @@ class HeldOutView(Artifact):
     response: Matrix = UNCHANGED
 
 
+class RefinedCamera(Artifact):
+    """The pose of a photo after its registration to the model. pixels: root mean square displacement of the subject
+    against the pose of the poses stage, pixels of the photo."""
+
+    index: int
+    world_from_cam: Matrix
+    pixels: float
+
+
+class RegisteredView(Artifact):
+    """A held-out photo whose camera was refined by registering this photo alone to the finished model; the fit never
+    used it. exr: the model's prediction from that camera, like that of the HeldOutView. camera: its pose is that of the
+    poses stage where the photo does not confirm another one."""
+
+    camera: RefinedCamera
+    exr: FileRef
+
+
 class FittedFace(Artifact):
-    """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit."""
+    """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit.
+    refined: fitted photos whose cameras the fit moved (pipeline.fitted_cameras). registered: held-out photos, for
+    figures without the error of their cameras; nothing else uses these poses."""
 
     field: FileRef
     light: FileRef
@@ -216,6 +236,8 @@ class FittedFace(Artifact):
     beta: float
     cell: float
     model: dict[str, dict[str, str | float | bool]]
+    refined: tuple[RefinedCamera, ...] = ()
+    registered: tuple[RegisteredView, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -98,21 +98,27 @@ def distort(xy: F64, d: F64) -> F64:
     )
 
 
+def distortion_slope(xy: F64, d: F64) -> tuple[F64, F64, F64]:
+    """a, b, c (N,) of the symmetric Jacobian [[a, b], [b, c]] of `distort` at xy (N, 2)."""
+    k1, k2, p1, p2, k3 = d
+    x, y = xy[:, 0], xy[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d x = slope * x
+    a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    b = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    c = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return a, b, c
+
+
 def undistort(xy: F64, d: F64) -> F64:
     """Exact inverse of `distort` by Newton's method with the analytic Jacobian. (N, 2) -> (N, 2)."""
     if not np.any(d):
         return xy.copy()
-    k1, k2, p1, p2, k3 = d
     out = xy.copy()
     for _ in range(UNDISTORT_STEPS):
-        x, y = out[:, 0], out[:, 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d x = slope * x
         error = distort(out, d) - xy
-        a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        b = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        c = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        a, b, c = distortion_slope(out, d)
         determinant = a * c - b * b
         step = np.stack([c * error[:, 0] - b * error[:, 1], a * error[:, 1] - b * error[:, 0]], -1)
         out -= step / np.where(np.abs(determinant) > 1e-9, determinant, 1.0)[:, None]
@@ -128,6 +134,19 @@ def project(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np
     safe = np.where(z > 1e-9, z, np.nan)
     xy = distort(p[:, :2] / safe[:, None], distortion) if np.any(distortion) else p[:, :2] / safe[:, None]
     return xy @ K[:2, :2].T + K[:2, 2], z
+
+
+def projection_slope(K: F64, cam_from_world: F64, distortion: F64, points: npt.NDArray[np.floating]) -> F64:
+    """(N, 2, 3) derivative of `project`'s image position by the world point, at points (N, 3) before the camera."""
+    p = apply(cam_from_world, points)
+    z = p[:, 2]
+    xy = p[:, :2] / z[:, None]
+    a, b, c = distortion_slope(xy, distortion)
+    lens = K[:2, :2] @ np.stack([np.stack([a, b], -1), np.stack([b, c], -1)], -2)  # (N, 2, 2), d uv / d xy
+    out = np.empty((len(p), 2, 3))
+    out[..., :2] = lens / z[:, None, None]
+    out[..., 2] = -np.einsum("nij,nj->ni", lens, xy) / z[:, None]
+    return np.asarray(out @ cam_from_world[:3, :3], np.float64)
 
 
 def rays(K: F64, world_from_cam: F64, distortion: F64, uv: F64) -> tuple[F64, F64]:

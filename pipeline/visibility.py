@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Camera, CameraSet, FittedFace, Located, MaskSet
 from pipeline.capture_artifacts import Capture
+from pipeline.fitted_cameras import cameras_of
 from pipeline.meshes import F64, Mask, Mesh
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, matrix, project
@@ -36,7 +37,8 @@ class FittedPhoto:
 def seen_by(
     fitted: FittedFace, poses: CameraSet, masks: Located[MaskSet], capture: Located[Capture]
 ) -> tuple[FittedPhoto, ...]:
-    """The views that the field was fitted to, in the order of its colour responses, without held-out views."""
+    """The views that the field was fitted to, with the cameras that it was fitted with, in the order of its colour
+    responses, without held-out views."""
     used = set(fitted.fitted_views) - {v.index for v in capture.artifact.views if v.holdout}
     cut = {m.index: m for m in masks.artifact.masks}
     shot = {v.index: v for v in capture.artifact.views}
@@ -52,7 +54,7 @@ def seen_by(
             None if mask is None or mask.asked is None else masks.path(mask.asked),
         )
 
-    return tuple(view(c) for c in poses.cameras if c.index in used)
+    return tuple(view(c) for c in cameras_of(poses, fitted).cameras if c.index in used)
 
 
 class Occluder(RayCaster):

@@ -139,6 +139,12 @@ class Config(StageConfig):
         default=AUTO,
         description="optimise the geometry, not only its prior; auto: by cross-validation",
     )
+    refine_poses: Decision = Field(
+        default=AUTO,
+        description="register the photos to the model during the fit and move their cameras, which also follows a head "
+        "that moves between photos; auto: if the photos show that the cameras are off by more than their noise; on: "
+        "without that condition",
+    )
     resolution: Literal["auto", "given"] = Field(
         default=AUTO,
         description="auto: limit grid_cells and hash_fine to the size of a pixel on the surface; given: no limit",
@@ -237,7 +243,7 @@ class Config(StageConfig):
             raise ValueError("a given light stands still: light_frame must be auto or world beside it")
         return self
 
-    @field_validator("specular", "refine_geometry", mode="before")
+    @field_validator("specular", "refine_geometry", "refine_poses", mode="before")
     @classmethod
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
 
+from pipeline.artifacts import RefinedCamera
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
@@ -27,6 +29,7 @@ from stages.inverse_rendering.model_selection import (
 )
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import Batch, PixelTable
+from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 
@@ -49,19 +52,28 @@ class Trainer(TrainingLoop):
     """The state of a running fit. prior: the surface with which refined geometry is compared. light_given: where the
     light comes from, if it is known before the fit: then it never changes."""
 
-    counted: ClassVar[tuple[str, ...]] = (*TrainingLoop.counted, "shadows_solved", "skin_asked", "skin_tells")
+    counted: ClassVar[tuple[str, ...]] = (
+        *TrainingLoop.counted,
+        "shadows_solved",
+        "skin_asked",
+        "skin_tells",
+        "refinements",
+    )
 
     prior: Start | None = None
     light_given: str = ""
     level: int = 0
     shadows_solved: int = 0
+    refinements: int = 0  # of the camera poses
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     validation: tuple[int, ...] = field(init=False)
+    poses: PoseHistory = field(init=False)
 
     def __post_init__(self) -> None:
         TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
         self.validation = validation_views(len(self.views), self.settings)
+        self.poses = PoseHistory.of(self.views)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """The optimiser of all parameters except the SDF grid, which has its own."""
@@ -137,6 +149,7 @@ class Trainer(TrainingLoop):
         if self.choices is None and self.share() >= SELECTION_AT:
             self.select_model()
         rate = self.set_rates()
+        self.refine_poses()
         due = sum(self.share() >= s for s in SHADOWS_AT)
         if self.shadows_solved < due:
             self.model.solve_shadows()
@@ -147,6 +160,23 @@ class Trainer(TrainingLoop):
             self.ask_skin(self.choices)
             self.skin_asked = True
         return rate
+
+    def refine_poses(self) -> None:
+        """Register the photos to the model when it is due, and move their cameras."""
+        due = sum(self.share() >= s for s in REFINE_AT)
+        if self.settings.refine_poses == "off" or self.choices is None or self.refinements >= due:
+            return
+        self.views = self.poses.refine(self.model, self.views, self.settings, self.device)
+        self.pixels.place(self.views)
+        self.refinements = due
+
+    def refined_cameras(self, widths: Mapping[int, int]) -> tuple[RefinedCamera, ...]:
+        """The cameras that the fit moved. widths: of the whole photos in pixels, by the views' index."""
+        return self.poses.cameras(self.views, widths)
+
+    def pose_facts(self) -> dict[str, str | float | bool]:
+        """For the report: how the fit moved the cameras."""
+        return self.poses.facts(self.views, self.settings.refine_poses)
 
     def ask_skin(self, choices: Choices) -> None:
         """Correct the light by the skin, if photos show a face."""
@@ -251,6 +281,7 @@ class Trainer(TrainingLoop):
             "level": self.level,
             "choices": self.choices.plain() if self.choices else None,
             "cell": g.cell,
+            "poses": self.poses.stored(self.views),
             "model": self.model.state_dict(),
             "band": g.optimiser_state(),
             "optimiser": self.optimiser.state_dict(),
@@ -261,6 +292,7 @@ class Trainer(TrainingLoop):
         g = self.grid
         g.cell = float(state["cell"])
         self.level = state["level"]
+        self.views = self.poses.restore(self.views, state["poses"])
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
         g.restore(state["model"]["geometry.values"].to(self.device))

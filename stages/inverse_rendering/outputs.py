@@ -111,6 +111,7 @@ def model_facts(
         "geometry": {**start["geometry"], "cell_mm": round(model.geometry.cell * 1e3, 4)},
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
+        "cameras": trainer.pose_facts(),
         "density": {"kind": spec.density, "why": "setting"},
         "system": {
             "method": {"grid": "fast", "displaced": "paper"}[spec.geometry],

@@ -132,8 +132,13 @@ class PixelTable:
         self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
         self.outside = torch.from_numpy(np.flatnonzero(kind == 0)).to(device)
         self._pools = self.inside, self.outside
-        self.R = torch.from_numpy(np.stack([v.world_from_cam[:3, :3] for v in views]).astype(np.float32)).to(device)
-        self.centre = torch.from_numpy(np.stack([v.world_from_cam[:3, 3] for v in views]).astype(np.float32)).to(device)
+        self.place(views)
+
+    def place(self, views: list[PhotoView]) -> None:
+        """Use the poses of these views from now on: the same photos, in the same order."""
+        poses, device = np.stack([v.world_from_cam for v in views]).astype(np.float32), self.xy.device
+        self.R = torch.from_numpy(np.ascontiguousarray(poses[:, :3, :3])).to(device)
+        self.centre = torch.from_numpy(np.ascontiguousarray(poses[:, :3, 3])).to(device)
 
     def exclude(self, views: tuple[int, ...]) -> None:
         """Draw from all views except these (positions in the fit) from now on."""

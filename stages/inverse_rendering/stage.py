@@ -38,6 +38,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.moving_light import light_frame
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
+    from stages.inverse_rendering.registered_views import registered_views
     from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.systems import first_surface, trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
@@ -90,6 +91,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
         trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, MIN_TRAINING * settings.seconds)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
+    views = trainer.views  # with the cameras that the fit moved
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     light = trainer.choices.facts.get("light", {}) if trainer.choices else {}
     wanted = "fitted" if known is not None and known.scaled and config.albedo_level == AUTO else config.albedo_level
@@ -100,6 +102,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     write_light(model, context)
     held_out = predict_held_out(
         model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
+    )
+    registered = registered_views(
+        model, inputs.capture, inputs.poses.artifact, inputs.masks, held_out, settings, context
     )
     facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level}
     if lit is not None:
@@ -119,6 +124,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         beta=float(model.beta),
         cell=model.geometry.cell,
         model=facts,
+        refined=trainer.refined_cameras({c.index: c.width for c in cameras}),
+        registered=registered,
         findings=findings(fitted),
     )
 
@@ -135,7 +142,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=24,
+    version=25,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

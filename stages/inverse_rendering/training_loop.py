@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 
+from pipeline.artifacts import RefinedCamera
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel
 from stages.inverse_rendering.config import Config
@@ -106,6 +107,14 @@ class TrainingLoop(ABC):
 
     def tend(self) -> None:  # noqa: B027  (most fits need nothing here)
         """Work after a step that is not part of its update."""
+
+    def refined_cameras(self, widths: Mapping[int, int]) -> tuple[RefinedCamera, ...]:
+        """The cameras that the fit moved. widths: of the whole photos in pixels, by the views' index."""
+        return ()
+
+    def pose_facts(self) -> dict[str, str | float | bool]:
+        """For the report: how the fit moved the cameras."""
+        return {"refined": False, "why": "the method has no refinement"}
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""

@@ -16,6 +16,7 @@ from pipeline.capture_artifacts import Capture, LightStage
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_linear
+from pipeline.maths.rigid_motion import motion_matrix
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, matrix, rows
 from stages.reflectance import motion as moves
@@ -68,7 +69,7 @@ def build(
     fitted_cameras = [c for c in cameras if c.index not in kept_out]
     _enough(len(fitted_cameras), 1, "cameras")
     six, pivot = _tracked(capture, stage, points, fitted_cameras, caster, config, step)
-    at = {f: moves.motion_matrix(v, pivot) for f, v in six.items()}
+    at = {f: motion_matrix(v, pivot) for f, v in six.items()}
     world = matrix(poses.artifact.capture_from_asset).reshape(4, 4)
     whole = rig_of(stage.lights, cameras, world, at)
     left_out = [i for i in range(len(whole.index)) if config.every and i % config.every == OFFSET % config.every]

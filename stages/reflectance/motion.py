@@ -14,29 +14,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.images import F32
-from pipeline.transforms import F64, inverse_rigid, matrix, project, rigid
+from pipeline.maths.rigid_motion import rotation, rotation_vector
+from pipeline.transforms import F64, inverse_rigid, matrix, project
 
 STEPS, SCALE, BLUR = 6, 0.02, 0.7
 FARTHEST = 0.02  # asset units (metres): a head that moved more has turned to other lights and cameras
 FEWEST = 200  # points
-
-
-def rotation(v: npt.NDArray[np.floating]) -> F64:
-    """(3, 3) rotation by |v| radians about v (3,)."""
-    import cv2
-
-    return np.asarray(cv2.Rodrigues(np.asarray(v, np.float64))[0], np.float64)
-
-
-def motion_matrix(six: F64, pivot: F64) -> F64:
-    """4x4 of x -> R (x - pivot) + pivot + t for six numbers: rotation vector, t."""
-    turn = rotation(six[:3])
-    return rigid(turn, pivot + six[3:] - turn @ pivot)
 
 
 def prepared(picture: F32, gain: float) -> F64:
@@ -63,14 +50,8 @@ def pose_between(
             return np.zeros(6)
         step = -np.linalg.solve(system, right)
         turn = rotation(step[:3]) @ rotation(six[:3])
-        six = np.concatenate([_vector(turn), six[3:] + step[3:]])
+        six = np.concatenate([rotation_vector(turn), six[3:] + step[3:]])
     return six
-
-
-def _vector(turn: F64) -> F64:
-    import cv2
-
-    return np.asarray(cv2.Rodrigues(turn)[0], np.float64).ravel()
 
 
 def _normal_equations(points: F64, camera: Camera, before: F64, after: F64, six: F64, pivot: F64) -> tuple[F64, F64]:

@@ -8,20 +8,22 @@ import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera
+from pipeline.fitted_cameras import cameras_of
 from pipeline.images import read_encoded
 from pipeline.transforms import centre_K_from_corner_K, matrix
 from stages.report.capture_figures import camera_kinds, reduced
-from stages.report.collect import Started
+from stages.report.collect import Results, Started
 from stages.report.pictures import U8, data_uri
 
 PHOTO_SIDE = 720  # pixels
 HELD_OUT, OTHERS = 8, 4  # photos in the page
 
 
-def cameras_shown(r: Started) -> list[dict[str, Any]]:
+def cameras_shown(r: Results) -> list[dict[str, Any]]:
     """Every camera in the order of its index: intrinsics in pixels of the photo, pose with OpenCV's axes, and `photo`
     as an address, if it is one of those that the page holds."""
-    cameras = sorted(r.poses.artifact.cameras, key=lambda c: c.index)
+    fitted_with = cameras_of(r.poses.artifact, r.inverse_rendering.artifact)
+    cameras = sorted(fitted_with.cameras, key=lambda c: c.index)
     kinds, shown = camera_kinds(r), set(chosen(r))
     return [
         {

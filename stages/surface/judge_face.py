@@ -18,8 +18,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import Camera, CameraSet, Located, MaskSet
+from pipeline.artifacts import Camera, CameraSet, FittedFace, Located, MaskSet
 from pipeline.faces.landmarks3d import head_frame, residuals
+from pipeline.fitted_cameras import cameras_of
 from pipeline.meshes import F64, Mesh
 from pipeline.transforms import matrix, rays
 from pipeline.verdict import Finding, Limits, judged
@@ -58,11 +59,13 @@ class _Inputs(Protocol):
     def poses(self) -> Located[CameraSet]: ...
     @property
     def masks(self) -> Located[MaskSet]: ...
+    @property
+    def inverse_rendering(self) -> Located[FittedFace]: ...
 
 
 def face_findings(inputs: _Inputs, mesh: Mesh) -> tuple[Finding, ...]:
     """The findings for a mesh; none if the photos agree on no face."""
-    masks, poses = inputs.masks, inputs.poses.artifact
+    masks, poses = inputs.masks, cameras_of(inputs.poses.artifact, inputs.inverse_rendering.artifact)
     if masks.artifact.landmarks is None:
         return ()
     found = read(masks.path(masks.artifact.landmarks), {c.index: c for c in poses.cameras})

@@ -69,12 +69,14 @@ def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
     """The decimated scan with charts of its own."""
     from pipeline import footprint
     from pipeline.faces.landmarks3d import load_landmarks
+    from pipeline.fitted_cameras import cameras_of
     from stages.uv.build import build
 
     texel = None
     if config.tiles == "auto":
-        fitted = set(inputs.inverse_rendering.artifact.fitted_views)
-        texel = footprint.pixel(dense, (c for c in inputs.poses.artifact.cameras if c.index in fitted))
+        fitted = inputs.inverse_rendering.artifact
+        cameras = cameras_of(inputs.poses.artifact, fitted).cameras
+        texel = footprint.pixel(dense, (c for c in cameras if c.index in fitted.fitted_views))
     ref = inputs.masks.artifact.landmarks
     landmarks = load_landmarks(inputs.masks.path(ref)) if ref is not None and config.face else None
     return build(dense, config, step, texel=texel, landmarks=landmarks)

@@ -8,6 +8,7 @@ import pytest
 from pipeline.artifacts import Camera
 from pipeline.capture_artifacts import StageLight
 from pipeline.errors import StageError
+from pipeline.maths.rigid_motion import motion_matrix
 from pipeline.transforms import apply, rigid, rows
 from stages.reflectance import motion
 from stages.reflectance.rig import rig_of
@@ -30,7 +31,7 @@ def lights_of(stage) -> list[StageLight]:
 def test_the_head_at_rest_sees_lamps_and_cameras_moved_back() -> None:
     """Oracle: distances and angles between the moved head's points and the unmoved lamp and camera."""
     stage = make_stage(2, 9)
-    move = motion.motion_matrix(np.array([0.02, -0.01, 0.03, 1e-3, 2e-3, -1e-3]), np.array([0.01, 0, 0]))
+    move = motion_matrix(np.array([0.02, -0.01, 0.03, 1e-3, 2e-3, -1e-3]), np.array([0.01, 0, 0]))
     rig = rig_of(lights_of(stage), cameras_of(stage.poses), np.eye(4), {n: move for n in range(1, 10)})
     points = np.random.default_rng(0).normal(size=(5, 3)) * 0.05
     lamps, axes = rig.lamps()
@@ -66,7 +67,7 @@ def test_a_known_motion_is_found_in_pictures() -> None:
     stage = make_stage(5, 9)
     cameras = cameras_of(stage.poses)
     true = np.array([0.004, -0.003, 0.005, 6e-4, -8e-4, 5e-4])
-    move = motion.motion_matrix(true, np.zeros(3))
+    move = motion_matrix(true, np.zeros(3))
     before = [motion.prepared(photograph(p, K, (SIZE, SIZE), RADIUS) / np.float32(255), 1.0) for p in stage.poses]
     after = [motion.prepared(photograph(np.linalg.inv(move) @ p, K, (SIZE, SIZE), RADIUS) / np.float32(255), 1.0)
              for p in stage.poses]  # fmt: skip
@@ -105,6 +106,6 @@ def test_a_head_that_moved_by_two_centimetres_is_named() -> None:
 
 def test_motion_is_a_rotation_about_the_pivot_and_a_shift() -> None:
     """Oracle: Rodrigues' formula for a quarter turn about y."""
-    m = motion.motion_matrix(np.array([0, np.pi / 2, 0, 0.1, 0, 0]), np.array([1.0, 0, 0]))
+    m = motion_matrix(np.array([0, np.pi / 2, 0, 0.1, 0, 0]), np.array([1.0, 0, 0]))
     np.testing.assert_allclose(apply(m, np.array([[1.0, 0, 0], [1, 0, 1]])), [[1.1, 0, 0], [2.1, 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(motion.motion_matrix(np.zeros(6), np.ones(3)), rigid(np.eye(3), np.zeros(3)))
+    np.testing.assert_allclose(motion_matrix(np.zeros(6), np.ones(3)), rigid(np.eye(3), np.zeros(3)))

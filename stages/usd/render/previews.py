@@ -14,6 +14,7 @@ from pipeline.artifacts import UNCHANGED, Camera, CameraSet, FittedFace, HeldOut
 from pipeline.camera import PinholeCamera
 from pipeline.colour import as_photographed, srgb_from_linear
 from pipeline.contract import Context
+from pipeline.fitted_cameras import cameras_of
 from pipeline.images import read_linear, write_exr, write_png
 from pipeline.transforms import matrix
 from stages.usd.render.camera import orbit_camera
@@ -62,7 +63,7 @@ def render_held_out(
 
     Without held-out views, a few fitted ones are rendered instead.
     """
-    by_index = {c.index: c for c in cameras.cameras}
+    by_index = {c.index: c for c in cameras_of(cameras, face).cameras}
     wanted = [(v.index, v.scale) for v in face.held_out if v.index in by_index]
     wanted = wanted or [(i, factor_for(by_index[i])) for i in spread(face.fitted_views, FITTED_SHOWN) if i in by_index]
     if not wanted:

@@ -15,6 +15,7 @@ from pxr import Gf, Sdf
 from pipeline.artifacts import CameraSet, FittedFace, Located, Surface, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
 from pipeline.errors import StageError
+from pipeline.fitted_cameras import cameras_of
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
 from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
@@ -83,7 +84,7 @@ def export(
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
     hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
     holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
-    cameras = tuple(sorted(poses.artifact.cameras, key=lambda c: c.index))
+    cameras = tuple(sorted(cameras_of(poses.artifact, face.artifact).cameras, key=lambda c: c.index))
     layers = {
         f"{name}.usd": (
             component.root_layer(
