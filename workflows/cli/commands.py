@@ -12,9 +12,11 @@ from typing import Any
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
 from workflows.cli.dry_run import dry_run
+from workflows.cli.keys import keys_of
 from workflows.cli.options import request_from, with_provenance, with_viewer
 from workflows.cli.summary import tell
 from workflows.cli.view import server_of
+from workflows.live.publisher import told_live
 from workflows.run import output_dirs
 from workflows.run.estimate import expected
 from workflows.run.interrupt import Interrupted, interruptible
@@ -50,10 +52,12 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 
         return run_with_session(request, watch)
     with (
-        interruptible(watch.stop, console.note) as caught,
+        keys_of(watch.steering, console) as keys,
+        interruptible(watch.stop, console.note, keys.restore) as caught,
         exclusive_run(plan.store.root, plan.out, watch.stopped, console.note),
+        told_live(plan, watch) as told,
     ):
-        record = publish(plan, run_stages(plan, watch), console.note, watch.stop.is_set)
+        record = publish(plan, run_stages(plan, told), told.observer.note, told.asked_to_stop)
     if caught.number is not None:  # it came when the results were being put in place
         console.note(f"the results are in {plan.out}, complete")
         raise Interrupted(caught.number)
