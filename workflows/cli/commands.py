@@ -16,6 +16,7 @@ from workflows.cli.keys import keys_of
 from workflows.cli.options import request_from, with_provenance, with_viewer
 from workflows.cli.summary import tell
 from workflows.cli.view import server_of
+from workflows.live.look import REPORT, check_is_run
 from workflows.live.publisher import told_live
 from workflows.run import output_dirs
 from workflows.run.estimate import expected
@@ -227,17 +228,12 @@ def report_command(options: argparse.Namespace, console: Console) -> int:
 
 def view_command(options: argparse.Namespace, console: Console) -> int:
     """neuface view"""
-    page = (Path(options.folder) / "report" / "index.html").resolve()
-    if not page.is_file():
-        raise StageError(
-            "there is no report",
-            where=page,
-            value="no such file",
-            limit="a finished run",
-            remedy=f"make it with: neuface report {options.folder}",
-        )
-    server, address = server_of(Path(options.folder))
-    print(f"{address}\nfor this machine only, until Ctrl-C; the page also opens without a server: {page}", flush=True)
+    folder = Path(options.folder)
+    check_is_run(folder)
+    server, address = server_of(folder)
+    page = (folder / REPORT).resolve()
+    without = f"; the page also opens without a server: {page}" if page.is_file() else ""
+    print(f"{address}\nfor this machine only, until Ctrl-C{without}", flush=True)
     webbrowser.open(address)
     with server:
         server.serve_forever()
