@@ -22,6 +22,7 @@ from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
+from pipeline.store import link_or_copy
 from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
 from stages.usd.render.map_lookup import bilinear
@@ -120,7 +121,8 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
 
 
 def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
-    """Copy every file of every map as NAME_map.format."""
+    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room; a copy of
+    the albedo, which `divided_albedo` may write anew."""
     count = bake.artifact.tiles
     wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
     wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
@@ -138,7 +140,7 @@ def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
             continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = map_file(asset, name, which, form)
-            shutil.copyfile(bake.path(ref), target)
+            (shutil.copyfile if which == "albedo" else link_or_copy)(bake.path(ref), target)
             written.append(target)
     return written
 
