@@ -138,7 +138,7 @@ def test_the_page_follows_the_run_and_becomes_its_report(
     child = start(child_environment, capture, out, **{"inverse_rendering.steps": 120})
     with served(out) as address:
         page.call("Page.navigate", url=address)
-        page.until("document.documentElement.dataset.status === 'running'", 120)
+        page.until("document.documentElement && document.documentElement.dataset.status === 'running'", 120)
         page.until("document.getElementById('picture-fit.jpg').naturalWidth > 0", 120)
         click(page, "[data-wish='pause']")
         page.until("document.documentElement.dataset.status === 'paused'", 60)
