@@ -77,18 +77,17 @@ def in_thread(work: Any) -> tuple[threading.Thread, list[BaseException]]:
 
 # ------------------------------------------------------------------ the wishes
 def test_a_pause_waits_and_its_time_is_counted_once() -> None:
-    steering = Steering()
+    steering, begun = Steering(), time.monotonic()
     steering.wish("pause")
     threads = [in_thread(lambda: steering.wait(lambda: False))[0] for _ in range(3)]
     wait_for(lambda: steering._waiting == 3)
     assert steering.pausing and steering.paused
-    begun = time.monotonic()
     time.sleep(0.3)
     steering.wish("go on")
     for thread in threads:
         thread.join(10)
     assert not steering.paused
-    assert 0.25 < steering.waited() < time.monotonic() - begun + 1  # not three times that
+    assert 0.25 < steering.waited() < time.monotonic() - begun  # not three times that
 
 
 def test_what_is_asked_elsewhere_is_looked_for_not_too_often() -> None:
@@ -184,7 +183,7 @@ def told_run(plan: Plan, watch: Session) -> Any:
 def test_a_run_tells_its_folder_and_takes_wishes_from_it(photos: Path, toys: None) -> None:
     plan, watch = plan_of(photos, sets=("second.steps=400", "second.pause=0.02")), Session(Recorded())
     thread, errors = in_thread(lambda: told_run(plan, watch))
-    wait_for(lambda: look_at(plan.out).state.get("percent", 0) > 0)
+    wait_for(lambda: any(s["state"] == "running" for s in look_at(plan.out).state.get("stages", [])[1:]))
     look = look_at(plan.out)
     assert look.alive and look.troubles == ()
     assert [(s["name"], s["state"]) for s in look.state["stages"]] == [

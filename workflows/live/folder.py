@@ -74,19 +74,20 @@ class LiveFolder:
 
 def remove_ours(folder: Path) -> None:
     """Remove our files of a folder that a run left."""
+    for path in ours_in(folder):
+        path.unlink(missing_ok=True)
+
+
+def ours_in(folder: Path) -> list[Path]:
+    """Our files of a folder that a run left: as we wrote them, no links."""
+    if not folder.is_dir() or folder.is_symlink():
+        return []
     known = listed(folder)
-    for name in PICTURES:
-        if is_ours(folder / name, known.get(name, ())):
-            (folder / name).unlink(missing_ok=True)
+    found = [folder / n for n in PICTURES if is_ours(folder / n, known.get(n, ()))]
     for name, ours in ((STATE, is_state), (ASK, is_wish)):
-        path = folder / name
-        if not path.is_symlink() and path.is_file() and ours(read_small(path)):
-            path.unlink(missing_ok=True)
-    if (folder / LIST).is_file() and not (folder / LIST).is_symlink():
-        (folder / LIST).unlink(missing_ok=True)
-    for left in folder.glob(".*.new-????????"):
-        if left.is_file() and not left.is_symlink():
-            left.unlink(missing_ok=True)
+        found += [folder / name] if ours(read_small(folder / name)) else []
+    found += [folder / LIST, *folder.glob(".*.new-????????")]
+    return [p for p in found if p.is_file() and not p.is_symlink()]
 
 
 def is_state(content: dict[str, Any]) -> bool:
