@@ -34,7 +34,8 @@ class Keys:
 
     def __init__(self, steering: Steering, console: Console, descriptor: int | None) -> None:
         self.steering, self.console, self.descriptor = steering, console, descriptor
-        self._ends, self._before = threading.Event(), None
+        self._ends = threading.Event()
+        self._before: list[Any] | None = None  # the terminal's settings, while ours are in force
         self._lock = threading.Lock()
 
     def restore(self) -> None:

@@ -33,6 +33,7 @@ SERVED = ("report", "asset", "reflectance")  # folders of a run
 RECORD = "run.json"
 LIVE = "live.html"
 PARTS = {LIVE: "text/html", "live.css": "text/css", "live.js": "text/javascript"}
+ICON = b'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><circle cx="8" cy="8" r="7" fill="#2a6fb8"/></svg>'
 MOST = 1000  # bytes of a POST
 POLICY = (
     "default-src 'none'; img-src 'self'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -81,6 +82,8 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             self.end_headers()
         elif name == "state":
             self._send(json.dumps(look_at(self.root).json()).encode(), "application/json")
+        elif name == "page/icon.svg":
+            self._send(ICON, "image/svg+xml")
         elif name.removeprefix("page/") in PARTS and name.startswith("page/"):
             part = name.removeprefix("page/")
             self._send(files("workflows.live").joinpath("page", part).read_bytes(), PARTS[part])

@@ -5,6 +5,7 @@ Every file may be missing, half written, of another version, or not ours at all.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ class Look:
         return {
             "name": self.out.name,
             "alive": self.alive,
+            "now": time.time(),
             "whole": self.whole,
             "state": self.state,
             "verdict": verdict if isinstance(verdict, dict) else {},

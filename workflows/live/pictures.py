@@ -89,7 +89,7 @@ def _mesh(finished: Finished) -> Drawn:
 
     surface = finished["surface"]
     mesh = meshes.load(surface.path(surface.artifact.mesh))
-    pictures = [shaded(mesh.vertices, mesh.faces, degrees, SIDE) for _, degrees in TURNS]
+    pictures = [shaded(mesh.vertices, mesh.faces, mesh.normals, degrees, SIDE) for _, degrees in TURNS]
     return Drawn("mesh.jpg", jpeg(sheet(pictures)), f"{surface.artifact.faces:,} triangles")
 
 
@@ -144,8 +144,15 @@ def sheet(pictures: list[U8], columns: int = COLUMNS) -> U8:
     return np.concatenate([np.concatenate(cells[i : i + columns], 1) for i in range(0, len(cells), columns)])
 
 
-def shaded(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer], degrees: float, side: int) -> U8:
-    """(side, side, 3) a mesh by parallel projection, lit from the viewer. degrees: of the viewer around +Y from +Z."""
+def shaded(
+    vertices: npt.NDArray[np.floating],
+    faces: npt.NDArray[np.integer],
+    normals: npt.NDArray[np.floating],
+    degrees: float,
+    side: int,
+) -> U8:
+    """(side, side, 3) a mesh by parallel projection, lit from the viewer. normals: of the
+    vertices; degrees: of the viewer around +Y from +Z."""
     from pipeline.ray_casting import RayCaster
 
     a = np.radians(degrees)
@@ -156,8 +163,7 @@ def shaded(vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer], d
     x, y = np.meshgrid(steps, -steps)
     origins = middle + x[..., None] * right + y[..., None] * np.array([0.0, 1.0, 0.0]) + 2 * reach * toward
     found = RayCaster(vertices, faces).first_faces(origins.reshape(-1, 3), np.tile(-toward, (side * side, 1)))
-    corners = vertices[faces[np.maximum(found, 0)]].astype(np.float64)
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normals[faces[np.maximum(found, 0)]].astype(np.float64).mean(1)
     light = np.abs(normal @ toward) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
     grey = np.where(found >= 0, 40 + 200 * light, GREY)
     return np.repeat(grey.round().astype(np.uint8).reshape(side, side, 1), 3, 2)

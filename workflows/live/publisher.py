@@ -151,7 +151,7 @@ class Live:
                 return 0.0
             begun = self._clock()
             image = make()
-            self._picture(f"{name}.jpg", jpeg(image), "photo, and the model now")
+            self._picture(f"{name}.jpg", jpeg(image), "left a fitted photo, right the model")
             taken = self._clock() - begun
             self._next_preview = self._now() + max(PREVIEW_EVERY - taken, taken / PREVIEW_SHARE)
             self._write()

@@ -28,9 +28,10 @@ function status(state) {
   if (!look.alive && !state.status) return look.whole ? "The run has ended." : "No run is at work here.";
   if (look.alive && !state.status) return "A run is at work here, and tells nothing: it began with --no-live, or by another version.";
   if (state.status === "stopped" || state.status === "failed") return `${state.status === "failed" ? "The run failed" : "The run was stopped"}: ${state.message}`;
-  const left = typeof state.remaining === "number" ? `, about ${clock(state.remaining)} left` : "";
+  const since = state.status === "paused" || !look.alive ? 0 : Math.max(look.now - state.updated, 0) || 0; // a stage may tell nothing for minutes
+  const left = typeof state.remaining === "number" ? `, about ${clock(Math.max(state.remaining - since, 0))} left` : "";
   const words = { running: "At work", pausing: "Pausing at the next checkpoint", paused: "Paused", "stops after the stage": "Stops after this stage" };
-  return `${words[state.status] || state.status}: ${state.percent} %, ${clock(state.elapsed || 0)}${left}. ${state.message || ""}`;
+  return `${words[state.status] || state.status}: ${state.percent} %, ${clock((state.elapsed || 0) + since)}${left}. ${state.message || ""}`;
 }
 
 function showStages(state) {
@@ -140,6 +141,7 @@ document.addEventListener("keydown", (e) => {
 const dark = () => (document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
 const named = () => { $("theme").textContent = dark() ? "Light" : "Dark"; };
 $("theme").addEventListener("click", () => { document.documentElement.dataset.theme = dark() ? "light" : "dark"; named(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", named);
 named();
 
 async function turn() {
