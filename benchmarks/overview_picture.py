@@ -39,7 +39,7 @@ def main() -> int:
     upper = [(photo[i], "photo") for i in used]
     upper += [(photo[held[0]], "photo, not used"), (rendered(given.run, held[0]), "asset, same camera")]
     textures = given.run / "asset" / "textures"
-    charts = read(next(textures.glob("*_coverage.png"))) > 60
+    charts = read(next((given.run / "asset" / "internal").glob("*_coverage.png"))) > 60
     lower = [
         (np.where(charts, stretched(read(next(textures.glob(f"*_{name}.png")))), np.uint8(255)), caption)
         for name, caption in MAPS

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from pipeline.images import read_exr, write_exr
+from stages.usd.layout import map_file
 from stages.usd.render.exported import read_cameras, read_usd_mesh
 from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0
@@ -48,10 +49,9 @@ def surface(textures: Path, name: str, **specular: float) -> dict[str, Any]:
 def tint(asset: Path, name: str, eye: np.ndarray) -> np.ndarray:
     """(H, W) sum_j c_j T_j(n.v, 1/kappa) at every texel, for an eye at one place; n without the normal map."""
     mesh = read_usd_mesh(asset / f"{name}.usd")
-    textures = asset / "textures"
-    coefficients = read_exr(textures / f"{name}_coefficients_rgb0.exr")[0]
-    s = read_exr(textures / f"{name}_inv_kappa.exr")[0][..., 0]
-    table = read_exr(textures / f"{name}_basis_rgb0.exr")[0]
+    coefficients = read_exr(map_file(asset, name, "coefficients_rgb0", "exr"))[0]
+    s = read_exr(map_file(asset, name, "inv_kappa", "exr"))[0][..., 0]
+    table = read_exr(map_file(asset, name, "basis_rgb0", "exr"))[0]
     place, normal = (vertex_image(mesh, a.astype(np.float64), len(s)) for a in (mesh.vertices, mesh.normals))
     toward = eye - place
     cosine = (normal * toward).sum(-1) / (np.linalg.norm(normal, axis=-1) * np.linalg.norm(toward, axis=-1))
@@ -75,7 +75,7 @@ def main() -> None:
     name = next(asset.glob("*.obj")).stem
     textures = asset / "textures"
     f0 = read_exr(textures / f"{name}_f0.exr")[0][..., :1]
-    covered = read_exr(textures / f"{name}_coverage.exr")[0][..., 0] > 0.5
+    covered = read_exr(map_file(asset, name, "coverage", "exr"))[0][..., 0] > 0.5
     view = read_cameras(asset / "lookdev.usda")[options.index][0]
     if options.look == "standard":
         bsdf = surface(textures, name, eta=ior_from_f0(float(f0[covered].mean())))

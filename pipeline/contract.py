@@ -16,6 +16,7 @@ import logging
 import platform
 import resource
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -23,6 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, Self, TypeVar
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from pipeline import threads
@@ -78,12 +81,54 @@ def never_cancelled() -> bool:
     return False
 
 
+Picture = Callable[[], npt.NDArray[np.uint8]]  # makes an 8-bit sRGB picture (H, W, 3)
+
+
+class Show(Protocol):
+    """Callback for pictures of a stage at work. Whoever watches decides how often `make` is called, if ever; what it
+    takes must change nothing of the stage. Returns the seconds that it took, 0 if it was not called."""
+
+    def __call__(self, name: str, make: Picture) -> float: ...
+
+
+def no_show(name: str, make: Picture) -> float:
+    """A Show that calls nothing."""
+    return 0.0
+
+
+class Checked:
+    """A cancel check that counts the time spent in it: where a run is paused, its stage waits there."""
+
+    def __init__(self, cancelled: Callable[[], bool]) -> None:
+        self._cancelled, self._lock = cancelled, threading.Lock()
+        self._inside, self._since, self._spent = 0, 0.0, 0.0
+
+    def __call__(self) -> bool:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._since = time.perf_counter()
+        try:
+            return self._cancelled()
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if self._inside == 0:
+                    self._spent += time.perf_counter() - self._since
+
+    def waited(self) -> float:
+        """Seconds during which any thread was in the check."""
+        with self._lock:
+            return self._spent + (time.perf_counter() - self._since if self._inside else 0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class Context:
     """The environment of a stage, besides inputs and config.
 
     workdir: empty, becomes the artifact's folder. scratch: for checkpoints; it is kept if a run with the same key is
-    killed. device: "cpu" or "cuda"; it only changes rounding, so it is recorded but not part of the key.
+    killed. device: "cpu" or "cuda"; it only changes rounding, so it is recorded but not part of the key. show: takes
+    pictures of the work. waited: seconds so far that the run was paused in this stage.
     """
 
     workdir: Path
@@ -92,6 +137,8 @@ class Context:
     progress: Progress = no_progress
     cancelled: Callable[[], bool] = never_cancelled
     log: logging.Logger = field(default_factory=lambda: logging.getLogger("neuface"))
+    show: Show = no_show
+    waited: Callable[[], float] = lambda: 0.0
 
     def file(self, path: Path | str) -> FileRef:
         """A reference to a file in workdir."""
@@ -170,8 +217,10 @@ def execute(
     device: str = "cpu",
     progress: Progress = no_progress,
     cancelled: Callable[[], bool] = never_cancelled,
+    show: Show = no_show,
 ) -> Done[O]:
-    """Run a stage, or return its result from the store.
+    """Run a stage, or return its result from the store. The time in which `cancelled` waits, while the run is paused,
+    is not counted in the record's seconds.
 
     Raises:
         StageError: invalid input or a disk error; incomplete results are removed.
@@ -187,11 +236,12 @@ def execute(
             return Done(stage.name, k, found, True, store.load_run(stage.name, k))
         start = time.perf_counter()
         with _folders(store, stage.name, k) as (partial, scratch):
-            context = Context(partial, scratch, device, progress, cancelled, logging.getLogger(f"neuface.{stage.name}"))
+            checked, log_of = Checked(cancelled), logging.getLogger(f"neuface.{stage.name}")
+            context = Context(partial, scratch, device, progress, checked, log_of, show, checked.waited)
             context.check()
             artifact = stage.run(inputs, config, context)
             run: dict[str, Any] = {
-                "seconds": round(time.perf_counter() - start, 3),
+                "seconds": round(time.perf_counter() - start - checked.waited(), 3),
                 "peak_memory_mb": peak_memory_mb(),
                 "device": device,
                 "threads": threads.in_use(),

@@ -159,6 +159,16 @@ class Store:
         return Located(artifact, final)
 
 
+def link_or_copy(source: Path, target: Path) -> None:
+    """A second name for a finished file of the store, which nobody writes to any more; a copy where that can't be."""
+    try:
+        os.link(source, target)
+    except OSError as e:
+        if e.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        shutil.copyfile(source, target)
+
+
 def lineage(path: Path) -> dict[str, list[str]]:
     """The inputs of a key; empty if unknown."""
     found = read_object(path)

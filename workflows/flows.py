@@ -15,6 +15,7 @@ from prefect.states import Completed
 
 from pipeline.errors import Cancelled
 from workflows.batch.request import BatchRequest
+from workflows.live.publisher import told_live
 from workflows.run.interrupt import PARENT, end_with, interruptible
 from workflows.run.plan import make_plan
 from workflows.run.publish import publish
@@ -63,9 +64,10 @@ def _run_capture(asked: Mapping[str, Any], watch: Session | None) -> Any:
     request = RunRequest(**asked)
     with _watched(asked, watch) as watched:
         plan, note = make_plan(request), watched.observer.note
-        with exclusive_run(plan.store.root, plan.out, watched.stopped, note):
-            done = run_stages(plan, watched, execute_as_task, with_slot(plan, watched.stopped))
-            record = publish(plan, done, note, watched.stop.is_set)
+        lock = exclusive_run(plan.store.root, plan.out, watched.stopped, note)
+        with lock, told_live(plan, watched) as told:
+            done = run_stages(plan, told, execute_as_task, with_slot(plan, told.stopped))
+            record = publish(plan, done, told.observer.note, told.asked_to_stop)
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))
     return record if name is None else Completed(name=name, message="\n".join(last_lines(record)), data=record)

@@ -38,13 +38,14 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.moving_light import light_frame
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
+    from stages.inverse_rendering.preview import Preview
     from stages.inverse_rendering.registered_views import registered_views
     from stages.inverse_rendering.residuals import view_errors
     from stages.inverse_rendering.systems import first_surface, trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.training_loop import Hooks, run_fit
 
-    clock, settings = Clock(), config
+    clock, settings = Clock(context.waited), config
     known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
     if known is not None and settings.light_order == AUTO:
         settings = settings.changed(light_order=MAX_ORDER)
@@ -90,7 +91,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
         trainer.allowance = max(settings.seconds - clock.elapsed() - reserve, MIN_TRAINING * settings.seconds)
-    model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt"))
+    preview = Preview(views, context.show, context.device)
+    model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt", preview))
     views = trainer.views  # with the cameras that the fit moved
     labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     light = trainer.choices.facts.get("light", {}) if trainer.choices else {}

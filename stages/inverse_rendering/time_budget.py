@@ -4,7 +4,7 @@ views."""
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -21,14 +21,14 @@ FINER = 1.5  # ratio of the rendering times on the final grid and on the initial
 
 
 class Clock:
-    """A stopwatch that starts when it is created."""
+    """A stopwatch that starts when it is created. waited: seconds so far that do not count, while the run is paused."""
 
-    def __init__(self) -> None:
-        self.begun = time.monotonic()
+    def __init__(self, waited: Callable[[], float] = lambda: 0.0) -> None:
+        self.begun, self.waited = time.monotonic(), waited
 
     def elapsed(self) -> float:
-        """Seconds since the start."""
-        return time.monotonic() - self.begun
+        """Seconds since the start, without those that do not count."""
+        return time.monotonic() - self.begun - self.waited()
 
 
 def seconds_to_predict(model: FaceModel, held: Sequence[Camera], settings: Config, device: str) -> float:

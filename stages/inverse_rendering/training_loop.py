@@ -34,11 +34,13 @@ NOTED = 10  # number of running PSNR values that are stored during a fit
 
 @dataclass(frozen=True, slots=True)
 class Hooks:
-    """Callbacks of the fit: progress, cancellation, and the checkpoint's file."""
+    """Callbacks of the fit: progress, cancellation, the checkpoint's file, and a picture of the model as it is now, if
+    it is time for one: returns the seconds that this took, and changes nothing of the fit."""
 
     progress: Callable[..., None]
     cancelled: Callable[[], bool]
     checkpoint: Path | None = None
+    preview: Callable[[FaceModel], float] = lambda model: 0.0
 
 
 @dataclass(slots=True)
@@ -248,6 +250,7 @@ def run_fit(trainer: TrainingLoop, hooks: Hooks) -> FaceModel:
             raise Cancelled("stopped by the user; the next run continues from the checkpoint")
         if now - shown > 0.5:
             hooks.progress(trainer.step, trainer.total(), "fitting", loss=trainer.loss, psnr=trainer.psnr)
+            trainer.spent += hooks.preview(trainer.model)  # counts for a time limit, and for nothing else
             shown = now
         if hooks.checkpoint is not None and now - saved > writing / CHECKPOINT_SHARE:
             trainer.save(hooks.checkpoint)

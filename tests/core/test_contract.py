@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
 import os
@@ -19,7 +20,7 @@ from pipeline import threads
 from pipeline.artifacts import Located
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, DiskError, StageError
-from pipeline.store import Store
+from pipeline.store import Store, link_or_copy
 from tests.support.points import hold
 from tests.support.toy_stages import FIRST, SECOND, THIRD, Config, FirstInputs, Number, SlowConfig, source
 
@@ -328,3 +329,22 @@ def test_located_paths_are_inside_the_folder(photos: Path, store: Store) -> None
     located: Located[Any] = done.located
     assert located.path(located.artifact.file) == located.folder / "total.txt"
     assert located.path(located.artifact.file).is_file()
+
+
+def test_a_second_name_takes_no_room_and_is_a_copy_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = tmp_path / "map.exr"
+    source.write_bytes(b"content")
+    link_or_copy(source, tmp_path / "same.exr")
+    assert (tmp_path / "same.exr").stat().st_ino == source.stat().st_ino
+    number = errno.EXDEV
+
+    def refuse(*_: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "link", refuse)
+    link_or_copy(source, tmp_path / "copy.exr")
+    assert (tmp_path / "copy.exr").read_bytes() == b"content"
+    assert (tmp_path / "copy.exr").stat().st_ino != source.stat().st_ino
+    number = errno.ENOSPC
+    with pytest.raises(OSError, match="No space"):
+        link_or_copy(source, tmp_path / "none.exr")

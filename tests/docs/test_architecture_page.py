@@ -22,6 +22,7 @@ FOLDERS = {
     "workflows": "## workflows/",
     "workflows/cli": "### workflows/cli/",
     "workflows/run": "### workflows/run/",
+    "workflows/live": "### workflows/live/",
     "workflows/server": "### workflows/server/",
     "workflows/batch": "### workflows/batch/",
     "workflows/compare": "### workflows/compare/",

@@ -107,10 +107,23 @@ def test_the_asset_is_valid_and_close_to_the_truth(done: Path, capture: Path) ->
 
 
 def test_everything_promised_is_there(done: Path) -> None:
-    promised = ["asset/lookdev.usda", "asset/head.usdz", "asset/environment.exr", "asset/light.json", "run.json"]
-    promised += ["report/index.html", "report/metrics.json", "report/views/2.exr", "report/asset_views/2.exr"]
-    maps = ["albedo.exr", "albedo.png", "specular_coefficients.exr", "shininess.exr", "inv_kappa.exr", "normal.png"]
-    promised += [f"asset/textures/head_{m}" for m in [*maps, "specular_intensity.exr", "basis_lut.exr", "f0.exr"]]
+    promised = [
+        "asset/lookdev.usda",
+        "asset/head.usdz",
+        "asset/environment.exr",
+        "asset/internal/light.json",
+        "run.json",
+    ]
+    promised += ["report/index.html", "report/metrics.json", "report/views/2.png", "report/asset_views/2.png"]
+    promised += [f"asset/textures/head_{m}" for m in ("albedo.exr", "albedo.png", "normal.png", "f0.exr")]
+    internal = (
+        "specular_coefficients.exr",
+        "shininess.exr",
+        "inv_kappa.exr",
+        "specular_intensity.exr",
+        "basis_lut.exr",
+    )
+    promised += [f"asset/internal/head_{m}" for m in internal]
     assert [p for p in promised if not (done / p).is_file()] == []
     page = (done / "report/index.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page

@@ -56,6 +56,7 @@ def test_level_sentence_remedy_photo_and_table(results: SyntheticResults, tmp_pa
     metrics, page = page_of(found(results, masks=(bad,), poses=(good,)), tmp_path / "work")
     top = page[page.index('<section class="verdict unusable"') : page.index('<section class="figures"')]
     assert page.index('<section class="verdict') < page.index('<section class="warnings"')
+    assert '<details class="troubles"><summary>' in top and "1 finding</b></span>; first, masks: 20 %" in top  # folded
     assert "\u2715 Unusable" in top  # the level in words and by a mark, not by colour alone
     assert (
         "20 % &lt;b&gt;agree&lt;/b&gt; &amp; no more." in top

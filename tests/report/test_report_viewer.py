@@ -21,6 +21,7 @@ from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Context
 from pipeline.maths.latlong import latlong_directions
 from pipeline.transforms import project, rows
+from pipeline.verdict import Limits, judged
 from stages.report.stage import STAGE, Config, Inputs
 from stages.report.viewer import MODULES, light_data
 from stages.report.viewer_cameras import chosen, straightened
@@ -292,3 +293,40 @@ def test_the_page_is_no_wider_than_a_phone(opened: Tab) -> None:
     opened.size(390, 844, phone=True)
     opened.until("document.documentElement.scrollWidth <= 390")
     opened.size(1280, 720)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
+def test_the_first_screen_shows_verdict_and_view_however_long_the_findings_are(
+    opened: Tab, results: SyntheticResults, tmp_path: Path, width: int, height: int
+) -> None:
+    """Also after the page of long findings was opened: no error in its console."""
+    long = [judged(f"toy_{i}", 0.2, Limits(0.9, 0.5), "This is wrong in many words. " * 20, "do it again " * 30,
+                   views=["3.png", "9.png"]) for i in range(9)]  # fmt: skip
+    masks = Located(results.masks.artifact.model_copy(update={"findings": tuple(long)}), results.masks.folder)
+    warned = results.uv.artifact.model_copy(update={"warnings": tuple(f"warning {i}" for i in range(30))})
+    changed_results = replace(results, masks=masks, uv=Located(warned, results.uv.folder))
+    opened.size(width, height, phone=width < 500)
+    opened.call("Page.navigate", url=page_of(changed_results, tmp_path / "long").as_uri())
+    opened.until("document.documentElement && document.documentElement.dataset.viewer")
+    box = "document.querySelector('{}').getBoundingClientRect()"
+    assert opened.run(f"{box.format('.verdict')}.bottom <= {box.format('#viewer .stage')}.top")
+    assert opened.run(f"innerHeight - {box.format('#viewer .stage')}.top") >= 250
+    folded = "document.querySelector('.troubles').open"
+    assert opened.run(folded) is False
+    opened.run("document.querySelector('.troubles summary').click()")
+    assert opened.run(folded) is True and opened.run(f"{box.format('#viewer .stage')}.top > innerHeight")
+
+
+@pytest.mark.slow
+def test_dark_and_light_follow_the_system_and_the_switch(opened: Tab) -> None:
+    colour = "getComputedStyle(document.body).backgroundColor"
+    found = {}
+    for theme in ("light", "dark"):
+        opened.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
+        opened.run("document.getElementById('theme').checked = false")
+        found[theme] = opened.run(colour)
+        opened.run("document.getElementById('theme').click()")
+        found[f"{theme}, switched"] = opened.run(colour)
+        opened.run("document.getElementById('theme').click()")
+    assert found["light"] == found["dark, switched"] != found["dark"] == found["light, switched"]

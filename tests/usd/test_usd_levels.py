@@ -196,7 +196,7 @@ def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path)
     read = load_exported(tmp_path / "work/asset/head.usd")
     np.testing.assert_allclose(read.albedo, arrays["albedo"], atol=1e-6)
     np.testing.assert_allclose(read.occlusion, ratio, atol=1e-6)
-    assert not (tmp_path / "work/asset/textures/head_occlusion.exr").exists()
+    assert not (tmp_path / "work/asset/internal/head_occlusion.exr").exists()
 
 
 @pytest.mark.slow

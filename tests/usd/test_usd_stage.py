@@ -42,12 +42,12 @@ def test_files_are_those_of_the_interface(exported) -> None:
         "asset/lookdev.usda",
         "asset/head.usdz",
         "asset/environment.exr",
-        "asset/light.json",
+        "asset/internal/light.json",
         "asset/textures/head_albedo.exr",
         "asset/textures/head_albedo.png",
-        "asset/textures/head_specular_coefficients.exr",
-        "asset/textures/head_basis_lut.exr",
-        "asset/textures/head_occlusion.exr",
+        "asset/internal/head_specular_coefficients.exr",
+        "asset/internal/head_basis_lut.exr",
+        "asset/internal/head_occlusion.exr",
         "asset/head.glb",
         "asset/head.obj",
         "asset/head.mtl",
@@ -358,7 +358,7 @@ def test_a_cancelled_export_stops(inputs: SyntheticInputs, tmp_path: Path) -> No
 
 
 def test_light_json_explains_itself(exported) -> None:
-    content = json.loads((exported[0] / "asset/light.json").read_text())
+    content = json.loads((exported[0] / "asset/internal/light.json").read_text())
     assert np.array(content["coefficients"]).shape == (121, 3)
     assert content["order"] == 10
     assert "l * (l + 1) + m" in content["convention"]

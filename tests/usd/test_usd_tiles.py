@@ -46,7 +46,8 @@ def cut_ball() -> UvSurface:
 
 
 def test_every_map_has_a_file_for_each_tile(tiled: tuple[Path, UsdAsset]) -> None:
-    names = {f.path.removeprefix("asset/textures/") for f in tiled[1].files if f.path.startswith("asset/textures/")}
+    maps = [f.path for f in tiled[1].files if f.path.startswith(("asset/textures/", "asset/internal/head_"))]
+    names = {path.rpartition("/")[2] for path in maps}
     single = {"head_basis_lut.exr", "head_basis_rgb0.exr"}
     assert single <= names
     stems = {n.split(".")[0] for n in names - single}
@@ -61,8 +62,8 @@ def test_the_networks_read_rows_of_tiles_and_usd_finds_them_all(tiled: tuple[Pat
     shaders = [UsdShade.Shader(p) for p in stage.Traverse() if p.IsA(UsdShade.Shader)]
     paths = {s.GetPath().name: s.GetInput("file").Get().path for s in shaders if s.GetInput("file")}
     assert paths["albedo"] == "./textures/head_albedo.<UDIM>.png"
-    assert paths["coefficients_0"] == "./textures/head_coefficients_rgb0.<UDIM>.exr"
-    assert paths["basis_0"] == "./textures/head_basis_rgb0.exr"
+    assert paths["coefficients_0"] == "./internal/head_coefficients_rgb0.<UDIM>.exr"
+    assert paths["basis_0"] == "./internal/head_basis_rgb0.exr"
     for path in paths.values():
         found = UsdShade.UdimUtils.ResolveUdimTilePaths(path, stage.GetRootLayer())
         assert "<UDIM>" not in path or tuple(number for _, number in found) == NUMBERS

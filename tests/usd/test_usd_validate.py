@@ -306,7 +306,7 @@ def test_findings_are_plain_json(asset: Path) -> None:
 
 
 def test_missing_map_of_another_look(asset: Path) -> None:
-    (asset / "textures/head_basis_rgb0.exr").unlink()
+    (asset / "internal/head_basis_rgb0.exr").unlink()
     assert "missing_texture" in [f.check for f in validate(asset / "head.usd") if f.level == "error"]
 
 

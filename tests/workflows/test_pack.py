@@ -30,8 +30,10 @@ from workflows.store.gc import belongings, purge
 
 pytestmark = pytest.mark.usefixtures("toys")
 FILES = ("head.usd", "open_in_blender.py", "textures/head_albedo.png", "textures/head_albedo.1001.exr",
-         "textures/head_confidence.exr", "textures/head_region.1002.png")  # fmt: skip
-KEPT = [f"head/{f}" for f in FILES[:2]] + ["head/textures/head_albedo.1001.exr", "head/textures/head_albedo.png"]
+         "internal/head_basis_rgb0.exr", "internal/head_inv_kappa.1001.exr", "internal/head_confidence.exr",
+         "internal/head_region.1002.png", "internal/light.json")  # fmt: skip
+KEPT = ["head/head.usd", "head/internal/head_basis_rgb0.exr", "head/internal/head_inv_kappa.1001.exr",
+        "head/open_in_blender.py", "head/textures/head_albedo.1001.exr", "head/textures/head_albedo.png"]  # fmt: skip
 
 
 @pytest.fixture
@@ -54,7 +56,7 @@ def usd(folder: Path, text: str = "#usda 1.0") -> Done[Any]:
 def test_it_holds_what_other_programs_open(plan: Plan, tmp_path: Path) -> None:
     record = publish(plan, [usd(tmp_path / "art")])
     with zipfile.ZipFile(plan.out / "head.zip") as z:
-        assert z.testzip() is None and z.namelist() == KEPT  # sorted, without maps of the measurement
+        assert z.testzip() is None and z.namelist() == KEPT  # sorted, and of internal/ what the asset reads
         assert {i.date_time for i in z.infolist()} == {(1980, 1, 1, 0, 0, 0)}
         assert z.read("head/head.usd") == b"head.usd #usda 1.0"
     assert record["pack"] == "head.zip" and paths(record, plan.out)["zip"] == plan.out / "head.zip"

@@ -13,6 +13,7 @@ from pipeline.artifacts import sha256_of
 from pipeline.store import LINEAGE, Store, lineage
 from workflows.batch.state import BatchState, Entry
 from workflows.cli.main import main
+from workflows.live.folder import LiveFolder
 from workflows.run.plan import make_plan
 from workflows.run.publish import publish
 from workflows.run.published import note_published
@@ -232,3 +233,22 @@ def test_purge_command_of_a_single_run(photos: Path, tmp_path: Path, capsys: pyt
     assert str(photos) in capsys.readouterr().out
     assert finished(out / ".store") == [] and not (out / "run.json").exists()
     assert (out / "notes.txt").is_file() and photos.is_dir()
+
+
+def test_purge_takes_what_a_stopped_run_told(photos: Path, tmp_path: Path) -> None:
+    """Nothing was published, so that no list names the folder; a file of the user's in it stays."""
+    out, store = tmp_path / "out", Store(tmp_path / "store")
+    out.mkdir()
+    live = LiveFolder(out)
+    live.state({"run": "abc", "stages": [], "capture": str(photos)})
+    live.write("fit.jpg", b"a face")
+    (out / "live/mine.txt").write_text("mine")
+    assert belongings("somebody", out, store).paths == ()
+    found = belongings(photos.name, out, store)
+    assert {p.name for p in found.paths} == {"state.json", "fit.jpg", ".published.json"}
+    assert found.users == (out / "live/mine.txt",)
+    assert purge(found, store) == []
+    assert [p.name for p in (out / "live").iterdir()] == ["mine.txt"]
+    (out / "live/mine.txt").unlink()
+    LiveFolder(out).state({"run": "abc", "stages": [], "capture": str(photos)})
+    assert purge(belongings(photos.name, out, store), store) == [] and not out.exists()

@@ -130,3 +130,22 @@ def test_distances_are_exact_on_a_plane() -> None:
     points = np.random.default_rng(0).uniform(-0.9, 0.9, (500, 3))
     assert np.allclose(geometry.distances(plane, points), abs(points[:, 2]), atol=1e-12)
     assert geometry.distances(plane, np.array([[2.0, 0, 0]]))[0] == pytest.approx(1)
+
+
+def test_held_out_pictures_are_found_in_the_store(tmp_path: Path) -> None:
+    from workflows.evaluation.held_out import held_out_exr
+
+    for stage, field in (("inverse_rendering", "held_out"), ("usd", "views")):
+        folder = tmp_path / "store" / stage / "k"
+        folder.mkdir(parents=True)
+        manifest = {field: [{"index": i, "exr": {"path": f"x/{i}.exr"}} for i in (3, 9)]}
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+    record = {"store": str(tmp_path / "store"), "stages": {s: {"key": "k"} for s in ("inverse_rendering", "usd")}}
+    (tmp_path / "run.json").write_text(json.dumps(record))
+    assert held_out_exr(tmp_path, "views", 9) == tmp_path / "store/inverse_rendering/k/x/9.exr"
+    assert held_out_exr(tmp_path, "asset_views", 3) == tmp_path / "store/usd/k/x/3.exr"
+    assert not held_out_exr(tmp_path, "asset_views", 4).is_file()
+    published = tmp_path / "report/views/9.exr"
+    published.parent.mkdir(parents=True)
+    published.write_bytes(b"x")
+    assert held_out_exr(tmp_path, "views", 9) == published

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +40,7 @@ class Notes(Silent):
     def __init__(self) -> None:
         self.lines: list[str] = []
 
+    def paused(self, waits: bool) -> None: ...
     def note(self, text: str) -> None:
         self.lines.append(text)
 
@@ -179,7 +179,7 @@ def test_the_rest_is_estimated_from_earlier_runs_with_the_same_settings(
 def test_a_budget_is_its_own_estimate(photos: Path) -> None:
     plan = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "out"), budget=600))
     assert (
-        estimate.remaining_time(plan, [], time.monotonic())
+        estimate.remaining_time(plan, [], 0.0)
         == "the rest (first to third) has what is left of the budget: about 10 minutes"
     )
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from pipeline.contract import Done
 from workflows.batch.failures import failure_of
+from workflows.live.publisher import told_live
 from workflows.run.interrupt import end_with, interruptible
 from workflows.run.plan import Plan, make_plan
 from workflows.run.publish import publish
@@ -51,6 +52,9 @@ class Events:
     def finished(self, done: Done[Any]) -> None:
         """Not shown: run.json has it."""
 
+    def paused(self, waits: bool) -> None:
+        """Not shown: whoever paused the capture's run sees it there."""
+
     def note(self, text: str) -> None:
         """Into the capture's log."""
         print(text, file=sys.stderr, flush=True)
@@ -67,8 +71,9 @@ def main(arguments: list[str]) -> int:
         with interruptible(watch.stop, events.note):  # its process group is its own: no Ctrl-C reaches it
             plan = make_plan(request)
             events.tell(event="plan", batch=rays_a_step(plan))
-            with exclusive_run(plan.store.root, plan.out, watch.stopped, events.note):
-                record = publish(plan, run_stages(plan, watch), events.note, watch.stop.is_set)
+            lock = exclusive_run(plan.store.root, plan.out, watch.stopped, events.note)
+            with lock, told_live(plan, watch) as told:
+                record = publish(plan, run_stages(plan, told), told.observer.note, told.asked_to_stop)
     except Exception as e:
         fault = failure_of(e, events.stage)
         events.tell(event="failed", fault=fault.model_dump())

@@ -12,9 +12,12 @@ from typing import Any
 from pipeline.errors import Cancelled, StageError
 from workflows.cli.console import Console
 from workflows.cli.dry_run import dry_run
+from workflows.cli.keys import keys_of
 from workflows.cli.options import request_from, with_provenance, with_viewer
 from workflows.cli.summary import tell
 from workflows.cli.view import server_of
+from workflows.live.look import REPORT, check_is_run
+from workflows.live.publisher import told_live
 from workflows.run import output_dirs
 from workflows.run.estimate import expected
 from workflows.run.interrupt import Interrupted, interruptible
@@ -50,10 +53,12 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
 
         return run_with_session(request, watch)
     with (
-        interruptible(watch.stop, console.note) as caught,
+        keys_of(watch.steering, console) as keys,
+        interruptible(watch.stop, console.note, keys.restore) as caught,
         exclusive_run(plan.store.root, plan.out, watch.stopped, console.note),
+        told_live(plan, watch) as told,
     ):
-        record = publish(plan, run_stages(plan, watch), console.note, watch.stop.is_set)
+        record = publish(plan, run_stages(plan, told), told.observer.note, told.asked_to_stop)
     if caught.number is not None:  # it came when the results were being put in place
         console.note(f"the results are in {plan.out}, complete")
         raise Interrupted(caught.number)
@@ -223,17 +228,12 @@ def report_command(options: argparse.Namespace, console: Console) -> int:
 
 def view_command(options: argparse.Namespace, console: Console) -> int:
     """neuface view"""
-    page = (Path(options.folder) / "report" / "index.html").resolve()
-    if not page.is_file():
-        raise StageError(
-            "there is no report",
-            where=page,
-            value="no such file",
-            limit="a finished run",
-            remedy=f"make it with: neuface report {options.folder}",
-        )
-    server, address = server_of(Path(options.folder))
-    print(f"{address}\nfor this machine only, until Ctrl-C; the page also opens without a server: {page}", flush=True)
+    folder = Path(options.folder)
+    check_is_run(folder)
+    server, address = server_of(folder)
+    page = (folder / REPORT).resolve()
+    without = f"; the page also opens without a server: {page}" if page.is_file() else ""
+    print(f"{address}\nfor this machine only, until Ctrl-C{without}", flush=True)
     webbrowser.open(address)
     with server:
         server.serve_forever()

@@ -28,7 +28,9 @@ class Console:
     """
 
     def __init__(self, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        self.stream, self.clock = sys.stderr if stream is None else stream, clock
+        self.stream, self._clock = sys.stderr if stream is None else stream, clock
+        self._paused: float | None = None  # since when
+        self._away, self.keys = 0.0, ""  # seconds of pauses before; which keys do what
         self.screen = Screen(self.stream) if can_redraw(self.stream) else None
         self.events: Events | None = None
         self.forecast = Forecast({}, clock())
@@ -38,9 +40,13 @@ class Console:
         self._lock = threading.RLock()  # the run, the thread of the signals and that of the ticks all write
         self._at_work = threading.Event()
 
+    def clock(self) -> float:
+        """Seconds since any moment, without those for which the run was paused."""
+        return (self._clock() if self._paused is None else self._paused) - self._away
+
     def to_json(self, stream: TextIO | None = None) -> None:
         """From now on events as JSON, on standard output, and nothing for people."""
-        self.events, self.screen = Events(sys.stdout if stream is None else stream, self.clock), None
+        self.events, self.screen = Events(sys.stdout if stream is None else stream, self._clock), None
 
     def expect(self, seconds: Mapping[str, float | None], deadline: float | None = None) -> None:
         """A run begins. seconds: how long each stage is expected to take; deadline: of the whole run, a budget."""
@@ -99,6 +105,19 @@ class Console:
                 self.warning = f"{done.stage}: {warning}"
             self._draw()
 
+    def paused(self, waits: bool) -> None:
+        """The stage at work waits, or goes on. The time between the two is not the run's."""
+        with self._lock:
+            now = self._clock()
+            if not waits and self._paused is not None:
+                self._away += now - self._paused
+            self._paused = now if waits else None
+            if self.events is not None:
+                self.events.tell("paused" if waits else "went_on", stage=self.stage)
+            elif self.screen is None:
+                self.note(f"{self.label}: {'paused' if waits else 'goes on'}")
+            self._draw()
+
     def note(self, text: str) -> None:
         """A line of its own."""
         with self._lock:
@@ -155,9 +174,12 @@ class Console:
         if expected and (self.counted or not self.stage):
             done, share = self.forecast.stages_done, self.forecast.share_of_run(now)
             text = f"{done} of {len(expected)} stages, {clock_time(now - self.forecast.begun)}{self._left(now)}"
+            text = f"paused, {text}" if self._paused is not None else text
             lines.append(f"run: {100 * share:3.0f} % {bar(share)} {text}")
         if self.warning:
             lines.append(f"last warning: {self.warning}")
+        if self.keys and self.stage:
+            lines.append(self.keys)
         return lines
 
     def _draw(self) -> None:

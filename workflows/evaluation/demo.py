@@ -20,6 +20,7 @@ from pipeline.images import read_alpha, read_encoded, read_exr, shrink
 from pipeline.transforms import matrix
 from workflows.evaluation import geometry
 from workflows.evaluation.geometry import as_seen, asset_mesh, distances, psnr
+from workflows.evaluation.held_out import held_out_exr
 
 F64 = npt.NDArray[np.float64]
 
@@ -59,8 +60,8 @@ def measure(out: Path, capture_folder: Path, capture: Capture) -> Figures:
     accuracy = 1000 * distances(truth, seen_by(mesh, fitted))
     completeness = 1000 * distances(mesh, seen_by(truth, fitted))
     return Figures(
-        psnr=_mean(_picture_psnr(out / "report/views", capture_folder, v) for v in held),
-        psnr_asset=_mean(_picture_psnr(out / "report/asset_views", capture_folder, v) for v in held),
+        psnr=_mean(_picture_psnr(held_out_exr(out, "views", v.index), capture_folder, v) for v in held),
+        psnr_asset=_mean(_picture_psnr(held_out_exr(out, "asset_views", v.index), capture_folder, v) for v in held),
         accuracy_mean=float(accuracy.mean()),
         accuracy_median=float(np.median(accuracy)),
         completeness_mean=float(completeness.mean()),
@@ -75,8 +76,8 @@ def _mean(values: Iterator[float]) -> float:
 
 
 # ------------------------------------------------------------------ pictures
-def _picture_psnr(views: Path, capture_folder: Path, view: CaptureView) -> float:
-    predicted = read_exr(views / f"{view.index}.exr")[0][..., :3]
+def _picture_psnr(render: Path, capture_folder: Path, view: CaptureView) -> float:
+    predicted = read_exr(render)[0][..., :3]
     photo = (read_encoded(capture_folder / view.name)[..., :3].astype(np.float32) / 255).astype(np.float32)
     factor = photo.shape[0] // predicted.shape[0]
     subject = shrink(read_alpha(capture_folder / f"truth/alpha/{view.index}.png"), factor) > 0.5

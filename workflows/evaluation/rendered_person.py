@@ -32,6 +32,7 @@ from workflows.bench.captures_figures import Figures, Run
 from workflows.evaluation import geometry
 from workflows.evaluation.albedo import Labels, albedo_figures
 from workflows.evaluation.geometry import F64, SEEN_BY, Mask
+from workflows.evaluation.held_out import held_out_exr
 
 SKIN = 1
 NAMES = {"skin": SKIN, "hair": 2, "eyes": 3, "cloth": 4}
@@ -187,7 +188,7 @@ def by_label(run: Run, truth: Path) -> Labels:
     for kind, name in (("views", "model"), ("asset_views", "asset")):
         total: dict[str, tuple[float, int]] = {}
         for view in run.manifest("capture").get("views", []):
-            render = run.out / "report" / kind / f"{view['index']}.exr"
+            render = held_out_exr(run.out, kind, view["index"])
             labels = truth / "labels" / f"{PurePath(view['name']).stem}.png"
             if not (view.get("holdout") and render.is_file() and labels.is_file()):
                 continue

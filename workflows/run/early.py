@@ -35,14 +35,14 @@ def ends_early(plan: Plan, done: Sequence[Done[Any]], watch: Session) -> bool:
         return False
     ends = verdict_of_done(done).level == "unusable" and not plan.request.force
     if ends or name == early[-1]:
-        for line in summary(plan, done, watch.begun):
+        for line in summary(plan, done, watch.elapsed()):
             watch.observer.note(line)
     return ends
 
 
-def summary(plan: Plan, done: Sequence[Done[Any]], begun: float) -> list[str]:
-    """Lines: the verdict so far, each trouble with its remedy, photos to look at, and what comes next. begun: of the
-    run, by time.monotonic()."""
+def summary(plan: Plan, done: Sequence[Done[Any]], elapsed: float) -> list[str]:
+    """Lines: the verdict so far, each trouble with its remedy, photos to look at, and what comes next. elapsed:
+    seconds of the run so far."""
     verdict = verdict_of_done(done)
     lines = [headline(verdict.level, verdict.stages, "verdict so far")]
     lines += [f"  {reason}" for reason in verdict.reasons()]
@@ -55,4 +55,4 @@ def summary(plan: Plan, done: Sequence[Done[Any]], begun: float) -> list[str]:
         return [*lines, f"  the run ends here, before {after}; finished stages are kept: --force continues from them"]
     if verdict.level == "unusable":
         lines.append("  going on although it is unusable (--force)")
-    return [*lines, f"  {estimate.remaining_time(plan, done, begun)}"]
+    return [*lines, f"  {estimate.remaining_time(plan, done, elapsed)}"]

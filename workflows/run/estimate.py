@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,12 +56,12 @@ NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subjec
 LOOKED_AT = 50  # earlier runs of a stage that are read, the latest first
 
 
-def remaining_time(plan: Plan, done: Sequence[Done[Any]], begun: float) -> str:
-    """A line for the user on the stages that are not done. begun: of the run, by time.monotonic()."""
+def remaining_time(plan: Plan, done: Sequence[Done[Any]], elapsed: float) -> str:
+    """A line for the user on the stages that are not done. elapsed: seconds of the run so far."""
     rest = [s.name for s in plan.stages[len(done) :]]
     which = rest[0] if len(rest) == 1 else f"{rest[0]} to {rest[-1]}"
     if plan.request.budget is not None:
-        left = max(0.0, plan.request.budget - (time.monotonic() - begun))
+        left = max(0.0, plan.request.budget - elapsed)
         return f"the rest ({which}) has what is left of the budget: about {_words(left)}"
     stored = {step.stage for step in preview(plan) if step.action == "reused"}
     found = {name: _of_stage(plan, name) for name in rest if name not in stored}

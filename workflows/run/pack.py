@@ -8,21 +8,16 @@ import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
+from stages.usd.layout import INTERNAL, is_read_by_the_asset
 from workflows.run.owned import partial_name, put_owned
 
 STAMP = (1980, 1, 1, 0, 0, 0)  # the earliest date in a zip: files have no dates of their own
 READABLE = 0o644 << 16  # Unix permissions, where a zip keeps them
-# Maps that say how the others were measured, and copies of the fitted lobe in other forms: no file of the asset opens
-# them, and no shader needs them.
-MEASUREMENT = re.compile(
-    r"_(confidence|coverage|clamped|region|lobe_fit|irradiance_ratio"
-    r"|lobe_coefficients|specular_coefficients|specular_intensity|shininess)(\.\d{4})?\.(exr|png)$"
-)
 
 
 def packed(files: Iterable[str]) -> list[str]:
-    """Which files of the asset are in the zip, sorted: all but maps of the measurement. Paths below asset/."""
-    return sorted(f for f in files if not (f.startswith("textures/") and MEASUREMENT.search(f)))
+    """Which files of the asset are in the zip, sorted: all but what of internal/ no layer reads. Paths below asset/."""
+    return sorted(f for f in files if not f.startswith(f"{INTERNAL}/") or is_read_by_the_asset(f))
 
 
 def write_pack(out: Path, name: str, files: Mapping[str, Path]) -> str | None:

@@ -81,7 +81,11 @@ def _replace_folders(
     path -> new."""
     out, known, moved = plan.out, published(plan.out), dict[str, str]()
     assets = asset_files(stages)
-    wanted = {"asset": assets, "report": report_files(stages), "reflectance": reflectance_files(stages)}
+    wanted = {
+        "asset": assets,
+        "report": report_files(stages, keep_all=plan.request.keep_all),
+        "reflectance": reflectance_files(stages),
+    }
     zipped = [assets[p] for p in packed(assets)] if plan.request.pack else []
     for name in wanted:
         moved |= tidy(out, name, known)
@@ -131,8 +135,9 @@ def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
     return {f.path.removeprefix(inside): usd.path(f) for f in usd.artifact.files if f.path.startswith(inside)}
 
 
-def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
-    """report/: the page and its figures, and the held-out views of the model and of the exported asset."""
+def report_files(stages: Mapping[str, Done[Any]], *, keep_all: bool) -> Copies:
+    """report/: the page and its figures, and the held-out views of the model and of the exported asset as PNG; with
+    `keep_all` as EXR too, which takes as much room as the asset."""
     copies: Copies = {}
     if "report" in stages:
         copies |= {f.path: stages["report"].located.path(f) for f in stages["report"].located.artifact.files}
@@ -141,7 +146,8 @@ def report_files(stages: Mapping[str, Done[Any]]) -> Copies:
             continue
         located = stages[stage].located
         for view in getattr(located.artifact, field):
-            copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
+            if keep_all:
+                copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
             copies[f"{folder}/{view.index}.png"] = located.path(view.png)
     return copies
 

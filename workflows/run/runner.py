@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -53,7 +52,8 @@ def run_stages(
         if stage.name in plan.anew:
             plan.store.forget(stage.name, key(stage, inputs, config))
         check_room_for_stage(stage, inputs, config, plan.store)
-        with around(stage, inputs, config), time_limit(stage.name, plan.request.stage_limit, watch.late):
+        limit = time_limit(stage.name, plan.request.stage_limit, watch.late, watch.steering)
+        with around(stage, inputs, config), limit, watch.steering.telling(watch.observer.paused):
             result = execute_stage(
                 stage,
                 inputs,
@@ -62,26 +62,35 @@ def run_stages(
                 device=plan.device,
                 progress=watch.observer.progress,
                 cancelled=watch.stopped,
+                show=watch.show,
             )
         watch.observer.finished(result)
         finished[stage.name] = result.located
         done.append(result)
         if ends_early(plan, done, watch):
             break
+        if number < len(plan.stages):
+            _stop_if_wished(watch, stage.name)
     _stop_if_asked(watch)
     return done
 
 
 def _stop_if_asked(watch: Session) -> None:
-    if watch.stop.is_set():
+    if watch.asked_to_stop():
         raise Cancelled("stopped by the user; finished stages are kept, nothing was published")
+
+
+def _stop_if_wished(watch: Session, stage: str) -> None:
+    """After a stage: whether the run was to go so far only."""
+    if watch.steering.ends_after_stage.is_set():
+        raise Cancelled(f"stopped by the user after {stage}; finished stages are kept, nothing was published")
 
 
 def within_budget(plan: Plan, done: list[Done[Any]], watch: Session) -> Plan:
     """The plan with settings, from the fit on, that fit into the rest of its budget."""
     assert plan.request.budget is not None
     taken = sum(float(d.run.get("seconds", 0.0)) for d in done if not d.reused)
-    left = plan.request.budget - max(time.monotonic() - watch.begun, taken) - START_UP
+    left = plan.request.budget - max(watch.elapsed(), taken) - START_UP
     request = plan.request.model_dump(mode="json", include={"budget", "sets", "config", "holdout", "seed", "device"})
     found = planned(plan.store, {**request, "after": [d.key for d in done]}, left, plan.device)
     watch.observer.note(found.describe(plan.request.budget))

@@ -7,7 +7,8 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from pipeline.contract import Done
+from pipeline.contract import Done, Show, no_show
+from workflows.run.steering import Steering
 
 
 class Observer(Protocol):
@@ -25,6 +26,10 @@ class Observer(Protocol):
         """The stage is done, or its result was found in the store."""
         ...
 
+    def paused(self, waits: bool) -> None:
+        """The stage at work waits, because the user paused the run; or it goes on."""
+        ...
+
     def note(self, text: str) -> None:
         """A message for the user."""
         ...
@@ -36,21 +41,37 @@ class Silent:
     def started(self, stage: str, number: int, of: int) -> None: ...
     def progress(self, done: int, total: int, message: str = "", **figures: float) -> None: ...
     def finished(self, done: Done[Any]) -> None: ...
+    def paused(self, waits: bool) -> None: ...
     def note(self, text: str) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """One run's observer and its stop flags.
+    """One run's observer, what the user asks of it, and its stop flags.
 
-    stop: set by the user. late: set by the time limit of the running stage. begun: start, by time.monotonic().
+    stop: set by the user. late: set by the time limit of the running stage. begun: start, by time.monotonic(). show:
+    takes pictures of the stages' work.
     """
 
     observer: Observer = field(default_factory=Silent)
     stop: threading.Event = field(default_factory=threading.Event)
     late: threading.Event = field(default_factory=threading.Event)
     begun: float = field(default_factory=time.monotonic)
+    steering: Steering = field(default_factory=Steering)
+    show: Show = no_show
 
     def stopped(self) -> bool:
-        """Whether the running stage has to end: the user stopped it, or its time is over."""
+        """Whether the running stage has to end: the user stopped it, or its time is over. Waits while it is paused."""
+        self.steering.wait(self._ended)
+        return self._ended() or self.steering.stops
+
+    def _ended(self) -> bool:
         return self.stop.is_set() or self.late.is_set()
+
+    def asked_to_stop(self) -> bool:
+        """Whether the user stopped the run; waits for nothing."""
+        return self.stop.is_set() or self.steering.stops
+
+    def elapsed(self) -> float:
+        """Seconds since the start, without those for which the run was paused."""
+        return time.monotonic() - self.begun - self.steering.waited()

@@ -16,7 +16,10 @@ from stages.registry import SOURCE
 from workflows.batch.captures import RECORDS
 from workflows.batch.page import AVERAGE, TABLES, captures_in
 from workflows.batch.state import Entry
+from workflows.live.folder import FOLDER as LIVE
+from workflows.live.folder import STATE, ours_in, read_small
 from workflows.run.published import FOLDERS, LIST, TRUTH, is_ours, is_record, listed, published, split
+from workflows.run.published import entries as files_in
 from workflows.run.room import size_of
 from workflows.run.run_lock import lock_is_free
 from workflows.store.roots import Root, forget_root, roots
@@ -129,6 +132,7 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
     paths, users = set(_made_from(photos, store)), set[Path]()
     outs |= {r.out for r in _roots_of(out, store) if any(store.folder(*m) in paths for m in _shapes_of(r, store))}
+    outs |= {out} if _tells_of(subject, out) else set()
     for o in (o for o in outs if o.is_dir()):
         ours, theirs = _results(o)
         users |= theirs
@@ -146,6 +150,11 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
         home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
         paths |= {home} if home.is_dir() else set()
     return Purge(out, tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+
+
+def _tells_of(subject: str, out: Path) -> bool:
+    """Whether a run of this capture tells of itself in OUT/live: one that ended before its results leaves no more."""
+    return Path(str(read_small(out / LIVE / STATE).get("capture", ""))).name == subject
 
 
 def _shapes_of(root: Root, store: Store) -> Iterator[tuple[str, str]]:
@@ -176,7 +185,10 @@ def _results(out: Path) -> tuple[set[Path], set[Path]]:
     ours |= {p for p in (out / LIST, out / "run.json") if is_record(p) or (p.name == LIST and p.is_file())}
     ours |= {p for p in out.iterdir() if _HALF.fullmatch(p.name)}
     folders = (*FOLDERS, TRUTH)
-    theirs = {p for p in out.iterdir() if p.name not in (*folders, ".store") and p not in ours}
+    theirs = {p for p in out.iterdir() if p.name not in (*folders, LIVE, ".store") and p not in ours}
+    told = set(ours_in(out / LIVE))  # of a run that stopped
+    users_beside = {out / LIVE / p for p in files_in(out / LIVE)} - told
+    ours, theirs = ours | told, theirs | users_beside
     for name in folders:
         mine, users = split(out, name, known)
         theirs |= {out / name / p for p in users}

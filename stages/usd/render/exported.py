@@ -21,6 +21,7 @@ from pipeline.lighting.dome import read_light, read_moving
 from pipeline.lighting.moving import MovingLight
 from pipeline.meshes import fans, vertex_normals
 from pipeline.transforms import apply
+from stages.usd.layout import existing, light_file
 from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.mesh import UvSurface, tile_count
 
@@ -60,13 +61,13 @@ class ExportedAsset:
 
 
 def load_exported(root: Path) -> ExportedAsset:
-    """Read NAME.usd, with payload.usdc, textures/ and light.json beside it. StageError if a file is missing."""
+    """Read NAME.usd, with payload.usdc, textures/ and internal/ beside it. StageError if a file is missing."""
     import json
 
     folder, name = root.parent, root.stem
-    light_file = folder / "light.json"
-    light = read_light(light_file)
-    attenuation = str(json.loads(light_file.read_text()).get("attenuation", "exponential"))
+    fitted = light_file(folder)
+    light = read_light(fitted)
+    attenuation = str(json.loads(fitted.read_text()).get("attenuation", "exponential"))
     mesh = read_usd_mesh(root)
     count = tile_count(mesh)
     albedo, inv_kappa = (_map(folder, name, m, count) for m in ("albedo", "inv_kappa"))
@@ -92,7 +93,7 @@ def load_exported(root: Path) -> ExportedAsset:
         _occlusion(folder, name, count),
         count,
         *_fitted(folder, name, count),
-        moving=read_moving(light_file),
+        moving=read_moving(fitted),
     )
 
 
@@ -126,7 +127,7 @@ def _files(folder: Path, name: str, which: str, count: int = 1) -> list[Path]:
 
 
 def _paths(folder: Path, name: str, which: str, kind: str, count: int) -> list[Path]:
-    return [folder / "textures" / f"{name}_{which}.{tiles.form(kind, t, count)}" for t in range(count)]
+    return [existing(folder, name, which, tiles.form(kind, t, count)) for t in range(count)]
 
 
 def numbered(path: Path) -> F32:

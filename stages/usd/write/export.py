@@ -20,6 +20,7 @@ from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
 from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
 from stages.usd.config import Config
+from stages.usd.layout import LIGHT
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.gltf import write_glb
@@ -113,9 +114,9 @@ def export(
     write_exr(folder / "environment.exr", dome)
     domes = [] if moving is None else write_domes(moving, folder, config.environment_width)
     figures = maps.figures | environment_figures(light, dome)
-    (folder / "light.json").write_text(light_json(light, face.artifact.attenuation, moving))
+    (folder / LIGHT).write_text(light_json(light, face.artifact.attenuation, moving))
     shutil.copyfile(Path(__file__).with_name(BLENDER), folder / BLENDER)
-    written += [folder / f for f in (*layers, "environment.exr", "light.json", BLENDER)] + domes
+    written += [folder / f for f in (*layers, "environment.exr", LIGHT, BLENDER)] + domes
     check()
     light_mesh, light_rig, light_eyes = replace(mesh, paired=False), None, None  # viewers want triangles
     if head is not None:

@@ -22,6 +22,8 @@ from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
+from pipeline.store import link_or_copy
+from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
 from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
@@ -60,25 +62,26 @@ def write_maps(
     acescg: bool = False,
     heights: F32 | None = None,
 ) -> Maps:
-    """Write textures/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also write that
-    albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it."""
-    folder = asset / "textures"
-    written = copy_maps(bake, name, folder)
+    """Write textures/ and internal/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also
+    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it."""
+    for folder in (TEXTURES, INTERNAL):
+        (asset / folder).mkdir(parents=True, exist_ok=True)
+    written = copy_maps(bake, name, asset)
     if heights is not None:
-        written += write_heights(bake, mesh, heights, name, folder)
+        written += write_heights(bake, mesh, heights, name, asset)
     figures: dict[str, float] = {}
     if divide and not shadows_fitted(bake) and not bake.artifact.standard_fitted:
-        shown, found = divided_albedo(bake, mesh, light, name, folder, check)
+        shown, found = divided_albedo(bake, mesh, light, name, asset, check)
         written += shown
         figures |= found
     basis = numbered(bake.path(bake.artifact.maps["basis_lut"].files["exr"])).mean(0)
     for i, picture in enumerate(in_groups(basis_table(basis))):
-        written.append(folder / f"{name}_basis_rgb{i}.exr")
+        written.append(map_file(asset, name, f"basis_rgb{i}", "exr"))
         write_exr(written[-1], picture, primaries=None)
     fits = []
     for tile in range(bake.artifact.tiles):
         check()
-        shown, fit = _derived(bake, tile, name, folder, basis, acescg=acescg)
+        shown, fit = _derived(bake, tile, name, asset, basis, acescg=acescg)
         written += shown
         fits += [] if fit is None else [fit]
     check()
@@ -86,26 +89,26 @@ def write_maps(
 
 
 def _derived(
-    bake: Located[TextureSet], tile: int, name: str, folder: Path, basis: F32, *, acescg: bool
+    bake: Located[TextureSet], tile: int, name: str, asset: Path, basis: F32, *, acescg: bool
 ) -> tuple[list[Path], LobeFit | None]:
     """One tile's maps that are computed from others, and the error of GGX there."""
     exr, png = (tiles.form(k, tile, bake.artifact.tiles) for k in ("exr", "png"))
     written = []
     if acescg:
-        written.append(folder / f"{name}_albedo_acescg.{exr}")
-        albedo = read_exr(folder / f"{name}_albedo.{exr}")[0][..., :3]
+        written.append(map_file(asset, name, "albedo_acescg", exr))
+        albedo = read_exr(map_file(asset, name, "albedo", exr))[0][..., :3]
         write_exr(written[-1], acescg_from_linear(albedo), primaries=ACESCG)
     coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]))
     for i, picture in enumerate(in_groups(coefficients)):
-        written.append(folder / f"{name}_coefficients_rgb{i}.{exr}")
+        written.append(map_file(asset, name, f"coefficients_rgb{i}", exr))
         write_exr(written[-1], picture, primaries=None)
     if "f0" not in bake.artifact.maps:
         return written, None
     f0 = _map(bake, "f0", tile)[..., 0]
-    written.append(folder / f"{name}_specular_color.{png}")
+    written.append(map_file(asset, name, "specular_color", png))
     write_png_from_linear(written[-1], np.repeat(f0[..., None].clip(0, 1), 3, -1))
     fit = lobe_fit(coefficients, _map(bake, "inv_kappa", tile)[..., 0], f0, basis, covered_texels(bake, tile))
-    written.append(folder / f"{name}_lobe_fit.{png}")
+    written.append(map_file(asset, name, "lobe_fit", png))
     # red: residual of the GGX lobe, 1 = 100 %; green: 1 where the light does not determine kappa; blue: 0
     write_png(written[-1], np.stack([fit.residual, fit.unresolved, np.zeros_like(fit.residual)], -1))
     return written, fit
@@ -117,8 +120,9 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
     return ratio is not None and not (ratio.minimum == ratio.maximum == 1)
 
 
-def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
-    """Copy every file of every map as NAME_map.format."""
+def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
+    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room; a copy of
+    the albedo, which `divided_albedo` may write anew."""
     count = bake.artifact.tiles
     wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
     wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
@@ -130,20 +134,19 @@ def copy_maps(bake: Located[TextureSet], name: str, folder: Path) -> list[Path]:
             limit=f"{', '.join(NEEDED)} as exr, albedo also as png",
             remedy="run the bake stage again",
         )
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
     for which, texture in sorted(bake.artifact.maps.items()):
         if which == "neuface_albedo" and not bake.artifact.standard_fitted:
             continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
-            target = folder / f"{name}_{which}.{form}"
-            shutil.copyfile(bake.path(ref), target)
+            target = map_file(asset, name, which, form)
+            (shutil.copyfile if which == "albedo" else link_or_copy)(bake.path(ref), target)
             written.append(target)
     return written
 
 
 def divided_albedo(
-    bake: Located[TextureSet], mesh: UvSurface, light: F32, name: str, folder: Path, check: Callable[[], None]
+    bake: Located[TextureSet], mesh: UvSurface, light: F32, name: str, asset: Path, check: Callable[[], None]
 ) -> tuple[list[Path], dict[str, float]]:
     """Divide shadows and interreflections out of the albedo files, and write `occlusion`: albedo * occlusion = baked.
 
@@ -164,9 +167,9 @@ def divided_albedo(
         albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
         image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
         exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
-        write_exr(folder / f"{name}_albedo.{exr}", albedo)
-        write_png_from_linear(folder / f"{name}_albedo.{png}", albedo)
-        written.append(folder / f"{name}_occlusion.{exr}")
+        write_exr(map_file(asset, name, "albedo", exr), albedo)
+        write_png_from_linear(map_file(asset, name, "albedo", png), albedo)
+        written.append(map_file(asset, name, "occlusion", exr))
         write_exr(written[-1], image)
         shown.append(image[covered_texels(bake, tile)][::count])  # in total as many as in one tile
     found = np.concatenate(shown)
@@ -198,12 +201,12 @@ def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F64, check: Callable[[
     return occlusion(transport, lit, unblocked, albedo, check)
 
 
-def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name: str, folder: Path) -> list[Path]:
+def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name: str, asset: Path) -> list[Path]:
     """NAME_cage_displacement.exr: metres along the cage's limit normal. heights (V,) at the vertices of the textured
     mesh. (NAME_displacement.exr is the bake's: from the textured mesh to the zero set.)"""
     count, written = bake.artifact.tiles, []
     for tile in range(count):
-        written.append(folder / f"{name}_{CAGE_HEIGHT}.{tiles.form('exr', tile, count)}")
+        written.append(map_file(asset, name, CAGE_HEIGHT, tiles.form("exr", tile, count)))
         image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.size)
         write_exr(written[-1], image, primaries=None, units="m")
     return written
@@ -228,10 +231,11 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
     count = bake.artifact.tiles
 
     def found(map_name: str, kind: str, of: int = count) -> str | None:
-        first = f"{name}_{map_name}.{tiles.form(kind, 0, of)}"
-        if not (asset / "textures" / first).is_file():
+        first = map_file(asset, name, map_name, tiles.form(kind, 0, of))
+        if not first.is_file():
             return None
-        return f"./textures/{first}" if of == 1 else f"./textures/{name}_{map_name}.{tiles.TOKEN}.{kind}"
+        file = first if of == 1 else map_file(asset, name, map_name, f"{tiles.TOKEN}.{kind}")
+        return f"./{file.relative_to(asset).as_posix()}"
 
     def counted(map_name: str, of: int) -> tuple[str, ...]:
         return tuple(f for i in range(99) if (f := found(f"{map_name}_rgb{i}", "exr", of)))
@@ -241,7 +245,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
     for tile in range(count):
         covered = covered_texels(bake, tile)
         texels += int(covered.sum())
-        shown = read_exr(asset / "textures" / f"{name}_albedo.{tiles.form('exr', tile, count)}")[0][..., :3]
+        shown = read_exr(map_file(asset, name, "albedo", tiles.form("exr", tile, count)))[0][..., :3]
         albedo += shown[covered].sum(0, dtype=np.float64)
         f0 += float(_map(bake, "f0", tile)[covered].sum(dtype=np.float64)) if has_f0 else 0.0
     red, green, blue = (round(float(x), 6) for x in albedo / texels)

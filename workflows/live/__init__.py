@@ -1,0 +1,1 @@
+"""What a run tells while it goes on, for `neuface view`, and what the viewer asks of it."""
