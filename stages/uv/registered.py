@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline import meshes, tiles
 from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
-from pipeline.registration.head import Head, kept_quads, limit_surface
+from pipeline.registration.head import Head, kept_quads, limit_surface, of_triangles
 from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
 from stages.uv import decimate
@@ -22,17 +22,22 @@ from stages.uv.chart_quality import Quality, measure
 from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import face_share
+from stages.uv.hair import hair_faces, hair_mesh
 from stages.uv.judge import judge
-from stages.uv.remainder import left_over
+from stages.uv.remainder import beside_head, left_over
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
-REST = 2  # share of uv.target_faces for what is beside the head
+EARS = "ears"
+REST = 2  # share of uv.target_faces for what is beside the head, and for hair
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
-def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step) -> Built:
-    """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to."""
+def build_registered(
+    head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step, hair: Mask | None = None
+) -> Built:
+    """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to; hair (V,):
+    vertices of the dense mesh that are hair."""
     step(0, 3, "subdividing")
     kept = kept_quads(head, regions)
     fine = np.repeat(kept, 4**head.levels)
@@ -43,7 +48,10 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: 
     proxy, _ = compacted(points, normals, head.quads[kept])
     face = np.repeat(face_quads(head, regions)[fine], 2)
     shown = _shown(head, regions, fine)
-    whole, laid = _with_rest(mesh, charts, shown, dense, config) if config.rest else (mesh, charts)
+    whole, laid, hairs = mesh, charts, 0
+    if config.rest:
+        ears = _ears(mesh, of_triangles(head, head.region, regions), regions)
+        whole, laid, hairs = _with_others(mesh, charts, shown, ears, dense, hair, config)
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
@@ -54,19 +62,33 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: 
     step(3, 3, "done")
     span = float(np.ptp(whole.vertices, axis=0).max())
     findings = judge(quality, deviation, span, against, 0.0, crumpled(whole))
-    return Built(whole, laid, proxy, quality, deviation, rough, (), findings)
+    return Built(whole, laid, proxy, quality, deviation, rough, (), findings, hair_faces=hairs)
 
 
-def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Config) -> tuple[Mesh, Charts]:
-    """The head, and what the scan shows beside it on the next tile."""
+def _with_others(
+    mesh: Mesh, charts: Charts, shown: Mask, ears: Mask, dense: Mesh, hair: Mask | None, config: Config
+) -> tuple[Mesh, Charts, int]:
+    """The head, what the scan shows beside it, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
-    rest = left_over(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
-    if rest is None:
-        return mesh, charts
-    rest = decimate.decimated(rest, config.target_faces // REST)
-    own = unwrap(rest, config.changed(tiles=1, remesh="adaptive"))  # triangles
-    moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
-    return joined([(mesh, charts), (rest, moved)])
+    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces), ears[rows])
+    own = None if hair is None else hair_faces(dense, hair, beside)
+    parts, hairs = [(mesh, charts)], 0
+    for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
+        hairs = 0
+        if part is not None:
+            part = decimate.decimated(part, config.target_faces // REST)
+            laid = unwrap(part, config.changed(tiles=1, remesh="adaptive"))  # triangles
+            parts.append((part, Charts(laid.uvs + np.array([tiles.count(parts[-1][1]), 0], np.float32), laid.faces)))
+            hairs = len(part.faces)
+    return *joined(parts), hairs
+
+
+def _ears(mesh: Mesh, region: Indices, regions: tuple[str, ...]) -> Mask:
+    """(V,) vertices of the head's mesh on its ears. region (F,): of its triangles."""
+    out = np.zeros(len(mesh.vertices), np.bool_)
+    if EARS in regions:
+        out[mesh.faces[region == regions.index(EARS)]] = True
+    return out
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:
