@@ -10,8 +10,11 @@ on the template; s in [0, 1] how well photos see p.
 
 f are kernel densities over seeds: skin on nose and upper cheeks (no beard grows there), hair where the surface stands
 clearly off the scalp, other (clothes) below the chin and beside the neck. After the first cut its sides are the seeds.
-Around eyes, nose and mouth, and on chin and throat, nothing is hair. Without enough surface that stands off the scalp
-there is no hair: the colour of stubble is as far from skin's as hair's is.
+Around eyes, nose and mouth, and on chin and throat, nothing is hair.
+
+Is it hair at all? The skull that a face makes probable is up to 10 mm off, and the colour of stubble is as far from
+skin's as fair hair's is. But hair rises from the skin at its border, and there a skull that is wrong does not. So the
+rise from the nearest skin to what lies RISE_AT inwards of the border must be enough, and so must the change of colour.
 
 Source: Boykov and Jolly, Interactive graph cuts (2001), for the two terms; Rother, Kolmogorov and Blake, GrabCut
 (2004), for the repeated seeds.
@@ -47,6 +50,8 @@ THROAT = -0.06  # height on the template below which places in front of the ears
 BELOW = -0.13  # from here on downwards, clothes are sought
 LEAST_SEEDS = 60  # patches: 5 square centimetres
 LEAST_SHARE = 0.12  # of the seen scalp that must stand off for there to be hair
+RISE_AT, LEAST_RISE = (0.010, 0.015), 0.0025  # inwards of the border; a phone's man has .006, a shaved scan .0005
+LEAST_CHANGE = 6.0  # units of CIELAB over the same way; the man has 40, the scan 3
 SMALL = 4e-4  # square metres: smaller islands and holes of hair are taken away
 BENEATH, INWARD = (
     0.002,
@@ -54,7 +59,7 @@ BENEATH, INWARD = (
 )  # how far the skin lies beneath hair at least, and how much more with each patch inwards
 
 KERNEL, FLOOR = 5.0, 1e-7  # of the densities: units of CIELAB, and the least density
-MOST_SEEDS = 800
+MOST_SEEDS = 500
 COLOUR, COLOUR_MOST = 1.0, 4.0  # weight of the log-odds of the colours, and the most that they count
 # log-odds of a place that stands off; ears are too different in shape and place for their height to tell anything
 STANDS = {"scalp": 4.0, "face": 3.0, "brows": 3.0, "neck": 1.5, "ears": 0.0}
@@ -69,12 +74,13 @@ UNITS = 1000  # of the cut's whole numbers
 @dataclass(frozen=True, slots=True)
 class Places:
     """Of P patches: region (P,) index into names of the nearest place of the skin; height (P,) out of it, at (P, 3)
-    that place on the template; metres of the template."""
+    that place on the template; metres of the template. shrink: such metres per world unit."""
 
     region: Indices
     names: tuple[str, ...]
     height: F64
     at: F64
+    shrink: float = 1.0
 
     def on(self, *names: str) -> Mask:
         """(P,) patches whose region is one of these."""
@@ -83,12 +89,15 @@ class Places:
 
 @dataclass(frozen=True, slots=True)
 class Hair:
-    """inside (P,): patches that are hair. share: of the seen scalp that stands off; reason: why there is none, or
-    ""."""
+    """inside (P,): patches that are hair; reason: why there is none, or "". share: of the seen scalp that stands off;
+    rise, change: of height (metres of the template) and colour (CIELAB) from the skin to what lies inwards of the
+    border, medians; 0 where there is no border."""
 
     inside: Mask
     share: float
     reason: str = ""
+    rise: float = 0.0
+    change: float = 0.0
 
 
 def places_of(template: Template, head: PlacedHead, patches: Patches) -> Places:
@@ -107,7 +116,7 @@ def places_of(template: Template, head: PlacedHead, patches: Patches) -> Places:
     row = used[nearest]
     out = ((patches.where - points[row]) * normals[row]).sum(1)
     signed = np.where(np.abs(out) > 0.5 * away, np.sign(out) * away, out)
-    return Places(region[kept][first[nearest] // 4 // 16], names, signed / head.scale, flat[row])
+    return Places(region[kept][first[nearest] // 4 // 16], names, signed / head.scale, flat[row], 1 / head.scale)
 
 
 def tell_hair(patches: Patches, places: Places, albedo: F64, seen: F64) -> Hair:
@@ -133,7 +142,30 @@ def tell_hair(patches: Patches, places: Places, albedo: F64, seen: F64) -> Hair:
             return Hair(none, share, "the surface that stands off has the colour of skin")
         if turn == 0:
             skin = shown & ~inside & _bare(places) & (np.abs(places.height) < FLAT) | skin
-    return Hair(_whole(patches, inside, off), share)
+    inside = _whole(patches, inside, off)
+    rise, change = _at_border(patches, places, colour, inside, shown)
+    reason = ""
+    if rise < LEAST_RISE:
+        reason = f"at its border it rises by {1000 * rise:.2g} mm, less than {1000 * LEAST_RISE:g}: a shaved head"
+    elif change < LEAST_CHANGE:
+        reason = f"its colour is {change:.2g} units of CIELAB from the skin beside it, less than {LEAST_CHANGE:g}"
+    return Hair(none if reason else inside, share, reason, rise, change)
+
+
+def _at_border(patches: Patches, places: Places, colour: F64, inside: Mask, shown: Mask) -> tuple[float, float]:
+    """Rise and change of colour from the nearest skin to the hair inside (P,) that lies RISE_AT inwards; both shown."""
+    rim = np.flatnonzero(patches.beside(inside) & shown & places.on("face", "scalp", "neck") & (places.height < REACH))
+    hair = np.flatnonzero(inside & shown)
+    if not len(rim) or not len(hair):
+        return 0.0, 0.0
+    away, nearest = cKDTree(patches.where[rim]).query(patches.where[hair])
+    away = away * places.shrink
+    use = (away > RISE_AT[0]) & (away <= RISE_AT[1])
+    if use.sum() < LEAST_SEEDS:
+        return 0.0, 0.0
+    a, b = hair[use], rim[nearest[use]]
+    change = np.linalg.norm(colour[a] - colour[b], axis=1)
+    return float(np.median(places.height[a] - places.height[b])), float(np.median(change))
 
 
 def depth_beneath(patches: Patches, inside: Mask) -> F64:
@@ -158,10 +190,10 @@ def log_density(colour: F64, seeds: F64) -> F64:
     """(N,) log of the kernel density of seeds (S, 3) at colour (N, 3); the floor keeps what is like no seed finite."""
     if not len(seeds):
         return np.full(len(colour), np.log(FLOOR))
-    some = seeds[:: -(-len(seeds) // MOST_SEEDS)]
-    far = ((colour[:, None] - some[None]) ** 2).sum(2)
-    kernel = np.exp(-0.5 * far / KERNEL**2) / (2 * np.pi * KERNEL**2) ** 1.5
-    return np.asarray(np.log(kernel.mean(1) + FLOOR))
+    some, at = (x / KERNEL for x in (seeds[:: -(-len(seeds) // MOST_SEEDS)], colour))
+    half = at @ some.T - 0.5 * (at**2).sum(1)[:, None] - 0.5 * (some**2).sum(1)  # -|a - b|^2 / 2
+    kernel = np.exp(half.astype(np.float32), dtype=np.float32).mean(1, dtype=np.float64)
+    return np.asarray(np.log(kernel / (2 * np.pi * KERNEL**2) ** 1.5 + FLOOR))
 
 
 def _cheeks(places: Places) -> Mask:

@@ -79,6 +79,8 @@ def _figures(patches: Patches, hair: Hair, seen: F64) -> dict[str, float]:
     area = 1e4 * patches.area
     return {
         "hair_standing": round(hair.share, 5),
+        "hair_rise_mm": round(1000 * hair.rise, 4),
+        "hair_change": round(hair.change, 3),
         "hair_cm2": round(float(area[hair.inside].sum()), 3),
         "hair_seen": round(float(area[hair.inside & (seen > 0)].sum() / max(area[hair.inside].sum(), 1e-30)), 5),
     }

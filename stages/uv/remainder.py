@@ -39,7 +39,7 @@ def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
 
 
 def beside_head(dense: Mesh, skin: Mesh, ears: Mask) -> Mask:
-    """(V,) vertices of the dense mesh that the head's skin does not stand for. ears (n,): vertices of the skin's ears."""
+    """(V,) vertices of the dense mesh that the skin does not stand for. ears (n,): vertices of the skin on its ears."""
     from scipy.spatial import cKDTree
 
     points: F64 = dense.vertices.astype(np.float64)
