@@ -7,11 +7,13 @@ Lashes are left out: they need a material with opacity.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline import meshes, tiles
+from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
 from pipeline.registration.head import Head, kept_quads, limit_surface, of_triangles
 from pipeline.registration.quality import face_quads, outer_quads
@@ -29,7 +31,7 @@ from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
 EARS = "ears"
-REST = 2  # share of uv.target_faces for what is beside the head, and for hair
+SHARE = 2  # of uv.target_faces and of uv.proxy_faces, for what is beside the head, and for hair
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
@@ -48,10 +50,12 @@ def build_registered(
     proxy, _ = compacted(points, normals, head.quads[kept])
     face = np.repeat(face_quads(head, regions)[fine], 2)
     shown = _shown(head, regions, fine)
-    whole, laid, hairs = mesh, charts, 0
+    whole, laid, others, hairs = mesh, charts, [], 0
     if config.rest:
         ears = _ears(mesh, of_triangles(head, head.region, regions), regions)
-        whole, laid, hairs = _with_others(mesh, charts, shown, ears, dense, hair, config)
+        others, hairs = _others(mesh, charts, shown, ears, dense, hair, config)
+        whole, laid = joined([(mesh, charts), *others])
+        proxy = _with_coarse(proxy, [part for part, _ in others], config.proxy_faces // SHARE)
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
@@ -65,22 +69,32 @@ def build_registered(
     return Built(whole, laid, proxy, quality, deviation, rough, (), findings, hair_faces=hairs)
 
 
-def _with_others(
+def _others(
     mesh: Mesh, charts: Charts, shown: Mask, ears: Mask, dense: Mesh, hair: Mask | None, config: Config
-) -> tuple[Mesh, Charts, int]:
-    """The head, what the scan shows beside it, and hair last, each on the next tile; and the number of hair's faces."""
+) -> tuple[list[tuple[Mesh, Charts]], int]:
+    """What the scan shows beside the head, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
     beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces), ears[rows])
     own = None if hair is None else hair_faces(dense, hair, beside)
-    parts, hairs = [(mesh, charts)], 0
+    out, tile, hairs = list[tuple[Mesh, Charts]](), tiles.count(charts), 0
     for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
         hairs = 0
         if part is not None:
-            part = decimate.decimated(part, config.target_faces // REST)
+            part = decimate.decimated(part, config.target_faces // SHARE)
             laid = unwrap(part, config.changed(tiles=1, remesh="adaptive"))  # triangles
-            parts.append((part, Charts(laid.uvs + np.array([tiles.count(parts[-1][1]), 0], np.float32), laid.faces)))
-            hairs = len(part.faces)
-    return *joined(parts), hairs
+            out.append((part, Charts(laid.uvs + np.array([tile, 0], np.float32), laid.faces)))
+            tile, hairs = tile + 1, len(part.faces)
+    return out, hairs
+
+
+def _with_coarse(proxy: Mesh, others: list[Mesh], faces: int) -> Mesh:
+    """The proxy with the meshes beside the head, in about `faces` triangles each; without one that breaks."""
+    parts = [proxy]
+    for part in others:
+        with suppress(StageError):
+            parts.append(decimate.decimated(part, faces))
+    none = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
+    return joined([(part, none) for part in parts])[0]
 
 
 def _ears(mesh: Mesh, region: Indices, regions: tuple[str, ...]) -> Mask:

@@ -8,30 +8,19 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from support import persons
+from support.hairy import DARK, SKIN, hairy_head
 
-from pipeline.meshes import F64, Mask, Mesh, triangles_of, unit, vertex_normals
+from pipeline.meshes import F64, Mask, unit
 from pipeline.patches import Patches, patches_of
 from pipeline.registration import hair as told
-from pipeline.registration.head import limit_surface
 from pipeline.registration.identity_fit import PlacedHead
-from pipeline.registration.subdivision import subdivided
 
-SKIN, DARK, SHIRT = (0.45, 0.28, 0.2), (0.02, 0.015, 0.012), (0.1, 0.2, 0.5)
 THICK = 0.015  # metres
 
 
 def surface(thickness: float) -> tuple[Patches, Mask]:
-    """The template's own skin with hair of some thickness on its upper scalp, and which patches have it."""
-    t = persons.template()
-    skin = t.quads[t.parts["skin"]]
-    points, normals, quads = limit_surface(t.vertices, subdivided(skin, len(t.vertices), 2))
-    used, flat = np.unique(quads, return_inverse=True)
-    points, normals, faces = points[used], normals[used], triangles_of(flat.reshape(-1, 4))
-    own = np.zeros(len(t.vertices))
-    own[np.unique(t.quads[t.regions["scalp"]])] = 1
-    share = np.clip((points[:, 1] - 0.03) / 0.01, 0, 1) * (points[:, 2] < 0.05)
-    moved = points + thickness * share[:, None] * normals
-    mesh = Mesh(moved.astype(np.float32), vertex_normals(moved, faces), faces)
+    """The patches of a head with hair of some thickness, and which of them have it."""
+    mesh, share = hairy_head(thickness)
     patches = patches_of(mesh, told.PATCH)
     return patches, patches.mean(share) > 0.5
 
