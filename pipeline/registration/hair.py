@@ -14,7 +14,9 @@ Around eyes, nose and mouth, and on chin and throat, nothing is hair.
 
 Is it hair at all? The skull that a face makes probable is up to 10 mm off, and the colour of stubble is as far from
 skin's as fair hair's is. But hair rises from the skin at its border, and there a skull that is wrong does not. So the
-rise from the nearest skin to what lies RISE_AT inwards of the border must be enough, and so must the change of colour.
+rise from the nearest skin to what lies RISE_AT inwards of the border must be enough, with the change of colour:
+
+    rise / RISE + change / CHANGE >= LEAST_SCORE
 
 Source: Boykov and Jolly, Interactive graph cuts (2001), for the two terms; Rother, Kolmogorov and Blake, GrabCut
 (2004), for the repeated seeds.
@@ -50,8 +52,10 @@ THROAT = -0.06  # height on the template below which places in front of the ears
 BELOW = -0.13  # from here on downwards, clothes are sought
 LEAST_SEEDS = 60  # patches: 5 square centimetres
 LEAST_SHARE = 0.12  # of the seen scalp that must stand off for there to be hair
-RISE_AT, LEAST_RISE = (0.010, 0.015), 0.0025  # inwards of the border; a phone's man has .006, a shaved scan .0005
-LEAST_CHANGE = 6.0  # units of CIELAB over the same way; the man has 40, the scan 3
+RISE_AT = (0.010, 0.015)  # inwards of the border, where rise and change are measured
+RISE, CHANGE = 0.0025, 20.0  # of height, and of colour in units of CIELAB: each counts as one
+LEAST_RISE, LEAST_CHANGE = 0.001, 6.0
+LEAST_SCORE = 1.5  # of their sum; phone photos of two men have 4.3 and 1.8, a shaved scanned head .3
 SMALL = 4e-4  # square metres: smaller islands and holes of hair are taken away
 BENEATH, INWARD = (
     0.002,
@@ -144,12 +148,10 @@ def tell_hair(patches: Patches, places: Places, albedo: F64, seen: F64) -> Hair:
             skin = shown & ~inside & _bare(places) & (np.abs(places.height) < FLAT) | skin
     inside = _whole(patches, inside, off)
     rise, change = _at_border(patches, places, colour, inside, shown)
-    reason = ""
-    if rise < LEAST_RISE:
-        reason = f"at its border it rises by {1000 * rise:.2g} mm, less than {1000 * LEAST_RISE:g}: a shaved head"
-    elif change < LEAST_CHANGE:
-        reason = f"its colour is {change:.2g} units of CIELAB from the skin beside it, less than {LEAST_CHANGE:g}"
-    return Hair(none if reason else inside, share, reason, rise, change)
+    if min(rise / LEAST_RISE, change / LEAST_CHANGE) >= 1 and rise / RISE + change / CHANGE >= LEAST_SCORE:
+        return Hair(inside, share, "", rise, change)
+    why = f"at its border it rises by {1000 * rise:.2g} mm and changes by {change:.2g} units of CIELAB: a shaved head"
+    return Hair(none, share, why, rise, change)
 
 
 def _at_border(patches: Patches, places: Places, colour: F64, inside: Mask, shown: Mask) -> tuple[float, float]:

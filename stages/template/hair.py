@@ -19,17 +19,16 @@ from pipeline.registration.scan import Scan
 from pipeline.template.model import Template
 
 ROUNDS = 30  # of smoothing: over about the size of a patch
+RIM = 0.25  # of the smoothed share: hair overlaps the skin by some vertices, so that its shadow on the skin is hidden
 FACE_REACH = 0.015  # metres of the template: points of the face that the identity is fitted to
 
 
 @dataclass(frozen=True, slots=True)
 class ToldHair:
-    """inside (V,): vertices of the scan that are hair; rim (V,): beside it, where the surface still rises to the hair;
-    beneath (V,): how far beneath the skin lies at least, 0 beside the hair; figures: of the artifact; reason: why there
-    is none, or ""."""
+    """inside (V,): vertices of the scan that are hair, with a rim of skin; beneath (V,): how far beneath the skin lies
+    at least, 0 on the rim and beside the hair; figures: of the artifact; reason: why there is none, or ""."""
 
     inside: Mask
-    rim: Mask
     beneath: F64
     figures: dict[str, float]
     reason: str
@@ -44,12 +43,11 @@ def told_hair(template: Template, landmarks: F64, placed: PlacedHead, scan: Scan
     hair = tell_hair(patches, places_of(template, head, patches), albedo, seen)
     deep = placed.scale * depth_beneath(patches, hair.inside)[patches.of_vertex]
     inside = smooth(scan.mesh, hair.inside[patches.of_vertex]) if hair.inside.any() else np.zeros(len(deep), np.bool_)
-    rim = patches.beside(hair.inside)[patches.of_vertex] & ~inside
-    return ToldHair(inside, rim, np.where(inside, deep, 0.0), _figures(patches, hair, seen), hair.reason)
+    return ToldHair(inside, np.where(inside, deep, 0.0), _figures(patches, hair, seen), hair.reason)
 
 
 def smooth(mesh: Mesh, inside: Mask) -> Mask:
-    """(V,) some vertices of a mesh, without the steps of the patches along their border."""
+    """(V,) some vertices of a mesh, without the steps of the patches along their border, and a rim around them."""
     ends, count = meshes.edges(mesh.faces), len(mesh.vertices)
     graph = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(count, count)).tocsr()
     graph = csr_array(graph + graph.T)
@@ -57,14 +55,14 @@ def smooth(mesh: Mesh, inside: Mask) -> Mask:
     share = inside.astype(np.float64)
     for _ in range(ROUNDS):
         share = 0.5 * (share + (graph @ share) / degree)
-    return np.asarray(share > 0.5, np.bool_)
+    return np.asarray(share > RIM, np.bool_)
 
 
 def under_hair(scan: Scan, hair: ToldHair) -> Scan:
     """The scan as the registration takes it: hair is unseen, and the skin lies beneath it."""
     if not hair.inside.any():
         return scan
-    return replace(scan, seen=np.where(hair.inside | hair.rim, 0.0, scan.seen), beneath=hair.beneath)
+    return replace(scan, seen=np.where(hair.inside, 0.0, scan.seen), beneath=hair.beneath)
 
 
 def _of_the_face(template: Template, landmarks: F64, placed: PlacedHead, scan: Scan) -> PlacedHead:

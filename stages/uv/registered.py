@@ -15,7 +15,7 @@ import numpy as np
 from pipeline import meshes, tiles
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
-from pipeline.registration.head import Head, kept_quads, limit_surface, of_triangles
+from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
 from stages.uv import decimate
@@ -30,7 +30,6 @@ from stages.uv.remainder import beside_head, left_over
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
-EARS = "ears"
 SHARE = 2  # of uv.target_faces and of uv.proxy_faces, for what is beside the head, and for hair
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
@@ -52,8 +51,7 @@ def build_registered(
     shown = _shown(head, regions, fine)
     whole, laid, others, hairs = mesh, charts, [], 0
     if config.rest:
-        ears = _ears(mesh, of_triangles(head, head.region, regions), regions)
-        others, hairs = _others(mesh, charts, shown, ears, dense, hair, config)
+        others, hairs = _others(mesh, charts, shown, dense, hair, config)
         whole, laid = joined([(mesh, charts), *others])
         proxy = _with_coarse(proxy, [part for part, _ in others], config.proxy_faces // SHARE)
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
@@ -70,11 +68,11 @@ def build_registered(
 
 
 def _others(
-    mesh: Mesh, charts: Charts, shown: Mask, ears: Mask, dense: Mesh, hair: Mask | None, config: Config
+    mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, hair: Mask | None, config: Config
 ) -> tuple[list[tuple[Mesh, Charts]], int]:
     """What the scan shows beside the head, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
-    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces), ears[rows])
+    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
     own = None if hair is None else hair_faces(dense, hair, beside)
     out, tile, hairs = list[tuple[Mesh, Charts]](), tiles.count(charts), 0
     for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
@@ -95,14 +93,6 @@ def _with_coarse(proxy: Mesh, others: list[Mesh], faces: int) -> Mesh:
             parts.append(decimate.decimated(part, faces))
     none = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
     return joined([(part, none) for part in parts])[0]
-
-
-def _ears(mesh: Mesh, region: Indices, regions: tuple[str, ...]) -> Mask:
-    """(V,) vertices of the head's mesh on its ears. region (F,): of its triangles."""
-    out = np.zeros(len(mesh.vertices), np.bool_)
-    if EARS in regions:
-        out[mesh.faces[region == regions.index(EARS)]] = True
-    return out
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:

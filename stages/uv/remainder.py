@@ -3,7 +3,6 @@ mesh of its own, with charts on a tile of its own.
 
 Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with normal n. p is left over if it lies outside
 (n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end) and |p - q| > JOINT.
-Near the ears nothing is left over: what the fit has there and the template has not is no second ear.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ from pipeline.meshes import F64, Mask, Mesh
 AWAY = 0.003  # metres: nearer, the head's skin stands for it
 JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
 OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not left over
-EAR = 0.025  # metres from an ear within which nothing is left over
 SMALL = 0.01  # of the dense mesh's area: smaller pieces are dropped
 
 
@@ -38,16 +36,15 @@ def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
     return Mesh(parted.astype(np.float32), normals, own)
 
 
-def beside_head(dense: Mesh, skin: Mesh, ears: Mask) -> Mask:
-    """(V,) vertices of the dense mesh that the skin does not stand for. ears (n,): vertices of the skin on its ears."""
+def beside_head(dense: Mesh, skin: Mesh) -> Mask:
+    """(V,) vertices of the dense mesh that the head's skin does not stand for."""
     from scipy.spatial import cKDTree
 
     points: F64 = dense.vertices.astype(np.float64)
     away, nearest = cKDTree(skin.vertices.astype(np.float64)).query(points)
     out = ((points - skin.vertices[nearest]) * skin.normals[nearest]).sum(1)
     at_border = _border(skin)[nearest]
-    beside = np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away))
-    return np.asarray(beside & ~(ears[nearest] & (away < EAR)))
+    return np.asarray(np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away)))
 
 
 def _border(mesh: Mesh) -> Mask:

@@ -99,14 +99,14 @@ def test_a_bald_or_shaved_head_has_none(thickness: float, colour: tuple[float, f
 
 
 def test_a_skull_that_is_wrong_is_no_hair() -> None:
-    """Stubble on a scalp that swells over 8 cm to 15 mm: it stands off, but does not rise at its border."""
+    """Stubble on a scalp that swells over 8 cm to 10 mm: it stands off, but does not rise at its border."""
     patches, _ = surface(0.0)
     places = told.places_of(persons.template(), placed(), patches)
-    swollen = replace(places, height=0.015 * np.clip((patches.where[:, 1] - 0.03) / 0.08, 0, 1) + 0 * places.height)
+    swollen = replace(places, height=0.01 * np.clip((patches.where[:, 1] - 0.03) / 0.08, 0, 1) + 0 * places.height)
     stubble = (places.at[:, 1] > 0.04) & places.on("scalp", "face")
     found = told.tell_hair(patches, swollen, albedo(patches, stubble, (0.2, 0.15, 0.13)), np.ones(len(stubble)))
     assert found.share > told.LEAST_SHARE and found.change > told.LEAST_CHANGE
-    assert not found.inside.any() and "shaved" in found.reason and 0 < found.rise < told.LEAST_RISE
+    assert not found.inside.any() and "shaved" in found.reason and 0 < found.rise < told.RISE
 
 
 def test_without_cheeks_there_is_no_skin_to_compare_with(hairy: tuple[Patches, Mask, told.Places]) -> None:

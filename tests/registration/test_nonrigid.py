@@ -122,6 +122,6 @@ def test_skin_under_hair_keeps_its_shape_and_is_found_beneath_it() -> None:
         top = own[:, 1] > 0.06
         rest, now = (np.linalg.norm(x[top], axis=1) for x in (own, cage.points(found.vertices)))
         if thick > 0:  # it moves with the lower half, which is met
-            assert np.abs(now - rest).max() < 2e-3 and np.linalg.norm(found.vertices, axis=1).max() < RADIUS + 2e-3
+            assert np.abs(now - rest).max() < 2.5e-3 and np.linalg.norm(found.vertices, axis=1).max() < RADIUS + 2e-3
         else:
             assert now.max() < RADIUS - 0.006 + 5e-4 and rest.min() > RADIUS - 0.004

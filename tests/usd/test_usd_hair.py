@@ -58,6 +58,7 @@ def test_it_is_a_prim_with_its_own_tile_and_material(made: tuple[SyntheticInputs
     assert len(hair.GetFaceVertexCountsAttr().Get()) == made[0].uv.artifact.hair_faces
     assert tiles_of(hair) == {3} and tiles_of(rest) == {2}
     assert hair.GetPurposeAttr().Get() == "render" and hair.GetSubdivisionSchemeAttr().Get() == "none"
+    assert hair.GetDoubleSidedAttr().Get() and not rest.GetDoubleSidedAttr().Get()
     material = bound(hair)
     assert str(material.GetPath()) == "/head/mtl/hair" and str(bound(rest).GetPath()) == "/head/mtl/captured"
     for output in ("", "mtlx"):
@@ -103,7 +104,7 @@ def test_nothing_is_wrong_with_it(made: tuple[SyntheticInputs, Path], file: str)
 def test_it_follows_the_head_and_no_expression(made: tuple[SyntheticInputs, Path], file: str, name: str) -> None:
     stage = Usd.Stage.Open(str(made[1] / file))
     hair = of(stage, name)
-    assert points(hair)[:, 1].min() > ABOVE
+    assert points(hair)[:, 1].min() > ABOVE and hair.GetDoubleSidedAttr().Get()
     cache = UsdSkel.Cache()
     root = UsdSkel.Root(stage.GetPrimAtPath("/head/geo"))
     cache.Populate(root, Usd.PrimDefaultPredicate)
@@ -134,6 +135,7 @@ def test_gltf_has_a_node_for_it_without_targets(made: tuple[SyntheticInputs, Pat
     assert [n["name"] for n in found["nodes"]] == ["head", "head_rest", "head_hair"]
     (hair,) = found["meshes"][found["nodes"][2]["mesh"]]["primitives"]
     assert "targets" not in hair and found["materials"][hair["material"]]["name"] == "head_1004_hair"
+    assert [m["name"] for m in found["materials"] if m.get("doubleSided")] == ["head_1004_hair"]
     assert found["accessors"][hair["indices"]]["count"] == 3 * made[0].uv.artifact.hair_faces
     assert found["accessors"][hair["attributes"]["POSITION"]]["min"][1] > ABOVE
 

@@ -25,9 +25,8 @@ def scan(thick: float = 0.015) -> tuple[Mesh, np.ndarray]:
     ), cap
 
 
-def beside(dense: Mesh, ears: np.ndarray | None = None) -> np.ndarray:
-    skin = ball_scan(RADIUS)
-    return beside_head(dense, skin, np.zeros(len(skin.vertices), bool) if ears is None else ears)
+def beside(dense: Mesh) -> np.ndarray:
+    return beside_head(dense, ball_scan(RADIUS))
 
 
 def test_the_cap_and_the_skin_at_its_rim_are_cut_out() -> None:
@@ -51,16 +50,6 @@ def test_a_small_piece_that_touches_hair_belongs_to_it() -> None:
     assert hole.sum() > 3 and knob.sum() > 3
     own = hair_faces(dense, cap & ~hole, beside(dense))
     assert own[hole[dense.faces].any(1)].all() and not own[knob[dense.faces].any(1)].any()
-
-
-def test_beside_an_ear_nothing_is_left_over() -> None:
-    dense, cap = scan()
-    at = ball_scan(RADIUS).vertices
-    ears = at[:, 0] > 0.06
-    found = beside(dense, ears)
-    assert found[cap & (dense.vertices[:, 0] < 0.04)].all() and not found[cap & (dense.vertices[:, 0] > 0.075)].any()
-    far = Mesh(2 * dense.vertices, dense.normals, dense.faces)
-    assert beside(far, ears)[dense.vertices[:, 0] > 0.075].all()
 
 
 def test_the_told_hair_must_be_that_of_the_surface(tmp_path: Path) -> None:

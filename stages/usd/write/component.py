@@ -183,6 +183,8 @@ def package_layer(
                 _mesh(stage, f"/{who.name}/geo/{kind}_{number}", part, material),
                 np.unique(part.faces).astype(np.int64),
             )
+            if is_hair:
+                made.CreateDoubleSidedAttr(True)
             if rig is not None and skeleton is not None and (is_hair or used[-1] < len(rig.weights)):
                 bind(stage, made, with_head(rig, len(used)) if is_hair else rig.of_vertices(used), skeleton)
     return detached(stage)
@@ -207,6 +209,7 @@ def _fill(
     hairs = None
     if isinstance(mesh, TemplateMesh) and mesh.hair is not None and hair is not None:
         hairs = _mesh(stage, f"/{name}/geo/{HAIR}", mesh.hair, _material(stage, f"/{name}/mtl/{HAIR}", hair))
+        hairs.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
         hairs.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*hair.mean_albedo)]))
         if mesh.rig is not None and skeleton is not None:
             bind(stage, hairs, with_head(mesh.rig, len(mesh.hair.vertices)), skeleton)

@@ -148,6 +148,8 @@ def write_glb(
         names[-1] += f"_{HAIR}"
     top = max((_top(folder / x.f0) for x in looks if x.f0), default=0.0)
     materials = [_material(n, x, folder, binary, images, top) for n, x in zip(names, looks, strict=True)]
+    if hair is not None:
+        materials[-1]["doubleSided"] = True  # an open shell, which is seen from inside at its rim
     materials += [_eye_material(names[t], materials[t]) for t in wet]
     asset: dict[str, Any] = {"version": "2.0", "generator": "NeuFace Asset"}
     if metadata:
