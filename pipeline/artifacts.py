@@ -277,7 +277,8 @@ class UvMesh(Artifact):
     to the face; None if the face is unknown. of_template: the mesh is the subdivided and displaced cage of the
     RegisteredHead, without the regions that the asset leaves out (pipeline.registration.head), then what lies beside.
     scan: the decimated scan with its own charts, if the asset has both meshes. quads: of `uv.remesh=quads`: pairs of
-    faces 2 q and 2 q + 1 that are one quad in space and texture; 0: triangles.
+    faces 2 q and 2 q + 1 that are one quad in space and texture; 0: triangles. hair_faces: of_template only: the
+    mesh's last faces are hair, on the last tile.
     """
 
     mesh: FileRef
@@ -287,6 +288,7 @@ class UvMesh(Artifact):
     vertices: int
     faces: int
     quads: int = 0
+    hair_faces: int = 0
     charts: int
     tiles: int = 1
     utilisation: float

@@ -31,8 +31,9 @@ class RegisteredHead(Artifact):
     displacement. quads: of the control cage. world_from_template: 4x4 similarity to asset coordinates; identity:
     weights in standard deviations. figures: by name, see docs/stages/template.md. distances_mm: by region (median and
     95 % of the subdivided head's distance from the fitted surface, then both with displacement), over skin that the
-    photos show. eyes: those that were fitted; eyes_reason: why others stay the template's own. quality: the checks;
-    they count for the stage uv where the asset is made from this head, and for no verdict else.
+    photos show. eyes: those that were fitted; eyes_reason: why others stay the template's own. hair: npz of `hair`
+    (V,), the vertices of the fitted surface that are hair; hair_reason: why there is none. quality: the checks; they
+    count for the stage uv where the asset is made from this head, and for no verdict else.
     """
 
     registered: bool
@@ -51,6 +52,8 @@ class RegisteredHead(Artifact):
     distances_mm: dict[str, tuple[float, float, float, float]] = {}
     eyes: tuple[FittedEye, ...] = ()
     eyes_reason: str = ""
+    hair: FileRef | None = None
+    hair_reason: str = ""
     quality: tuple[Finding, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()

@@ -2,8 +2,8 @@
 
 Symbols: p, N limit points and normals; t the distance from p along N to the surface, e that to its nearest place. A
 point is displaced if the surface there faces as the head does, photos see it, and t <= AGREE e + CLOSE: else the normal
-meets another part (the other lip, the lid below). Where displaced places pass through each other, the displacement is
-taken back.
+meets another part (the other lip, the lid below). Under hair nothing is displaced outwards, but what would come through
+the hair is sunk. Where displaced places pass through each other, the displacement is taken back.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Sc
     blocked[quads[~free]] = True
     use = agrees & (seen > 0) & ~blocked
     moved = np.where(use, np.nan_to_num(signed), 0.0) * _faded(use, quads)
+    sunk = np.where(blocked, 0.0, np.minimum(scan.over(points, normals, 2 * REACH * unit), REACH * unit))
+    moved = np.where(sunk > 0, np.minimum(moved, -sunk), moved)
     faces = triangles_of(quads[free])
     before = np.unique(piercing_edges(points, faces))
     for _ in range(TAKEN_BACK):

@@ -128,8 +128,9 @@ class _Data:
 
 
 def _data(cage: Cage, x: F64, scan: Scan, trust: F64, reach: float, unit: float) -> _Data:
-    pairs = scan.pairs(cage.points(x), cage.normals(x), reach)
-    limit = np.where(cage.loose, min(LOOSE_REACH * unit, reach), reach)
+    far = reach if scan.beneath is None else max(reach, STEPS[0][1] * unit)
+    pairs = scan.pairs(cage.points(x), cage.normals(x), far)
+    limit = np.where(pairs.hair, far, np.where(cage.loose, min(LOOSE_REACH * unit, reach), reach))
     weight = trust * pairs.weight / (1 + (pairs.distance / (SOFT * limit)) ** 2)
     weight[~cage.shown | (pairs.distance > limit)] = 0.0
     rows = np.flatnonzero(weight > 1e-5)

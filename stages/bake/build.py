@@ -24,7 +24,7 @@ from stages.bake.eyes import Eyes
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.mouth import Inside
-from stages.bake.regions import Votes, areas
+from stages.bake.regions import Votes, areas, unanimous
 from stages.bake.smooth import continued
 from stages.bake.standard_observe import standard_material
 from stages.bake.statistics import Statistics, statistics_of
@@ -94,15 +94,19 @@ class Baker:
         eyes: Eyes | None = None,
         mouth: Inside | None = None,
         region: Indices | None = None,
+        hair: Mask | None = None,
+        hair_code: int = -1,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
         `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
-        vertex (unseen.region_of); None: one region."""
+        vertex (unseen.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
+        is the last tile, with the label `hair_code`."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
         self._step, self._scratch = step, scratch
+        self._hair_code = hair_code if hair is not None else -1
         self._occluder = Occluder(mesh)
         around = ambient(mesh, self._occluder, lambda done, total: step(done, total, "ambient occlusion"))
         self._known = replace(_known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes)
@@ -113,7 +117,7 @@ class Baker:
             step(0, 1, "standard material")
             seen = self._known.unseen < 0.5
             fitted = standard_material(
-                field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material")
+                field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material"), hair
             )
             if fitted.plausible:
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
@@ -159,9 +163,11 @@ class Baker:
             100 * found.coverage,
             self.residual,
         )
-        labelled = any(v.labels is not None for v in self._views)
-        regions = areas(mesh, charts, seen.votes) if labelled else {}
-        return Baked(size, texel, nearest, samples, seen.confidence, self.lut, found, seen.votes, regions)
+        labelled, votes = any(v.labels is not None for v in self._views), seen.votes
+        if labelled and self._hair_code > 0 and number == self.tiles - 1:
+            votes = unanimous(self._hair_code)
+        regions = areas(mesh, charts, votes) if labelled else {}
+        return Baked(size, texel, nearest, samples, seen.confidence, self.lut, found, votes, regions)
 
 
 def _per_tile(side: int, count: int) -> int:

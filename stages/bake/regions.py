@@ -43,6 +43,11 @@ class Votes:
         return elected(self.codes, upper * (1 - y) + lower * y)
 
 
+def unanimous(code: int) -> Votes:
+    """Votes for one code everywhere."""
+    return Votes(np.array([code], np.uint8), np.ones((1, 1, 1), np.float32))
+
+
 def elected(codes: U8, votes: npt.NDArray[np.floating]) -> U8:
     """(N,) code with the most of the votes (N, L) of codes (L,); 0 with too few."""
     return np.where(votes.max(1) > FEW_VOTES, codes[votes.argmax(1)], 0).astype(np.uint8)

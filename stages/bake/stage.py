@@ -15,7 +15,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import Indices, Mesh
+from pipeline.meshes import Indices, Mask, Mesh
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
@@ -81,6 +81,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.judge import together as texels_of_all
     from stages.bake.mouth import inside_of
     from stages.bake.statistics import together
+    from stages.bake.unseen import with_hair
     from stages.bake.write import joined, write_maps
 
     uv, fitted = inputs.uv, inputs.inverse_rendering
@@ -100,10 +101,12 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     skin = labels.index("face") if "face" in labels else -1
     eyes = painted_eyes(inputs.template, field, mesh, views, response) if uv.artifact.of_template else None
     mouth = inside_of(inputs.template, mesh) if uv.artifact.of_template else None
-    region = _regions(inputs.masks, mesh)
+    region, hair = _regions(inputs.masks, mesh), hair_of(mesh, uv.artifact.hair_faces)
+    if region is not None and hair is not None:
+        region = with_hair(region, hair)
     baker = Baker(
         field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
-        region,
+        region, hair, labels.index("hair") if "hair" in labels else -1,
     )  # fmt: skip
     parts, counted, judged, areas = [], [], [], Counter[int]()
     for number in range(baker.tiles):
@@ -157,6 +160,15 @@ def _regions(masks: Located[MaskSet], mesh: Mesh) -> Indices | None:
     return None if head is None else region_of(mesh.vertices.astype(np.float64), template, head)
 
 
+def hair_of(mesh: Mesh, faces: int) -> Mask | None:
+    """(V,) vertices of a mesh whose last faces are hair; None without any."""
+    if not faces:
+        return None
+    out = np.zeros(len(mesh.vertices), np.bool_)
+    out[mesh.faces[-faces:]] = True
+    return out
+
+
 def unfitted_eyes(head: RegisteredHead, uv: UvMesh) -> tuple[str, ...]:
     """Why eyes of the asset stay the template's own."""
     return (f"eyes stay the template's own: {head.eyes_reason}",) if uv.of_template and head.eyes_reason else ()
@@ -177,4 +189,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=18, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=19, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -18,10 +18,11 @@ pooled (WIDTH), because F0 varies slowly; towards the mean of its group a prior 
 alpha is one number a group: one still light of low order does not determine it from place to place.
 
 The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and USUAL_F0 where a layer does not explain
-MIN_EXPLAINED of what changes with the view. Everything else has no prior for F0, and then no layer; nor one where
-F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos are clipped. An object without any
-other material keeps the one that is read off NeuFace's lobe. At last r follows by linear least squares, pooled over
-EDGES edges.
+MIN_EXPLAINED of what changes with the view. Hair that is a mesh of its own is matt: F0 is keratin's at most, roughness
+about HAIR_ROUGHNESS, and without evidence there is no layer. Everything else has no prior for F0, and then no layer;
+nor one where F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos are clipped. An object
+without any other material keeps the one that is read off NeuFace's lobe. At last r follows by linear least squares,
+pooled over EDGES edges.
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ SKIN_RANGE = (0.02, 0.045)
 USUAL_F0 = 0.028  # of skin, index 1.40; microfacet.SKIN_F0 is the convention that the light's level assumes
 F0_SPREAD, TRUST = 0.01, 3.0  # standard deviation of F0 inside a group; observations that count as one
 SKIN_ROUGHNESS, ROUGHNESS_SPREAD = 0.45, 0.05
+HAIR_RANGE, HAIR_ROUGHNESS = (0.0, 0.046), 0.7  # keratin has index 1.55; a shell of many strands has no sharp highlight
 OBJECT_SPREAD = 0.15  # of roughness, about the same mean
 INDEPENDENT = 30  # observations that a group's roughness counts as: errors of light and shape are common to all others
 MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must explain to be measured
@@ -53,6 +55,25 @@ OUTLIER = 2.5  # robust standard deviations of the field's residual from which t
 CORRECTION = (0.4, 2.5)  # limits of r
 DIELECTRIC = 0.17  # F0 of diamond, the largest of a dielectric that is common
 TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the base
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What is known of a group's material before the photos. f0: its range; usual: F0 where the photos say nothing;
+    roughness, spread: mean and standard deviation; most: F0 above which there is no layer; top: largest F0 of a
+    place."""
+
+    f0: tuple[float, float]
+    usual: float
+    roughness: float
+    spread: float
+    most: float = np.inf
+    top: float = 1.0
+
+
+SKIN = Prior(SKIN_RANGE, USUAL_F0, SKIN_ROUGHNESS, ROUGHNESS_SPREAD)
+HAIR = Prior(HAIR_RANGE, 0.0, HAIR_ROUGHNESS, ROUGHNESS_SPREAD, top=HAIR_RANGE[1])
+REST = Prior((0.0, 1.0), 0.0, SKIN_ROUGHNESS, OBJECT_SPREAD, DIELECTRIC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +123,12 @@ class _Sums:
 
 def fit(
     mesh: Mesh, normals: F64, at: standard.Arrivals | Lit, albedo: F64, seen: Seen, skin: Mask,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] = lambda: None, hair: Mask | None = None,
 ) -> Fitted:  # fmt: skip
     """Fit everything. normals, albedo (V, 3) of the field at the vertices; at: a still light as it arrives at them, or
-    what arrives at the observations; skin (V,): where the prior of skin holds."""
+    what arrives at the observations; skin, hair (V,): where these priors hold."""
+    hair = np.zeros_like(skin) if hair is None else hair
+    skin = skin & ~hair
     w = _weights(normals, seen)
     lit = at if isinstance(at, Lit) else under_dome(at, normals, seen)
     check()
@@ -116,12 +139,12 @@ def fit(
     h, g = (near(x * often[:, None]) for x in (sums.h, sums.g))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
     figures: dict[str, float] = {}
-    for name, group, is_skin in (("skin", skin, True), ("rest", ~skin, False)):
+    for name, group, prior in (("skin", skin, SKIN), ("hair", hair, HAIR), ("rest", ~skin & ~hair, REST)):
         if not group.any():
             continue
-        found = _group(sums, group & often, is_skin)
+        found = _group(sums, group & often, prior)
         pulled = (g[:, found.k] + found.pull * found.f0) / (h[:, found.k] + found.pull)
-        f0[group] = pulled[group].clip(0, 1) if found.f0 > 0 else 0.0
+        f0[group] = pulled[group].clip(0, prior.top) if found.f0 > 0 else 0.0
         rough[group], layered[group] = found.roughness, found.f0 > 0
         figures |= {f"gloss_{name}_f0": float(f0[group].mean()), f"gloss_{name}_roughness": found.roughness}
         figures[f"gloss_{name}_explained"] = found.explained
@@ -191,24 +214,22 @@ class _Group:
     refused: float = 0.0
 
 
-def _group(sums: _Sums, own: Mask, is_skin: bool) -> _Group:
+def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
     """The material of a group by the evidence of its vertices `own` (V,)."""
-    low, high = SKIN_RANGE if is_skin else (0.0, 1.0)
     if own.sum() < MIN_VERTICES:
-        return _Group(USUAL_F0 if is_skin else 0.0, 0, SKIN_ROUGHNESS, 1.0, 0.0)
+        return _Group(prior.usual, 0, prior.roughness, 1.0, 0.0)
     h, g, q = (np.maximum(x[own].sum(0), 1e-30) if x is not sums.g else x[own].sum(0) for x in (sums.h, sums.g, sums.q))
-    mean = (g / h).clip(low, high)
+    mean = (g / h).clip(*prior.f0)
     error = np.maximum(q - 2 * mean * g + mean**2 * h, 1e-30)
-    spread = ROUGHNESS_SPREAD if is_skin else OBJECT_SPREAD
     cost = 0.5 * INDEPENDENT * np.log(error / error.min())
-    cost += 0.5 * ((np.sqrt(ALPHAS) - SKIN_ROUGHNESS) / spread) ** 2
+    cost += 0.5 * ((np.sqrt(ALPHAS) - prior.roughness) / prior.spread) ** 2
     k = int(cost.argmin())
     explained = 1 - float(error[k]) / max(float(sums.bare[own].sum()), 1e-30)
     variance = float(error[k]) / max(3 * float(sums.weight[own].sum()), 1e-30)
     if explained < MIN_EXPLAINED:  # the photos say nothing: skin is as usual, everything else has no layer
-        return _Group(USUAL_F0 if is_skin else 0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained)
-    if not is_skin and mean[k] > DIELECTRIC:
-        return _Group(0.0, k, SKIN_ROUGHNESS, CERTAIN * float(h.max()), explained, float(mean[k]))
+        return _Group(prior.usual, k, prior.roughness, CERTAIN * float(h.max()), explained)
+    if mean[k] > prior.most:
+        return _Group(0.0, k, prior.roughness, CERTAIN * float(h.max()), explained, float(mean[k]))
     rough = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost)
     return _Group(float(mean[k]), k, rough, max(TRUST * variance / F0_SPREAD**2, 1e-12), explained)
 

@@ -28,9 +28,9 @@ MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradi
 
 def standard_material(
     field: Field, mesh: Mesh, views: Sequence[FittedPhoto], skin_code: int, seen: Mask, found: Detail,
-    check: Callable[[], None],
+    check: Callable[[], None], hair: Mask | None = None,
 ) -> standard_fit.Fitted:  # fmt: skip
-    """The fitted material at the vertices. skin_code: label of skin in the photos, -1 for none; seen (V,)."""
+    """The fitted material at the vertices. skin_code: label of skin in the photos, -1 for none; seen, hair (V,)."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
     observations, view, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
@@ -42,7 +42,7 @@ def standard_material(
     else:
         poses = [matrix(v.camera.world_from_cam) for v in views]
         at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
-    out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check)
+    out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check, hair)
     correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
     return replace(out, correction=correction)
 

@@ -25,6 +25,7 @@ MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median;
 NEAR = {"scalp": 0.04, "neck": 0.012, "ears": 0.02, "face": 0.02}
 REGIONS = tuple(NEAR)
 REST = len(REGIONS)
+HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
 
 
 def replaced_share(cosine: F64) -> F64:
@@ -43,6 +44,12 @@ def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
     distance, nearest = cKDTree(points).query(vertices)
     reach = np.array(list(NEAR.values()))[names[nearest]] * head.scale
     return np.where(distance <= reach, names[nearest], REST).astype(np.int64)
+
+
+def with_hair(region: Indices, hair: Mask) -> Indices:
+    """The regions (V,) of a mesh whose vertices hair (V,) are a mesh of hair."""
+    bare = np.where(region == REGIONS.index("scalp"), REGIONS.index("face"), region)
+    return np.where(hair, HAIR, bare)
 
 
 def region_colours(albedo: F64, region: Indices, cosine: F64) -> F64:

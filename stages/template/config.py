@@ -18,6 +18,7 @@ class Config(StageConfig):
     enabled: bool = Field(False, description="register the head template; default: only with uv.mesh=template")
     levels: int = Field(2, ge=1, le=3, description="subdivisions of the registered head's quads")
     require: bool = Field(False, description="fail if the template does not fit the head, or the capture shows no face")
+    hair: bool = Field(True, description="tell hair apart and keep it as a mesh of its own; off: the skin follows it")
     folder: str = Field(
         "", description="folder of another template (docs/template.md); default: the project's own", exclude=True
     )

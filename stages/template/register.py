@@ -50,14 +50,15 @@ class Registration:
     eyes: Mapping[str, FittedBall]
 
 
-def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> Scan:
-    """The part of the fitted surface around the head, and how well the photos see it."""
+def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> tuple[Scan, Indices]:
+    """The part of the fitted surface around the head, and how well the photos see it; rows (V,) of its vertices in the
+    surface."""
     middle = head.world_from_template[:3, 3]
     near = np.linalg.norm(mesh.vertices - middle, axis=1) < AROUND * head.scale
     faces = mesh.faces[near[mesh.faces].all(1)]
     used, flat = np.unique(faces, return_inverse=True)
     part = Mesh(mesh.vertices[used], mesh.normals[used], flat.reshape(-1, 3).astype(np.int32))
-    return Scan(part, _seen(part, views, Occluder(mesh)))
+    return Scan(part, _seen(part, views, Occluder(mesh))), np.asarray(used, np.int64)
 
 
 def _seen(part: Mesh, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:

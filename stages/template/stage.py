@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface
 from pipeline.capture_artifacts import Capture
@@ -18,9 +19,10 @@ from stages.template.config import Config as Config
 if TYPE_CHECKING:
     from pipeline.registration.scan import Scan
     from pipeline.template.model import Template
+    from stages.template.hair import ToldHair
     from stages.template.register import Registration
 
-HEAD, RIG = "head.npz", "rig.npz"
+HEAD, RIG, HAIR = "head.npz", "rig.npz", "hair.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         return RegisteredHead(registered=False, reason="not asked for (template.enabled)")
     from pipeline import meshes
     from pipeline.faces.landmarks3d import load_landmarks, photos_that_agree
+    from pipeline.fields.face import load_face
     from pipeline.registration.identity_fit import placed_on_landmarks
     from pipeline.template.load import load_template
     from pipeline.visibility import seen_by
+    from stages.template.hair import told_hair, under_hair
     from stages.template.judge import refused_faces, refused_placing
     from stages.template.register import register, scan_of
 
@@ -66,9 +70,32 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         return _refused(config, why)
     step(0, 5, "visibility")
     views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
-    scan = scan_of(meshes.load(inputs.surface.path(inputs.surface.artifact.mesh)), placed, views)
+    dense = meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))
+    scan, rows = scan_of(dense, placed, views)
+    hair = None
+    if config.hair:
+        step(0, 5, "hair")
+        fitted = inputs.inverse_rendering
+        hair = told_hair(
+            template, landmarks, placed, scan, load_face(fitted.path(fitted.artifact.field), context.device)
+        )
+        scan = under_hair(scan, hair)
     found = register(template, landmarks, placed, scan, config.levels, step, views, inputs.poses.artifact.metric)
-    return _registered(found, template, scan, config, context)
+    made = _registered(found, template, scan, config, context)
+    return _with_hair(made, hair, rows, len(dense.vertices), context) if made.registered and hair else made
+
+
+def _with_hair(
+    made: RegisteredHead, hair: ToldHair, rows: NDArray[np.int64], count: int, context: Context
+) -> RegisteredHead:
+    """The artifact with the hair that was told. rows (V,): the scan's vertices among the `count` of the surface."""
+    figures, file = made.figures | hair.figures, None
+    if hair.inside.any():
+        told = np.zeros(count, np.bool_)
+        told[rows] = hair.inside
+        np.savez(context.workdir / HAIR, hair=told)
+        file = context.file(HAIR)
+    return made.model_copy(update={"figures": figures, "hair": file, "hair_reason": hair.reason})
 
 
 def _registered(
@@ -123,4 +150,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=5, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=6, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

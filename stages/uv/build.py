@@ -31,7 +31,8 @@ Step = Callable[[int, int, str], None]
 @dataclass(frozen=True, slots=True)
 class Built:
     """The decimated mesh, its charts, the proxy, the charts' figures, and the distances of mesh and proxy from the
-    dense mesh (m). quads: number of its pairs of triangles that are quads (meshes.whole_quads); 0 for triangles."""
+    dense mesh (m). quads: number of its pairs of triangles that are quads (meshes.whole_quads); 0 for triangles.
+    hair_faces: number of the mesh's last faces that are hair."""
 
     mesh: Mesh
     charts: Charts
@@ -42,6 +43,7 @@ class Built:
     warnings: tuple[str, ...]
     findings: tuple[Finding, ...] = ()
     quads: int = 0
+    hair_faces: int = 0
 
 
 def build(

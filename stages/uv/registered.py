@@ -7,11 +7,13 @@ Lashes are left out: they need a material with opacity.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline import meshes, tiles
+from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
 from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
@@ -22,17 +24,21 @@ from stages.uv.chart_quality import Quality, measure
 from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import face_share
+from stages.uv.hair import hair_faces, hair_mesh
 from stages.uv.judge import judge
-from stages.uv.remainder import left_over
+from stages.uv.remainder import beside_head, left_over
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
-REST = 2  # share of uv.target_faces for what is beside the head
+SHARE = 2  # of uv.target_faces and of uv.proxy_faces, for what is beside the head, and for hair
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
-def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step) -> Built:
-    """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to."""
+def build_registered(
+    head: Head, regions: tuple[str, ...], dense: Mesh, config: Config, step: Step, hair: Mask | None = None
+) -> Built:
+    """The mesh, its layout, a proxy (the cage) and their figures. regions: names that head.region refers to; hair (V,):
+    vertices of the dense mesh that are hair."""
     step(0, 3, "subdividing")
     kept = kept_quads(head, regions)
     fine = np.repeat(kept, 4**head.levels)
@@ -43,7 +49,11 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: 
     proxy, _ = compacted(points, normals, head.quads[kept])
     face = np.repeat(face_quads(head, regions)[fine], 2)
     shown = _shown(head, regions, fine)
-    whole, laid = _with_rest(mesh, charts, shown, dense, config) if config.rest else (mesh, charts)
+    whole, laid, others, hairs = mesh, charts, [], 0
+    if config.rest:
+        others, hairs = _others(mesh, charts, shown, dense, hair, config)
+        whole, laid = joined([(mesh, charts), *others])
+        proxy = _with_coarse(proxy, [part for part, _ in others], config.proxy_faces // SHARE)
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
@@ -54,19 +64,35 @@ def build_registered(head: Head, regions: tuple[str, ...], dense: Mesh, config: 
     step(3, 3, "done")
     span = float(np.ptp(whole.vertices, axis=0).max())
     findings = judge(quality, deviation, span, against, 0.0, crumpled(whole))
-    return Built(whole, laid, proxy, quality, deviation, rough, (), findings)
+    return Built(whole, laid, proxy, quality, deviation, rough, (), findings, hair_faces=hairs)
 
 
-def _with_rest(mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, config: Config) -> tuple[Mesh, Charts]:
-    """The head, and what the scan shows beside it on the next tile."""
+def _others(
+    mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, hair: Mask | None, config: Config
+) -> tuple[list[tuple[Mesh, Charts]], int]:
+    """What the scan shows beside the head, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
-    rest = left_over(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
-    if rest is None:
-        return mesh, charts
-    rest = decimate.decimated(rest, config.target_faces // REST)
-    own = unwrap(rest, config.changed(tiles=1, remesh="adaptive"))  # triangles
-    moved = Charts(own.uvs + np.array([tiles.count(charts), 0], np.float32), own.faces)
-    return joined([(mesh, charts), (rest, moved)])
+    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
+    own = None if hair is None else hair_faces(dense, hair, beside)
+    out, tile, hairs = list[tuple[Mesh, Charts]](), tiles.count(charts), 0
+    for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
+        hairs = 0
+        if part is not None:
+            part = decimate.decimated(part, config.target_faces // SHARE)
+            laid = unwrap(part, config.changed(tiles=1, remesh="adaptive"))  # triangles
+            out.append((part, Charts(laid.uvs + np.array([tile, 0], np.float32), laid.faces)))
+            tile, hairs = tile + 1, len(part.faces)
+    return out, hairs
+
+
+def _with_coarse(proxy: Mesh, others: list[Mesh], faces: int) -> Mesh:
+    """The proxy with the meshes beside the head, in about `faces` triangles each; without one that breaks."""
+    parts = [proxy]
+    for part in others:
+        with suppress(StageError):
+            parts.append(decimate.decimated(part, faces))
+    none = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
+    return joined([(part, none) for part in parts])[0]
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:

@@ -1,5 +1,5 @@
-"""What the scan shows beside the registered template: hair, clothes, shoulders. It becomes a mesh of its own, with
-charts on a tile of its own.
+"""What the scan shows beside the registered template: clothes, shoulders, and hair where it is not told apart. It is a
+mesh of its own, with charts on a tile of its own.
 
 Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with normal n. p is left over if it lies outside
 (n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end) and |p - q| > JOINT.
@@ -18,13 +18,16 @@ OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not 
 SMALL = 0.01  # of the dense mesh's area: smaller pieces are dropped
 
 
-def left_over(dense: Mesh, skin: Mesh) -> Mesh | None:
-    """The part of the dense mesh that the head's skin does not stand for; None if there is none."""
-    beside = _beside(dense, skin)
+def left_over(dense: Mesh, beside: Mask, without: Mask | None = None) -> Mesh | None:
+    """The part of the dense mesh with vertices beside (V,) the head; None if there is none. without (F,): its faces
+    that are another mesh's."""
     keep = np.asarray(beside[dense.faces].any(1), np.bool_)
-    faces = _large(dense, keep)
-    if not len(faces):
-        return None
+    faces = _large(dense, keep if without is None else keep & ~without)
+    return cut_out(dense, faces) if len(faces) else None
+
+
+def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
+    """Faces (F', 3) of the dense mesh as a mesh in which no two fans share a vertex."""
     vertices, compact, rows = meshes.compact(dense.vertices, faces)
     parted, own = meshes.split_apart(np.asarray(vertices, np.float64), compact)
     normals = meshes.vertex_normals(parted, own)
@@ -33,8 +36,8 @@ def left_over(dense: Mesh, skin: Mesh) -> Mesh | None:
     return Mesh(parted.astype(np.float32), normals, own)
 
 
-def _beside(dense: Mesh, skin: Mesh) -> Mask:
-    """(V,) vertices that are left over."""
+def beside_head(dense: Mesh, skin: Mesh) -> Mask:
+    """(V,) vertices of the dense mesh that the head's skin does not stand for."""
     from scipy.spatial import cKDTree
 
     points: F64 = dense.vertices.astype(np.float64)

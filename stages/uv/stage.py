@@ -45,10 +45,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     ref = head.artifact.head if config.mesh != "scan" else None
     if ref is not None:
         from pipeline.registration.head import load_head
+        from stages.uv.hair import hair_vertices
         from stages.uv.registered import build_registered
 
-        registered = load_head(head.path(ref))
-        built, quality = build_registered(registered, head.artifact.regions, dense, config, step), head.artifact.quality
+        registered, hair = load_head(head.path(ref)), hair_vertices(head, len(dense.vertices))
+        built = build_registered(registered, head.artifact.regions, dense, config, step, hair)
+        quality = head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
         if config.mesh != "scan":
@@ -93,6 +95,7 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
         vertices=len(built.mesh.vertices),
         faces=len(built.mesh.faces),
         quads=built.quads,
+        hair_faces=built.hair_faces,
         charts=built.quality.charts,
         tiles=len(built.quality.tile_utilisation),
         utilisation=built.quality.utilisation,
@@ -110,4 +113,4 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=10, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=11, inputs=Inputs, config=Config, output=UvMesh, run=run)

@@ -9,7 +9,18 @@ from pipeline.meshes import Mesh
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.load import load_template
 from stages.bake.smooth import continued
-from stages.bake.unseen import CLEAR, GRAZING, LENGTH, REGIONS, REST, region_colours, region_of, replaced_share
+from stages.bake.unseen import (
+    CLEAR,
+    GRAZING,
+    HAIR,
+    LENGTH,
+    REGIONS,
+    REST,
+    region_colours,
+    region_of,
+    replaced_share,
+    with_hair,
+)
 
 TEMPLATE = load_template()
 
@@ -72,3 +83,17 @@ def test_with_all_or_nothing_seen_the_albedo_is_unchanged() -> None:
     for seen in (True, False):
         whole = np.full(len(albedo), seen)
         np.testing.assert_array_equal(continued(mesh, albedo, whole, np.zeros_like(albedo), LENGTH), albedo)
+
+
+def test_the_scalp_under_hair_goes_on_in_the_colour_of_the_face() -> None:
+    scalp, face = REGIONS.index("scalp"), REGIONS.index("face")
+    region = np.repeat([scalp, face, REST, scalp], 100)
+    hair = np.arange(400) >= 300
+    found = with_hair(region, hair)
+    assert (found[:200] == face).all() and (found[200:300] == REST).all() and (found[300:] == HAIR).all()
+    cosine = np.where(region == scalp, 0.0, 0.9)
+    cosine[300:350] = 0.9
+    albedo = np.where(hair, 0.02, 0.6)[:, None] * np.ones((400, 3))
+    colours = region_colours(albedo, found, cosine)
+    np.testing.assert_allclose(colours[:200], 0.6)
+    np.testing.assert_allclose(colours[300:], 0.02)

@@ -139,3 +139,15 @@ def test_an_objects_material_is_found_under_a_flash() -> None:
     assert np.median(found.f0[well]) == pytest.approx(0.05, rel=0.15)
     assert np.median(found.roughness) == pytest.approx(0.45, abs=0.06)
     assert np.median(found.correction[well]) == pytest.approx(1.1, rel=0.03)
+
+
+def test_hair_is_matt() -> None:
+    """Shine like metal's is keratin's at most; without shine there is no layer; what is labelled skin is hair too."""
+    for f0, wanted in ((0.5, fits.HAIR_RANGE[1]), (0.035, 0.035), (0.0, 0.0)):
+        mesh, at, albedo, seen = scene(f0, 0.6)
+        every = np.ones(len(albedo), bool)
+        found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, every, hair=every)
+        assert found.f0.max() <= fits.HAIR_RANGE[1] + 1e-6 and found.plausible
+        assert np.median(found.f0) == pytest.approx(wanted, rel=0.2, abs=1e-9)  # a rougher lobe needs more
+        assert np.median(found.roughness) > 0.55 and "gloss_skin_f0" not in found.figures
+    assert np.median(found.roughness) == pytest.approx(fits.HAIR_ROUGHNESS, abs=1e-3)

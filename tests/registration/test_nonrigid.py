@@ -106,3 +106,22 @@ def test_a_cancelled_run_stops() -> None:
     cage = cage_of(ball_template(3))
     with pytest.raises(Stop):
         fitted(cage, ball_template(3).vertices, whole(0.1), none(cage), 1.0, check)
+
+
+def test_skin_under_hair_keeps_its_shape_and_is_found_beneath_it() -> None:
+    """The upper half is hair: 8 mm off it says nothing; one that the skin would come through pushes it inwards."""
+    template = ball_template()
+    at = ball_scan(RADIUS)
+    hair = at.vertices[:, 1] > 0.02
+    beneath = np.where(hair, 0.002, 0.0)
+    for thick in (0.008, -0.004):
+        moved = at.vertices * np.where(hair, 1 + thick / RADIUS, 1.0).astype(np.float32)[:, None]
+        scan = Scan(type(at)(moved, at.normals, at.faces), (~hair).astype(float), beneath)
+        cage, found = fit(template, scan)
+        own = cage.points(template.vertices[cage.of_template])
+        top = own[:, 1] > 0.06
+        rest, now = (np.linalg.norm(x[top], axis=1) for x in (own, cage.points(found.vertices)))
+        if thick > 0:  # it moves with the lower half, which is met
+            assert np.abs(now - rest).max() < 2.5e-3 and np.linalg.norm(found.vertices, axis=1).max() < RADIUS + 2e-3
+        else:
+            assert now.max() < RADIUS - 0.006 + 5e-4 and rest.min() > RADIUS - 0.004

@@ -42,3 +42,21 @@ def test_pairs_have_the_plane_s_distance_and_the_weight_of_what_is_seen() -> Non
 def test_nearest_vertex() -> None:
     where, away = scan().nearest(np.array([[0.0, 0.0, 0.2]]))
     assert np.allclose(where, [[0, 0, 0.1]], atol=1e-6) and np.isclose(away[0], 0.1, atol=1e-6)
+
+
+def test_under_hair_only_what_lies_outside_counts() -> None:
+    """A ball whose upper half is hair with the skin 3 mm beneath: a place outside of that is paired with it."""
+    ball = ball_scan(0.1)
+    hair = ball.vertices[:, 1] > 0
+    scan = Scan(ball, (~hair).astype(float), np.where(hair, 0.003, 0.0))
+    way = np.array([[0.0, 1, 0], [0, 1, 0], [0, 1, 0], [0, -1, 0]])
+    points = way * np.array([[0.101], [0.098], [0.095], [0.095]])
+    pairs = scan.pairs(points, way, 0.02)
+    np.testing.assert_allclose(pairs.weight, [1, 1, 0, 1])
+    np.testing.assert_allclose(np.linalg.norm(pairs.where, axis=1), [0.097, 0.097, 0.097, 0.1], atol=1e-6)
+    np.testing.assert_allclose(pairs.distance, [0.004, 0.001, 0.002, 0.005], atol=1e-6)
+    assert pairs.hair.tolist() == [True, True, True, False]
+    sunk = scan.over(points, way, 0.02)
+    np.testing.assert_allclose(sunk, [0.004, 0.001, 0, 0], atol=1e-6)
+    assert not Scan(ball, np.ones(len(hair))).over(points, way, 0.02).any()
+    assert not scan.over(10 * points, way, 0.02).any()

@@ -86,19 +86,34 @@ def write_head(folder: Path) -> Located[RegisteredHead]:
     return Located(made, folder)
 
 
-def template_inputs(folder: Path, mesh: Literal["template", "both"] = "template") -> SyntheticInputs:
-    """The inputs of the usd stage with uv.mesh=template or both."""
+def with_told_hair(template: Located[RegisteredHead], dense: meshes.Mesh) -> Located[RegisteredHead]:
+    """The same, with the vertices above the ball told as hair."""
+    np.savez(template.folder / "hair.npz", hair=dense.vertices[:, 1] > 1.2 * RADIUS)
+    told = template.artifact.model_copy(update={"hair": FileRef.of(template.folder, "hair.npz")})
+    return Located(told, template.folder)
+
+
+def template_inputs(
+    folder: Path, mesh: Literal["template", "both"] = "template", *, hair_told: bool = False
+) -> SyntheticInputs:
+    """The inputs of the usd stage with uv.mesh=template or both. hair_told: the ball above is hair, and one beside is
+    the rest; else the ball above is the rest."""
     plain, template = write_inputs(folder / "plain"), write_head(folder / "head")
-    ball, hair = ball_scan(RADIUS), ball_scan(0.25 * RADIUS, 12, (0, 1.5 * RADIUS, 0))
+    balls = [ball_scan(RADIUS), ball_scan(0.25 * RADIUS, 12, (0, 1.5 * RADIUS, 0))]
+    if hair_told:
+        balls.append(ball_scan(0.3 * RADIUS, 12, (1.6 * RADIUS, 0, 0)))
+    first = np.cumsum([0, *(len(b.vertices) for b in balls)])
     dense = meshes.Mesh(
-        np.concatenate([ball.vertices, hair.vertices]), np.concatenate([ball.normals, hair.normals]),
-        np.concatenate([ball.faces, hair.faces + len(ball.vertices)]),
+        np.concatenate([b.vertices for b in balls]), np.concatenate([b.normals for b in balls]),
+        np.concatenate([b.faces + n for b, n in zip(balls, first[:-1].astype(np.int32), strict=True)]),
     )  # fmt: skip
     meshes.save(folder / "surface.npz", dense)
+    if hair_told:
+        template = with_told_hair(template, dense)
     surface = Located(
         Surface(
             mesh=FileRef.of(folder, "surface.npz"), vertices=len(dense.vertices), faces=len(dense.faces),
-            watertight=True, components=2, removed_components=0, cell=0.001,
+            watertight=True, components=len(balls), removed_components=0, cell=0.001,
         ),
         folder,
     )  # fmt: skip

@@ -91,7 +91,7 @@ export class Channels {
     this.maps = new Map();
     root.traverse((o) => {
       if (!o.isMesh) return;
-      const tile = data.materials.indexOf(o.material.name.replace(/_eyes$/, "")); // eyes have the maps of their tile
+      const tile = data.materials.indexOf(o.material.name.replace(/_(eyes|hair)$/, "")); // both have the maps of their tile
       const state = { arriving: { value: null }, hasArriving: { value: 0 }, darkenSpecular: { value: 0 } };
       if (tile >= 0 && o.material.map) occlude(o.material, state);
       this.parts.push({ mesh: o, look: o.material, tile, state, lines: null });

@@ -2,7 +2,7 @@
 do not subdivide.
 
 The textured mesh (uv stage) begins with the subdivided and displaced quads of the cage, two triangles each. What
-follows is beside the head (hair, clothes) and stays triangles.
+follows is beside the head (clothes) and stays triangles, and so does hair, which comes last.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ class CageSurface:
 @dataclass(frozen=True, slots=True)
 class TemplateMesh:
     """cage: the control cage. coarse: triangles of its first subdivision, displaced. rest: what the scan shows beside
-    it. heights (n,): displacement in metres at the vertices of the textured mesh. rig, coarse_rig: expressions and
-    joints of cage and coarse. coarse_eyes (F,): triangles of coarse that are fitted eyes; None without any."""
+    it; hair: its hair. heights (n,): displacement in metres at the vertices of the textured mesh. rig, coarse_rig:
+    expressions and joints of cage and coarse. coarse_eyes (F,): triangles of coarse that are fitted eyes; None without
+    any."""
 
     cage: CageSurface
     coarse: UvSurface
@@ -58,13 +59,14 @@ class TemplateMesh:
     rig: MeshRig | None = None
     coarse_rig: MeshRig | None = None
     coarse_eyes: Mask | None = None
+    hair: UvSurface | None = None
 
 
 def template_mesh(
-    registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool, measured: str = ""
+    registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool, measured: str = "", hair_faces: int = 0
 ) -> TemplateMesh:
     """What the asset shows of the registered head, and the rest of the textured mesh; with its rig if asked for and
-    there is one. measured: file of further expressions; none if empty."""
+    there is one. measured: file of further expressions; none if empty. hair_faces: the textured mesh's last ones."""
     ref = registered.artifact.head
     assert ref is not None, "the uv stage made its mesh from the head"
     head = load_head(registered.path(ref))
@@ -76,7 +78,9 @@ def template_mesh(
     eyes = eye_quads(head, registered.artifact)[kept]
     cage, (coarse, points) = _cage(head, kept, eyes), _coarse(head, kept)
     fine_eyes = np.repeat(eyes, len(coarse.faces) // len(eyes)) if eyes.any() else None
-    made = TemplateMesh(cage, coarse, _rest(textured, 2 * len(quads)), heights, coarse_eyes=fine_eyes)
+    first, hair = 2 * len(quads), len(textured.faces) - hair_faces
+    rest, hairs = _part(textured, first, hair), _part(textured, hair, len(textured.faces))
+    made = TemplateMesh(cage, coarse, rest, heights, coarse_eyes=fine_eyes, hair=hairs)
     found = registered.artifact.rig
     if found is None or not rigged:
         return made
@@ -114,12 +118,12 @@ def _coarse(head: Head, kept: Mask) -> tuple[UvSurface, csr_array]:
     return made, csr_array((limit(level.quads, level.stencil.shape[0]).point @ level.stencil)[rows])
 
 
-def _rest(textured: UvSurface, first: int) -> UvSurface | None:
-    """The triangles from `first` on, with the vertices that they use."""
-    if len(textured.faces) <= first:
+def _part(textured: UvSurface, first: int, end: int) -> UvSurface | None:
+    """The triangles from `first` to before `end`, with the vertices that they use; None if there are none."""
+    if end <= first:
         return None
-    rows, faces = np.unique(textured.faces[first:], return_inverse=True)
-    used, uv_faces = np.unique(textured.uv_faces[first:], return_inverse=True)
+    rows, faces = np.unique(textured.faces[first:end], return_inverse=True)
+    used, uv_faces = np.unique(textured.uv_faces[first:end], return_inverse=True)
     return UvSurface(
         textured.vertices[rows], textured.normals[rows], faces.reshape(-1, 3).astype(np.int32),
         textured.uvs[used], uv_faces.reshape(-1, 3).astype(np.int32),
@@ -127,8 +131,9 @@ def _rest(textured: UvSurface, first: int) -> UvSurface | None:
 
 
 def with_rest(made: TemplateMesh) -> UvSurface:
-    """The coarse mesh and the rest as one; the vertices of the coarse mesh come first."""
-    return made.coarse if made.rest is None else joined([made.coarse, made.rest])
+    """The coarse mesh, the rest and hair as one; the vertices of the coarse mesh come first, those of hair last."""
+    others = [part for part in (made.rest, made.hair) if part is not None]
+    return joined([made.coarse, *others]) if others else made.coarse
 
 
 def joined(parts: list[UvSurface]) -> UvSurface:

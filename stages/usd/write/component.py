@@ -19,9 +19,10 @@ from stages.usd.write.cage import TemplateMesh, write_cage
 from stages.usd.write.eyes import EYES, bind_eyes, eye_material, pieces
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
-from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
+from stages.usd.write.rig import RIG, MeshRig, bind, with_head, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
 from stages.usd.write.variants import (
+    HAIR,
     RENDER,
     REST,
     SCAN,
@@ -92,9 +93,11 @@ def root_layer(
     thumbnail: str | None,
     rest: bool = False,
     scan: Look | None = None,
+    hair: Look | None = None,
 ) -> Sdf.Layer:
     """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded. rest:
-    whether there is a mesh beside the template; scan: the look of the scan's mesh, if there is one beside it."""
+    whether there is a mesh beside the template; scan, hair: the looks of the scan's mesh and of hair, if there are
+    such meshes beside it."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
@@ -105,12 +108,13 @@ def root_layer(
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    write_looks(stage, prim, look, scan)
-    write_levels(stage, prim, rest=rest, scan=scan is not None, high=high, proxy=proxy)
+    write_looks(stage, prim, look, scan, hair)
+    beside = (*([REST] if rest else []), *([HAIR] if hair is not None else []))
+    write_levels(stage, prim, beside=beside, scan=scan is not None, high=high, proxy=proxy)
     if look.displacement:
         without_displacement(stage, prim, look)
     if scan is not None:
-        write_meshes(stage, prim, rest=rest)
+        write_meshes(stage, prim, beside=beside)
     return detached(stage)
 
 
@@ -120,11 +124,12 @@ def payload_layer(
     proxy: UvSurface | None,
     look: Look,
     scan: tuple[UvSurface, Look] | None = None,
+    hair: Look | None = None,
 ) -> Sdf.Layer:
     """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default. scan:
-    the scan's mesh with its own maps, beside the template's."""
+    the scan's mesh with its own maps, beside the template's. hair: the look of the template's hair."""
     stage = new_stage("Geometry and material of the captured head.", name)
-    _fill(stage, name, mesh, proxy, look)
+    _fill(stage, name, mesh, proxy, look, hair)
     if scan is not None:
         _scan(stage, name, *scan, purposes=proxy is not None)
     return detached(stage)
@@ -143,11 +148,17 @@ def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
 
 
 def package_layer(
-    who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None, eyes: Mask | None = None
+    who: Identity,
+    mesh: UvSurface,
+    look: Look,
+    rig: MeshRig | None = None,
+    eyes: Mask | None = None,
+    hair: Look | None = None,
 ) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
     tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
-    of the mesh's first vertices; eyes (n,): of its first triangles, those with the eyes' material."""
+    of the mesh's first vertices; eyes (n,): of its first triangles, those with the eyes' material; hair: the look of
+    the last tile, if that is hair."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
@@ -158,8 +169,12 @@ def package_layer(
         skeleton = _geo(stage, who.name, rig)
         for piece in pieces(mesh, count, eyes):
             number, part = tiles.FIRST + piece.tile, piece.mesh
-            kind = EYES if piece.eyes else RENDER
-            if piece.eyes:
+            is_hair = hair is not None and piece.tile == count - 1
+            kind = EYES if piece.eyes else HAIR if is_hair else RENDER
+            if hair is not None and is_hair:
+                material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{HAIR}_{number}")
+                preview_networks(stage, material, hair.on_tile(piece.tile))
+            elif piece.eyes:
                 material = eye_material(stage, f"/{who.name}/mtl/{EYES}_{number}", look.on_tile(piece.tile))
             else:
                 material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
@@ -168,12 +183,21 @@ def package_layer(
                 _mesh(stage, f"/{who.name}/geo/{kind}_{number}", part, material),
                 np.unique(part.faces).astype(np.int64),
             )
-            if rig is not None and skeleton is not None and used[-1] < len(rig.weights):
-                bind(stage, made, rig.of_vertices(used), skeleton)
+            if is_hair:
+                made.CreateDoubleSidedAttr(True)
+            if rig is not None and skeleton is not None and (is_hair or used[-1] < len(rig.weights)):
+                bind(stage, made, with_head(rig, len(used)) if is_hair else rig.of_vertices(used), skeleton)
     return detached(stage)
 
 
-def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
+def _fill(
+    stage: Usd.Stage,
+    name: str,
+    mesh: UvSurface | TemplateMesh,
+    proxy: UvSurface | None,
+    look: Look,
+    hair: Look | None = None,
+) -> None:
     skeleton = _geo(stage, name, mesh.rig if isinstance(mesh, TemplateMesh) else None)
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
     material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
@@ -182,12 +206,19 @@ def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: Uv
         bind_eyes(shown[0], mesh.cage.eyes, eye_material(stage, f"/{name}/mtl/{EYES}", look), material)
     if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
         bind(stage, shown[0], mesh.rig, skeleton)
+    hairs = None
+    if isinstance(mesh, TemplateMesh) and mesh.hair is not None and hair is not None:
+        hairs = _mesh(stage, f"/{name}/geo/{HAIR}", mesh.hair, _material(stage, f"/{name}/mtl/{HAIR}", hair))
+        hairs.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
+        hairs.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*hair.mean_albedo)]))
+        if mesh.rig is not None and skeleton is not None:
+            bind(stage, hairs, with_head(mesh.rig, len(mesh.hair.vertices)), skeleton)
     stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)
     for one in shown if stand_in is None else [*shown, stand_in]:
         one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     if stand_in is not None:
         stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
-        for one in shown:
+        for one in shown if hairs is None else [*shown, hairs]:
             one.CreatePurposeAttr(UsdGeom.Tokens.render)
         shown[0].SetProxyPrim(stand_in)
 

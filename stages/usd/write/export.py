@@ -65,7 +65,9 @@ def export(
     mesh = read_mesh(uv.path(uv.artifact.mesh), paired=uv.artifact.quads > 0)
     head, notes = None, _not_written(template, uv, config)
     if uv.artifact.of_template:
-        head = template_mesh(template, mesh, rigged=config.expressions, measured=config.measured)
+        head = template_mesh(
+            template, mesh, rigged=config.expressions, measured=config.measured, hair_faces=uv.artifact.hair_faces
+        )
     proxy, left_out = _proxy(uv, mesh) if config.proxy else (None, [])
     notes += left_out
     high, left_out = _high(surface, mesh) if config.high else (None, [])
@@ -76,7 +78,7 @@ def export(
     maps = write_maps(
         bake, mesh, light, name, folder, check,
         divide=config.divide_shadows and moving is None, acescg=config.acescg,
-        heights=None if head is None else head.heights,
+        heights=None if head is None else head.heights, hair=uv.artifact.hair_faces > 0,
     )  # fmt: skip
     written, look = maps.written, maps.look
     scan = _scan(uv, bake, light, config, folder, check)
@@ -97,11 +99,14 @@ def export(
                 thumbnail=THUMBNAIL,
                 rest=head is not None and head.rest is not None,
                 scan=None if scan is None else scan[1].look,
+                hair=maps.hair,
             ),
             "usda",
         ),
         "payload.usdc": (
-            component.payload_layer(name, head or mesh, proxy, look, None if scan is None else (scan[0], scan[1].look)),
+            component.payload_layer(
+                name, head or mesh, proxy, look, None if scan is None else (scan[0], scan[1].look), maps.hair
+            ),
             "usdc",
         ),
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius, moving), "usda"),
@@ -123,16 +128,22 @@ def export(
         light_mesh, light_rig, light_eyes = with_rest(head), head.coarse_rig, head.coarse_eyes
     if config.usdz:
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
-        plain = replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
-        single = component.package_layer(who, light_mesh, plain, light_rig, light_eyes)
+        plain = _plain(look)
+        hair = None if maps.hair is None else _plain(maps.hair)
+        single = component.package_layer(who, light_mesh, plain, light_rig, light_eyes, hair)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")
-        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig, light_eyes)
+        write_glb(written[-1], name, light_mesh, look, folder, who.stated(), light_rig, light_eyes, maps.hair)
     if config.obj:
-        written += write_obj(folder, name, mesh, look)
+        written += write_obj(folder, name, mesh, look, maps.hair)
     check()
     return Export(written, notes, figures, who.stated())
+
+
+def _plain(look: Look) -> Look:
+    """The look of the preview surface's metallic workflow alone."""
+    return replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
 
 
 def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:

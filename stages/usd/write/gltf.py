@@ -12,7 +12,7 @@ Fitted eyes are a primitive with a material of its own: the colours of their til
 
 Expressions are morph targets of the primitives that they move, as sparse accessors: offsets of positions and normals
 at the moved vertices only. Primitives of one mesh must have the same targets, so what no expression moves is a second
-mesh.
+mesh. Hair is a mesh and a node of its own: the file has no joints, so that it stays with the head.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from stages.usd.write.mesh import UvSurface, tile_count
 from stages.usd.write.package import bounded_png
 from stages.usd.write.rig import MeshRig
 from stages.usd.write.shading import Look
+from stages.usd.write.variants import HAIR
 
 FLOAT, UINT, USHORT, ARRAY_BUFFER, ELEMENT_BUFFER = 5126, 5125, 5123, 34962, 34963
 LINEAR, LINEAR_MIPMAPS, CLAMP = 9729, 9987, 33071
@@ -110,15 +111,18 @@ def write_glb(
     metadata: dict[str, str],
     rig: MeshRig | None = None,
     eyes: Mask | None = None,
+    hair: Look | None = None,
 ) -> None:
     """Write the file. `folder`: base of the look's paths. `metadata`: from the user. rig: of the mesh's first vertices;
-    eyes (n,): of its first triangles, those with the eyes' material."""
+    eyes (n,): of its first triangles, those with the eyes' material; hair: the look of the last tile, if that is
+    hair."""
     binary, count = _Binary(), tile_count(mesh)
-    looks = [look.on_tile(t) for t in range(count)]
+    looks = [(look if hair is None or t < count - 1 else hair).on_tile(t) for t in range(count)]
     bent = [] if rig is None else bent_normals(mesh, rig)
     meshes: list[dict[str, Any]] = []
     moving: list[dict[str, Any]] = []
     still: list[dict[str, Any]] = []
+    hairs: list[dict[str, Any]] = []
     wet: list[int] = []  # tiles with eyes
     for piece in pieces(mesh, count, eyes):
         part = piece.mesh
@@ -127,7 +131,8 @@ def write_glb(
         made = _primitive(part, count + len(wet) - 1 if piece.eyes else piece.tile, binary)
         if rig is not None and part.faces.max() < len(rig.weights):
             made["targets"] = _targets(corners(part)[0], rig, bent, binary)
-        (moving if "targets" in made else still).append(made)
+        is_hair = hair is not None and piece.tile == count - 1
+        (hairs if is_hair else moving if "targets" in made else still).append(made)
     if moving and rig is not None:
         names = [s.name for s in rig.shapes]
         meshes.append(
@@ -135,10 +140,16 @@ def write_glb(
         )
     if still:
         meshes.append({"name": f"{name}_rest" if moving else name, "primitives": still})
+    if hairs:
+        meshes.append({"name": f"{name}_{HAIR}", "primitives": hairs})
     images: list[dict[str, Any]] = []
     names = [name] if count == 1 else [f"{name}_{tiles.FIRST + t}" for t in range(count)]
+    if hair is not None:
+        names[-1] += f"_{HAIR}"
     top = max((_top(folder / x.f0) for x in looks if x.f0), default=0.0)
     materials = [_material(n, x, folder, binary, images, top) for n, x in zip(names, looks, strict=True)]
+    if hair is not None:
+        materials[-1]["doubleSided"] = True  # an open shell, which is seen from inside at its rim
     materials += [_eye_material(names[t], materials[t]) for t in wet]
     asset: dict[str, Any] = {"version": "2.0", "generator": "NeuFace Asset"}
     if metadata:

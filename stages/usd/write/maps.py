@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +43,13 @@ OCCLUSION_SIZE = 1024  # texels: it is computed at the vertices
 
 @dataclass(frozen=True, slots=True)
 class Maps:
-    """The written files, those that the material reads, and figures for the report."""
+    """The written files, those that the material reads, and figures for the report. hair: the look of hair, if the last
+    tile is hair's."""
 
     written: list[Path]
     look: Look
     figures: dict[str, float]
+    hair: Look | None = None
 
 
 def write_maps(
@@ -61,9 +63,11 @@ def write_maps(
     divide: bool,
     acescg: bool = False,
     heights: F32 | None = None,
+    hair: bool = False,
 ) -> Maps:
     """Write textures/ and internal/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also
-    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it."""
+    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it. hair: the last tile
+    is hair's."""
     for folder in (TEXTURES, INTERNAL):
         (asset / folder).mkdir(parents=True, exist_ok=True)
     written = copy_maps(bake, name, asset)
@@ -85,7 +89,11 @@ def write_maps(
         written += shown
         fits += [] if fit is None else [fit]
     check()
-    return Maps(written, look_of(bake, name, asset), figures | fit_figures(fits))
+    every, own = range(bake.artifact.tiles), None
+    if hair:
+        every = every[:-1]
+        own = replace(look_of(bake, name, asset, range(bake.artifact.tiles)[-1:]), displacement=None)
+    return Maps(written, look_of(bake, name, asset, every), figures | fit_figures(fits), own)
 
 
 def _derived(
@@ -225,8 +233,9 @@ def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
 
 
 # ------------------------------------------------------------------ what the material reads
-def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
-    """The files for the material's networks, and the index of refraction of the mean F0 over covered texels."""
+def look_of(bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequence[int] | None = None) -> Look:
+    """The files for the material's networks, and the index of refraction of the mean F0 over covered texels of some
+    tiles; None: of all."""
 
     count = bake.artifact.tiles
 
@@ -242,7 +251,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path) -> Look:
 
     has_f0, texels = "f0" in bake.artifact.maps, 0
     albedo, f0 = np.zeros(3), 0.0
-    for tile in range(count):
+    for tile in range(count) if of_tiles is None else of_tiles:
         covered = covered_texels(bake, tile)
         texels += int(covered.sum())
         shown = read_exr(map_file(asset, name, "albedo", tiles.form("exr", tile, count)))[0][..., :3]

@@ -13,10 +13,12 @@ from pipeline import tiles
 from pipeline.meshes import Charts
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
 from stages.usd.write.shading import MATERIAL, Look
+from stages.usd.write.variants import HAIR
 
 
-def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path]:
-    """Write the files: metres, +Y up, as the asset. Indices start at 1; v, vt and vn are indexed separately."""
+def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look, hair: Look | None = None) -> list[Path]:
+    """Write the files: metres, +Y up, as the asset. Indices start at 1; v, vt and vn are indexed separately. hair: the
+    look of the last tile, if that is hair, which becomes an object of its own."""
     normals = mesh.normals.astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     count = tile_count(mesh)
@@ -34,8 +36,11 @@ def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look) -> list[Path
     lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]
     materials = []
     for t in range(count):
-        called = MATERIAL if count == 1 else f"{MATERIAL}_{tiles.FIRST + t}"
-        materials += _material(called, look.on_tile(t))
+        called, own = MATERIAL if count == 1 else f"{MATERIAL}_{tiles.FIRST + t}", look
+        if hair is not None and t == count - 1:
+            called, own = HAIR, hair
+            lines.append(f"o {name}_{HAIR}")
+        materials += _material(called, own.on_tile(t))
         lines += [f"usemtl {called}", "s 1"]
         lines += [face for face, at in zip(faces, of_face, strict=True) if at == t]
     obj, mtl = folder / f"{name}.obj", folder / f"{name}.mtl"

@@ -5,6 +5,7 @@ geo (SkelRoot)
     animation (SkelAnimation: every weight 0, every joint at rest)
   render (Mesh, bound to rig)
     jawOpen, ... (BlendShape: offsets of the points that it moves)
+  hair (Mesh, if there is hair: follows the joint head and no expression)
 """
 
 from __future__ import annotations
@@ -50,6 +51,13 @@ class MeshRig:
             keep = new[s.rows] >= 0
             shapes.append(Shape(s.name, new[s.rows[keep]], s.offsets[keep]))
         return MeshRig(tuple(shapes), self.joints, self.places, self.weights[rows])
+
+
+def with_head(rig: MeshRig, count: int) -> MeshRig:
+    """The rig of a mesh of `count` vertices that turns with the head as a whole and that no expression moves."""
+    weights = np.zeros((count, len(rig.joints)))
+    weights[:, 0] = 1.0
+    return MeshRig((), rig.joints, rig.places, weights)
 
 
 def mesh_rig(rig: Rig, points: csr_array | None = None) -> MeshRig:

@@ -12,16 +12,19 @@ from stages.usd.write.shading import HEIGHT, MATERIAL, Look
 
 STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
 HIGH, RENDER, PROXY = "high", "render", "proxy"
-REST = "rest"  # beside the template: hair, clothes
+REST = "rest"  # beside the template: clothes, and hair that was not told apart
+HAIR = "hair"  # a mesh and its material
 TEMPLATE, SCAN = "template", "scan"
 SCAN_MATERIAL = f"{MATERIAL}_{SCAN}"
 HIGH_FILE = "high.usdc"
 
 
-def write_looks(stage: Usd.Stage, prim: Usd.Prim, look: Look, scan: Look | None = None) -> None:
+def write_looks(
+    stage: Usd.Stage, prim: Usd.Prim, look: Look, scan: Look | None = None, hair: Look | None = None
+) -> None:
     """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
-    payload alone equals the first variant. scan: of the scan's own material, which follows."""
-    names = (MATERIAL, SCAN_MATERIAL) if scan is not None else (MATERIAL,)
+    payload alone equals the first variant. scan, hair: of these meshes' own materials, which follow."""
+    names = [MATERIAL, *([HAIR] if hair is not None else []), *([SCAN_MATERIAL] if scan is not None else [])]
     materials = [prim.GetPath().AppendPath(f"mtl/{n}") for n in names]
     outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
     if not look.specular:
@@ -40,8 +43,11 @@ def write_looks(stage: Usd.Stage, prim: Usd.Prim, look: Look, scan: Look | None 
     looks.SetVariantSelection(STANDARD)
 
 
-def write_levels(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool, scan: bool, high: bool, proxy: bool) -> None:
-    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone."""
+def write_levels(
+    stage: Usd.Stage, prim: Usd.Prim, *, beside: tuple[str, ...], scan: bool, high: bool, proxy: bool
+) -> None:
+    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone. beside: names of
+    the meshes beside the template (REST, HAIR)."""
     path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
     for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
@@ -52,7 +58,7 @@ def write_levels(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool, scan: bool, hi
         if variant == RENDER:
             continue
         with lods.GetVariantEditContext():
-            for hidden in (RENDER, *([REST] if rest else []), *([SCAN] if scan else [])):
+            for hidden in (RENDER, *beside, *([SCAN] if scan else [])):
                 stage.OverridePrim(path.AppendPath(f"geo/{hidden}")).SetActive(False)
             if variant == HIGH:
                 if proxy:
@@ -88,9 +94,9 @@ def without_displacement(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
     lods.SetVariantSelection(RENDER)
 
 
-def write_meshes(stage: Usd.Stage, prim: Usd.Prim, *, rest: bool) -> None:
-    """Variant set `mesh`: the template's cage with what lies beside it, or the scan's triangles."""
-    shown = {TEMPLATE: [RENDER, *([REST] if rest else [])], SCAN: [SCAN]}
+def write_meshes(stage: Usd.Stage, prim: Usd.Prim, *, beside: tuple[str, ...]) -> None:
+    """Variant set `mesh`: the template's cage with the meshes beside it, or the scan's triangles."""
+    shown = {TEMPLATE: [RENDER, *beside], SCAN: [SCAN]}
     meshes = prim.GetVariantSets().AddVariantSet("mesh")
     for variant, other in ((TEMPLATE, SCAN), (SCAN, TEMPLATE)):
         meshes.AddVariant(variant)

@@ -1,0 +1,61 @@
+"""Hair cut from the dense mesh, and what beside the head is no hair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.ball_head import RADIUS, ball_scan, no_head
+
+from pipeline import meshes
+from pipeline.artifacts import FileRef, Located
+from pipeline.head_artifacts import RegisteredHead
+from pipeline.meshes import Mesh
+from stages.uv.hair import hair_faces, hair_mesh, hair_vertices
+from stages.uv.remainder import beside_head, left_over
+
+
+def scan(thick: float = 0.015) -> tuple[Mesh, np.ndarray]:
+    """A head with a cap of hair, and the cap's vertices."""
+    ball = ball_scan(RADIUS)
+    cap = ball.vertices[:, 1] > 0.05
+    return Mesh(
+        ball.vertices * np.where(cap, 1 + thick / RADIUS, 1)[:, None].astype(np.float32), ball.normals, ball.faces
+    ), cap
+
+
+def beside(dense: Mesh) -> np.ndarray:
+    return beside_head(dense, ball_scan(RADIUS))
+
+
+def test_the_cap_and_the_skin_at_its_rim_are_cut_out() -> None:
+    dense, cap = scan()
+    own = hair_faces(dense, cap, beside(dense))
+    assert (own == cap[dense.faces].any(1)).all()
+    hair = hair_mesh(dense, own)
+    assert hair is not None and meshes.topology(hair.faces, len(hair.vertices)).sound
+    assert len(hair.faces) == own.sum() and (hair.normals * meshes.unit(hair.vertices)).sum(1).min() > 0.9
+    assert left_over(dense, beside(dense), own) is None and left_over(dense, beside(dense)) is not None
+    assert hair_mesh(dense, np.zeros(len(dense.faces), bool)) is None
+
+
+def test_a_small_piece_that_touches_hair_belongs_to_it() -> None:
+    """Some of the cap was not told; far away a knob of the same size stays what it is."""
+    dense, cap = scan()
+    hole = cap & (np.linalg.norm(dense.vertices - [0, 0.115, 0], axis=1) < 0.012)
+    knob = np.linalg.norm(dense.vertices - [0, -RADIUS, 0], axis=1) < 0.008
+    moved = dense.vertices * np.where(knob, 1.1, 1)[:, None].astype(np.float32)
+    dense = Mesh(moved, dense.normals, dense.faces)
+    assert hole.sum() > 3 and knob.sum() > 3
+    own = hair_faces(dense, cap & ~hole, beside(dense))
+    assert own[hole[dense.faces].any(1)].all() and not own[knob[dense.faces].any(1)].any()
+
+
+def test_the_told_hair_must_be_that_of_the_surface(tmp_path: Path) -> None:
+    assert hair_vertices(no_head(tmp_path), 10) is None
+    np.savez(tmp_path / "hair.npz", hair=np.arange(10) > 6)
+    head = Located(RegisteredHead(registered=True, hair=FileRef.of(tmp_path, "hair.npz")), tmp_path)
+    assert hair_vertices(head, 10).tolist() == (np.arange(10) > 6).tolist()  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match="10 vertices.*12"):
+        hair_vertices(head, 12)
