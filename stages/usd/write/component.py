@@ -16,9 +16,10 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
 from pipeline import tiles
 from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
-from stages.usd.write.eyes import EYES, bind_eyes, eye_material, pieces
+from stages.usd.write.eyes import EYES, bind_eyes, eye_material
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
+from stages.usd.write.pieces import Piece, bind_pieces, grouped, pieces, together
 from stages.usd.write.rig import RIG, MeshRig, bind, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
 from stages.usd.write.variants import (
@@ -146,8 +147,9 @@ def package_layer(
     who: Identity, mesh: UvSurface, look: Look, rig: MeshRig | None = None, eyes: Mask | None = None
 ) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
-    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
-    of the mesh's first vertices; eyes (n,): of its first triangles, those with the eyes' material."""
+    tiles is a face set with its own material, because these viewers do not support <UDIM>; what no expression moves is
+    a mesh of its own. rig: of the mesh's first vertices; eyes (n,): of its first triangles,
+    those with the eyes' material."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
@@ -156,21 +158,23 @@ def package_layer(
     else:
         UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
         skeleton = _geo(stage, who.name, rig)
-        for piece in pieces(mesh, count, eyes):
-            number, part = tiles.FIRST + piece.tile, piece.mesh
-            kind = EYES if piece.eyes else RENDER
-            if piece.eyes:
-                material = eye_material(stage, f"/{who.name}/mtl/{EYES}_{number}", look.on_tile(piece.tile))
-            else:
-                material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
-                preview_networks(stage, material, look.on_tile(piece.tile))
-            made, used = (
-                _mesh(stage, f"/{who.name}/geo/{kind}_{number}", part, material),
-                np.unique(part.faces).astype(np.int64),
-            )
-            if rig is not None and skeleton is not None and used[-1] < len(rig.weights):
-                bind(stage, made, rig.of_vertices(used), skeleton)
+        for kind, some in grouped(list(pieces(mesh, count, eyes)), 0 if rig is None else len(rig.weights)).items():
+            whole, faces = together(some, count)
+            made = _mesh(stage, f"/{who.name}/geo/{kind}", whole, None)
+            bind_pieces(made, faces, [_piece_material(stage, who.name, piece, look, count) for piece in some])
+            if rig is not None and skeleton is not None and kind == RENDER:
+                bind(stage, made, rig.of_vertices(np.unique(whole.faces).astype(np.int64)), skeleton)
     return detached(stage)
+
+
+def _piece_material(stage: Usd.Stage, name: str, piece: Piece, look: Look, count: int) -> UsdShade.Material:
+    """The material of one tile's triangles, or of the eyes on it. count: of the tiles."""
+    own, path = look.on_tile(piece.tile), f"/{name}/mtl/{EYES if piece.eyes else MATERIAL}_{tiles.FIRST + piece.tile}"
+    if piece.eyes:
+        return eye_material(stage, path, own, (piece.tile, count))
+    material = UsdShade.Material.Define(stage, path)
+    preview_networks(stage, material, own, (piece.tile, count))
+    return material
 
 
 def _fill(stage: Usd.Stage, name: str, mesh: UvSurface | TemplateMesh, proxy: UvSurface | None, look: Look) -> None:
