@@ -60,7 +60,7 @@ def test_a_template_without_an_open_neck_moves_everywhere() -> None:
 
 
 def collar(low: float, high: float, out: float) -> Scan:
-    """The template's skin, but its neck from `low` to `high` metres from the border, which lies `out` metres outside."""
+    """The template's skin, whose neck from `low` to `high` metres from the border lies `out` metres further out."""
     skin = triangles_of(TEMPLATE.quads[TEMPLATE.parts["skin"]])
     normals = vertex_normals(TEMPLATE.vertices, skin).astype(np.float64)
     under = ((AWAY[skin] > low) & (AWAY[skin] < high)).all(1)
