@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.eyes.ball import IRIS, RADIUS, SPREAD, Eye, sphere_on, turned
 from pipeline.eyes.iris import LEAST_PIXELS, Iris, find_iris
-from pipeline.eyes.picture import directions_at, plane, sights
+from pipeline.eyes.picture import directions_at, plane, shown_between_lids, sights
 from pipeline.meshes import F64
 from pipeline.registration.scan import Scan
 from pipeline.visibility import FittedPhoto, Occluder
@@ -48,6 +48,12 @@ def fitted_eyes(
     return paired({name: _with_iris(eye, off, views, lids, unit) for name, (eye, off) in same.items()})
 
 
+def unseen_eye(ball: F64, axes: F64, unit: float, reason: str) -> FittedBall:
+    """An eye that stays the template's own without a look at the photos: ball (n, 3) its vertices, axes as above."""
+    middle = 0.5 * (ball.min(0) + ball.max(0))
+    return FittedBall(Eye(middle, RADIUS * unit, axes, IRIS * unit), 0.0, 0.0, 0.0, 0.0, reason)
+
+
 def paired(found: Mapping[str, FittedBall]) -> dict[str, FittedBall]:
     """Two eyes with an iris of the same size; both with a reason if they are no pair."""
     good = [f.eye for f in found.values() if not f.reason]
@@ -74,7 +80,7 @@ def _ball(
     start = middle + (own - radius) * axes[2]  # its front stays where it is
     eye, off = Eye(start, radius, axes, IRIS * unit), 0.0
     for _ in range(2):
-        directions = directions_at(plane(SIDE)[sights(eye, views, lids, SIDE).shown()])
+        directions = directions_at(plane(SIDE)[shown_between_lids(eye, views, lids, SIDE)])
         if not len(directions):
             break
         normals = directions @ axes

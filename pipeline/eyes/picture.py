@@ -81,8 +81,47 @@ def looked_up(image: F32, places: F64) -> F32:
     return np.asarray(upper * (1 - y) + lower * y, np.float32)
 
 
+@dataclass(frozen=True, slots=True)
+class _Sight:
+    """A photo that shows an eye: its row, how well (score), cosines (side^2,), pixels (side^2, 2), and pixels per
+    metre."""
+
+    row: int
+    score: float
+    cosine: F64
+    uv: F64
+    fine: float
+
+
+def shown_between_lids(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) -> Mask:
+    """(side, side) what the photos that `sights` reads show of the eye; without reading them."""
+    best = _best_sights(eye, views, lids, side)
+    return np.asarray(np.any([s.cosine > 0 for s in best] or [np.zeros(side * side, bool)], 0).reshape(side, side))
+
+
 def sights(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) -> Sights:
     """What the photos show of the eye between the lids (a mesh without the eye)."""
+    best = _best_sights(eye, views, lids, side)
+    colours, weights = [], []
+    most = max((s.fine for s in best), default=1.0)
+    for s in best:
+        photo = views[s.row].photo
+        assert photo is not None
+        image = np.asarray(read_linear(photo)[..., :3], np.float32)
+        camera = views[s.row].camera
+        scale = np.array([image.shape[1] / camera.width, image.shape[0] / camera.height])
+        at = np.nan_to_num(s.uv * scale - 0.5).astype(np.float32).reshape(side, side, 2)
+        colours.append(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(-1, 3))
+        weights.append((s.cosine * s.fine / most) ** 2)
+    shape = (len(best), side * side)
+    return Sights(
+        np.asarray(colours, np.float32).reshape(*shape, 3), np.asarray(weights, np.float32).reshape(shape),
+        np.array([s.fine for s in best]), tuple(s.row for s in best), side,
+    )  # fmt: skip
+
+
+def _best_sights(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) -> list[_Sight]:
+    """The photos that show the eye best."""
     directions = directions_at(plane(side).reshape(-1, 2))
     points, normals = eye.points(directions), directions @ eye.axes
     front = directions[:, 2] > np.cos(FRONTAL)
@@ -96,24 +135,8 @@ def sights(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) ->
         cosine = np.where(open_ & (cosine > LEAST_COSINE), cosine, 0.0)
         fine = resolution(view, eye)
         if cosine.any():
-            found.append((float(cosine[front].sum()) * fine, i, cosine, uv, fine))
-    best = sorted(found, key=lambda f: (-f[0], f[1]))[:PHOTOS]
-    colours, weights = [], []
-    most = max((f[4] for f in best), default=1.0)
-    for _, i, cosine, uv, fine in best:
-        photo = views[i].photo
-        assert photo is not None
-        image = np.asarray(read_linear(photo)[..., :3], np.float32)
-        camera = views[i].camera
-        scale = np.array([image.shape[1] / camera.width, image.shape[0] / camera.height])
-        at = np.nan_to_num(uv * scale - 0.5).astype(np.float32).reshape(side, side, 2)
-        colours.append(cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR).reshape(-1, 3))
-        weights.append((cosine * fine / most) ** 2)
-    shape = (len(best), side * side)
-    return Sights(
-        np.asarray(colours, np.float32).reshape(*shape, 3), np.asarray(weights, np.float32).reshape(shape),
-        np.array([f[4] for f in best]), tuple(f[1] for f in best), side,
-    )  # fmt: skip
+            found.append(_Sight(i, float(cosine[front].sum()) * fine, cosine, uv, fine))
+    return sorted(found, key=lambda f: (-f.score, f.row))[:PHOTOS]
 
 
 def resolution(view: FittedPhoto, eye: Eye) -> float:

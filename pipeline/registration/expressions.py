@@ -57,9 +57,11 @@ class Triangles:
     gradient: csr_array
 
 
-def transferred(template: Template, vertices: F64, world_from_template: F64) -> Expressions:
+def transferred(
+    template: Template, vertices: F64, world_from_template: F64, covered: Mask | None = None
+) -> Expressions:
     """The expressions on a person's vertices (V, 3), whose similarity (4, 4) from the template is known; offsets in the
-    unit of vertices. Lashes get none."""
+    unit of vertices. Lashes get none. covered (V,): see `neck_share`."""
     given = template.expressions
     if given is None:
         return Expressions((), np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -70,7 +72,7 @@ def transferred(template: Template, vertices: F64, world_from_template: F64) -> 
     before, after = triangles(template.vertices, skin), triangles(person, skin)
     system = csr_array(after.gradient.T @ diags_array(np.repeat(after.area, 2)) @ after.gradient)
     starts, rows, offsets = [0], [], []
-    share = neck_share(template)[:, None]
+    share = neck_share(template, covered)[:, None]
     for name in given.names:
         wanted = template.expression(name) * share
         moves = np.linalg.norm(wanted, axis=1) > LEAST

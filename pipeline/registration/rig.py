@@ -55,17 +55,18 @@ def load_rig(path: Path) -> Rig:
         return Rig(shapes, joints, z["places"], z["weights"].astype(np.float64))
 
 
-def rig_of(template: Template, vertices: F64, world_from_template: F64) -> Rig | None:
-    """The rig of a person's vertices (V, 3); None if the template has no expressions and no joint of the head."""
+def rig_of(template: Template, vertices: F64, world_from_template: F64, covered: Mask | None = None) -> Rig | None:
+    """The rig of a person's vertices (V, 3); None if the template has no expressions and no joint of the head. covered
+    (V,): vertices of the neck under clothes or hair, which stay still."""
     if HEAD not in template.joints:
         return None
-    shapes = transferred(template, vertices, world_from_template)
+    shapes = transferred(template, vertices, world_from_template, covered)
     own = {HEAD: np.ones(len(vertices), np.float64)}
     places = {HEAD: _placed(template, vertices, template.joints[HEAD])}
     jaw = jaw_axis(template)
     if jaw is not None:
         turn, on_axis = jaw
-        own[JAW], places[JAW] = jaw_weights(template, turn, on_axis), _placed(template, vertices, on_axis)
+        own[JAW], places[JAW] = jaw_weights(template, turn, on_axis, covered), _placed(template, vertices, on_axis)
     for eye in EYES:
         if eye in template.parts:
             ball = vertices[template.part_vertices(eye)]
@@ -90,9 +91,9 @@ def jaw_axis(template: Template) -> tuple[F64, F64] | None:
     return turn, np.asarray(np.linalg.lstsq(np.eye(3) - turn, shift, rcond=1e-3)[0])
 
 
-def jaw_weights(template: Template, turn: F64, on_axis: F64) -> F64:
-    """(V,) how far each vertex follows the jaw."""
-    moved = template.expression(OPENS) * neck_share(template)[:, None]
+def jaw_weights(template: Template, turn: F64, on_axis: F64, covered: Mask | None = None) -> F64:
+    """(V,) how far each vertex follows the jaw. covered (V,): see `neck_share`."""
+    moved = template.expression(OPENS) * neck_share(template, covered)[:, None]
     with_jaw = (template.vertices - on_axis) @ turn.T + on_axis - template.vertices
     share = (moved * with_jaw).sum(1) / np.maximum((with_jaw**2).sum(1), 1e-12)
     out = np.clip(share, 0, 1) * _inside(template, SKIN)

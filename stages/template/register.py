@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from pipeline.eyes.fit import FittedBall, fitted_eyes
+from pipeline.eyes.fit import FittedBall, fitted_eyes, unseen_eye
 from pipeline.eyes.place import eye_displacement, eye_rows, with_eyes
 from pipeline.meshes import F64, Indices, Mesh, triangles_of
 from pipeline.registration.cage import Cage, cage_of
@@ -17,6 +17,7 @@ from pipeline.registration.followers import followed
 from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.lids import REST, closing, lids_closed, with_lids
+from pipeline.registration.lips import closing_lips, lips_closed
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
 from pipeline.registration.quality import outer_quads
 from pipeline.registration.refine_identity import refined
@@ -30,7 +31,7 @@ AROUND = 0.25  # metres of the template: the surface further from the head's mid
 ASKED = 30_000  # vertices of the surface whose visibility is computed; the others take that of the nearest
 LANDMARK_REACH = 0.006  # metres of the template: a landmark further from the surface does not guide
 ADULT = 1.1  # metres per metre of the template of an average adult: the unit of a capture of unknown scale
-CLOSED_LIDS = 2.0  # weight of what pulls closed lids together, in that of a point on the surface
+CLOSED_LIDS = 2.0  # weight of what pulls closed lids, or closed lips, together, in that of a point on the surface
 
 Step = Callable[[int, int, str], None]
 
@@ -134,19 +135,18 @@ def eyes_between_lids(
     balls = {part: vertices[template.part_vertices(part)] for part in EYES if part in template.parts}
     if not balls or not views:
         return {}
+    axes = (placed.world_from_template[:3, :3] / placed.scale).T
+    if closed:
+        return {part: unseen_eye(ball, axes, unit, "the eyes are closed") for part, ball in balls.items()}
     points, normals, quads = limit_surface(vertices, level)
     steps = len(quads) // len(template.quads)
     skin = quads[np.repeat(np.isin(np.arange(len(template.quads)), template.parts[SKIN]), steps)]
     lids = Occluder(Mesh(points.astype(np.float32), normals.astype(np.float32), triangles_of(skin)))
-    axes = (placed.world_from_template[:3, :3] / placed.scale).T
-    found = fitted_eyes(balls, axes, scan, views, lids, unit)
-    if not closed:
-        return found
-    return {part: replace(f, reason="the eyes are closed") for part, f in found.items()}
+    return fitted_eyes(balls, axes, scan, views, lids, unit)
 
 
 def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, landmarks: F64, closed: bool) -> Guides:
-    """The landmarks, laid on the scan (their depth is less certain than the surface's), and closed lids."""
+    """The landmarks, laid on the scan (their depth is less certain than the surface's); closed lids and closed lips."""
     points = template.landmarks
     where = landmarks[points.network]
     known = np.isfinite(where).all(1)
@@ -162,6 +162,10 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
     least = np.zeros(len(use))
     if closed:
         more, there = closing(template, placed, cage)
+        stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
+        least = np.concatenate([least, np.full(len(there), CLOSED_LIDS)])
+    if lips_closed(template, landmarks, placed.scale):
+        more, there = closing_lips(template, placed, cage, placed.vertices[cage.of_template])
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
         least = np.concatenate([least, np.full(len(there), CLOSED_LIDS)])
     return Guides(stencil, place_at, least)

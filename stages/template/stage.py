@@ -101,6 +101,7 @@ def _with_hair(
 def _registered(
     found: Registration, template: Template, scan: Scan, config: Config, context: Context
 ) -> RegisteredHead:
+    from pipeline.registration.neck import covered_neck
     from pipeline.registration.rig import rig_of
     from stages.template.figures import figures_of, fitted_eye, region_figures
     from stages.template.judge import judge, refused_fit
@@ -114,7 +115,8 @@ def _registered(
     if why:
         return _refused(config, why)
     found.head.save(context.workdir / HEAD)
-    rig = rig_of(template, found.head.vertices, found.placed.world_from_template)
+    covered = covered_neck(template, found.head.vertices, scan, found.placed.scale)
+    rig = rig_of(template, found.head.vertices, found.placed.world_from_template, covered)
     if rig is not None:
         rig.save(context.workdir / RIG)
     context.log.info("template: %.3f mm from the surface, %d repairs", figures["distance_mm"], found.fitted.repairs)

@@ -11,7 +11,16 @@ import pytest
 from pipeline.eyes.ball import Eye, turned
 from pipeline.eyes.fit import FittedBall, fitted_eyes, paired
 from pipeline.eyes.iris import LEAST_SCORE, find_iris
-from pipeline.eyes.picture import REACH, directions_at, looked_up, places_of, plane, quantile, sights
+from pipeline.eyes.picture import (
+    REACH,
+    directions_at,
+    looked_up,
+    places_of,
+    plane,
+    quantile,
+    shown_between_lids,
+    sights,
+)
 from pipeline.registration.scan import Scan
 from pipeline.visibility import Occluder
 from tests.support.ball_head import ball_scan
@@ -79,6 +88,7 @@ def test_skin_has_no_iris() -> None:
 def test_photos_give_the_colours_without_the_lamp(tmp_path: Path) -> None:
     views = photographed(EYE, tmp_path, VIEWS)
     seen = sights(EYE, views, Occluder(slit(EYE)), 96)
+    assert np.array_equal(shown_between_lids(EYE, views, Occluder(slit(EYE)), 96), seen.shown())
     colour, weight = seen.combined()
     angle = np.arccos(directions_at(plane(96))[..., 2])
     limbus = np.arcsin(EYE.iris / EYE.radius)

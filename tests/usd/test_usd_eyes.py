@@ -59,19 +59,24 @@ def test_nothing_is_wrong_with_it(asset: Path, file: str) -> None:
     assert not [f for f in validate(asset / file) if f.level != "info"]
 
 
-def test_the_package_shows_the_eyes_as_a_mesh_of_their_own(asset: Path) -> None:
+def test_the_package_has_the_eyes_as_a_face_set_of_the_head(asset: Path) -> None:
     stage = Usd.Stage.Open(str(asset / "head.usdz"))
-    eyes = UsdGeom.Mesh.Get(stage, "/head/geo/eyes_1002")
-    assert eyes and len(eyes.GetFaceVertexCountsAttr().Get()) == 2 * 4 * EYES
-    material = UsdShade.MaterialBindingAPI(eyes).ComputeBoundMaterial()[0]
+    head = UsdGeom.Mesh.Get(stage, "/head/geo/render")
+    sets = {str(s.GetPrim().GetName()): s for s in UsdGeom.Subset.GetAllGeomSubsets(head)}
+    assert len(sets["eyes_1002"].GetIndicesAttr().Get()) == 2 * 4 * EYES
+    material = UsdShade.MaterialBindingAPI(sets["eyes_1002"]).ComputeBoundMaterial()[0]
     assert inputs_of(material)["ior"].Get() == pytest.approx(IOR)
     texture = UsdShade.Shader(inputs_of(material)["diffuseColor"].GetConnectedSources()[0][0].source.GetPrim())
     assert texture.GetInput("file").Get().path.endswith("1002.png")
-    every = sum(len(UsdGeom.Mesh(p).GetFaceVertexCountsAttr().Get()) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh))
     full = Usd.Stage.Open(str(asset / "head.usd"))
-    quads = len(UsdGeom.Mesh.Get(full, "/head/geo/render").GetFaceVertexCountsAttr().Get())
-    rest = len(UsdGeom.Mesh.Get(full, "/head/geo/rest").GetFaceVertexCountsAttr().Get())
-    assert every == 2 * 4 * quads + rest
+    count = {
+        name: len(UsdGeom.Mesh.Get(full, f"/head/geo/{name}").GetFaceVertexCountsAttr().Get())
+        for name in ("render", "rest")
+    }
+    assert len(head.GetFaceVertexCountsAttr().Get()) == 2 * 4 * count["render"]
+    assert len(UsdGeom.Mesh.Get(stage, "/head/geo/rest").GetFaceVertexCountsAttr().Get()) == count["rest"]
+    rows = np.concatenate([np.asarray(s.GetIndicesAttr().Get()) for s in sets.values()])
+    assert np.array_equal(np.sort(rows), np.arange(2 * 4 * count["render"]))
 
 
 def test_gltf_has_a_primitive_with_the_cornea_s_index(asset: Path) -> None:

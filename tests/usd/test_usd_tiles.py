@@ -121,13 +121,21 @@ def test_other_formats_have_a_material_for_each_tile(tiled: tuple[Path, UsdAsset
     with zipfile.ZipFile(folder / "head.usdz") as z:
         assert {f"textures/head_albedo.{n}.png" for n in NUMBERS} <= set(z.namelist())
     stage = Usd.Stage.Open(str(folder / "head.usdz"))
-    meshes = [UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
-    assert sum(len(m.GetFaceVertexCountsAttr().Get()) for m in meshes) == count and len(meshes) == 2
-    for m in meshes:
-        material = UsdShade.MaterialBindingAPI(m).ComputeBoundMaterial()[0]
+    (mesh,) = [UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    assert len(mesh.GetFaceVertexCountsAttr().Get()) == count
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()).reshape(-1, 3, 2)
+    assert st.min() >= 0 and st.max() <= 1
+    sets = UsdGeom.Subset.GetAllGeomSubsets(mesh)
+    assert sum(len(s.GetIndicesAttr().Get()) for s in sets) == count
+    for one in sets:
+        material = UsdShade.MaterialBindingAPI(one).ComputeBoundMaterial()[0]
         file = UsdShade.Shader(material.GetPrim().GetChild("albedo")).GetInput("file").Get()
-        assert m.GetPath().name[-4:] in file.path and file.resolvedPath
-        assert np.array(UsdGeom.PrimvarsAPI(m).GetPrimvar("st").Get()).max() <= 1
+        number = one.GetPrim().GetName()[-4:]
+        assert number in file.path and file.resolvedPath
+        moved = UsdShade.Shader(material.GetPrim().GetChild("st_of_part"))
+        scale, shift = (np.array(moved.GetInput(n).Get()) for n in ("scale", "translation"))
+        own = st[np.array(one.GetIndicesAttr().Get())] * scale + shift
+        assert own.min() >= -1e-6 and own.max() <= 1 + 1e-6 and own.max() > 0.9, number
 
 
 # ------------------------------------------------------------------ faults

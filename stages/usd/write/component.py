@@ -16,9 +16,10 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
 from pipeline import tiles
 from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
-from stages.usd.write.eyes import EYES, bind_eyes, eye_material, pieces
+from stages.usd.write.eyes import EYES, bind_eyes, eye_material
 from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
+from stages.usd.write.pieces import Piece, bind_pieces, grouped, pieces, together
 from stages.usd.write.rig import RIG, MeshRig, bind, with_head, write_skeleton
 from stages.usd.write.shading import MATERIAL, Look, preview_networks
 from stages.usd.write.variants import (
@@ -156,9 +157,9 @@ def package_layer(
     hair: Look | None = None,
 ) -> Sdf.Layer:
     """The layer of NAME.usdz. It has no proxy, because viewers on phones show all purposes at once. Each of several
-    tiles is a mesh with its own material and st in the unit square, because these viewers do not support <UDIM>. rig:
-    of the mesh's first vertices; eyes (n,): of its first triangles, those with the eyes' material; hair: the look of
-    the last tile, if that is hair."""
+    tiles is a face set with its own material, because these viewers do not support <UDIM>; what no expression moves is
+    a mesh of its own, and so is hair. rig: of the mesh's first vertices; eyes (n,): of its first triangles, those with
+    the eyes' material; hair: the look of the last tile, if that is hair."""
     stage = new_stage("Preview of the captured head.", who.name)
     _as_component(stage, who)
     count = tile_count(mesh)
@@ -167,27 +168,29 @@ def package_layer(
     else:
         UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
         skeleton = _geo(stage, who.name, rig)
-        for piece in pieces(mesh, count, eyes):
-            number, part = tiles.FIRST + piece.tile, piece.mesh
-            is_hair = hair is not None and piece.tile == count - 1
-            kind = EYES if piece.eyes else HAIR if is_hair else RENDER
-            if hair is not None and is_hair:
-                material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{HAIR}_{number}")
-                preview_networks(stage, material, hair.on_tile(piece.tile))
-            elif piece.eyes:
-                material = eye_material(stage, f"/{who.name}/mtl/{EYES}_{number}", look.on_tile(piece.tile))
-            else:
-                material = UsdShade.Material.Define(stage, f"/{who.name}/mtl/{MATERIAL}_{number}")
-                preview_networks(stage, material, look.on_tile(piece.tile))
-            made, used = (
-                _mesh(stage, f"/{who.name}/geo/{kind}_{number}", part, material),
-                np.unique(part.faces).astype(np.int64),
-            )
-            if is_hair:
-                made.CreateDoubleSidedAttr(True)
-            if rig is not None and skeleton is not None and (is_hair or used[-1] < len(rig.weights)):
-                bind(stage, made, with_head(rig, len(used)) if is_hair else rig.of_vertices(used), skeleton)
+        found, moving = list(pieces(mesh, count, eyes)), 0 if rig is None else len(rig.weights)
+        for kind, some in grouped(found, moving, None if hair is None else count - 1).items():
+            whole, faces = together(some, count)
+            made = _mesh(stage, f"/{who.name}/geo/{kind}", whole, None)
+            own = hair if kind == HAIR and hair is not None else look
+            bind_pieces(made, faces, [_piece_material(stage, who.name, kind, piece, own, count) for piece in some])
+            used = np.unique(whole.faces).astype(np.int64)
+            if kind == HAIR:
+                made.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
+            if rig is not None and skeleton is not None and kind in (RENDER, HAIR):
+                bind(stage, made, with_head(rig, len(used)) if kind == HAIR else rig.of_vertices(used), skeleton)
     return detached(stage)
+
+
+def _piece_material(stage: Usd.Stage, name: str, kind: str, piece: Piece, look: Look, count: int) -> UsdShade.Material:
+    """The material of one tile's triangles, of hair's or of the eyes on it. count: of the tiles."""
+    called = EYES if piece.eyes else HAIR if kind == HAIR else MATERIAL
+    own, path = look.on_tile(piece.tile), f"/{name}/mtl/{called}_{tiles.FIRST + piece.tile}"
+    if piece.eyes:
+        return eye_material(stage, path, own, (piece.tile, count))
+    material = UsdShade.Material.Define(stage, path)
+    preview_networks(stage, material, own, (piece.tile, count))
+    return material
 
 
 def _fill(

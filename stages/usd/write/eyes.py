@@ -5,31 +5,17 @@ The eyes lie on a tile that they share with teeth and tongue; they read the same
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
 from pxr import Usd, UsdGeom, UsdShade, Vt
 
-from pipeline import tiles
 from pipeline.eyes.material import IOR, ROUGHNESS
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import Charts, Mask
+from pipeline.meshes import Mask
 from pipeline.registration.head import Head
 from stages.usd.write.materialx import eye_network
-from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, eye_preview
 
 EYES = "eyes"  # name of the material and of the faces that have it
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """The triangles of one tile that have one material; texture coordinates in the unit square."""
-
-    tile: int
-    eyes: bool
-    mesh: UvSurface
 
 
 def eye_quads(head: Head, found: RegisteredHead) -> Mask:
@@ -38,26 +24,11 @@ def eye_quads(head: Head, found: RegisteredHead) -> Mask:
     return np.asarray(np.isin(head.part, fitted), np.bool_)
 
 
-def pieces(mesh: UvSurface, count: int, eyes: Mask | None) -> Iterator[Piece]:
-    """The pieces of a mesh of `count` tiles. eyes (n,): of its first triangles, those that are eyes."""
-    whole = np.zeros(len(mesh.faces), np.bool_)
-    if eyes is not None:
-        whole[: len(eyes)] = eyes
-    tile = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces)) if count > 1 else np.zeros(len(whole), np.int64)
-    for t in range(count):
-        part, own = on_tile(mesh, t, count), whole[tile == t]
-        for is_eye, keep in ((False, ~own), (True, own)):
-            if keep.all():
-                yield Piece(t, is_eye, part)
-            elif keep.any():
-                some = UvSurface(part.vertices, part.normals, part.faces[keep], part.uvs, part.uv_faces[keep])
-                yield Piece(t, is_eye, some)
-
-
-def eye_material(stage: Usd.Stage, path: str, look: Look) -> UsdShade.Material:
-    """Author the eyes' material with the files of the head's; in MaterialX too where that has such networks."""
+def eye_material(stage: Usd.Stage, path: str, look: Look, part: tuple[int, int] = (0, 1)) -> UsdShade.Material:
+    """Author the eyes' material with the files of the head's; in MaterialX too where that has such networks. part: of
+    the texture coordinates (write/shading.py)."""
     material = UsdShade.Material.Define(stage, path)
-    eye_preview(stage, material, look, IOR, ROUGHNESS)
+    eye_preview(stage, material, look, IOR, ROUGHNESS, part)
     if look.roughness and look.f0:
         eye_network(stage, material, look, IOR, ROUGHNESS)
     return material

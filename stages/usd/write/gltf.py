@@ -30,9 +30,10 @@ from pipeline.colour import srgb_from_linear
 from pipeline.eyes.material import IOR, ROUGHNESS
 from pipeline.images import read_encoded, read_exr
 from pipeline.meshes import F32, Indices, Mask, vertex_normals
-from stages.usd.write.eyes import EYES, pieces
+from stages.usd.write.eyes import EYES
 from stages.usd.write.mesh import UvSurface, tile_count
 from stages.usd.write.package import bounded_png
+from stages.usd.write.pieces import pieces
 from stages.usd.write.rig import MeshRig
 from stages.usd.write.shading import Look
 from stages.usd.write.variants import HAIR

@@ -66,8 +66,8 @@ def write_maps(
     hair: bool = False,
 ) -> Maps:
     """Write textures/ and internal/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also
-    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it. hair: the last tile
-    is hair's."""
+    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it. hair: the last
+    tile is hair's."""
     for folder in (TEXTURES, INTERNAL):
         (asset / folder).mkdir(parents=True, exist_ok=True)
     written = copy_maps(bake, name, asset)

@@ -68,16 +68,17 @@ def connect(target: UsdShade.Input, source: UsdShade.Output) -> None:
 
 
 # ------------------------------------------------------------------ UsdPreviewSurface
-def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) -> None:
+def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look, part: tuple[int, int] = (0, 1)) -> None:
     """Author `preview` as the material's surface, in the metallic workflow, which all importers read in the same way.
-    Author `preview_specular` with a map of F0; it is a variant, because many importers misread it.
+    Author `preview_specular` with a map of F0; it is a variant, because many importers misread it. part: see
+    `_in_part`.
     """
     path = str(material.GetPath())
     name = material.CreateInput("st_name", T.String)
     name.Set("st")
     reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", T.String).ConnectToSource(name)
-    st = reader.CreateOutput("result", T.Float2)
+    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), *part)
     albedo = _texture(stage, st, f"{path}/albedo", look.albedo, "sRGB")
     roughness = _texture(stage, st, f"{path}/roughness", look.roughness, "raw", "r") if look.roughness else None
     normal = _normal_texture(stage, st, f"{path}/normal", look.normal) if look.normal else None
@@ -108,12 +109,20 @@ def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look) 
         material.CreateDisplacementOutput().ConnectToSource(preview, "displacement")
 
 
-def eye_preview(stage: Usd.Stage, material: UsdShade.Material, look: Look, ior: float, roughness: float) -> None:
-    """Author `preview` of an eye: the head's colours and displacement under a clear surface of one roughness."""
+def eye_preview(
+    stage: Usd.Stage,
+    material: UsdShade.Material,
+    look: Look,
+    ior: float,
+    roughness: float,
+    part: tuple[int, int] = (0, 1),
+) -> None:
+    """Author `preview` of an eye: the head's colours and displacement under a clear surface of one roughness. part: see
+    `_in_part`."""
     path = str(material.GetPath())
     reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", T.String).Set("st")
-    st = reader.CreateOutput("result", T.Float2)
+    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), *part)
     surface = shader(stage, f"{path}/preview", "UsdPreviewSurface")
     surface.CreateInput("useSpecularWorkflow", T.Int).Set(0)
     for name, value in (("metallic", 0.0), ("ior", ior), ("roughness", roughness)):
@@ -126,6 +135,18 @@ def eye_preview(stage: Usd.Stage, material: UsdShade.Material, look: Look, ior: 
         connect(surface.CreateInput("displacement", T.Float), height)
         surface.CreateOutput("displacement", T.Token)
         material.CreateDisplacementOutput().ConnectToSource(surface.ConnectableAPI(), "displacement")
+
+
+def _in_part(stage: Usd.Stage, path: str, st: UsdShade.Output, number: int, count: int) -> UsdShade.Output:
+    """Texture coordinates of a map of which the mesh has `count` side by side in the unit square, in this map's own
+    square: (count u - number, v)."""
+    if count == 1:
+        return st
+    out = shader(stage, f"{path}/st_of_part", "UsdTransform2d")
+    connect(out.CreateInput("in", T.Float2), st)
+    out.CreateInput("scale", T.Float2).Set(Gf.Vec2f(count, 1))
+    out.CreateInput("translation", T.Float2).Set(Gf.Vec2f(-number, 0))
+    return out.CreateOutput("result", T.Float2)
 
 
 def _texture(

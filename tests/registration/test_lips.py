@@ -1,0 +1,78 @@
+"""Closed lips are held together; an open mouth is left as it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import eye_array
+from scipy.sparse.linalg import splu
+from support.ball_head import ball_template
+
+from pipeline.registration.cage import cage_of
+from pipeline.registration.identity_fit import PlacedHead
+from pipeline.registration.lips import CLOSED, GAP, INNER, closing_lips, lips_closed, touching
+from pipeline.registration.subdivision import limit
+from pipeline.template.load import load_template
+
+TEMPLATE = load_template()
+CAGE = cage_of(TEMPLATE)
+
+
+def placed(scale: float = 1.0) -> PlacedHead:
+    world = np.diag([scale, scale, scale, 1.0])
+    return PlacedHead(world, np.zeros(0), scale * TEMPLATE.vertices, np.zeros(0), 0.0)
+
+
+def landmarks(apart: float) -> np.ndarray:
+    out = np.full((468, 3), np.nan)
+    out[INNER[0]], out[INNER[1]] = [0, apart / 2, 0.1], [0, -apart / 2, 0.1]
+    return out
+
+
+@pytest.mark.parametrize("scale", [1.0, 37.0])
+def test_what_is_wanted_is_the_rest_without_its_slit(scale: float) -> None:
+    """By geometry alone: each pull is a difference of limit points, and only its part along y changes."""
+    head = placed(scale)
+    rest = head.vertices[CAGE.of_template]
+    stencil, where = closing_lips(TEMPLATE, head, CAGE, rest)
+    assert len(where) > 10
+    np.testing.assert_allclose(np.asarray(stencil.sum(1)).ravel(), 0, atol=1e-12)
+    before = np.asarray(stencil @ rest)
+    np.testing.assert_allclose(where[:, 1], GAP * scale, rtol=1e-9)
+    np.testing.assert_allclose(where[:, [0, 2]], before[:, [0, 2]], atol=1e-12 * scale)
+    assert np.abs(before[:, 1]).max() < 0.004 * scale  # they do face each other
+    assert np.abs(before[:, 0]).max() < 1e-3 * scale
+
+
+def test_lips_that_are_pulled_apart_meet_again() -> None:
+    """A least-squares solution with a weak pull to a mouth whose lower lip has dropped by 2 mm."""
+    head = placed()
+    rest = head.vertices[CAGE.of_template]
+    stencil, where = closing_lips(TEMPLATE, head, CAGE, rest)
+    drop = TEMPLATE.expression("jawOpen")[CAGE.of_template]
+    open_ = rest + 2e-3 * drop / np.abs(drop[:, 1]).max()
+    a = (stencil.T @ stencil + 1e-4 * eye_array(len(rest))).tocsc()
+    x = splu(a).solve(stencil.T @ where + 1e-4 * open_)
+    assert (np.asarray(stencil @ open_)[:, 1] > 1.2e-3).mean() > 0.5
+    np.testing.assert_allclose((stencil @ x)[:, 1], GAP, atol=2e-5)
+
+
+def test_the_ring_is_where_the_mean_head_touches() -> None:
+    points = np.asarray(limit(CAGE.quads, len(CAGE.of_template)).point @ TEMPLATE.vertices[CAGE.of_template])
+    rows = np.searchsorted(CAGE.of_template, touching(TEMPLATE))
+    upper = points[rows[-TEMPLATE.expression("jawOpen")[touching(TEMPLATE), 1] < 1e-3]]
+    lower = points[rows[-TEMPLATE.expression("jawOpen")[touching(TEMPLATE), 1] > 5e-3]]
+    middle = [p[np.abs(p[:, 0]) < 0.008, 1].mean() for p in (upper, lower)]
+    assert abs(middle[0] - middle[1]) < 1.5e-3
+
+
+@pytest.mark.parametrize(
+    ("apart", "closed"), [(0.0, True), (0.9 * CLOSED, True), (1.1 * CLOSED, False), (0.02, False), (np.nan, False)]
+)
+def test_an_open_mouth_is_left_open(apart: float, closed: bool) -> None:
+    assert lips_closed(TEMPLATE, landmarks(apart), 1.0) is closed
+    assert lips_closed(TEMPLATE, 9.0 * landmarks(apart), 9.0) is closed
+
+
+def test_a_template_without_a_mouth_is_never_closed() -> None:
+    assert not lips_closed(ball_template(4), landmarks(0.0), 1.0)
