@@ -14,7 +14,7 @@ Source: Laurentini, The visual hull concept for silhouette-based image understan
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -292,35 +292,80 @@ def surface_points(hull: Hull) -> F64:
     return np.concatenate(found)
 
 
-def render_silhouette(hull: Hull, camera: Camera, height: int, width: int) -> F32:
-    """(height, width) soft silhouette in [0, 1] of the hull in the camera's whole frame, distortion included.
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """What `render_silhouette` projects: a hull as points, made once for all views.
 
-    Points on the surface and inside voxels are projected, and gaps between them are filled by a morphological closing.
-    It does not move the outermost points, so the outline is accurate to about a tenth of a voxel's footprint.
+    shell: (N, 3) points on the surface, and centres of the inside voxels at the surface or at the grid's border.
+    inside: (M, 3) the same with all inside voxels, for the depth. cell: asset units.
+    """
+
+    shell: F64
+    inside: F64
+    cell: float
+
+
+def cloud(hull: Hull) -> Cloud:
+    """A hull as points. The shell lacks voxels deep inside: in every view a part of the surface lies before them."""
+    inside = hull.level <= 0
+    deep = ndimage.binary_erosion(inside)  # with its six neighbours inside; beyond the grid is outside
+    surface = surface_points(hull)
+    shell = np.concatenate([surface, hull.centres(inside & ~deep)])
+    return Cloud(shell, np.concatenate([surface, hull.centres(inside)]), hull.cell)
+
+
+def render_silhouette(points: Cloud, camera: Camera, height: int, width: int) -> F32:
+    """(height, width) soft silhouette in [0, 1] of a hull in the camera's whole frame, distortion included.
+
+    The shell is projected, and gaps between its points are filled by a morphological closing. It does not move the
+    outermost points, so the outline is accurate to about a tenth of a voxel's footprint.
     """
     import cv2
 
-    points = np.concatenate([surface_points(hull), hull.centres(hull.level <= 0)])
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
     cam_from_world = inverse_rigid(matrix(camera.world_from_cam))
-    uv, z = project(K, cam_from_world, d, points)
-    good = z > 1e-9
-    if np.any(d):
-        flat = points @ cam_from_world[:2, :3].T + cam_from_world[:2, 3]
-        good &= np.hypot(flat[:, 0], flat[:, 1]) < lens_radius(camera) * np.where(good, z, 0)
-    if not good.any():
+    reach = lens_radius(camera) if np.any(d) else None
+    depth = _middle_depth(points, cam_from_world, reach)
+    if depth is None:
         return np.zeros((height, width), np.float32)
-    footprint = hull.cell * np.sqrt(K[0, 0] * K[1, 1]) / float(np.median(z[good]))
+    footprint = points.cell * np.sqrt(K[0, 0] * K[1, 1]) / depth
     factor = float(np.clip(4.0 / footprint, 256 / max(camera.width, camera.height), 1.0))  # about 4 pixels a voxel
     w, h = max(1, round(camera.width * factor)), max(1, round(camera.height * factor))
     radius = int(np.ceil(1.2 * footprint * factor)) + 1
     pad = 2 * radius + 1
-    at = np.floor(uv[good] * (w / camera.width, h / camera.height)).astype(np.int64) + pad
-    at = at[(at >= 0).all(1) & (at[:, 0] < w + 2 * pad) & (at[:, 1] < h + 2 * pad)]
     canvas = np.zeros((h + 2 * pad, w + 2 * pad), np.uint8)
-    canvas[at[:, 1], at[:, 0]] = 255
+    for some in _chunks(points.shell):
+        uv, z = project(K, cam_from_world, d, some)
+        uv = uv[_before(some, z, cam_from_world, reach)]
+        at = np.floor(uv * (w / camera.width, h / camera.height)).astype(np.int64) + pad
+        at = at[(at >= 0).all(1) & (at[:, 0] < w + 2 * pad) & (at[:, 1] < h + 2 * pad)]
+        canvas[at[:, 1], at[:, 0]] = 255
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     canvas = np.asarray(cv2.morphologyEx(canvas, cv2.MORPH_CLOSE, disc), np.uint8)[pad : pad + h, pad : pad + w]
     smooth = np.ascontiguousarray(canvas.astype(np.float32) / 255)
     mode = cv2.INTER_AREA if width <= w else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(smooth, (width, height), interpolation=mode), np.float32)
+
+
+def _middle_depth(points: Cloud, cam_from_world: F64, reach: float | None) -> float | None:
+    """Median depth_z of the hull's inside, asset units; None if the camera sees nothing of it."""
+    found = []
+    for some in _chunks(points.inside):
+        z = some @ cam_from_world[2, :3] + cam_from_world[2, 3]
+        found.append(z[_before(some, z, cam_from_world, reach)])
+    depths = np.concatenate([*found, np.empty(0)])
+    return float(np.median(depths)) if len(depths) else None
+
+
+def _chunks(points: F64) -> Iterator[F64]:
+    return (points[i : i + CHUNK] for i in range(0, len(points), CHUNK))
+
+
+def _before(points: F64, z: F64, cam_from_world: F64, reach: float | None) -> Bool:
+    """(N,) which points are in front of the camera and within `reach` of the axis on the z = 1 plane, where its lens
+    model holds; None: everywhere."""
+    good = z > 1e-9
+    if reach is not None:
+        x, y = (points @ m[:3] + m[3] for m in cam_from_world[:2])  # one by one: BLAS is slow for (N, 3) by (3, 2)
+        good &= x * x + y * y < (reach * np.where(good, z, 0)) ** 2
+    return np.asarray(good)

@@ -18,7 +18,7 @@ from pipeline.artifacts import Camera, Extent
 from pipeline.errors import StageError
 from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
-from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, visual_hull
+from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, visual_hull
 from pipeline.transforms import inverse_rigid, matrix
 
 F32 = npt.NDArray[np.float32]
@@ -66,9 +66,10 @@ def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agree
     cell = 2 * edge / CELLS
     small = [_shrunk(a) for a in alphas]
     lenient = visual_hull(cameras, small, [-edge] * 3, [edge] * 3, cell, max_outside=WRONG, outside_share=WRONG_SHARE)
+    points = cloud(lenient)
     out, doubtful = list(alphas), {}
     for i, (camera, alpha) in enumerate(zip(cameras, small, strict=True)):
-        lacks = _lacks(lenient, camera, alpha, cell)
+        lacks = _lacks(points, camera, alpha, cell)
         if lacks is not None:
             h, w = alphas[i].shape
             where = cv2.resize(lacks.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
@@ -85,7 +86,7 @@ def _shrunk(alpha: F32) -> F32:
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _lacks(lenient: Hull, camera: Camera, alpha: F32, cell: float) -> Bool | None:
+def _lacks(lenient: Cloud, camera: Camera, alpha: F32, cell: float) -> Bool | None:
     """(h, w) where a mask clearly lacks what the lenient hull shows; None if it lacks nothing significant."""
     h, w = alpha.shape
     shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5

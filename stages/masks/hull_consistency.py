@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.artifacts import Camera
-from pipeline.hull import BAND_CELLS, Hull, render_silhouette, visual_hull
+from pipeline.hull import BAND_CELLS, Hull, cloud, render_silhouette, visual_hull
 from pipeline.support import Support
 from stages.masks.region import F32, Bool, dilated, eroded, region
 
@@ -60,6 +60,7 @@ def opinions(
                     min_views=least, max_outside=lenient, outside_share=WRONG_SHARE)
         for least in (min(3, len(voters)), 0)
     ))  # fmt: skip
+    hull, may_be = cloud(sure), cloud(possible)
     out = []
     for camera, alpha in zip(cameras, alphas, strict=True):
         h, w = alpha.shape
@@ -69,8 +70,8 @@ def opinions(
             out.append(Opinion(nowhere, ~nowhere, nowhere, 1, None))
             continue
         disc = disc.scaled(w / camera.width)
-        silhouette = render_silhouette(sure, camera, h, w) >= 0.5
-        may = (render_silhouette(possible, camera, h, w) >= 0.5) | ~disc.covers(h, w, POSSIBLE)
+        silhouette = render_silhouette(hull, camera, h, w) >= 0.5
+        may = (render_silhouette(may_be, camera, h, w) >= 0.5) | ~disc.covers(h, w, POSSIBLE)
         here = disc.covers(h, w)
         margin = max(1, round(MARGIN * disc.radius * cell / roi_radius))
         out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here)))

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.directions import STEEP, elevations, grid
-from pipeline.hull import Hull, render_silhouette, surface_points, visual_hull
+from pipeline.hull import Hull, cloud, render_silhouette, surface_points, visual_hull
 from pipeline.transforms import F64, matrix
 from pipeline.verdict import Finding, Limits, judged
 from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
@@ -188,12 +188,13 @@ def _carved(views: Sequence[Seen], roi_radius: float, lenient: int) -> Hull:
 
 def _ious(views: Sequence[Seen], hull: Hull, roi_radius: float) -> F64:
     """(N,) IoU of each mask with the hull's silhouette within the region of interest."""
+    points = cloud(hull)
     out = []
     for v in views:
         h, w = v.alpha.shape
         disc = region(v.camera, roi_radius)
         here = np.ones((h, w), bool) if disc is None else disc.scaled(w / v.camera.width).covers(h, w)
-        mask, shown = v.alpha >= 0.5, render_silhouette(hull, v.camera, h, w) >= 0.5
+        mask, shown = v.alpha >= 0.5, render_silhouette(points, v.camera, h, w) >= 0.5
         out.append((mask & shown & here).sum() / max(1, ((mask | shown) & here).sum()))
     return np.array(out, np.float64)
 

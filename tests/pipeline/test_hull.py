@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
-from pipeline.hull import Hull, hull_bounds, hull_sdf, render_silhouette, surface_points, visual_hull
+from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, surface_points, visual_hull
 from pipeline.silhouettes import signed_pixels
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 
@@ -231,14 +231,37 @@ def test_silhouette_matches_the_photo(ball: tuple[list[Camera], list[F32], Hull]
     for camera in (looking_at([0.5, 0.4, 0.8]), looking_at([0.3, -0.7, 0.6], distortion=LENS)):
         truth = sphere_alpha(camera) >= 0.5
         for size in (SIZE, 2 * SIZE):
-            found = render_silhouette(hull, camera, size, size)
+            found = render_silhouette(cloud(hull), camera, size, size)
             assert found.dtype == np.float32 and found.shape == (size, size)
             scaled = np.kron(truth, np.ones((size // SIZE, size // SIZE), bool))
             assert ((found >= 0.5) & scaled).sum() / ((found >= 0.5) | scaled).sum() > 0.955
     behind = looking_at([0.0, 0.0, 1.0])
     turned = matrix(behind.world_from_cam)
     turned[:3, :3] = turned[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
-    assert not render_silhouette(hull, behind.model_copy(update={"world_from_cam": rows(turned)}), 64, 64).any()
+    assert not render_silhouette(cloud(hull), behind.model_copy(update={"world_from_cam": rows(turned)}), 64, 64).any()
+
+
+@pytest.mark.parametrize("edge", [0.16, 0.05])  # the ball, and a cube in it: all of its surface is the grid's border
+def test_the_shell_covers_what_all_voxels_cover(edge: float) -> None:
+    cameras = around(40)
+    hull = visual_hull(cameras, [sphere_alpha(c) for c in cameras], *cube(edge), CELL)
+    points = cloud(hull)
+    assert len(points.shell) < 0.5 * len(points.inside)
+    every = Cloud(points.inside, points.inside, points.cell)
+    for camera in (
+        *around(5),
+        looking_at([0.3, -0.2, 0.25], focal=150.0),
+        looking_at([0.5, 0.1, 1.0], distortion=LENS),
+    ):
+        found = render_silhouette(points, camera, SIZE, SIZE)
+        assert found.any()
+        assert (found == render_silhouette(every, camera, SIZE, SIZE)).all()
+
+
+def test_an_empty_hull_has_no_silhouette() -> None:
+    level = np.full((3, 4, 5), 0.1, np.float32)
+    empty = Hull(level <= 0, level, np.zeros((3, 4, 5), np.int16), np.zeros(3), 0.1)
+    assert not render_silhouette(cloud(empty), looking_at([0.0, 0.0, 1.0]), 32, 32).any()
 
 
 def test_signed_pixels_are_sub_pixel() -> None:

@@ -17,7 +17,7 @@ import pytest
 from stages import registry
 from tests.support.points import PATIENCE, hold, read_until
 from tests.support.toy_stages import TOYS
-from workflows.cli.main import main, parser
+from workflows.cli.main import COMMANDS, main, parser
 
 TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
 
@@ -70,19 +70,7 @@ def test_unknown_words_are_exit_code_2_and_leave_nothing(
 
 
 def test_every_command_has_help(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (
-        "run",
-        "demo",
-        "validate",
-        "render",
-        "report",
-        "view",
-        "doctor",
-        "batch",
-        "serve",
-        "schedule",
-        "check",
-    ):
+    for command in COMMANDS:
         with pytest.raises(SystemExit) as e:
             parser().parse_args([command, "--help"])
         assert e.value.code == 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import threading
 from pathlib import Path
-from typing import Any
 
 from pipeline.errors import Cancelled, UsageError
 from workflows.batch.request import BatchRequest
@@ -17,9 +16,8 @@ from workflows.server import environment
 ON_A_SERVER = ("deployment", "chunk", "priority", "gpus", "lost_after")
 
 
-def add_commands(commands_of: Any) -> None:
-    """Their options."""
-    batch = commands_of.add_parser("batch", help="many captures, each a run of its own; run it again to resume")
+def batch_options(batch: argparse.ArgumentParser) -> None:
+    """Those of neuface batch."""
     add_request_options(batch, BatchRequest, without=ON_A_SERVER)
     batch.add_argument("--workers", type=int, default=1, metavar="N", help="captures at a time here (%(default)s)")
     batch.add_argument("--dry-run", action="store_true", help="say what would run, and run nothing")
@@ -27,7 +25,10 @@ def add_commands(commands_of: Any) -> None:
     server.add_argument("--server", action="store_true", help="submit a run for each capture to $PREFECT_API_URL")
     add_request_options(server, BatchRequest, only=ON_A_SERVER)
     batch.set_defaults(run=batch_command)
-    serve = commands_of.add_parser("serve", help="a server and this machine as its worker, without a pool")
+
+
+def serve_options(serve: argparse.ArgumentParser) -> None:
+    """Those of neuface serve."""
     serve.add_argument("--host", default="127.0.0.1", help="address of the server's page (%(default)s: this machine)")
     serve.add_argument("--port", type=int, default=4200, help="(%(default)s)")
     serve.add_argument("--limit", type=int, default=1, metavar="N", help="captures at a time (%(default)s)")

@@ -18,19 +18,12 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
+from importlib import import_module
 
 from pipeline.errors import Cancelled, NeufaceError, UsageError, stage_error_from_os_error
-from workflows.batch import commands as batch_commands
-from workflows.batch import schedule
-from workflows.bench import commands as bench_commands
-from workflows.cli import check, commands, settings
-from workflows.cli.console import Console
-from workflows.cli.options import add_request_options
 from workflows.cli.parsing import Parser
-from workflows.compare import command as compare
 from workflows.run.interrupt import Interrupted, as_exceptions, code_of
-from workflows.run.request import RunRequest
-from workflows.store import commands as store_commands
 
 EXAMPLES = """examples:
   neuface demo                                        a made-up head, start to end, checked against the truth
@@ -40,12 +33,59 @@ EXAMPLES = """examples:
   neuface render runs/anna --env studio.hdr --turntable 24 --out runs/anna/turntable
 """
 
-JSON_HELP = "one JSON object per line on standard output: stages, progress, warnings, verdict"
-ENV_HELP = "captured, key, overcast, sunset, or a lat-long .hdr or .exr"
+# Every command: its help, and the module and function that add its options. Loaded when the command is asked for, so
+# that `neuface --help` does not load what the commands work with.
+COMMANDS: dict[str, tuple[str, str, str]] = {
+    "run": ("one capture -> asset and report", "workflows.cli.command_options", "run_options"),
+    "check": ("are these photos good enough? no fit, seconds", "workflows.cli.check", "add_options"),
+    "demo": (
+        "the built-in demo capture -> asset, report, figures against the truth",
+        "workflows.cli.command_options",
+        "demo_options",
+    ),
+    "validate": (
+        "every check of an asset; exit code 1 on a fault",
+        "workflows.cli.command_options",
+        "validate_options",
+    ),
+    "render": (
+        "render the exported asset: photos' views, or a turntable",
+        "workflows.cli.command_options",
+        "render_options",
+    ),
+    "turntable": (
+        "a film of one turn around the exported asset",
+        "workflows.cli.command_options",
+        "turntable_options",
+    ),
+    "expressions": (
+        "an OBJ for each expression of an asset",
+        "workflows.cli.command_options",
+        "expressions_options",
+    ),
+    "compare": ("two runs side by side: figures, settings, views, maps", "workflows.compare.command", "add_options"),
+    "report": ("(re)build the report of a run", "workflows.cli.command_options", "report_options"),
+    "view": (
+        "show a run in this machine's browser, also while it goes on",
+        "workflows.cli.command_options",
+        "view_options",
+    ),
+    "bench": ("measurements that repeat", "workflows.bench.commands", "add_commands"),
+    "batch": (
+        "many captures, each a run of its own; run it again to resume",
+        "workflows.batch.commands",
+        "batch_options",
+    ),
+    "serve": ("a server and this machine as its worker, without a pool", "workflows.batch.commands", "serve_options"),
+    "store": ("what finished stages take on disk: ls, gc, purge", "workflows.store.commands", "add_commands"),
+    "schedule": ("hours, cost and disk of a batch, on paper", "workflows.batch.schedule", "add_options"),
+    "settings": ("every setting: meaning, limits, presets", "workflows.cli.settings", "add_options"),
+    "doctor": ("is this machine ready?", "workflows.cli.command_options", "doctor_options"),
+}
 
 
 def parser() -> argparse.ArgumentParser:
-    """All commands and their options."""
+    """All commands. A command's own options are added when it is the one that is parsed."""
     p = Parser(
         prog="neuface",
         description="Photos of a head in, a relightable USD asset out.",
@@ -54,90 +94,13 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--verbose", action="store_true", help="also show the log of the stages, and tracebacks")
     commands_of = p.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _run_options(commands_of.add_parser("run", help="one capture -> asset and report"))
-    check.add_options(commands_of.add_parser("check", help="are these photos good enough? no fit, seconds"))
-    demo = commands_of.add_parser("demo", help="the built-in demo capture -> asset, report, figures against the truth")
-    demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
-    demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
-    demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
-    add_request_options(demo, RunRequest, only=("preset", "device", "store"))
-    demo.add_argument("--json", action="store_true", help=JSON_HELP)
-    demo.set_defaults(run=commands.demo_command)
-    validate = commands_of.add_parser("validate", help="every check of an asset; exit code 1 on a fault")
-    validate.add_argument("asset", metavar="ASSET.usd", help=".usd, .usda, .usdc or .usdz")
-    validate.add_argument("--json", metavar="FILE", help="write every finding as JSON; - for standard output")
-    validate.set_defaults(run=commands.validate_command)
-    _render_options(commands_of.add_parser("render", help="render the exported asset: photos' views, or a turntable"))
-    _turntable_options(commands_of.add_parser("turntable", help="a film of one turn around the exported asset"))
-    _expressions_options(commands_of.add_parser("expressions", help="an OBJ for each expression of an asset"))
-    for name, text, run in (
-        ("report", "(re)build the report of a run", commands.report_command),
-        ("view", "serve the report of a run to this machine's browser", commands.view_command),
-    ):
-        sub = commands_of.add_parser(name, help=text)
-        sub.add_argument("folder", metavar="DIR", help="the --out of that run")
-        sub.set_defaults(run=run)
-    compare.add_options(commands_of.add_parser("compare", help="two runs side by side: figures, settings, views, maps"))
-    bench_commands.add_commands(commands_of.add_parser("bench", help="measurements that repeat"))
-    batch_commands.add_commands(commands_of)
-    store_commands.add_commands(
-        commands_of.add_parser("store", help="what finished stages take on disk: ls, gc, purge")
-    )
-    schedule.add_options(commands_of.add_parser("schedule", help="hours, cost and disk of a batch, on paper"))
-    settings.add_options(commands_of.add_parser("settings", help="every setting: meaning, limits, presets"))
-    doctor = commands_of.add_parser("doctor", help="is this machine ready?")
-    doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
-    doctor.set_defaults(run=commands.doctor_command)
+    for name, (text, module, function) in COMMANDS.items():
+        commands_of.add_parser(name, help=text).fill = partial(_add_options, module, function)
     return p
 
 
-def _run_options(run: argparse.ArgumentParser) -> None:
-    add_request_options(run, RunRequest, without=("fit_slots",))
-    run.add_argument("--author", help="who made the capture; recorded in the asset")
-    run.add_argument("--license", help="licence of the capture; recorded in the asset")
-    run.add_argument("--subject-consent", metavar="TEXT", help="what the subject agreed to; recorded in the asset")
-    run.add_argument("--no-viewer", action="store_true", help="no 3D view in the report")
-    run.add_argument("--dry-run", action="store_true", help="print the plan: what would run, and why; then stop")
-    run.add_argument("--json", action="store_true", help=JSON_HELP)
-    run.set_defaults(run=commands.run_command)
-
-
-def _render_options(render: argparse.ArgumentParser) -> None:
-    render.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
-    render.add_argument("--out", required=True, metavar="OUT", help="folder for the pictures")
-    render.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
-    render.add_argument(
-        "--light", action="append", metavar="X,Y,Z[,R,G,B]",
-        help="by the reflectance field of a light stage: a lamp at this place, metres in the capture's world, of this "
-        "radiant intensity (1,1,1); several add up",
-    )  # fmt: skip
-    render.add_argument("--field", action="store_true", help="by the reflectance field, also without --light")
-    render.add_argument(
-        "--deform", metavar="FILE", help="by the reflectance field on this mesh: its rest.obj with moved vertices"
-    )
-    render.add_argument("--quick", action="store_true", help="with --field and --env: fewer lamps for the environment")
-    render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
-    render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
-    render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
-    render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
-    render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
-    render.set_defaults(run=commands.render_command)
-
-
-def _turntable_options(turntable: argparse.ArgumentParser) -> None:
-    turntable.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
-    turntable.add_argument("--out", required=True, metavar="FILE", help="film.mp4 or film.webp")
-    turntable.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
-    turntable.add_argument("--frames", type=_at_least(1), default=120, help="pictures of the turn (%(default)s)")
-    turntable.add_argument("--size", type=_at_least(16), default=1080, help="pixels along each side (%(default)s)")
-    turntable.set_defaults(run=commands.turntable_command)
-
-
-def _expressions_options(expressions: argparse.ArgumentParser) -> None:
-    expressions.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
-    expressions.add_argument("--out", required=True, metavar="OUT", help="folder for the files")
-    expressions.add_argument("--only", action="append", metavar="NAME", help="this expression; may be repeated")
-    expressions.set_defaults(run=commands.expressions_command)
+def _add_options(module: str, function: str, command: argparse.ArgumentParser) -> None:
+    getattr(import_module(module), function)(command)
 
 
 def _unicode(options: argparse.Namespace) -> None:
@@ -155,21 +118,11 @@ def _unicode(options: argparse.Namespace) -> None:
                 )
 
 
-class _at_least:  # noqa: N801  (used like a function)
-    """An integer with a lower limit, as argparse wants it."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-
-    def __call__(self, text: str) -> int:
-        if not text.isdecimal() or int(text) < self.limit:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {self.limit}")
-        return int(text)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; errors that a user can meet are printed without a traceback."""
     options = parser().parse_args(arguments)
+    from workflows.cli.console import Console
+
     level = logging.INFO if options.verbose else logging.WARNING
     logging.basicConfig(level=level, format="%(name)s: %(message)s", stream=sys.stderr)
     console = Console()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 
@@ -16,10 +16,18 @@ def meant(word: str, choices: Collection[str]) -> str:
 
 
 class Parser(argparse.ArgumentParser):
-    """As argparse's, for a command and all of its sub-commands. Wrong usage exits with code 2."""
+    """As argparse's, for a command and all of its sub-commands. Wrong usage exits with code 2.
+
+    fill: adds the options, the first time that this parser parses. What it needs is loaded then and not before.
+    """
+
+    fill: Callable[[argparse.ArgumentParser], None] | None = None
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """As argparse's; an option that no command knows is an error here, before missing ones are complained of."""
+        fill, self.fill = self.fill, None
+        if fill is not None:
+            fill(self)
         words = sys.argv[1:] if args is None else list(args)
         self._refuse_unknown(words if self._subparsers is None else words[: self._own(words)])
         return super().parse_known_args(words, namespace)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,7 @@ def _names_a_folder(text: str, option: str) -> None:
 
 def device_for(wanted: str) -> str:
     """The device that "auto" means here, or the wanted one if it is there."""
-    if wanted == "cpu":
+    if wanted == "cpu" or (wanted == "auto" and _without_cuda()):
         return "cpu"
     import torch
 
@@ -186,6 +187,14 @@ def device_for(wanted: str) -> str:
             remedy="run with --device cpu, or install a CUDA build of torch",
         )
     return "cpu"
+
+
+def _without_cuda() -> bool:
+    """Whether the installed torch is a build for the CPU alone: its version says so, without loading it (a second)."""
+    try:
+        return version("torch").endswith("+cpu")
+    except PackageNotFoundError:  # a torch that no package manager knows of
+        return False
 
 
 @dataclass(frozen=True, slots=True)
