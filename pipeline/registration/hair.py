@@ -200,9 +200,8 @@ def log_density(colour: F64, seeds: F64) -> F64:
 
 def _cheeks(places: Places) -> Mask:
     x, y, z = places.at.T
-    return (places.on("nose") | places.on("face") & (y > CHEEK[0]) & (y < CHEEK[1]) & (z > FRONT)) & (
-        np.abs(places.height) < STANDING
-    )
+    cheeks = places.on("face") & (y > CHEEK[0]) & (y < CHEEK[1]) & (z > FRONT)
+    return np.asarray((places.on("nose") | cheeks) & (np.abs(places.height) < STANDING), np.bool_)
 
 
 def _bare(places: Places) -> Mask:

@@ -7,13 +7,11 @@ Lashes are left out: they need a material with opacity.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline import meshes, tiles
-from pipeline.errors import StageError
 from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
 from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
@@ -30,7 +28,7 @@ from stages.uv.remainder import beside_head, left_over
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
-SHARE = 2  # of uv.target_faces and of uv.proxy_faces, for what is beside the head, and for hair
+SHARE = 2  # of uv.target_faces, for what is beside the head, and for hair
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
@@ -49,11 +47,10 @@ def build_registered(
     proxy, _ = compacted(points, normals, head.quads[kept])
     face = np.repeat(face_quads(head, regions)[fine], 2)
     shown = _shown(head, regions, fine)
-    whole, laid, others, hairs = mesh, charts, [], 0
+    whole, laid, hairs = mesh, charts, 0
     if config.rest:
         others, hairs = _others(mesh, charts, shown, dense, hair, config)
         whole, laid = joined([(mesh, charts), *others])
-        proxy = _with_coarse(proxy, [part for part, _ in others], config.proxy_faces // SHARE)
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
@@ -83,16 +80,6 @@ def _others(
             out.append((part, Charts(laid.uvs + np.array([tile, 0], np.float32), laid.faces)))
             tile, hairs = tile + 1, len(part.faces)
     return out, hairs
-
-
-def _with_coarse(proxy: Mesh, others: list[Mesh], faces: int) -> Mesh:
-    """The proxy with the meshes beside the head, in about `faces` triangles each; without one that breaks."""
-    parts = [proxy]
-    for part in others:
-        with suppress(StageError):
-            parts.append(decimate.decimated(part, faces))
-    none = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
-    return joined([(part, none) for part in parts])[0]
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:
