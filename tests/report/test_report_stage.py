@@ -56,7 +56,8 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag not in VOID:
             self.open.append(tag)
-        self.links += [v or "" for k, v in attrs if k in ("src", "href", "action", "data", "srcset", "poster")]
+        found = [v or "" for k, v in attrs if k in ("src", "href", "action", "data", "srcset", "poster")]
+        self.links += [v for v in found if (tag, v) != ("link", "data:,")]  # an empty icon: no server is asked for one
         self.wrong += [f"{tag} {k}" for k, _ in attrs if k.startswith("on")]
 
     def handle_endtag(self, tag: str) -> None:
