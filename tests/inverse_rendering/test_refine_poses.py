@@ -12,6 +12,7 @@ from pipeline.fitted_cameras import cameras_of
 from pipeline.maths.rigid_motion import camera_of_moved, motion_between, motion_matrix
 from pipeline.transforms import F64, rows
 from stages.inverse_rendering import refine_poses
+from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.refine_poses import Evidence, PoseHistory, in_gauge, weighed
 from stages.inverse_rendering.registration import NOTHING, Registered
 from tests.support.balls import Ball
@@ -92,14 +93,13 @@ def test_the_difference_between_cameras_stays() -> None:
 VIEWS = Ball(views=6).photos()
 
 
-def refined_with(monkeypatch: pytest.MonkeyPatch, found: list[Registered]) -> PoseHistory:
+def refined_with(monkeypatch: pytest.MonkeyPatch, found: list[Registered]) -> tuple[PoseHistory, list[PhotoView]]:
     history, given = PoseHistory.of(VIEWS), iter(found)
     monkeypatch.setattr(refine_poses, "pair_of", lambda *a: type("P", (), {"factor": 2}))
     monkeypatch.setattr(refine_poses, "response_of", lambda *a: np.eye(3))
     monkeypatch.setattr(refine_poses, "register", lambda pair: next(given))
     settings = type("S", (), {"image_side": 96, "samples": 6, "refine_poses": "auto"})
-    history.views = history.refine(None, VIEWS, settings, "cpu")  # type: ignore[attr-defined, arg-type]
-    return history
+    return history, history.refine(None, VIEWS, settings, "cpu")  # type: ignore[arg-type]
 
 
 def test_only_confirmed_photos_move(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,8 +108,7 @@ def test_only_confirmed_photos_move(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [told(s * 0.02 * six) if s else told(six, gain=0.0) for s in signs]
     found = [replace(r, G=1e4 * np.eye(6)) for r in found]
     monkeypatch.setattr(refine_poses.Registered, "pixels", lambda self, xi: 1.0)
-    history = refined_with(monkeypatch, found)
-    views = history.views  # type: ignore[attr-defined]
+    history, views = refined_with(monkeypatch, found)
     turned = [motion_between(a.world_from_cam, b.world_from_cam)[2] for a, b in zip(VIEWS, views, strict=True)]
     np.testing.assert_allclose(turned, 0.006 * np.array(signs) * history.evidence[0].factor, atol=1e-4)
     facts = history.facts(views, "auto")
@@ -119,17 +118,15 @@ def test_only_confirmed_photos_move(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_exact_cameras_stay_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    history = refined_with(monkeypatch, [told(1e-3 * np.ones(6)) for _ in VIEWS])
-    views = history.views  # type: ignore[attr-defined]
+    history, views = refined_with(monkeypatch, [told(1e-3 * np.ones(6)) for _ in VIEWS])
     assert all(np.array_equal(a.world_from_cam, b.world_from_cam) for a, b in zip(VIEWS, views, strict=True))
     assert history.cameras(views, {}) == ()
     assert history.facts(views, "auto")["refined"] is False
 
 
 def test_a_checkpoint_keeps_poses_and_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
-    history = refined_with(monkeypatch, [told((-1) ** n * np.ones(6)) for n in range(6)])
+    history, views = refined_with(monkeypatch, [told((-1) ** n * np.ones(6)) for n in range(6)])
     again = PoseHistory.of(VIEWS)
-    views = history.views  # type: ignore[attr-defined]
     back = again.restore(VIEWS, history.stored(views))
     assert all(np.array_equal(a.world_from_cam, b.world_from_cam) for a, b in zip(views, back, strict=True))
     assert again.evidence == history.evidence
