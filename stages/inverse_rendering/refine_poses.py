@@ -117,13 +117,14 @@ def in_gauge(poses: Sequence[F64], first: Sequence[F64]) -> list[F64]:
     """Poses (4, 4) after one common motion and one common factor of their distances from the origin, so that the mean
     motion against the first poses and the mean change of distance vanish."""
     out = [np.array(p) for p in poses]
-    for _ in range(2):  # the mean of rotations is exact for small ones only
+    for _ in range(4):  # means of rotations are exact for small ones only, and scale and shift depend on each other
         mean = np.mean([motion_between(a, b) for a, b in zip(first, out, strict=True)], 0)
         out = [np.asarray(motion_matrix(mean) @ p, np.float64) for p in out]
-    away = [np.linalg.norm(b[:3, 3]) / max(np.linalg.norm(a[:3, 3]), 1e-12) for a, b in zip(first, out, strict=True)]
-    grown = float(np.mean(away))
-    for p in out:
-        p[:3, 3] /= max(grown, 1e-12)
+        away = [
+            np.linalg.norm(b[:3, 3]) / max(np.linalg.norm(a[:3, 3]), 1e-12) for a, b in zip(first, out, strict=True)
+        ]
+        for p in out:
+            p[:3, 3] /= max(float(np.mean(away)), 1e-12)
     return out
 
 
@@ -170,8 +171,8 @@ class PoseHistory:
         """For the report: what the first refinement found, what the last one left, and how far the cameras moved."""
         if not self.evidence:
             return {"refined": False, "why": "setting" if setting == "off" else "the fit has no refinement"}
-        six = np.array([motion_between(a, v.world_from_cam) for a, v in zip(self.first, views, strict=True)])
-        moved = six[np.abs(six).max(1) > 0]
+        pairs = [(a, v.world_from_cam) for a, v in zip(self.first, views, strict=True)]
+        moved = np.array([motion_between(a, b) for a, b in pairs if not np.array_equal(a, b)])
         first, last = self.evidence[0], self.evidence[-1]
         out: dict[str, str | float | bool] = {
             "refined": bool(len(moved)),

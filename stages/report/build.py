@@ -37,6 +37,7 @@ FIXED_RANGES = {  # the same in every report, so that assets can be compared
     "f0": (0.0, 0.06), "roughness": (0.0, 1.0), "ambient_occlusion": (0.0, 1.0), "confidence": (0.0, 1.0),
     "inv_kappa": (0.0, 0.5), "specular_intensity": (0.0, 0.2), "displacement": (-2.0, 2.0),
 }  # fmt: skip
+REGISTERED = ("psnr", "psnr_matched")  # scores that are also given from the held-out photos' registered cameras
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."
 
 
@@ -49,6 +50,7 @@ class JudgedRow:
     model: Scores | None
     asset: Scores | None
     row: ViewRow
+    registered: Scores | None = None
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
 
@@ -72,6 +74,7 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
         view.model_scores,
         view.asset_scores,
         ViewRow(f"View {view.index}", f"{view.name}, {note}", pictures),
+        view.registered_scores,
         view.model_labels,
         view.asset_labels,
     )
@@ -101,6 +104,8 @@ def summary(rows: list[JudgedRow]) -> dict[str, Any]:
     held_out = bool(rows) and all(r.held_out for r in rows)
     out: dict[str, Any] = {"views": len(rows), "held_out": held_out, **mean_scores(model)}
     out |= {f"asset_{k}": v for k, v in mean_scores(asset).items()}
+    again = mean_scores([r.registered for r in rows if r.registered])
+    out |= {f"{k}_registered": again[k] for k in REGISTERED if again[k] is not None}
     scored = [(s.psnr, r.index) for r in rows if (s := r.asset or r.model)]
     out["worst_view"] = min(scored)[1] if scored else None
     labels = {"psnr": pooled(r.model_labels for r in rows), "asset_psnr": pooled(r.asset_labels for r in rows)}
@@ -111,6 +116,8 @@ def summary(rows: list[JudgedRow]) -> dict[str, Any]:
 
 def _both(row: JudgedRow) -> dict[str, float | None]:
     model = row.model.json() if row.model else {}
+    again = row.registered.json() if row.registered else {}
+    model |= {f"{k}_registered": again[k] for k in REGISTERED if k in again}
     return model | ({f"asset_{k}": v for k, v in row.asset.json().items()} if row.asset else {})
 
 

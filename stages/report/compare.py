@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import HeldOutView, Located, ViewMask
+from pipeline.artifacts import HeldOutView, Located, RegisteredView, ViewMask
 from pipeline.images import read_alpha, read_encoded, read_exr, read_linear, shrink
 from stages.report.by_label import LabelErrors, label_errors
 from stages.report.collect import Results, own_colours
@@ -23,8 +23,9 @@ class JudgedView:
     """One view. photo (H, W, 3), mask (H, W) of the subject inside its extent, renders (H, W, 4) restricted to the
     region that counts; scores are None if there is no render.
 
-    own_colours: photos differ in exposure or white balance, and those of this photo are unknown. model_labels,
-    asset_labels: errors by the photo's labels, empty if it has none.
+    registered_scores: of the model from the camera that the photo's own registration to it found, None where it was not
+    registered. own_colours: photos differ in exposure or white balance, and those of this photo are unknown.
+    model_labels, asset_labels: errors by the photo's labels, empty if it has none.
     """
 
     index: int
@@ -36,6 +37,7 @@ class JudgedView:
     asset: F32 | None
     model_scores: Scores | None
     asset_scores: Scores | None
+    registered_scores: Scores | None = None
     own_colours: bool = False
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
@@ -49,6 +51,7 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
     """Views with a mask and with a render of the model or the asset, in the order of their index."""
     predicted = {v.index: v for v in r.inverse_rendering.artifact.held_out}
     rendered = {v.index: v for v in r.usd.artifact.views}
+    registered = {v.camera.index: v for v in r.inverse_rendering.artifact.registered}
     masks = {m.index: m for m in r.masks.artifact.masks}
     own = own_colours(r.inverse_rendering.artifact.model)
     for view in sorted(r.capture.artifact.views, key=lambda v: v.index):
@@ -59,11 +62,17 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         photo = shrink(read_linear(r.capture.path(view.image)), factor)
         asked = _asked(r, masks[i], factor)
         mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor) * asked
-        model, asset = _read(r.inverse_rendering, predicted.get(i)), _read(r.usd, rendered.get(i))
-        model, asset = (None if x is None else np.asarray(x * asked[..., None], np.float32) for x in (model, asset))
-        scores = [score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset)]
+        shown = (
+            _read(r.inverse_rendering, predicted.get(i)),
+            _read(r.usd, rendered.get(i)),
+            _read(r.inverse_rendering, registered.get(i)),
+        )
+        model, asset, again = (None if x is None else np.asarray(x * asked[..., None], np.float32) for x in shown)
+        scores = [
+            score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset, again)
+        ]
         errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
-        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], own, *errors)
+        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, *scores, own, *errors)
 
 
 def _asked(r: Results, mask: ViewMask, factor: int) -> F32:
@@ -93,5 +102,5 @@ def unjudged(r: Results) -> list[str]:
     return out
 
 
-def _read(at: Located, view: HeldOutView | None) -> F32 | None:  # type: ignore[type-arg]
+def _read(at: Located, view: HeldOutView | RegisteredView | None) -> F32 | None:  # type: ignore[type-arg]
     return None if view is None else read_exr(at.path(view.exr))[0][..., :4]

@@ -64,6 +64,11 @@ def headline(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     for prefix, what in (("", "model"), ("asset_", "exported asset")):
         if h.get(f"{prefix}psnr") is not None:
             out.append((f"{h[f'{prefix}psnr']:.1f} dB", f"PSNR, {what}", f"subject's pixels of {h['views']} {kind}"))
+    if h.get("psnr_registered") is not None:
+        meaning = (
+            "as the first, after each held-out photo alone was registered to the model (six numbers of its camera)"
+        )
+        out.append((f"{h['psnr_registered']:.1f} dB", "PSNR, model, registered", meaning))
     if own_colours(metrics["model"]) and h.get("asset_psnr_matched") is not None:
         meaning = "as before, after a 3 x 3 matrix per photo, because photos differ in exposure or white balance"
         out.append((f"{h['asset_psnr_matched']:.1f} dB", "PSNR in the photos' colours, exported asset", meaning))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.artifacts import CameraSet, FileRef, Located, MaskSet
+from pipeline.artifacts import CameraSet, FileRef, FittedFace, Located, MaskSet
 from pipeline.meshes import Mesh, vertex_normals
 from pipeline.transforms import rows
 from pipeline.verdict import Finding
@@ -144,6 +144,8 @@ class Stage:
             source="given", metric=True, capture_from_asset=rows(np.eye(4)), roi_radius=0.12, cameras=tuple(CAMERAS)
         )
         self.poses, self.masks = Located(poses, folder), Located(masks, folder)
+        fitted = FittedFace.model_construct(refined=())
+        self.inverse_rendering = Located(fitted, folder)
 
 
 def test_from_the_masks_file(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ def figures_of(run: Run) -> Figures:
         "held_out": held.get("views") if held.get("held_out") else None,
         "psnr": held.get("psnr"),
         "psnr_matched": held.get("psnr_matched"),
+        "psnr_registered": held.get("psnr_registered"),
         "asset_psnr": held.get("asset_psnr"),
         "asset_psnr_matched": held.get("asset_psnr_matched"),
         "asset_mask_iou": held.get("asset_mask_iou"),

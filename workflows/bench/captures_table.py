@@ -43,6 +43,13 @@ TABLES = (
         (
             Figure("psnr", "model (dB)", "PSNR of the fitted model over the subject in held-out views", 1, DB),
             Figure("psnr_matched", "matched (dB)", "the same in each photo's own colours (`psnr_matched`)", 1, DB),
+            Figure(
+                "psnr_registered",
+                "registered (dB)",
+                "of the model, after each held-out photo alone was registered to it (`psnr_registered`)",
+                1,
+                DB,
+            ),
             Figure("asset_psnr", "asset (dB)", "PSNR of the exported asset over the same pixels", 1, DB),
             Figure("asset_psnr_matched", "matched (dB)", "the same in each photo's own colours", 1, DB),
             Figure(

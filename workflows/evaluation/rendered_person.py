@@ -93,7 +93,11 @@ def true_cameras(truth: Path) -> dict[str, PinholeCamera]:
 
 def head_from_asset(run: Run, cameras: dict[str, PinholeCamera]) -> F64 | None:
     """4x4 similarity by the centres of the run's cameras; None with fewer than three in common."""
-    own = {PurePath(c["name"]).stem: matrix(c["world_from_cam"])[:3, 3] for c in run.manifest("poses")["cameras"]}
+    refined = {c["index"]: c["world_from_cam"] for c in run.manifest("inverse_rendering").get("refined", [])}
+    own = {
+        PurePath(c["name"]).stem: matrix(refined.get(c["index"], c["world_from_cam"]))[:3, 3]
+        for c in run.manifest("poses")["cameras"]
+    }
     both = [stem for stem in own if stem in cameras]
     if len(both) < SEEN_BY:
         return None
