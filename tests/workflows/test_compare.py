@@ -186,6 +186,23 @@ def test_the_distance_is_signed_and_unknown_far_away(tmp_path: Path) -> None:
     assert np.isnan(surface.nearest(ours, far, np.eye(4))[1]).all()
 
 
+def plane(height: float, up: float, u: float) -> surface.Sheet:
+    """A sheet of 1 cm x 1 cm at z = height that faces up or down, with u as all its texture coordinates."""
+    x, y = np.meshgrid(np.linspace(0, 0.01, 20), np.linspace(0, 0.01, 20))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1)
+    one = np.ones((len(points), 1))
+    return surface.Sheet(np.zeros((len(points), 3), np.int64), one * [u, 0.5], points, one * [0, 0, up], 1, 20)
+
+
+def test_of_two_near_sheets_the_one_that_faces_the_same_way_is_the_place() -> None:
+    """As of a lip: the other side is at 0.5 mm, the right one at 2 mm."""
+    front, back = plane(-0.002, 1, 0.25), plane(0.0005, -1, 0.75)
+    lip = [np.concatenate(x) for x in zip(*[(s.at, s.uv, s.points, s.normals) for s in (front, back)], strict=True)]
+    uv, distance = surface.nearest(plane(0.0, 1, 0.5), surface.Sheet(*lip[:4], 1, 20), np.eye(4))
+    assert (uv[:, 0] == 0.25).all() and distance == pytest.approx(0.002)
+    assert np.isnan(surface.nearest(plane(0.0, 1, 0.5), back, np.eye(4))[1]).all()  # only the wrong side is there
+
+
 def test_cameras_place_one_run_on_the_other(made: tuple[Made, Made]) -> None:
     """B's world is A's, twice as large and moved."""
     changed(made[1], "run.json", lambda r: r["stages"]["poses"].update(key="other"))

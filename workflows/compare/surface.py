@@ -4,7 +4,8 @@ For each texel of A's charts: the nearest point of B's surface, its texture coor
 
     B in A's frame:  the similarity that moves the cameras of common photos onto each other [Umeyama 1991]; the identity
                      where both runs have the same cameras
-    nearest point:   of a dense set of texel centres on B's surface
+    nearest point:   of a dense set of texel centres on B's surface, by |p_A - p_B|^2 + NORMAL^2 |n_A - n_B|^2, so that
+                     the other side of a lip or a lid is not taken
     distance:        n_B . (p_A - p_B), positive where A lies outside of B
 """
 
@@ -25,6 +26,7 @@ F64 = npt.NDArray[np.float64]
 GRID = 256  # texels of A's charts along a side of a tile
 DENSE = 640  # the same of B, whose points are searched
 FAR = 0.006  # metres beyond which the two surfaces are not the same place
+NORMAL = 0.003  # metres that two perpendicular normals count as, over sqrt(2)
 LEAST_RANK = 1e-4  # of the camera centres: on one line they determine no rotation
 
 
@@ -119,14 +121,12 @@ def nearest(ours: Sheet, theirs: Sheet, a_of_b: F64) -> tuple[F64, F64]:
 
     placed = apply(a_of_b, theirs.points)
     normals = theirs.normals @ (a_of_b[:3, :3] / scale_of(a_of_b)).T
-    # of the few nearest points the one whose normal agrees best: lips and lids lie close to each other
-    away, index = cKDTree(placed).query(ours.points, k=4, workers=1)
-    facing = np.einsum("nj,nkj->nk", ours.normals, normals[index])
-    best = np.argmin(away + np.where(facing > 0.3, 0.0, 1.0), 1)
-    rows = np.arange(len(best))
-    chosen, far = index[rows, best], away[rows, best]
-    distance = np.einsum("nj,nj->n", normals[chosen], ours.points - placed[chosen])
-    return theirs.uv[chosen], np.where((far < FAR) & (facing[rows, best] > 0), distance, np.nan)
+    found = cKDTree(np.concatenate([placed, NORMAL * normals], 1))
+    _, near = found.query(np.concatenate([ours.points, NORMAL * ours.normals], 1), workers=1)
+    away = ours.points - placed[near]
+    known = (np.linalg.norm(away, axis=1) < FAR) & ((ours.normals * normals[near]).sum(1) > 0)
+    distance = np.einsum("nj,nj->n", normals[near], away)
+    return theirs.uv[near], np.where(known, distance, np.nan)
 
 
 def same_charts(one: Path, two: Path) -> bool:
