@@ -83,7 +83,7 @@ def _replace_folders(
     assets = asset_files(stages)
     wanted = {
         "asset": assets,
-        "report": report_files(stages, keep_all=plan.request.keep_all),
+        "report": report_files(stages, exr=not plan.request.no_exr_views),
         "reflectance": reflectance_files(stages),
     }
     zipped = [assets[p] for p in packed(assets)] if plan.request.pack else []
@@ -135,9 +135,9 @@ def asset_files(stages: Mapping[str, Done[Any]]) -> Copies:
     return {f.path.removeprefix(inside): usd.path(f) for f in usd.artifact.files if f.path.startswith(inside)}
 
 
-def report_files(stages: Mapping[str, Done[Any]], *, keep_all: bool) -> Copies:
-    """report/: the page and its figures, and the held-out views of the model and of the exported asset as PNG; with
-    `keep_all` as EXR too, which takes as much room as the asset."""
+def report_files(stages: Mapping[str, Done[Any]], *, exr: bool) -> Copies:
+    """report/: the page and its figures, and the held-out views of the model and of the exported asset as PNG
+    and, for programs that measure them, as EXR."""
     copies: Copies = {}
     if "report" in stages:
         copies |= {f.path: stages["report"].located.path(f) for f in stages["report"].located.artifact.files}
@@ -146,7 +146,7 @@ def report_files(stages: Mapping[str, Done[Any]], *, keep_all: bool) -> Copies:
             continue
         located = stages[stage].located
         for view in getattr(located.artifact, field):
-            if keep_all:
+            if exr:
                 copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
             copies[f"{folder}/{view.index}.png"] = located.path(view.png)
     return copies

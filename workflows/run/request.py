@@ -58,8 +58,8 @@ class RunRequest(BaseModel):
     pack: Literal["zip"] | None = Field(
         default=None, description="also write OUT/NAME.zip with what other programs import of the asset"
     )
-    keep_all: bool = Field(
-        default=False, description="also put the EXR pictures of the held-out views into OUT/report; the store has them"
+    no_exr_views: bool = Field(
+        default=False, description="no EXR pictures of the held-out views in OUT/report, only PNG; the store has them"
     )
     no_live: bool = Field(default=False, description="tell `neuface view` nothing while the run goes on")
     strict: bool = Field(default=False, description="a result that is only usable also counts as refused: exit code 3")
