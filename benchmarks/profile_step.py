@@ -13,7 +13,7 @@ import sys
 import pipeline.threads  # noqa: F401  (before torch)
 from stages.inverse_rendering.config import Config
 from workflows.run.calibration_scene import WHOLE, ball_trainer
-from workflows.run.host_info import machine, told
+from workflows.run.host_info import describe, machine
 
 SHOWN = 16
 
@@ -32,7 +32,7 @@ def main(steps: int) -> None:
     rows = pstats.Stats(profile).get_stats_profile()
     ordered = sorted(rows.func_profiles.items(), key=lambda item: -item[1].tottime)
     total = rows.total_tt
-    print(f"{told(machine())}; {steps} steps of {settings.batch} rays, {1e3 * total / steps:.1f} ms each")
+    print(f"{describe(machine())}; {steps} steps of {settings.batch} rays, {1e3 * total / steps:.1f} ms each")
     for name, row in ordered[:SHOWN]:
         print(f"{row.tottime / total:6.1%}  {1e3 * row.tottime / steps:7.2f} ms  {name}  ({row.file_name})")
 

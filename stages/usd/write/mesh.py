@@ -19,6 +19,7 @@ I32 = npt.NDArray[np.int32]
 SHRINK, SHRINK_ROUNDS = 0.85, 6
 AREAS = (0.25, 4.0)  # accepted ratio of texture area to the triangle's own; others are parameterised again
 INSIDE = 1e-5  # of a tile: least distance of corners from its border, against rounding errors
+LINE = 1e-14  # of the squared edges: triangles of a smaller squared area are lines
 CANDIDATES = 12  # nearest triangles that are searched for the exact nearest point
 
 
@@ -136,7 +137,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     chart = charts_of(full.uv_faces, len(full.uvs))
     corners, t = full.vertices[full.faces].astype(np.float64), full.uvs[full.uv_faces].astype(np.float64)
     ends = proxy.vertices[proxy.faces].astype(np.float64)
-    near = cKDTree(corners.mean(1)).query(ends.mean(1), candidates)[1]
+    near = cKDTree(corners.mean(1)).query(ends.mean(1), candidates, workers=-1)[1]
     hit, weights_at_centre = _nearest(ends.mean(1), corners, near)
     scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres per unit of texture
     expected = _continued(ends, corners[hit], t[hit], weights_at_centre)
@@ -146,7 +147,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     for number in np.unique(chart[hit]):
         rows, inside = np.flatnonzero(chart[hit] == number), np.flatnonzero(chart == number)
         query = wanted[rows].reshape(-1, 5)
-        near = cKDTree(places[inside]).query(query, min(candidates, len(inside)))[1].reshape(len(query), -1)
+        near = cKDTree(places[inside]).query(query, min(candidates, len(inside)), workers=-1)[1].reshape(len(query), -1)
         face, weights = _nearest(query[:, :3], corners[inside], near)
         found = (t[inside[face]] * weights[..., None]).sum(1)
         if beyond > 0:
@@ -160,8 +161,7 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     home = tiles.of_face(Charts(full.uvs, full.uv_faces))[hit].astype(np.float64)
     if home.any():  # several tiles: a corner outside its own tile would show texels of another one
         uvs[..., 0] = uvs[..., 0].clip(home[:, None] + INSIDE, home[:, None] + 1 - INSIDE)
-    values, inverse = np.unique(uvs.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
-    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
+    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, *_shared(uvs))
 
 
 def _lay_flat(uvs: F64, ends: F64, corners: F64, t: F64, weights: F64, most: float) -> None:
@@ -249,8 +249,7 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
             row = ((1 - places[..., 1]) * size).astype(int).clip(0, size - 1)
             folded = own[twice[row, column].any(1)]
             t[folded] += (1 - SHRINK) * (t[folded].mean(1, keepdims=True) - t[folded])
-    values, inverse = np.unique(t.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
-    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, values, inverse.reshape(-1, 3).astype(np.int32))
+    return UvSurface(proxy.vertices, proxy.normals, proxy.faces, *_shared(t))
 
 
 def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
@@ -258,7 +257,19 @@ def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
     edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
     on = (corners * weights[..., None]).sum(1)
     start = (t * weights[..., None]).sum(1)
-    return np.asarray(start[:, None] + (points - on[:, None]) @ np.linalg.pinv(edges) @ along)
+    return np.asarray(start[:, None] + (points - on[:, None]) @ (_pseudoinverse(edges) @ along))
+
+
+def _pseudoinverse(edges: F64) -> F64:
+    """(N, 3, 2) pseudoinverses of (N, 2, 3): E^T (E E^T)^-1. Of two edges along one line, E^T / |E|^2; of none, 0."""
+    a, b = edges[:, 0], edges[:, 1]
+    aa, ab, bb = ((x * y).sum(1) for x, y in ((a, a), (a, b), (b, b)))
+    size, area = aa + bb, aa * bb - ab * ab
+    thin = area <= LINE * size * size
+    safe, length = np.where(thin, 1.0, area)[:, None], np.maximum(size, 1e-300)[:, None]
+    first = np.where(thin[:, None], a / length, (bb[:, None] * a - ab[:, None] * b) / safe)
+    second = np.where(thin[:, None], b / length, (aa[:, None] * b - ab[:, None] * a) / safe)
+    return np.asarray(np.stack([first, second], -1))
 
 
 def _areas(triangles: F64) -> F64:
@@ -269,17 +280,24 @@ def _areas(triangles: F64) -> F64:
 
 def _nearest(points: F64, corners: F64, candidates: npt.NDArray[np.integer]) -> tuple[npt.NDArray[np.int64], F64]:
     """The nearest (N,) of the candidate triangles (N, K), and barycentric weights (N, 3) of its nearest point."""
-    import trimesh
+    from stages.usd.write.nearest_kernels import nearest_on_triangles
 
-    best = np.full(len(points), np.inf)
-    face, on = np.zeros(len(points), np.int64), np.zeros_like(points)
-    for column in candidates.T:
-        near = trimesh.triangles.closest_point(corners[column], points)
-        distance = np.linalg.norm(near - points, axis=1)
-        closer = distance < best - 1e-12
-        best[closer], face[closer], on[closer] = distance[closer], column[closer], near[closer]
-    weights = trimesh.triangles.points_to_barycentric(corners[face], on)
-    return face, np.nan_to_num(weights).clip(0, 1)
+    face, weights = np.zeros(len(points), np.int64), np.zeros((len(points), 3))
+    nearest_on_triangles(
+        np.ascontiguousarray(points),
+        np.ascontiguousarray(corners),
+        np.ascontiguousarray(candidates, np.int64),
+        face,
+        weights,
+    )
+    return face, weights
+
+
+def _shared(uvs: F64) -> tuple[F32, I32]:
+    """The different texture coordinates (U, 2) among those of the corners (F, 3, 2), and their indices (F, 3)."""
+    pairs = np.ascontiguousarray(uvs, np.float32).view(np.complex64)[..., 0]  # numpy sorts these by u, then v
+    values, inverse = np.unique(pairs, return_inverse=True)
+    return values.view(np.float32).reshape(-1, 2), inverse.reshape(-1, 3).astype(np.int32)
 
 
 def uv_fault(proxy: UvSurface, full: UvSurface, limit: float = 0.005) -> str:
