@@ -161,7 +161,7 @@ class PoseHistory:
         for view, first, G in zip(views, self.first, self.metrics, strict=True):
             if not np.array_equal(view.world_from_cam, first):
                 six = motion_between(first, view.world_from_cam)
-                pixels = widths[view.index] / view.size[0] * float(np.sqrt(max(six @ G @ six, 0.0)))
+                pixels = widths[view.index] / view.size[0] * float(np.sqrt(max(float(six @ G @ six), 0.0)))
                 pose = rows(view.world_from_cam)
                 out.append(RefinedCamera(index=view.index, world_from_cam=pose, pixels=round(pixels, 4)))
         return tuple(out)
