@@ -140,7 +140,7 @@ class Config(StageConfig):
         description="optimise the geometry, not only its prior; auto: by cross-validation",
     )
     refine_poses: Decision = Field(
-        default=AUTO,
+        default="off",
         description="register the photos to the model during the fit and move their cameras, which also follows a head "
         "that moves between photos; auto: if the photos show that the cameras are off by more than their noise; on: "
         "without that condition",

@@ -120,11 +120,10 @@ def in_gauge(poses: Sequence[F64], first: Sequence[F64]) -> list[F64]:
     for _ in range(4):  # means of rotations are exact for small ones only, and scale and shift depend on each other
         mean = np.mean([motion_between(a, b) for a, b in zip(first, out, strict=True)], 0)
         out = [np.asarray(motion_matrix(mean) @ p, np.float64) for p in out]
-        away = [
-            np.linalg.norm(b[:3, 3]) / max(np.linalg.norm(a[:3, 3]), 1e-12) for a, b in zip(first, out, strict=True)
-        ]
+        lengths = [[float(np.linalg.norm(p[:3, 3])) for p in some] for some in (first, out)]
+        grown = float(np.mean([b / (a or 1.0) for a, b in zip(*lengths, strict=True)]))
         for p in out:
-            p[:3, 3] /= max(float(np.mean(away)), 1e-12)
+            p[:3, 3] /= grown or 1.0
     return out
 
 
@@ -162,7 +161,7 @@ class PoseHistory:
         for view, first, G in zip(views, self.first, self.metrics, strict=True):
             if not np.array_equal(view.world_from_cam, first):
                 six = motion_between(first, view.world_from_cam)
-                pixels = widths[view.index] / view.size[0] * float(np.sqrt(max(six @ G @ six, 0.0)))
+                pixels = widths[view.index] / view.size[0] * float(np.sqrt(max(float(six @ G @ six), 0.0)))
                 pose = rows(view.world_from_cam)
                 out.append(RefinedCamera(index=view.index, world_from_cam=pose, pixels=round(pixels, 4)))
         return tuple(out)

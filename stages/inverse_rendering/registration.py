@@ -96,7 +96,7 @@ class Registered:
 
     def pixels(self, xi: F64) -> float:
         """Root mean square displacement of the subject by a motion (6,), in blocks."""
-        return float(np.sqrt(max(xi @ self.G @ xi, 0.0)))
+        return float(np.sqrt(max(float(xi @ self.G @ xi), 0.0)))
 
     @property
     def signal(self) -> float:

@@ -86,7 +86,7 @@ def _trusted(view: PhotoView, factor: int) -> Bool:
         out &= shrink_whole(view.asked, factor) > WHOLE
     if view.doubtful is not None:
         out &= shrink_whole(view.doubtful.astype(np.float32), factor) == 0
-    return out
+    return np.asarray(out, np.bool_)
 
 
 def _surface(view: PhotoView, opacity: F32, x: F64, factor: int) -> Bool:
@@ -94,9 +94,9 @@ def _surface(view: PhotoView, opacity: F32, x: F64, factor: int) -> Bool:
     away = np.linalg.norm(x - view.world_from_cam[:3, 3], axis=-1)
     there = (opacity > OPAQUE) & np.isfinite(away)
     if not there.any():
-        return there
+        return np.asarray(there, np.bool_)
     depth = np.where(there, away, 0).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
     jump = cv2.dilate(depth, window) - cv2.erode(depth, window)
     block = factor * float(np.median(away[there])) / view.K[0, 0]
-    return there & (jump < STEEP * block)
+    return np.asarray(there & (jump < STEEP * block), np.bool_)

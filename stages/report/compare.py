@@ -72,7 +72,9 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
             score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset, again)
         ]
         errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
-        yield JudgedView(i, view.name, view.holdout, photo, mask, model, asset, *scores, own, *errors)
+        yield JudgedView(
+            i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, *errors
+        )
 
 
 def _asked(r: Results, mask: ViewMask, factor: int) -> F32:

@@ -107,7 +107,7 @@ def test_only_confirmed_photos_move(monkeypatch: pytest.MonkeyPatch) -> None:
     signs = [1, -1, 1, -1, 0, 0]
     found = [told(s * 0.02 * six) if s else told(six, gain=0.0) for s in signs]
     found = [replace(r, G=1e4 * np.eye(6)) for r in found]
-    monkeypatch.setattr(refine_poses.Registered, "pixels", lambda self, xi: 1.0)
+    monkeypatch.setattr(Registered, "pixels", lambda self, xi: 1.0)
     history, views = refined_with(monkeypatch, found)
     turned = [motion_between(a.world_from_cam, b.world_from_cam)[2] for a, b in zip(VIEWS, views, strict=True)]
     np.testing.assert_allclose(turned, 0.006 * np.array(signs) * history.evidence[0].factor, atol=1e-4)

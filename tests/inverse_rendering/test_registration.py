@@ -85,7 +85,7 @@ def test_colours_alone_find_the_motion() -> None:
 def test_the_rows_of_the_system_are_finite_differences_of_the_residuals() -> None:
     """At the true motion of a smooth picture, where photo and model have one gradient."""
     p = pair(0.0, REST, noise=0.0)
-    smooth = cv2.GaussianBlur(p.model, (0, 0), 6.0)
+    smooth = np.asarray(cv2.GaussianBlur(p.model, (0, 0), 6.0), np.float32)
     p = replace(p, photo=smooth, model=smooth)
     for side in (1, 2):
         level, h = registration._level(p, side), 1e-4

@@ -19,7 +19,7 @@ PIVOT = np.array([0.01, -0.03, 0.02])
 
 def camera() -> F64:
     """4x4 cam_from_world, half a metre away."""
-    turn = cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))[0]
+    turn = np.asarray(cv2.Rodrigues(np.array([0.3, -0.2, 0.1]))[0], np.float64)
     return rigid(turn, np.array([0.01, -0.02, 0.5]))
 
 
@@ -27,7 +27,7 @@ def by_opencv(points: F64, lens: F64 = LENS) -> F64:
     """(N, 2) pixels, by code that this project does not share."""
     cam = camera()
     uv, _ = cv2.projectPoints(points, cv2.Rodrigues(cam[:3, :3])[0], cam[:3, 3], K, lens)
-    return uv[:, 0]
+    return np.asarray(uv[:, 0], np.float64)
 
 
 def of_lie_algebra(six: F64, pivot: F64) -> F64:
