@@ -11,13 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
-from pipeline.artifacts import Camera, CameraSet, Located, ReflectanceField, UvMesh
+from pipeline.artifacts import (
+    Camera,
+    CameraSet,
+    Located,
+    UvMesh,
+)
 from pipeline.capture_artifacts import Capture, LightStage
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.images import read_linear
 from pipeline.maths.rigid_motion import motion_matrix
 from pipeline.ray_casting import RayCaster
+from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.transforms import F64, matrix, rows
 from stages.reflectance import motion as moves
 from stages.reflectance.deform import REST, write_rest

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.artifacts import LeftOutPicture
 from pipeline.images import F32, read_linear, write_png
 from pipeline.maths import studio_lights
+from pipeline.reflectance_artifacts import LeftOutPicture
 from stages.reflectance.field import Field, Lamp
 from stages.reflectance.relight import FULL, QUICK, lamps_of, look_up, picture
 from stages.reflectance.rig import Rig

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.artifacts import CameraSet, Located, ReflectanceField, UvMesh
+from pipeline.artifacts import (
+    CameraSet,
+    Located,
+    UvMesh,
+)
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
+from pipeline.reflectance_artifacts import ReflectanceField
 from stages.reflectance.config import Config
 
 

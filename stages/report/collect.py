@@ -10,13 +10,13 @@ from pipeline.artifacts import (
     FittedFace,
     Located,
     MaskSet,
-    ReflectanceField,
     Surface,
     TextureSet,
     UsdAsset,
     UvMesh,
 )
 from pipeline.capture_artifacts import Capture
+from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.tiles import FIRST
 from stages.report.chart import chart_figures
 from stages.report.field_figures import field_figures

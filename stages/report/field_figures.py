@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import LeftOutPicture, ReflectanceField
+from pipeline.reflectance_artifacts import LeftOutPicture, ReflectanceField
 
 BANDS = 4  # of the angle to the nearest light, with as many angles in each
 

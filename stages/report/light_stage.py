@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.artifacts import LeftOutPicture, Located, ReflectanceField
+from pipeline.artifacts import (
+    Located,
+)
 from pipeline.images import read_encoded
+from pipeline.reflectance_artifacts import LeftOutPicture, ReflectanceField
 from stages.report.field_figures import by_angle
 from stages.report.page import Picture, ViewRow
 from stages.report.pictures import ERROR_RANGE, data_uri, heat

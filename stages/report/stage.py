@@ -11,7 +11,6 @@ from pipeline.artifacts import (
     FittedFace,
     Located,
     MaskSet,
-    ReflectanceField,
     Report,
     Surface,
     TextureSet,
@@ -20,6 +19,7 @@ from pipeline.artifacts import (
 )
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
+from pipeline.reflectance_artifacts import ReflectanceField
 
 PICTURE_SIDE = 360  # pixels: longer side of a picture on the page
 VIEWS_SHOWN = 8  # held-out views shown as pictures; the table lists all

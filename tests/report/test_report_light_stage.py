@@ -13,9 +13,13 @@ import numpy as np
 import pytest
 from support.synthetic_results import write_results
 
-from pipeline.artifacts import FileRef, LeftOutPicture, Located, ReflectanceField
+from pipeline.artifacts import (
+    FileRef,
+    Located,
+)
 from pipeline.contract import Context
 from pipeline.images import write_png
+from pipeline.reflectance_artifacts import LeftOutPicture, ReflectanceField
 from stages.report.field_figures import by_angle, field_figures, together
 from stages.report.light_stage import plot, shown_field
 from stages.report.stage import STAGE, Config, Inputs

@@ -15,7 +15,6 @@ from pipeline.artifacts import (
     HeldOutView,
     Located,
     MaskSet,
-    ReflectanceField,
     Surface,
     TextureSet,
     UsdAsset,
@@ -24,6 +23,7 @@ from pipeline.artifacts import (
 )
 from pipeline.capture_artifacts import Capture
 from pipeline.images import write_exr, write_png
+from pipeline.reflectance_artifacts import ReflectanceField
 
 
 @dataclass(frozen=True, slots=True)
