@@ -119,7 +119,7 @@ WITHOUT = {
 }
 
 
-NUMPY = {"latlong", "microfacet", "studio_lights"}  # after the fit: nothing is differentiated there
+NUMPY = {"latlong", "microfacet", "rigid_motion", "studio_lights"}  # beside the fit: nothing is differentiated there
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -100,7 +100,7 @@ def test_nothing_is_wrong_with_it(made: tuple[SyntheticInputs, Path], file: str)
     assert not [f for f in validate(made[1] / file) if f.level != "info"]
 
 
-@pytest.mark.parametrize(("file", "name"), [("head.usd", "hair"), ("head.usdz", "hair_1004")])
+@pytest.mark.parametrize(("file", "name"), [("head.usd", "hair"), ("head.usdz", "hair")])
 def test_it_follows_the_head_and_no_expression(made: tuple[SyntheticInputs, Path], file: str, name: str) -> None:
     stage = Usd.Stage.Open(str(made[1] / file))
     hair = of(stage, name)
@@ -119,7 +119,7 @@ def test_it_follows_the_head_and_no_expression(made: tuple[SyntheticInputs, Path
 
 def test_the_package_reads_its_tile(made: tuple[SyntheticInputs, Path]) -> None:
     stage = Usd.Stage.Open(str(made[1] / "head.usdz"))
-    material = bound(of(stage, "hair_1004"))
+    material = bound(of(stage, "hair"))
     assert material.GetPath().name == "hair_1004"
     texture = material.ComputeSurfaceSource()[0].GetInput("diffuseColor").GetConnectedSources()[0][0].source
     assert UsdShade.Shader(texture.GetPrim()).GetInput("file").Get().path.endswith("1004.png")

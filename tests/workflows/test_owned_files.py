@@ -18,7 +18,7 @@ from workflows.batch.page import TABLES, write_page
 from workflows.batch.request import BatchRequest
 from workflows.batch.state import Summary
 from workflows.cli.main import main
-from workflows.cli.render import _put, given_cameras
+from workflows.cli.render import given_cameras, put_file
 from workflows.run import replace
 from workflows.run.owned import write_owned
 from workflows.run.plan import Plan, make_plan
@@ -197,7 +197,7 @@ def test_pictures_rendered_among_the_photos(tmp_path: Path) -> None:
     (tmp_path / "2.exr").write_text("a photo")
     notes: list[str] = []
     for _ in range(2):
-        _put(tmp_path, "2.exr", write_exr, np.zeros((4, 4, 4), np.float32), notes.append)
+        put_file(tmp_path, "2.exr", write_exr, np.zeros((4, 4, 4), np.float32), notes.append)
     assert len(notes) == 1 and "2.exr.yours-1" in notes[0]
     assert (tmp_path / "2.exr.yours-1").read_text() == "a photo"
     assert sorted(p.name for p in tmp_path.iterdir()) == [LIST, "2.exr", "2.exr.yours-1"]

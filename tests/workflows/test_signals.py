@@ -100,7 +100,7 @@ def test_a_terminal_that_is_gone_changes_no_exit_code(photos: Path, child_enviro
 
 
 @pytest.mark.parametrize("number", ALL)
-@pytest.mark.parametrize("module", ["argparse", "pipeline.errors", "workflows.batch.schedule"])
+@pytest.mark.parametrize("module", ["argparse", "pipeline.errors", "workflows.cli.command_options"])
 def test_a_signal_during_the_imports_shows_no_traceback(
     tmp_path: Path, child_environment: dict[str, str], number: signal.Signals, module: str
 ) -> None:

@@ -189,7 +189,9 @@ def person(tmp_path: Path) -> Path:
 
 def solved(asset_from_head: np.ndarray) -> dict[str, Any]:
     """The poses' manifest of cameras in a world of their own."""
-    cameras = [{"name": f"p{i}.jpg", "world_from_cam": rows(asset_from_head @ pose(e))} for i, e in enumerate(EYES)]
+    cameras = [
+        {"index": i, "name": f"p{i}.jpg", "world_from_cam": rows(asset_from_head @ pose(e))} for i, e in enumerate(EYES)
+    ]
     return {"source": "colmap", "cameras": cameras}
 
 

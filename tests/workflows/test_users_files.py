@@ -57,7 +57,7 @@ def listing(folder: Path) -> dict[str, str]:
             for p in sorted((folder / n).rglob("*")) if p.is_file()}  # fmt: skip
 
 
-OURS = {"asset/head.usd", "asset/textures/a.png", "report/asset_views/7.png"}
+OURS = {"asset/head.usd", "asset/textures/a.png", "report/asset_views/7.exr", "report/asset_views/7.png"}
 
 
 def test_foreign_files_stay_where_they_are(plan: Plan) -> None:
