@@ -37,8 +37,7 @@ from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from stages.inverse_rendering.config import AUTO
 from stages.inverse_rendering.observations import surface_hits
-from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, PixelTable
-from stages.inverse_rendering.residuals import U8, codes_at
+from stages.inverse_rendering.ray_sampling import U8, WHOLE, PhotoView, PixelTable, codes_at
 
 F64 = npt.NDArray[np.float64]
 Fact = dict[str, str | float | bool]

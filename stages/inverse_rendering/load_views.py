@@ -11,8 +11,7 @@ from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
 from stages.inverse_rendering.albedo_level import FACE
-from stages.inverse_rendering.ray_sampling import F32, Bool, PhotoView, factor_for
-from stages.inverse_rendering.residuals import U8
+from stages.inverse_rendering.ray_sampling import F32, U8, Bool, PhotoView, factor_for
 
 
 def read_views(

@@ -25,6 +25,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 Int8 = npt.NDArray[np.int8]
+U8 = npt.NDArray[np.uint8]
 NEAR_BAND = 0.05  # of the image side: all background pixels within this distance of the subject are used
 FAR_EVERY = 16  # of the other background pixels one in so many is used, against floating artefacts
 DARKEST = 1e-4  # smallest mean radiance for the initial light
@@ -118,6 +119,16 @@ def normalised_positions(view: PhotoView, factor: int) -> F32:
     uv = transforms.pixel_centres(w, h, factor)
     xy = np.asarray(np.linalg.solve(view.K[:2, :2], (uv - view.K[:2, 2]).T).T, np.float64)
     return transforms.undistort(xy, view.distortion).astype(np.float32).reshape(h // factor, w // factor, 2)
+
+
+def codes_at(view: PhotoView, xy: Tensor, codes: U8) -> U8:
+    """(N,) label codes of a view's pixels. xy: (N, 2) on the z = 1 plane; codes: (H, W) at any size."""
+    positions = np.asarray(xy.cpu().numpy(), np.float64)
+    uv = transforms.distort(positions, view.distortion) @ view.K[:2, :2].T + view.K[:2, 2]
+    height, width = codes.shape
+    column = (uv[:, 0] * width / view.size[0]).astype(np.int64).clip(0, width - 1)
+    row = (uv[:, 1] * height / view.size[1]).astype(np.int64).clip(0, height - 1)
+    return np.asarray(codes[row, column], np.uint8)
 
 
 class PixelTable:

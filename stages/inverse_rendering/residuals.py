@@ -11,20 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from pipeline import transforms
 from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.fields.face import FaceModel
 from pipeline.images import shrink_whole
 from stages.inverse_rendering.objective import calibrated_colours
-from stages.inverse_rendering.ray_sampling import WHOLE, Batch, PhotoView, PixelTable, factor_for
+from stages.inverse_rendering.ray_sampling import U8, WHOLE, Batch, PhotoView, PixelTable, codes_at, factor_for
 from stages.inverse_rendering.stereo import noise_of
 from stages.inverse_rendering.systems import render_any
 
-U8 = npt.NDArray[np.uint8]
 PIXELS = 60_000  # of all photos' subjects together: about a second on two cores
 MAX_PIXELS, MIN_PIXELS = 2000, 300  # of one photo: its PSNR is then accurate to about 0.2 and 0.5 dB
 SEED = 40_961
@@ -158,13 +155,3 @@ def _by_label(
     found, errors = codes_at(view, xy, codes), square.cpu().numpy()
     here = (int(c) for c in np.unique(found) if 0 < c < len(names))
     return {names[c]: LabelError(int((found == c).sum()), float(errors[found == c].mean())) for c in here}
-
-
-def codes_at(view: PhotoView, xy: Tensor, codes: U8) -> U8:
-    """(N,) label codes of a view's pixels. xy: (N, 2) on the z = 1 plane; codes: (H, W) at any size."""
-    positions = np.asarray(xy.cpu().numpy(), np.float64)
-    uv = transforms.distort(positions, view.distortion) @ view.K[:2, :2].T + view.K[:2, 2]
-    height, width = codes.shape
-    column = (uv[:, 0] * width / view.size[0]).astype(np.int64).clip(0, width - 1)
-    row = (uv[:, 1] * height / view.size[1]).astype(np.int64).clip(0, height - 1)
-    return np.asarray(codes[row, column], np.uint8)
