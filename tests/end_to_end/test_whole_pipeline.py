@@ -114,7 +114,7 @@ def test_everything_promised_is_there(done: Path) -> None:
         "asset/internal/light.json",
         "run.json",
     ]
-    promised += ["report/index.html", "report/metrics.json", "report/views/2.png", "report/asset_views/2.png"]
+    promised += ["report/index.html", "report/metrics.json", "report/views/2.exr", "report/asset_views/2.exr"]
     promised += [f"asset/textures/head_{m}" for m in ("albedo.exr", "albedo.png", "normal.png", "f0.exr")]
     internal = (
         "specular_coefficients.exr",
