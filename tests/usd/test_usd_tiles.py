@@ -202,3 +202,15 @@ def test_other_levels_stay_on_their_charts_tile() -> None:
         parts = [on_tile(got, t, 2) for t in (0, 1)]
         assert sum(len(p.faces) for p in parts) == len(made["faces"])
         assert all(p.uvs[p.uv_faces].min() >= 0 and p.uvs[p.uv_faces].max() <= 1 for p in parts)
+
+
+def test_overlaps_along_an_edge_are_found() -> None:
+    """Two texture triangles that share a strip of six texels beside one edge of each."""
+    from stages.usd.check.chart_checks import overlap
+
+    uvs = np.array([[0.1, 0.1], [0.9, 0.1], [0.5, 0.8], [0.9, 0.106], [0.1, 0.106], [0.5, 0.02]], np.float32)
+    faces = np.arange(6, dtype=np.int32).reshape(2, 3)
+    points = np.c_[uvs, np.zeros(6)].astype(np.float32)
+    apart = without_overlap(UvSurface(points, np.tile(np.float32([0, 0, 1]), (6, 1)), faces, uvs, faces))
+    before, after = (overlap(t.astype(np.float64)) for t in (uvs[faces], apart.uvs[apart.uv_faces]))
+    assert before > 0.01 and after < before / 3

@@ -17,6 +17,7 @@ F64 = npt.NDArray[np.float64]
 I32 = npt.NDArray[np.int32]
 
 SHRINK, SHRINK_ROUNDS = 0.85, 6
+SAMPLED = 6  # steps along an edge between the places of a triangle that are tested for overlap: slivers lie at edges
 AREAS = (0.25, 4.0)  # accepted ratio of texture area to the triangle's own; others are parameterised again
 INSIDE = 1e-5  # of a tile: least distance of corners from its border, against rounding errors
 LINE = 1e-14  # of the squared edges: triangles of a smaller squared area are lines
@@ -233,7 +234,8 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
     from pipeline import raster
 
     t = proxy.uvs[proxy.uv_faces].astype(np.float64)
-    inside = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4], [2, 2, 0.5], [2, 0.5, 2], [0.5, 2, 2]], np.float64)
+    n = SAMPLED
+    inside = np.array([[i + 1 / 3, j + 1 / 3, n - i - j + 1 / 3] for i in range(n + 1) for j in range(n + 1 - i)])
     inside /= inside.sum(1, keepdims=True)
     tile = tiles.of_face(Charts(proxy.uvs, proxy.uv_faces))
     for number in range(int(tile.max()) + 1):
