@@ -5,23 +5,9 @@ tests/docs/test_mutations.py keeps it in step with the code.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class Mutation:
-    """A text that stands once in a file, what stands there instead, and the tests (files, or FILE::TEST) that fail."""
-
-    file: str
-    before: str
-    after: str
-    tests: str
-
-    @property
-    def change(self) -> str:
-        """In one line."""
-        return f"{self.file}: {' '.join(self.before.split())} -> {' '.join(self.after.split()) or 'nothing'}"
-
+from benchmarks.mutation import Mutation
+from benchmarks.mutation_list_of_asset import OF_ASSET
+from benchmarks.mutation_list_of_fit import OF_FIT
 
 MUTATIONS = (
     # ---------------------------------------------------------------- equations
@@ -81,7 +67,7 @@ MUTATIONS = (
              "(c * self.shading.bases(n[:1], n[:1]))",
              "tests/inverse_rendering/test_objective.py::test_the_objective_is_eq_20_by_hand"),
     Mutation("pipeline/fields/light.py", "grad[count(order) :] = 0", "grad[count(order) + 1 :] = 0",
-             "tests/inverse_rendering/test_fit.py"),
+             "tests/fields/test_face.py::test_while_the_light_learns_alone_its_gradient_is_white_and_of_low_order"),
     Mutation("pipeline/fields/encodings.py", "(share * count - level)", "(share * count - level + 1)",
              "tests/fields/test_kernels.py"),
     Mutation("pipeline/fields/paper/displaced.py", "FACTOR = 1.2", "FACTOR = 1.0",
@@ -113,20 +99,23 @@ MUTATIONS = (
     Mutation("stages/inverse_rendering/paper/trainer.py", "whole | (batch.alpha < EMPTY)", "whole",
              "tests/inverse_rendering/paper/test_paper.py::test_the_terms_are_eq_20_by_hand"),
     Mutation("stages/inverse_rendering/paper/render.py", "-d.repeat_interleave", "d.repeat_interleave",
-             "tests/inverse_rendering/paper/test_paper.py::test_what_is_rendered_is_eq_18_by_hand"),
+             "tests/inverse_rendering/paper/test_paper.py::"
+             "test_samples_lie_half_a_millimetre_around_the_surface_and_the_last_reaches_to_the_far_side"),
     Mutation("stages/inverse_rendering/paper/render.py", "SHELL = 5e-4", "SHELL = 5e-3",
-             "tests/inverse_rendering/paper/test_paper.py::test_what_is_rendered_is_eq_18_by_hand"),
+             "tests/inverse_rendering/paper/test_paper.py::"
+             "test_samples_lie_half_a_millimetre_around_the_surface_and_the_last_reaches_to_the_far_side"),
     Mutation("stages/inverse_rendering/paper/render.py", "(far - t0 - shell)", "0.1 * (far - t0 - shell)",
-             "tests/inverse_rendering/paper/test_paper.py::test_what_is_rendered_is_eq_18_by_hand"),
+             "tests/inverse_rendering/paper/test_paper.py::"
+             "test_samples_lie_half_a_millimetre_around_the_surface_and_the_last_reaches_to_the_far_side"),
     Mutation("stages/inverse_rendering/objective.py", "losses.white_light(model.light()).sum()",
              "losses.white_light(model.light()).mean()",
              "tests/inverse_rendering/test_objective.py::test_the_objective_is_eq_20_by_hand"),
     Mutation("stages/inverse_rendering/objective.py", "settings.specular_energy * energy", "settings.white * energy",
              "tests/inverse_rendering/test_objective.py::test_the_objective_is_eq_20_by_hand"),
     Mutation("stages/inverse_rendering/model_selection.py", "MIN_SPECULAR = 0.3", "MIN_SPECULAR = 0.6",
-             "tests/inverse_rendering/test_cross_validation.py"),
+             "tests/inverse_rendering/test_model_selection.py"),
     Mutation("stages/inverse_rendering/model_selection.py", "and (with_gains < control or alone < without)", "",
-             "tests/inverse_rendering/test_cross_validation.py"),
+             "tests/inverse_rendering/test_model_selection.py"),
     # ---------------------------------------------------------------- cameras and poses
     Mutation("pipeline/transforms.py", "out[:2, 2] += 0.5", "out[:2, 2] += 0.0", "tests/core/test_transforms.py"),
     Mutation("pipeline/transforms.py", "to_from_world[:3, :3] / scale @", "to_from_world[:3, :3] @",
@@ -213,4 +202,6 @@ MUTATIONS = (
              "tests/workflows/test_schedule.py"),
     Mutation("workflows/run/budget.py", "stage = left - slower * rung.after", "stage = left",
              "tests/workflows/test_budget.py"),
+    *OF_FIT,
+    *OF_ASSET,
 )  # fmt: skip

@@ -3,6 +3,7 @@
     python -m benchmarks.mutations                 # all of them: a table; exit code 1 if one survives
     python -m benchmarks.mutations --only hull     # those whose file or tests have "hull" in their name
     python -m benchmarks.mutations --write         # all of them, and docs/benchmarks/mutations.md, .json
+    python -m benchmarks.mutations --left --write  # those that were not made yet, or were not killed
 
 Each change is made in a copy of the tree, where its tests then run; nothing here is touched. Before that the tests run
 once on the unchanged copy: a test that fails there proves nothing. The list is in benchmarks/mutation_list.py.
@@ -20,11 +21,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.mutation_list import MUTATIONS, Mutation
+from benchmarks.mutation import Mutation
+from benchmarks.mutation_list import MUTATIONS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE, RECORD = ROOT / "docs/benchmarks/mutations.md", ROOT / "docs/benchmarks/mutations.json"
-NOT_RUN = "not made yet"
+NOT_RUN, KILLED = "not made yet", "killed"
 PARTS = ("benchmarks", "docker", "docs", "pipeline", "stages", "tests", "workflows")
 LIMIT, PATIENCE = 900.0, 5.0  # seconds, and times all tests' own time: what hangs on a change has noticed it
 FAILED = 1  # pytest's exit code where tests failed; 2 to 5 say that they did not run
@@ -109,12 +111,16 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--only", nargs="+", default=[""], help="texts, one of them in the name of the file or of the tests"
     )
+    parser.add_argument("--left", action="store_true", help="only those not recorded as killed")
     parser.add_argument("--write", action="store_true", help=f"write the table of {PAGE.relative_to(ROOT)}")
     options = parser.parse_args(arguments)
     only = options.only
     chosen = [m for m in MUTATIONS if any(text in m.file or text in m.tests for text in only)]
     if not chosen:
         parser.error(f"no change has {only!r} in the name of its file or tests")
+    if options.left:
+        done = dict(zip(MUTATIONS, recorded(), strict=True))
+        chosen = [m for m in chosen if done[m] != KILLED]
     with tempfile.TemporaryDirectory(prefix="mutations") as folder:
         tree = copied(Path(folder) / "tree")
         begun = time.monotonic()

@@ -151,3 +151,41 @@ def test_hair_is_matt() -> None:
         assert np.median(found.f0) == pytest.approx(wanted, rel=0.2, abs=1e-9)  # a rougher lobe needs more
         assert np.median(found.roughness) > 0.55 and "gloss_skin_f0" not in found.figures
     assert np.median(found.roughness) == pytest.approx(fits.HAIR_ROUGHNESS, abs=1e-3)
+
+
+def test_places_that_few_photos_see_do_not_tell_the_material() -> None:
+    """One side is seen by three photos only, in which it shines as metal does: the same as if nobody had seen it."""
+    mesh, at, albedo, seen = scene(0.04, 0.45)
+    shown = scene(0.5, 0.45)[3].colour
+    order = np.arange(len(seen.vertex)) - np.searchsorted(seen.vertex, seen.vertex)
+    side = mesh.vertices[seen.vertex, 0] > 0
+    few, other = side & (order < fits.MIN_VIEWS - 1), ~side
+    material = []
+    for keep in (few | other, other):
+        colour = np.where(side[:, None], shown, seen.colour)[keep]
+        some = fits.Seen(seen.vertex[keep], seen.wo[keep], colour, colour)
+        made = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, some, np.zeros(len(albedo), bool))
+        material.append((made.f0, made.roughness))
+    for with_few, without in zip(*material, strict=True):
+        np.testing.assert_allclose(with_few, without, rtol=1e-3)
+    assert np.median(material[0][0]) == pytest.approx(0.04, rel=0.2)
+
+
+@pytest.mark.parametrize("wrong", [1.3, 0.7])
+def test_photos_at_grazing_angles_do_not_tell_the_albedo(wrong: float) -> None:
+    """Within a fifth of the horizon a photo mixes the surface with what lies behind it."""
+    mesh, at, albedo, seen = scene(0.04, 0.45)
+    n = mesh.normals.astype(np.float64)
+    flat = (n[seen.vertex] * seen.wo).sum(1) < 0.3
+    turned = seen.wo[flat] - (0.3 - fits.GRAZING + 0.02) * n[seen.vertex[flat]]
+    wo = seen.wo.copy()
+    wo[flat] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    assert ((n[seen.vertex[flat]] * wo[flat]).sum(1) < fits.GRAZING).all() and flat.sum() > 1000
+    colour = np.where(flat[:, None], wrong, 1.0) * seen.colour
+    some = fits.Seen(seen.vertex, wo, colour, colour)
+    found = fits.fit(mesh, n, at, albedo, some, np.zeros(len(albedo), bool))
+    keep = ~flat
+    clean = fits.Seen(seen.vertex[keep], seen.wo[keep], seen.colour[keep], seen.colour[keep])
+    wanted = fits.fit(mesh, n, at, albedo, clean, np.zeros(len(albedo), bool))
+    np.testing.assert_allclose(found.correction, wanted.correction, rtol=2e-3)
+    np.testing.assert_allclose(found.f0, wanted.f0, rtol=0.02, atol=1e-4)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.mutation_list import MUTATIONS, Mutation
+from benchmarks.mutation import Mutation
+from benchmarks.mutation_list import MUTATIONS
 from benchmarks.mutations import NOT_RUN, PAGE, PARTS, fate, main, page, recorded
 
 ROOT = Path(__file__).resolve().parents[2]

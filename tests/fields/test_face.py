@@ -14,6 +14,7 @@ from pipeline.fields.appearance import TYPICAL_INV_KAPPA, IntegratedBasis
 from pipeline.fields.calibration import Calibration
 from pipeline.fields.face import FaceModel, FittedField, load_face, load_model
 from pipeline.fields.geometry import GridSdf, coarse_distance
+from pipeline.fields.light import ShLight
 from pipeline.fields.spec import FaceSpec
 from pipeline.maths import brdf
 
@@ -206,3 +207,16 @@ def test_coarse_distance_is_never_too_long(shape: tuple[int, int, int]) -> None:
     found = coarse_distance(free)
     assert found.shape == free.shape and found.min() == 0.5
     assert (found <= np.maximum(true, 0.5) + 1e-5).all() and (found >= true - 4).all()
+
+
+def test_while_the_light_learns_alone_its_gradient_is_white_and_of_low_order() -> None:
+    light = ShLight(4, 1.0)
+    gradient = torch.randn(25, 3, generator=torch.Generator().manual_seed(3))
+    light.coefficients.grad = gradient.clone()
+    light.uniform_gradient(2)
+    found = light.coefficients.grad
+    assert torch.allclose(found[:9], gradient[:9].mean(1, keepdim=True).expand(9, 3))
+    assert (found[:9] != 0).all() and not found[9:].any()
+    light.coefficients.grad = None
+    light.uniform_gradient(2)  # nothing was learnt: nothing to restrict
+    assert light.coefficients.grad is None

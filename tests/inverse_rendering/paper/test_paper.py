@@ -17,6 +17,7 @@ from pipeline.maths.density import laplace_density, ray_weights
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.objective import Terms
 from stages.inverse_rendering.outputs import predict_view
+from stages.inverse_rendering.paper import render as paper_render
 from stages.inverse_rendering.paper import trainer as paper
 from stages.inverse_rendering.paper.comparison import new_compared_trainer, sphere_start
 from stages.inverse_rendering.paper.config import PaperConfig
@@ -131,6 +132,43 @@ def test_what_is_rendered_is_eq_18_by_hand() -> None:
         assert torch.allclose(got.colour[i], expected, rtol=0.03, atol=1e-4), i
         assert float(got.opacity[i]) == pytest.approx(float(-torch.expm1(-tau)), abs=0.02)
     assert got.opacity[0] > 0.99 and got.opacity[2] < 0.3 and got.opacity[3] == 0
+
+
+def test_samples_lie_half_a_millimetre_around_the_surface_and_the_last_reaches_to_the_far_side(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What the renderer asks its parts for, on a ray through the ball's middle: places, directions and lengths."""
+    t = trainer()
+    centre, radius = geometry_of(t.model).known.sphere()
+    asked: dict[str, torch.Tensor] = {}
+    shade, weights = type(t.model).shade, ray_weights
+
+    def spied_shade(self: FaceModel, x: torch.Tensor, n: torch.Tensor, wo: torch.Tensor) -> Any:
+        asked.update(x=x, wo=wo)
+        return shade(self, x, n, wo)
+
+    def spied_weights(density: torch.Tensor, delta: torch.Tensor) -> Any:
+        asked.update(delta=delta)
+        return weights(density, delta)
+
+    monkeypatch.setattr(type(t.model), "shade", spied_shade)
+    monkeypatch.setattr(paper_render, "ray_weights", spied_weights)
+    monkeypatch.setattr(paper_render, "NEGLIGIBLE", -1.0)
+    d = torch.nn.functional.normalize(torch.tensor([[0.2, -0.1, -1.0]]), dim=-1)
+    o = torch.as_tensor(centre) - 0.5 * d
+    with torch.no_grad():
+        render_samples(t.model, Rays(o, d), 8, None)
+        along = ((asked["x"] - o) @ d[0]).sort().values
+        depth = torch.linspace(0.5 - float(radius), 0.5, 20_001)
+        s = torch.cat([geometry_of(t.model)(o + part[:, None] * d)[0] for part in depth.split(5_000)])
+        t0 = float(depth[(s < 0).nonzero()[0, 0]])
+    shell = 5e-4 * float(radius) / 0.15
+    assert torch.allclose(asked["wo"], -d.expand(8, 3))
+    assert torch.allclose(along, t0 + shell * ((torch.arange(8) + 0.5) / 4 - 1), atol=0.3 * shell)
+    assert float(along[-1] - along[0]) == pytest.approx(2 * shell * 7 / 8, rel=0.01)
+    far = 0.5 + float(radius)
+    assert float(asked["delta"].sum()) == pytest.approx(far - t0 + shell, abs=0.3 * shell)
+    assert torch.allclose(asked["delta"][0, :7], torch.full((7,), shell / 4), rtol=1e-4)
 
 
 @pytest.mark.parametrize("prior", ["hull", "imface"])
