@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,3 +152,31 @@ def _halves(index: int) -> np.ndarray:
     codes[rgb[..., 0] > 1.5 * rgb[..., 2]] = 1
     codes[rgb[..., 2] > 1.5 * rgb[..., 0]] = 3
     return codes
+
+
+def test_bright_skin_alone_is_no_reason_to_darken_it() -> None:
+    found = decide(LabelledAlbedos(np.full((2000, 3), 1.5), np.zeros((0, 3))), None, None)
+    assert found.gain == 1.0
+
+
+def test_eyes_whose_iris_is_as_red_as_skin_are_open() -> None:
+    """The white is what is compared with the skin, not the whole eye."""
+    seen = head(0.3)
+    eyes = seen.eyes.copy()
+    eyes[200:450] = np.array([1.5, 0.9, 0.65]) * 0.07
+    assert sclera(LabelledAlbedos(seen.face, eyes)) == pytest.approx(0.39, abs=0.01)
+
+
+def test_eyes_are_read_without_what_they_reflect(fitted: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """a = (I - L_s) a_0 / L_d: with a_0 / L_d = 2, a reflection of .02 takes .04."""
+    model = copy.deepcopy(fitted.model)
+    labels, found = [_halves(v.index) for v in fitted.views], []
+    for reflected in (0.0, 0.02):
+
+        def shade(self: Any, x: torch.Tensor, *a: Any, reflected: float = reflected) -> Any:
+            one = torch.ones(len(x), 3)
+            return SimpleNamespace(specular=reflected * one, albedo=0.5 * one, diffuse=0.25 * one)
+
+        monkeypatch.setattr(type(model), "shade", shade)
+        found.append(labelled_albedos(model, fitted.pixels, fitted.views, labels, NAMES).eyes)
+    np.testing.assert_allclose(found[0] - found[1], 0.04, atol=1e-5)

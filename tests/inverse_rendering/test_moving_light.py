@@ -15,6 +15,7 @@ from pipeline import transforms
 from pipeline.colour import srgb_from_linear
 from pipeline.maths import sh
 from pipeline.maths.light_frame import CAMERA, FLASH, TURNTABLE, WORLD, level_axes
+from stages.inverse_rendering import moving_light
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.moving_light import LAMPS, chosen_frame, decide, first_light, light_frame
 from stages.inverse_rendering.outputs import predict_view
@@ -202,3 +203,25 @@ def test_a_fit_under_a_flash_predicts_a_photo_that_it_did_not_see() -> None:
         psnr[frame] = -10 * np.log10((error**2).mean())
     assert psnr["auto"] > psnr[WORLD] + 4 and psnr["auto"] > 27
     assert model.spec.light_frame == WORLD
+
+
+def test_a_flash_says_nothing_of_a_turntable() -> None:
+    errors = {WORLD: 1.0, TURNTABLE: 0.9, CAMERA: 0.97, FLASH: 0.95}
+    assert chosen_frame(errors, flashed=True)[0] == WORLD
+    assert chosen_frame(errors | {TURNTABLE: 0.7}, flashed=True)[0] == TURNTABLE
+
+
+def test_errors_are_those_of_points_that_had_no_vote() -> None:
+    """Every second point of the views without a vote gives their gain, the others the error: .1 of the mean here."""
+    from stages.inverse_rendering.observations import Observations
+
+    point, view = (a.ravel() for a in np.meshgrid(np.arange(240), np.arange(12), indexing="ij"))
+    colour = np.repeat(np.random.default_rng(0).uniform(0.5, 1.5, 240)[point, None], 3, 1)
+    n = torch.from_numpy(unit(np.random.default_rng(1).normal(size=(240, 3))))
+    seen = Observations(n, n, point, view, colour, np.zeros((len(point), 3)))
+    parts = moving_light._divided(seen)
+    assert not (parts.train & parts.test).any() and not (parts.tune & parts.test).any()
+    lit = np.ones((len(point), 1))
+    assert moving_light._solve(seen, parts, lit).error < 1e-6
+    wrong = replace(seen, colour=colour + 0.1 * parts.test[:, None])
+    assert moving_light._solve(wrong, parts, lit).error == pytest.approx(0.1 / wrong.colour.mean(), rel=1e-6)

@@ -149,3 +149,16 @@ def test_later_stages_use_refined_cameras_of_fitted_photos_only() -> None:
     assert [c.world_from_cam for c in found.cameras] == [rows(FIRST[0]), rows(FIRST[5]), rows(FIRST[2])]
     assert found.cameras[1].name == "1.jpg"
     assert cameras_of(poses, FittedFace.model_construct(refined=())) is poses
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_motions_are_told_in_pixels_of_the_fits_photos(monkeypatch: pytest.MonkeyPatch, factor: int) -> None:
+    """A photo is compared on blocks of `factor` of its pixels; here the fit's photos have the photos' own size."""
+    six = np.array([0.0, 0.3, 0.0, 0.0, 0.4, 0.0])  # half a block
+    history, given = PoseHistory.of(VIEWS), iter([told(six) for _ in VIEWS])
+    monkeypatch.setattr(refine_poses, "pair_of", lambda *a: type("P", (), {"factor": factor}))
+    monkeypatch.setattr(refine_poses, "response_of", lambda *a: np.eye(3))
+    monkeypatch.setattr(refine_poses, "register", lambda pair: next(given))
+    settings = type("S", (), {"image_side": max(VIEWS[0].size), "samples": 6, "refine_poses": "auto"})
+    history.refine(None, VIEWS, settings, "cpu")  # type: ignore[arg-type]
+    assert history.evidence[0].motion == pytest.approx(0.5 * factor)

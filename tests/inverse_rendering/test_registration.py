@@ -151,3 +151,38 @@ def test_a_motion_that_is_too_large_is_not_used() -> None:
     grown = registration.FARTHEST / found.pixels(found.xi)
     assert replace(found, xi=0.99 * grown * found.xi).better
     assert not replace(found, xi=1.01 * grown * found.xi).better
+
+
+def test_an_unsure_gain_does_not_confirm_a_motion() -> None:
+    found = replace(NOTHING, gain=0.03, error=0.02)
+    assert found.better and not replace(found, gain=0.01).better and not replace(found, gain=0.0).better
+
+
+@pytest.mark.parametrize("side", [1, 2, 4])
+def test_the_halves_are_the_colours_of_a_chessboard(side: int) -> None:
+    """Both halves have all rows and all columns, so that neither sees a motion that the other does not."""
+    level = registration._level(pair(0.0, REST, outline=False), side)
+    column, row = (level.at * side // registration.SQUARE).astype(int).T
+    np.testing.assert_array_equal(level.half == 1, (row % 2 == 1) != (column % 2 == 1))
+    for line in (row, column):
+        assert all(len(set(level.half[line == k])) == 2 for k in set(line) if (line == k).sum() > 30 * 16 / side)
+
+
+def test_the_motion_is_the_least_sum_of_evidence_and_prior(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a squared residual H (xi - t)^2 the minimum with 6 xi^T G xi / d^2 is (H + 6 G / d^2)^-1 H t."""
+    p = pair(0.0, REST, outline=False)
+    levels = [registration._level(p, side) for side in registration.LEVELS]
+    G, H = np.diag([3.0, 3.0, 3.0, 1.0, 2.0, 4.0]), np.diag([1.0, 1.0, 1.0, 0.5, 1.0, 2.0])
+    target = np.array([0, 0, 0, 0.3, -0.2, 0.1])
+    monkeypatch.setattr(registration, "_colours", lambda pair, level, xi: (H, H @ (xi - target)))
+    found = registration._solve(p, levels, G, 0)
+    expected = np.diag(H) / (np.diag(H) + 6 * np.diag(G) / 4.0**2) * target
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0])
+def test_the_robust_deviation_is_that_of_a_normal_distribution(size: float) -> None:
+    r = size * np.random.default_rng(7).standard_normal(20_000)
+    r[:1000] = 1e3  # one in twenty is wrong
+    assert registration.scale_of(r) == pytest.approx(size, rel=0.1)
+    assert registration.scale_of(np.zeros(9)) == registration.SMALLEST

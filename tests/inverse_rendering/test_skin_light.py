@@ -10,6 +10,7 @@ import torch
 
 from pipeline.fields.appearance import SpatialField
 from pipeline.meshes import F64
+from stages.inverse_rendering import skin_light
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.observations import surface_hits
 from stages.inverse_rendering.relight_model import change_light
@@ -161,3 +162,34 @@ def test_the_photos_stay_when_the_light_changes(ball: Trainer) -> None:
     assert float(found[1] / found[0]) == pytest.approx(0.371, abs=0.06)
     assert float((look() / seen - 1).abs().mean()) < 0.03
     assert float(light.irradiance(n).detach().mean()) == pytest.approx(float(lit), rel=0.02)  # hence the albedo's level
+
+
+@pytest.mark.parametrize(("explained", "wanted"), [(0.45, 0.02), (0.25, 0.29), (0.1, 0.3), (None, 0.3)])
+def test_light_from_above_is_free_only_where_the_lobe_did_not_tell_it(
+    ball: Trainer, monkeypatch: pytest.MonkeyPatch, explained: float | None, wanted: float
+) -> None:
+    """The numbers of the heads beside the constant."""
+    asked: list[float] = []
+    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even: asked.append(even))
+    views = [replace(v, skin=v.alpha > 0.99) for v in ball.views]
+    assert correct_light(ball.model, views, ball.pixels.draw(100, 0.0, 3).rays, explained, "cpu") is None
+    assert asked == pytest.approx([wanted], abs=0.003)
+
+
+def test_noise_counts_as_that_of_fifty_places() -> None:
+    """Against the posterior mean of a linear model with noise of a known deviation: a skin's spots are no 4,000
+    independent observations, so that a strong pattern is drawn towards the prior."""
+    n, rng, a = face(), np.random.default_rng(5), 0.8
+    rows = irradiance_basis(n)
+    rows[:, 0] = 1
+    true = np.array([1.0, 0, 0, 0.3, 0, 0, 0, 0, 0])
+    y = rows @ true + a * rng.uniform(-1, 1, len(n))
+    found = correction(np.repeat(y[:, None], 3, 1), np.ones((len(n), 3)), n, EVEN_STD)
+    std = np.array([10.0, 0.3, 0.3, 0.5, 0.5, 0.3, 0.3, 0.5, 0.3])  # xy, xz and x are odd
+    weight = 50 / len(n) / (1.4826 * a / 2) ** 2
+    y = y / np.median(y)
+    best = np.linalg.solve(weight * rows.T @ rows + np.diag(std**-2), weight * rows.T @ y)
+    free = np.linalg.lstsq(rows, y, rcond=None)[0]
+    assert found is not None
+    np.testing.assert_allclose(found.change[1:, 0], best[1:] / best[0], atol=0.012)
+    assert abs(best[3] / best[0] - free[3] / free[0]) > 0.03
