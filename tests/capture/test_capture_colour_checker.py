@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +14,9 @@ from skimage.color import lab2xyz
 from pipeline.colour import srgb_from_linear
 from pipeline.errors import StageError
 from pipeline.images import read_linear, write_exr
+from stages.capture import colour_matrix
 from stages.capture.colour_checker import HUES, PATCHES, REFLECTANCES, Patches, find_chart, hues, places
+from stages.capture.colour_correction import read_charts
 from stages.capture.colour_matrix import ColourMatrix, colour_matrix_of
 
 LAB = np.array([
@@ -229,3 +233,38 @@ def test_float_files_stay_float_and_cameras_have_maps_of_their_own(tmp_path: Pat
         assert view.image.path.endswith(".exr")
         shown = read_linear(found.path(view.image)) / chart.level
         assert float(np.abs(shown - truth).max()) < 0.03
+
+
+def test_of_a_cameras_charts_the_best_counts_at_its_photos_exposure() -> None:
+    """The same chart three times: at twice and at half the exposure, and with noise."""
+    rng, known = np.random.default_rng(6), exact(CAMERA)
+    noisy = known.colours * rng.normal(1, 0.03, (PATCHES, 3))
+    colours = [2.0 * noisy, 0.5 * known.colours, noisy]
+    views: Any = [
+        SimpleNamespace(name=f"{i}.png", camera_group="one", exposure=e, index=i) for i, e in enumerate((2.0, 0.5, 1.0))
+    ]
+    chart = read_charts(views, [Patches(QUAD, c, known.usable) for c in colours], wanted=True).chart
+    assert chart is not None and chart.photos == ("0.png", "1.png", "2.png")
+    (fit,) = chart.fits
+    assert fit.photo == "1.png" and fit.error < 1e-6
+    np.testing.assert_allclose(np.array(fit.matrix).reshape(3, 3), np.linalg.inv(CAMERA), atol=1e-5)
+
+
+@pytest.mark.parametrize("diagonal", [True, False])
+def test_the_error_is_that_of_patches_that_were_left_out(diagonal: bool) -> None:
+    """Against the closed form of least squares: what a block of rows is off by without itself is (1 - H)^-1 of what it
+    is off by with itself, H the block of the hat matrix."""
+    rng = np.random.default_rng(8)
+    found = Patches(QUAD, exact(CAMERA).colours * rng.normal(1, 0.05, (PATCHES, 3)), np.ones(PATCHES, bool))
+    count = 3 if diagonal else 9
+    rows, y = np.zeros((PATCHES, 3, count + 2)), np.zeros((PATCHES, 3))
+    for i, (c, r, at) in enumerate(zip(found.colours, REFLECTANCES, places(), strict=True)):
+        weight = 1 / (r @ [0.2126, 0.7152, 0.0722] + 0.1)
+        linear = np.diag(c) if diagonal else np.kron(np.eye(3), c[None])
+        rows[i], y[i] = weight * np.hstack([linear, -r[:, None] * at]), weight * r
+    flat = rows.reshape(-1, count + 2)
+    hat = flat @ np.linalg.pinv(flat)
+    off = (hat @ y.ravel() - y.ravel()).reshape(PATCHES, 3)
+    blocks = [hat[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(PATCHES)]
+    without = np.stack([np.linalg.solve(np.eye(3) - h, e) for h, e in zip(blocks, off, strict=True)])
+    assert colour_matrix._left_out(found, diagonal) == pytest.approx(float(np.sqrt((without**2).mean())), rel=1e-6)

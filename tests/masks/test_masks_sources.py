@@ -91,6 +91,15 @@ def test_no_uniform_background() -> None:
     assert find_background([]) is None
 
 
+@pytest.mark.parametrize("softness", [1.0, 3.0])
+def test_soft_edge_is_the_share_of_the_subject_in_each_pixel(softness: float) -> None:
+    alpha = blob(120, 40.0, softness)
+    found = soft_edge(photo(alpha, (0.6, 0.3, 0.2), (0.05, 0.1, 0.3)), alpha >= 0.5, 4)
+    assert np.abs(found - alpha).max() < 0.06
+    mixed = (alpha > 0.1) & (alpha < 0.9)
+    assert np.corrcoef(found[mixed], alpha[mixed])[0, 1] > 0.99
+
+
 def test_soft_edge_without_contrast_is_a_blurred_edge() -> None:
     grey = np.full((80, 80, 3), 128, np.uint8)
     inside = blob(80, 20.0) >= 0.5

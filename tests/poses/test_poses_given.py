@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from pipeline.artifacts import Camera
 from pipeline.errors import UsageError
-from pipeline.transforms import apply, matrix, project
+from pipeline.transforms import apply, matrix, project, rows
+from stages.poses import given_cameras, sfm
+from stages.poses.config import Config
+from stages.poses.epipolar_check import FAR, IMPERFECT
 from tests.support.textured_ball import camera_on_orbit, flat, write_facescape
 
 SIZE = (96, 80)
@@ -72,3 +78,45 @@ def test_shared_captures(name: str, repo: Path, capture_of, place) -> None:
     found = place(capture).artifact
     assert len(found.cameras) == len(capture.artifact.views) == 54 and found.metric
     assert 0.15 < found.roi_radius < 0.2 and found.warnings == ()
+
+
+def cameras_around(distance: float) -> list[Camera]:
+    return [
+        Camera(index=i, name=f"{i}.jpg", width=SIZE[0], height=SIZE[1], K=rows(K), distortion=(0,) * 5,
+               world_from_cam=rows(camera_on_orbit(40.0 * i, 8, distance, TARGET)))
+        for i in range(5)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "limit"), [("refine", IMPERFECT), ("triangulate", FAR)])
+def test_cameras_that_are_refined_may_be_less_exact(monkeypatch: pytest.MonkeyPatch, given: str, limit: float) -> None:
+    """The check that finds a photo of another camera asks for less, where the fit of the cameras mends the rest."""
+    asked: list[float] = []
+    cameras: Any = cameras_around(1.0)
+    verdict = SimpleNamespace(share=np.ones(5), wrong=[], known=5)
+    monkeypatch.setattr(given_cameras, "photos_of", lambda capture: [])
+    monkeypatch.setattr(given_cameras, "progress_of", lambda context: None)
+    monkeypatch.setattr(given_cameras, "features_of", lambda *a: [])
+    monkeypatch.setattr(given_cameras, "find_mirrored", lambda *a: [])
+    monkeypatch.setattr(given_cameras, "check_cameras", lambda *a: asked.append(a[-1]) or verdict)
+    wrong, _ = given_cameras._contradicted(None, cameras, Config(given=given), None)  # type: ignore[arg-type]
+    assert asked == [limit] and wrong == [] and IMPERFECT > FAR
+
+
+@pytest.mark.parametrize("distance", [1.0, 250.0])
+def test_given_centres_may_move_by_a_share_of_their_distance(monkeypatch: pytest.MonkeyPatch, distance: float) -> None:
+    """In whatever unit the cameras are given."""
+    told: dict[str, Any] = {}
+
+    def triangulated(*a: Any, **options: Any) -> Any:
+        told.update(options)
+        return SimpleNamespace(poses=[]), []
+
+    monkeypatch.setattr(sfm, "triangulate_given", triangulated)
+    monkeypatch.setattr(given_cameras, "photos_of", lambda capture: list(range(5)))
+    monkeypatch.setattr(given_cameras, "progress_of", lambda context: None)
+    capture: Any = SimpleNamespace(artifact=SimpleNamespace(kind="photos", views=[]))
+    config = Config(given="triangulate", given_deviation=0.02)
+    context: Any = SimpleNamespace(scratch=None)
+    given_cameras._triangulated(capture, list(range(5)), cameras_around(distance), config, context)
+    assert told["deviation"] == pytest.approx(0.02 * distance, rel=1e-3) and told["refine"] is False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -214,3 +215,20 @@ def test_the_size_of_a_head_is_guessed_from_its_landmarks() -> None:
     found = size_of_head(landmarks_of(faces))
     assert found is not None and found.metres_per_unit == pytest.approx(HEAD_SIZE / unit, rel=0.02)
     assert "guessed" in found.source and size_of_head(landmarks_of([])) is None and landmarks_of(faces[:2]) is None
+
+
+def test_the_error_of_positions_is_without_bias() -> None:
+    """A similarity has seven free numbers, which so few positions partly take up: the mean of the squares told is 3
+    sigma^2 all the same."""
+    rng, sigma = np.random.default_rng(3), 0.12
+    ring = [camera_on_orbit(a, 10, 1.0, np.zeros(3)) for a in range(0, 360, 60)]
+    cameras = [CAMERAS[0].model_copy(update={"index": i, "world_from_cam": rows(p)}) for i, p in enumerate(ring)]
+    told = []
+    for _ in range(300):
+        scale, why = by_positions(
+            cameras, {i: tuple(p[:3, 3] + sigma * rng.normal(size=3)) for i, p in enumerate(ring)}
+        )
+        said = re.search(r"an error of (\S+) m", why if scale is None else scale.source)
+        assert said is not None
+        told.append(float(said[1]) ** 2)
+    assert np.mean(told) == pytest.approx(3 * sigma**2, rel=0.1)

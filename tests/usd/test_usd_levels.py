@@ -153,6 +153,12 @@ def test_glb_holds_the_same_mesh_and_look(exported, inputs: SyntheticInputs) -> 
     stored = cv2.imdecode(np.frombuffer(content[start : start + view["byteLength"]], np.uint8), -1)[..., 0] / 255
     linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(0.04 * factor * linear, texture_arrays()["f0"][..., 0], atol=5e-4)
+    index = material["pbrMetallicRoughness"]["metallicRoughnessTexture"]["index"]
+    view = document["bufferViews"][document["images"][index]["bufferView"]]
+    start = 20 + length + 8 + view["byteOffset"]
+    packed = cv2.imdecode(np.frombuffer(content[start : start + view["byteLength"]], np.uint8), -1)  # blue, green, red
+    np.testing.assert_allclose(packed[..., 1] / 255, texture_arrays()["roughness"][..., 0], atol=3e-3)
+    assert not packed[..., 0].any(), "blue is how metallic it is"
 
 
 def test_obj_reads_back(exported) -> None:

@@ -66,6 +66,16 @@ def test_infinite_suns_are_bounded() -> None:
     assert found.directions[found.flux[:, 0].argmax()] @ latlong_directions(16, 8)[2, 3] > 0.999
 
 
+def test_a_bright_window_leaves_lamps_to_the_dim_sky() -> None:
+    """Nearly all of the light comes from a two-hundredth of the sphere; half of the cuts are of the rest."""
+    image = np.full((64, 128, 3), 1e-3, np.float32)
+    image[28:36, 60:68] = 100.0
+    found = lamps(image, 64)
+    dim = found.flux[:, 1] / found.solid < 1
+    assert 20 <= dim.sum() <= 44 and found.solid[dim].max() < 0.1 * 4 * np.pi
+    assert found.flux[~dim].sum() > 0.999 * found.flux.sum() and found.solid[~dim].sum() < 0.02 * 4 * np.pi
+
+
 def test_nothing_is_in_the_way_on_a_convex_body() -> None:
     mesh = ball(48, 24, height=1.0)
     transport = Transport(mesh["vertices"], mesh["normals"], mesh["faces"])
