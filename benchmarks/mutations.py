@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.mutation import Mutation
@@ -79,6 +80,13 @@ def recorded() -> list[str]:
     return [known.get(m.change, NOT_RUN) for m in MUTATIONS]
 
 
+def chosen(only: Sequence[str] = ("",), *, left: bool = False) -> list[Mutation]:
+    """The changes with one of these texts in the name of their file or tests. left: without those that were killed."""
+    named = [m for m in MUTATIONS if any(text in m.file or text in m.tests for text in only)]
+    fates = dict(zip(MUTATIONS, recorded(), strict=True))
+    return [m for m in named if not left or fates[m] != KILLED]
+
+
 def page() -> str:
     """The document: a row for each change, in the order of the list."""
     fates = recorded()
@@ -114,24 +122,23 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--left", action="store_true", help="only those not recorded as killed")
     parser.add_argument("--write", action="store_true", help=f"write the table of {PAGE.relative_to(ROOT)}")
     options = parser.parse_args(arguments)
-    only = options.only
-    chosen = [m for m in MUTATIONS if any(text in m.file or text in m.tests for text in only)]
-    if not chosen:
-        parser.error(f"no change has {only!r} in the name of its file or tests")
-    if options.left:
-        done = dict(zip(MUTATIONS, recorded(), strict=True))
-        chosen = [m for m in chosen if done[m] != KILLED]
+    if not chosen(options.only):
+        parser.error(f"no change has {options.only!r} in the name of its file or tests")
+    asked = chosen(options.only, left=options.left)
+    if not asked:
+        print("nothing is left: all of them were killed")
+        return 0
     with tempfile.TemporaryDirectory(prefix="mutations") as folder:
         tree = copied(Path(folder) / "tree")
         begun = time.monotonic()
-        code, said = outcome(tree, sorted({m.tests for m in chosen}))
+        code, said = outcome(tree, sorted({m.tests for m in asked}))
         limit = max(LIMIT, PATIENCE * (time.monotonic() - begun))
         if code != 0:
             print(f"the tests fail without any change: {said}")
             return 2
         fates: list[str] = []
         known = {m.change: f for m, f in zip(MUTATIONS, recorded(), strict=True)}
-        for m in chosen:
+        for m in asked:
             begun = time.monotonic()
             what, said = fate(tree, m, limit)
             fates.append(what)

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.mutation import Mutation
 from benchmarks.mutation_list import MUTATIONS
-from benchmarks.mutations import NOT_RUN, PAGE, PARTS, fate, main, page, recorded
+from benchmarks.mutations import KILLED, NOT_RUN, PAGE, PARTS, chosen, fate, main, page, recorded
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,7 +33,7 @@ def test_the_list_spans_the_product() -> None:
 def test_the_page_says_what_was_measured_and_none_survived() -> None:
     """Made by --write; a change that was never made says so."""
     assert PAGE.read_text() == page()
-    assert set(recorded()) <= {"killed", NOT_RUN}
+    assert set(recorded()) <= {KILLED, NOT_RUN}
 
 
 @pytest.mark.parametrize(
@@ -56,6 +56,17 @@ def test_a_change_is_killed_only_by_a_test_that_fails_and_is_taken_back(
     assert fate(tmp_path, Mutation("code_to_change.py", "1 + 1", "1 + 2", "test_it.py"))[0] == expected
     assert code.read_text() == "def f():\n    return 1 + 1\n" and code.stat().st_mtime_ns == before
     assert fate(tmp_path, Mutation("code_to_change.py", "1 + 7", "1", "test_it.py"))[0] == "unclear"
+
+
+def test_a_run_may_leave_out_what_was_killed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fates = [KILLED, "survived", NOT_RUN] + [KILLED] * (len(MUTATIONS) - 3)
+    monkeypatch.setattr("benchmarks.mutations.recorded", lambda: fates)
+    assert chosen(left=True) == list(MUTATIONS[1:3]) and len(chosen()) == len(MUTATIONS)
+    assert chosen(["stages/uv/"]) == [m for m in MUTATIONS if m.file.startswith("stages/uv/")] != []
+    assert chosen(["stages/uv/"], left=True) == []
+    assert main(["--left", "--only", "stages/uv/"]) == 0 and "nothing is left" in capsys.readouterr().out
 
 
 def test_a_choice_without_changes_is_refused() -> None:

@@ -199,3 +199,20 @@ def test_where_the_lobe_is_not_asked(changes: dict[str, Any]) -> None:
     t = trainer(Ball(gloss(4, 0.25)), **changes)
     t.select_model()
     assert t.choices is not None and not t.choices.light_known and t.weights().albedo_sparsity > 0
+
+
+@pytest.mark.parametrize("index", [20, 30, 45])
+def test_the_scale_is_that_which_makes_the_albedo_even(index: int) -> None:
+    """D = a E / pi of one albedo, and the lobe's part of any size beside it: nothing is left to explain at the scale
+    with which the colours were made."""
+    light, scale, rng = true_light(ratio=3.0), lamp_module.SCALES[index], np.random.default_rng(4)
+    n = unit(rng.normal(size=(400, 3)))
+    glow, even = 0.3 * light[0] * rng.normal(size=400), rng.uniform(0.02, 0.06, 400)
+    lambdas = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4, 0], [1, 3, 5, 7])
+    scaled = light * np.concatenate([[1.0], np.full(15, scale)])
+    lit = 0.4 / np.pi * harmonics(n, ORDER) @ (lambdas * scaled)
+    none = np.zeros(0, np.int64)
+    seen = Observations(torch.zeros(400, 3), torch.from_numpy(n), none, none, np.zeros((0, 3)), np.zeros((0, 3)))
+    total = lit + scale * glow + even * light[0]
+    found = lamp_module._evenest(seen, light, total, glow, even, np.ones(400, bool))
+    assert (lit > 0.05 * lit.mean()).all() and found == pytest.approx(scale, rel=1e-9)

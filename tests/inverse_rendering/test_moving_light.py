@@ -225,3 +225,18 @@ def test_errors_are_those_of_points_that_had_no_vote() -> None:
     assert moving_light._solve(seen, parts, lit).error < 1e-6
     wrong = replace(seen, colour=colour + 0.1 * parts.test[:, None])
     assert moving_light._solve(wrong, parts, lit).error == pytest.approx(0.1 / wrong.colour.mean(), rel=1e-6)
+
+
+def test_a_flash_falls_off_with_the_square_of_the_distance() -> None:
+    """A camera at the origin looks along +z at two places that face it, at 1 and at 2 metres."""
+    from stages.inverse_rendering.observations import Observations
+
+    one, toward = np.arange(2), np.array([[0.0, 0, -1], [0, 0, -1]])
+    x = torch.tensor([[0.0, 0, 1], [0, 0, 2]])
+    seen = Observations(x, torch.from_numpy(toward), one, np.zeros(2, np.int64), np.ones((2, 3)), toward)
+    view: Any = type("V", (), {"world_from_cam": np.eye(4)})()
+    stations, distance = moving_light._stations(seen, [view])
+    lit = {f: moving_light._lit(f, seen, stations, distance) for f in (WORLD, CAMERA, FLASH)}
+    np.testing.assert_allclose(lit[FLASH][0], 4 * lit[FLASH][1], rtol=1e-9)
+    np.testing.assert_allclose(lit[CAMERA][0], lit[CAMERA][1], rtol=1e-9)
+    assert lit[WORLD].shape == (2, 1) and (lit[FLASH] > 0).any()

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from pipeline.fields.appearance import SpatialField
+from pipeline.fields.light import ShLight
 from pipeline.meshes import F64
 from stages.inverse_rendering import skin_light
 from stages.inverse_rendering.fit import Trainer
@@ -18,6 +19,7 @@ from stages.inverse_rendering.skin_light import (
     DARKEST,
     EVEN_STD,
     MIN_POINTS,
+    SkinLight,
     bright_enough,
     correct_light,
     correction,
@@ -193,3 +195,26 @@ def test_noise_counts_as_that_of_fifty_places() -> None:
     assert found is not None
     np.testing.assert_allclose(found.change[1:, 0], best[1:] / best[0], atol=0.012)
     assert abs(best[3] / best[0] - free[3] / free[0]) > 0.03
+
+
+def test_the_fitted_light_may_have_sides_of_its_own() -> None:
+    """E' = E + E_0 sum b A Y is exact for lights of one mean radiance, however uneven the fitted one is."""
+    n = face()
+    seen = of_three(WHITE + 0.8 * WINDOW, WHITE + 0.5 * WINDOW, WHITE - 0.4 * WINDOW)
+    true = of_three(WHITE - 0.5 * WINDOW, WHITE + WINDOW, WHITE + 0.3 * WINDOW)
+    found = correction(*fitted(n, true, seen), n, EVEN_STD)
+    assert found is not None and (found.explained > 0.99).all()
+    np.testing.assert_allclose(found.change[1:], (true - seen)[1:], atol=0.05)
+
+
+@pytest.mark.parametrize("size", [0.5, -0.5])
+def test_the_faces_mean_irradiance_stays(size: float) -> None:
+    """Light from the front makes a face brighter and dimmer as a whole; its albedo's level must not follow."""
+    n = torch.from_numpy(face()).float()
+    light, change = ShLight(4, 1.0), np.zeros((9, 3))
+    change[2] = size  # z
+    before = light.irradiance(n).detach()
+    skin_light._apply(light, SkinLight(change, np.ones(3)), n, before)
+    after = light.irradiance(n).detach()
+    assert float(after.mean()) == pytest.approx(float(before.mean()), rel=1e-5)
+    assert float(after.std()) > 0.02 * float(after.mean())

@@ -57,6 +57,14 @@ def test_a_mesh_that_did_not_move_changes_nothing() -> None:
     np.testing.assert_allclose(twice.normal, field.normal, atol=1e-4)
 
 
+def test_one_turn_after_another_is_their_product() -> None:
+    field, v = uneven(), uneven().mesh.vertices.astype(float)
+    other = Rotation.from_rotvec([0.9, -0.4, 0.2]).as_matrix()
+    twice = moved(moved(field, v @ TURN.T), v @ TURN.T @ other.T)
+    assert twice.turn is not None and np.abs(other @ TURN - TURN @ other).max() > 0.1
+    np.testing.assert_allclose(twice.turn, np.broadcast_to(other @ TURN, twice.turn.shape), atol=1e-5)
+
+
 def test_normals_of_a_stretched_ball_are_an_ellipsoids() -> None:
     """Oracle: the gradient of x^2 / a^2 + y^2 / b^2 + z^2 / c^2."""
     field, axes = field_of(np.full(3, 0.5)), np.array([1.4, 0.8, 1.1])

@@ -72,6 +72,22 @@ def test_unseen_values_are_harmonic() -> None:
     np.testing.assert_array_equal(harmonic(values, np.ones(400, bool), position), values)
 
 
+def test_near_texels_count_more_than_far_ones() -> None:
+    """Against the same system written as a full matrix, on texels that lie unevenly: w = 1 / distance."""
+    rng = np.random.default_rng(11)
+    position = rng.uniform(size=(60, 3)) ** 3
+    values, known = rng.normal(size=(60, 2)).astype(np.float32), rng.random(60) > 0.4
+    away = np.linalg.norm(position[:, None] - position[None], axis=2)
+    near = np.argsort(away, axis=1)[:, 1:9]
+    w = np.zeros((60, 60))
+    for i in range(60):
+        w[i, near[i]] = 1 / away[i, near[i]]
+    w += w.T
+    u, k = np.flatnonzero(~known), np.flatnonzero(known)
+    wanted = np.linalg.solve(np.diag(w[u].sum(1)) - w[np.ix_(u, u)], w[np.ix_(u, k)] @ values[k])
+    np.testing.assert_allclose(harmonic(values, known, position)[u], wanted, atol=1e-4)
+
+
 def test_a_matt_ball_is_lamberts() -> None:
     """Oracle: a / pi n.l I / d^2, by hand, at pixels near the middle."""
     field = field_of(np.array([0.5, 0.4, 0.3]))

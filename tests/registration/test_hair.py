@@ -147,3 +147,34 @@ def test_the_skin_lies_deeper_further_inwards() -> None:
     np.testing.assert_allclose(1000 * told.depth_beneath(patches, inside), wanted, atol=1e-9)
     assert not told.depth_beneath(patches, np.zeros(12, bool)).any()
     np.testing.assert_allclose(told.depth_beneath(patches, np.ones(12, bool)), told.BENEATH)
+
+
+def test_heights_are_metres_of_the_template_in_any_unit(hairy: tuple[Patches, Mask, told.Places]) -> None:
+    """The same head ten times as large, as in a capture whose unit is a decimetre."""
+    mesh, _ = hairy_head(THICK)
+    large = replace(mesh, vertices=(10 * mesh.vertices).astype(np.float32))
+    head = PlacedHead(np.diag([10.0, 10.0, 10.0, 1.0]), np.zeros(0), 10 * persons.template().vertices, np.zeros(0), 0.0)
+    found = told.places_of(persons.template(), head, patches_of(large, 10 * told.PATCH))
+    assert found.shrink == pytest.approx(0.1)
+    for name in ("scalp", "face"):
+        wanted = np.quantile(hairy[2].height[hairy[2].on(name)], [0.1, 0.5, 0.9])
+        np.testing.assert_allclose(np.quantile(found.height[found.on(name)], [0.1, 0.5, 0.9]), wanted, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("rise", "change", "hair"),
+    [
+        (0.0025, 20.0, True),  # one and one
+        (0.0035, 8.0, True),  # 1.4 and 0.4
+        (0.0016, 12.0, False),  # 0.64 and 0.6
+        (0.0014, 60.0, False),  # hardly rises
+        (0.0200, 5.0, False),  # hardly changes
+    ],
+)
+def test_rise_and_change_together_say_that_it_is_hair(
+    hairy: tuple[Patches, Mask, told.Places], monkeypatch: pytest.MonkeyPatch, rise: float, change: float, hair: bool
+) -> None:
+    patches, true, places = hairy
+    monkeypatch.setattr(told, "_at_border", lambda *a: (rise, change))
+    found = told.tell_hair(patches, places, albedo(patches, true), np.ones(len(true)))
+    assert found.inside.any() == hair and (found.reason == "") == hair

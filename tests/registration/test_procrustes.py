@@ -58,6 +58,15 @@ def test_a_mirrored_shape_is_turned_and_not_mirrored() -> None:
     assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
 
 
+def test_the_scale_of_a_mirrored_shape_is_that_of_least_squares() -> None:
+    """For the rotation found, the best scale is sum y . R x / sum x . x about the middles."""
+    target = 1.3 * SHAPE * [-1, 1, 1]
+    found = weighted(SHAPE, target, ONE, scaled=True)
+    x, y = SHAPE - SHAPE.mean(0), target - target.mean(0)
+    turned = x @ (found[:3, :3] / scale_of(found)).T
+    assert scale_of(found) == pytest.approx(float((y * turned).sum() / (x * x).sum()))
+
+
 @pytest.mark.parametrize("weights", [0 * ONE, np.eye(200)[0], np.eye(200)[0] + np.eye(200)[1]])
 def test_too_few_points_have_no_rotation(weights: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"line|weight"):
