@@ -103,6 +103,34 @@ def test_a_layer_keeps_what_microfacets_reflect() -> None:
     np.testing.assert_allclose(standard.layer(cosine, np.full(4, 0.03), alpha), 0.03 * a + b, rtol=0.05)
 
 
+@pytest.mark.parametrize("f0", [0.04, 0.5, 0.95])
+@pytest.mark.parametrize("cosine", [0.9, 0.3, 0.1])
+def test_a_single_sharp_lamp_reflects_by_the_formula(f0: float, cosine: float) -> None:
+    """Opposite of the eye, where Schlick's rim is strongest."""
+    n, v = tilted(cosine)
+    w = 2 * (n @ v) * n - v
+    one = np.ones((1, 1, 3), np.float32)
+    at = standard.Arrivals(one, np.concatenate([w, [0.0]]).astype(np.float32)[:, None], np.ones((1, 3), np.float32))
+    corner, weights = np.zeros((1, 3), np.int32), np.full((1, 3), 1 / 3, np.float32)
+    base, values = np.zeros((1, 3), np.float32), [np.full(1, x, np.float32) for x in (f0, 0.6)]
+    shown = standard.radiance(at, corner, weights, n[None], v[None], base, *values)[1]
+    np.testing.assert_allclose(shown, float(ggx(n, v, w, f0, 0.36)), rtol=2e-4)
+
+
+def test_the_layers_table_is_exact_where_it_was_made_and_linear_between() -> None:
+    """Entries are at the middles of SIDE intervals of the cosine and of the roughness, which is the root of alpha."""
+    at = (np.array([9, 10, 20, 40, 41]) + 0.5) / standard.SIDE
+    cosine, rough = (g.ravel() for g in np.meshgrid(at, at))
+    a, b = microfacet.split_albedo(cosine, rough**2)
+    f0 = np.full(len(a), 0.03)
+    exact = 0.03 * a + b
+    np.testing.assert_allclose(standard.layer(cosine, f0, rough**2), exact, rtol=1e-9)
+    half = at[0] + 0.5 / standard.SIDE
+    middle = standard.layer(np.full(5, half), f0[:5], at**2)
+    square = exact.reshape(5, 5)  # rows of one roughness
+    np.testing.assert_allclose(middle, (square[:, 0] + square[:, 1]) / 2, rtol=1e-9)
+
+
 def test_light_arrives_on_a_convex_body_without_loss() -> None:
     mesh = ball(48, 24, height=1.0)
     lit = lamps(sky(64), 96)

@@ -38,6 +38,20 @@ def test_a_ball_in_patches() -> None:
     assert len(np.unique(np.stack([patches.a, patches.b], 1), axis=0)) == len(patches.a)
 
 
+def test_each_patch_has_a_third_of_the_area_of_its_vertices_triangles() -> None:
+    """Triangle by triangle, on a ball whose upper half is three times as wide."""
+    ball = ball_scan(RADIUS)
+    wide = np.where(ball.vertices[:, 1:2] > 0, np.float32([3, 1, 1]), np.float32([1, 1, 1]))
+    mesh = Mesh(ball.vertices * wide, ball.normals, ball.faces)
+    patches = patches_of(mesh, 0.012)
+    wanted = np.zeros(len(patches.where))
+    for face, area in zip(mesh.faces, areas(mesh.vertices, mesh.faces), strict=True):
+        for corner in face:
+            wanted[patches.of_vertex[corner]] += area / 3
+    np.testing.assert_allclose(patches.area, wanted, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(patches.normals, axis=1), 1, rtol=1e-6)
+
+
 def test_two_sheets_in_one_cell_are_two_patches() -> None:
     a, b = sheet(0.0), sheet(0.001, up=False)
     both = Mesh(
