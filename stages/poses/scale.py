@@ -149,9 +149,8 @@ def find_markers(grey: U8, dictionary: str) -> dict[int, F64]:
     corners, numbers, _ = detector.detectMarkers(grey)
     if numbers is None:
         return {}
-    found = {
-        int(n): np.asarray(c, np.float64).reshape(4, 2) + 0.5 for n, c in zip(numbers.ravel(), corners, strict=True)
-    }
+    # AprilTag counts pixels from their corners, unlike the rest of OpenCV: nothing is to be added
+    found = {int(n): np.asarray(c, np.float64).reshape(4, 2) for n, c in zip(numbers.ravel(), corners, strict=True)}
     twice = {int(n) for n in numbers.ravel() if (numbers == n).sum() > 1}
     return {n: c for n, c in found.items() if n not in twice}
 

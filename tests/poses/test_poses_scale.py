@@ -232,3 +232,15 @@ def test_the_error_of_positions_is_without_bias() -> None:
         assert said is not None
         told.append(float(said[1]) ** 2)
     assert np.mean(told) == pytest.approx(3 * sigma**2, rel=0.1)
+
+
+@pytest.mark.parametrize("kind", ["aruco_4x4", "apriltag_36h11"])
+def test_corners_of_a_marker_are_where_its_edges_are(kind: str) -> None:
+    """Of pixels 100 to 199, the first of which begins at 100.0: a pixel's centre is at a half."""
+    picture = np.full((300, 300), 255, np.uint8)
+    dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[kind])
+    picture[100:200, 100:200] = cv2.aruco.generateImageMarker(dictionary, 7, 100)
+    (corners,) = find_markers(cv2.GaussianBlur(picture, (0, 0), 0.8), kind).values()
+    wanted = np.array([[100.0, 100], [200, 100], [200, 200], [100, 200]])
+    apart = np.linalg.norm(corners[:, None] - wanted[None], axis=2).min(1)
+    assert apart.max() < 0.25, corners

@@ -200,3 +200,20 @@ def test_the_penalty_is_the_squared_laplacian() -> None:
     values = penalties(3)
     assert len(values) == 16
     np.testing.assert_allclose((values - 1e-3)[[0, 1, 4, 9]], 0.5 / 36 * np.array([0, 4, 36, 144]))
+
+
+@pytest.mark.parametrize("arrived", [0.0, 0.3, 0.8, 1.0])
+def test_the_share_that_arrives_is_that_of_the_model(arrived: float) -> None:
+    """A matt texel seen by two cameras, one of which says a little more and one a little less."""
+    from stages.reflectance.fit_kernels import observe
+
+    point, normal = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
+    light, axis = np.array([[0.3, 0.2, 1.0]]), -np.array([[0.3, 0.2, 1.0]]) / np.sqrt(1.13)
+    eyes = np.array([[[0.0, 0.5, 1.0]], [[-0.5, 0.0, 1.0]]])
+    albedo, lobes, alphas = np.array([[0.6, 0.4, 0.3]]), np.zeros((1, 3)), np.array([0.3, 0.12, 0.04])
+    model = albedo[0] / np.pi / np.sqrt(1.13)
+    samples = (arrived * model * np.array([[1.05], [0.95]]))[:, None].astype(np.float32)
+    share, trust = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.float32)
+    observe(point, normal, np.array([0, 2]), np.array([0, 1]), np.ones(2), samples, light, axis, eyes, alphas, albedo,
+            lobes, 0.1, share, trust)  # fmt: skip
+    assert float(share[0, 0]) == pytest.approx(arrived, abs=1e-5) and float(trust[0, 0]) == 1

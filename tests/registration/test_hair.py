@@ -178,3 +178,18 @@ def test_rise_and_change_together_say_that_it_is_hair(
     monkeypatch.setattr(told, "_at_border", lambda *a: (rise, change))
     found = told.tell_hair(patches, places, albedo(patches, true), np.ones(len(true)))
     assert found.inside.any() == hair and (found.reason == "") == hair
+
+
+def test_a_colour_of_skin_or_of_clothes_speaks_against_hair() -> None:
+    """On the scalp without height, where nothing but the colour differs: seeds of three colours far apart."""
+    rng, count = np.random.default_rng(2), 30
+    kind = np.repeat([0, 1, 2], count)
+    colour = np.array([[20.0, 5, 8], [65.0, 18, 20], [40.0, 0, -40]])[kind] + rng.normal(size=(3 * count, 3))
+    none = np.zeros(3 * count)
+    places = told.Places(np.zeros(3 * count, np.int64), ("scalp",), none, np.zeros((3 * count, 3)))
+    odds = told._log_odds(places, none + 1, colour, kind == 1, kind == 0, kind == 2)
+    hair, skin, clothes = (odds[kind == k] for k in range(3))
+    np.testing.assert_allclose(hair - skin, 2 * told.COLOUR_MOST)
+    np.testing.assert_allclose(hair - clothes, 2 * told.COLOUR_MOST)
+    unseen = told._log_odds(places, none, colour, kind == 1, kind == 0, kind == 2)
+    np.testing.assert_allclose(unseen, told.PRIOR["scalp"])

@@ -143,3 +143,31 @@ def test_gltf_has_morph_targets_with_normals(asset: Path) -> None:
             assert np.linalg.norm(normals + bent, axis=1).min() > 0.5
             moved += int((offsets != 0).any(1).sum())
     assert moved > 100
+
+
+def test_a_shapes_normals_are_those_of_the_moved_mesh() -> None:
+    """A flat square whose middle is lifted: beside it the normals tilt away, by half of a roof's slope."""
+    from types import SimpleNamespace
+
+    from stages.usd.write.gltf import bent_normals
+    from stages.usd.write.mesh import UvSurface
+
+    y, x = np.mgrid[0:5, 0:5]
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1).astype(np.float32)
+    at = np.arange(25).reshape(5, 5)
+    a, b, c, d = at[:-1, :-1].ravel(), at[:-1, 1:].ravel(), at[1:, 1:].ravel(), at[1:, :-1].ravel()
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]).astype(np.int32)
+    rows = np.array([7, 11, 12, 13, 17])
+    offsets = np.where((rows == 12)[:, None], [0.0, 0, 0.5], 0.0)
+    rig: Any = SimpleNamespace(weights=np.zeros((25, 2)), shapes=[SimpleNamespace(rows=rows, offsets=offsets)])
+    mesh = UvSurface(points, np.tile(np.float32([0, 0, 1]), (25, 1)), faces, points[:, :2] / 4, faces)
+    (bent,) = bent_normals(mesh, rig)
+    moved = points.astype(float)
+    moved[rows] += offsets
+    corners = moved[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros((25, 3))
+    np.add.at(total, faces.ravel(), np.repeat(across, 3, 0))
+    wanted = total / np.linalg.norm(total, axis=1, keepdims=True) - [0, 0, 1]
+    np.testing.assert_allclose(bent, wanted[rows], atol=1e-6)
+    assert bent[1, 0] < -0.1 < 0.1 < bent[3, 0], "left and right of the middle"
