@@ -4,8 +4,10 @@
 
 As benchmarks/kill_matrix.py for one run, whose cells these are. The batch has two captures of three small photos, and
 toy stages behind the real capture (tests/support/toy_batch.py). No clock decides where a capture is: its process is
-held at a named checkpoint, and the signal goes to the batch. The batch is started again and again into the same folder;
-at the end it goes through undisturbed, and each asset must have the bytes of a batch that nothing disturbed.
+held at a named checkpoint, and the signal goes to the batch. While it starts up it is `neuface` itself, up to the stage
+capture, in a folder of its own: the toy's program imports more before it can heed a signal. The batch is started again
+and again into the same folder; at the end it goes through undisturbed, and each asset must have the bytes of a batch
+that nothing disturbed.
 """
 
 from __future__ import annotations
@@ -54,6 +56,7 @@ BEGIN, END = "<!-- made by benchmarks/kill_batch.py -->", "<!-- end of the batch
 TOY = ROOT / "tests/support/toy_batch.py"
 CAPTURES = ("1/1_neutral", "2/1_neutral")
 STEPS = 60  # of the toy stage: each start of the batch takes up to two further
+STEPPED = ("--set", f"work.steps={STEPS}")
 HELD = "work.checkpoint@2"
 GONE = 5.0  # seconds in which the captures' processes must follow a batch that was killed
 
@@ -75,12 +78,13 @@ MOMENTS = (
 )
 
 
-def start(folder: Path, out: Path, mark: str, point: Point | None, *more: str) -> subprocess.Popen[str]:
+def start(
+    folder: Path, out: Path, mark: str, point: Point | None, *more: str, program: Sequence[str] = (str(TOY),)
+) -> subprocess.Popen[str]:
     """The batch's process, in a group of its own; all that it starts has the mark in its environment."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_API") and k != "NEUFACE_STORE"}
     environment = {**kept, **ONE_THREAD, "PYTHONPATH": str(ROOT), MARK: mark, **(point.environment() if point else {})}
-    command = [sys.executable, str(TOY), "batch", str(folder / "tree"), "--out", str(out)]
-    command += ["--set", f"work.steps={STEPS}", *more]
+    command = [sys.executable, *program, "batch", str(folder / "tree"), "--out", str(out), *more]
     with (folder / "said.txt").open("w") as said:
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, text=True, cwd=ROOT,
                                 env=environment, start_new_session=True)  # fmt: skip
@@ -88,7 +92,7 @@ def start(folder: Path, out: Path, mark: str, point: Point | None, *more: str) -
 
 def run_through(folder: Path, out: Path, *more: str) -> dict[str, str]:
     """Let a batch go to its end. The hash of each asset, by its capture."""
-    process = start(folder, out, uuid.uuid4().hex, None, *more)
+    process = start(folder, out, uuid.uuid4().hex, None, *STEPPED, *more)
     code = process.wait(PATIENCE)
     if code not in (0, 3):
         raise SystemExit(f"the batch failed with exit code {code}: {(folder / 'said.txt').read_text()}")
@@ -102,9 +106,13 @@ def left_in(out: Path) -> set[Path]:
 
 def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
     """One batch that gets the signal at this moment, and what it left."""
-    mark, before = uuid.uuid4().hex, left_in(out)
-    point = hold(HELD, folder / f"signs-{mark[:8]}") if moment.wait is None else None
-    process = start(folder, out, mark, point)
+    mark, before = uuid.uuid4().hex, {*left_in(out), *left_in(out.with_name(f"{out.name}-start"))}
+    if moment.wait is None:
+        point = hold(HELD, folder / f"signs-{mark[:8]}")
+        process = start(folder, out, mark, point, *STEPPED)
+    else:
+        point, out = None, out.with_name(f"{out.name}-start")
+        process = start(folder, out, mark, None, "--until", "capture", program=("-m", "workflows.cli"))
     end = time.monotonic() + PATIENCE
     while point is not None and not point.reached() and process.poll() is None and time.monotonic() < end:
         time.sleep(0.005)
