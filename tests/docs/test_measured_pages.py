@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import kill_matrix
+from benchmarks import kill_batch, kill_matrix
 from workflows.bench import speed, tradeoff
 from workflows.bench.captures import read_table
 from workflows.bench.captures_table import markdown
@@ -52,6 +52,16 @@ def test_the_table_of_signals_is_made_of_its_record_and_has_no_fault() -> None:
     assert kill_matrix.table(columns) in kill_matrix.PAGE.read_text()
     assert {"INT", "TERM", "HUP", "KILL"} <= set(columns)
     assert not [(n, m) for n, c in columns.items() for m, cell in c.cells.items() if cell.is_fault()]
+
+
+def test_the_table_of_a_batch_is_made_of_its_record_and_has_no_fault() -> None:
+    """Made by: python -m benchmarks.kill_batch FOLDER --write"""
+    columns = kill_batch.recorded()
+    assert kill_batch.part(columns) in kill_batch.PAGE.read_text()
+    assert {"INT", "TERM", "KILL"} <= set(columns)
+    for column in columns.values():
+        assert list(column.cells) == [*(m.name for m in kill_batch.MOMENTS), kill_batch.LAST]
+        assert not any(cell.is_fault() for cell in column.cells.values())
 
 
 # ------------------------------------------------------------------ the README

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from benchmarks import kill_matrix
 from benchmarks.kill_matrix import PUBLISHING, RETRIES, Cell, Moment, left_in, moments, strike_in_time, under_way
 from stages.registry import REGISTRY
+from workflows.run.run_lock import exclusive_run
 
 
 def partial_of(out: Path, stage: str, key: str = "a") -> Path:
@@ -79,3 +81,38 @@ def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None
     for call, ignored in (("kill_matrix.not_ignored()", "False"), ("pass", "True")):
         command = [sys.executable, "-c", parent.format(call)]
         assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == ignored
+
+
+def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of what a batch may leave, put there by hand."""
+    from benchmarks import kill_batch
+
+    out = tmp_path / "out"
+    (out / "batch/logs").mkdir(parents=True)
+    (tmp_path / "said.txt").write_text("")
+    monkeypatch.setattr(kill_batch, "survivors", lambda mark: [])
+    monkeypatch.setattr(kill_batch, "GONE", 0.2)
+    cell = Cell(143, 1.0)
+
+    def found(name: str = "TERM") -> list[str]:
+        return list(kill_batch._faults(tmp_path, out, cell, signal.SIGTERM, name, "mark", set()))
+
+    assert found() == []
+    cell.code = 1
+    assert found() == ["exit code 1"]
+    cell.code, cell.seconds = -15, 1e3
+    assert found() == ["1000 s until the end"]
+    cell.seconds = 1.0
+    (out / "batch/logs/1.log").write_text("Traceback (most recent call last)")
+    assert found() == ["says Traceback"]
+    (out / "batch/logs/1.log").write_text("")
+    partial_of(out, "capture")
+    assert found() == ["left 1 partial folders"] and found("KILL") == []
+    (out / "1/1_neutral/asset").mkdir(parents=True)
+    assert found("KILL") == ["published asset alone"]
+    (out / "1/1_neutral/run.json").write_text("{}")
+    monkeypatch.setattr(kill_batch, "survivors", lambda mark: [7])
+    assert found("KILL") == ["1 processes live on"]
+    monkeypatch.setattr(kill_batch, "survivors", lambda mark: [])
+    with exclusive_run(out / ".store", out / "batch", lambda: False, print):
+        assert found("KILL") == ["a lock is held"]
