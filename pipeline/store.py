@@ -34,6 +34,7 @@ MANIFEST, RUN = "manifest.json", "run.json"
 MAX_BYTES = 1 << 28  # of a manifest: a larger file is not one
 MAX_SECONDS = 1e9
 LONGEST_PATH = 250  # bytes: the stages write names of a few dozen
+MOST_FAULTS, LONGEST_WORDS = 1000, 300  # of a manifest, in a message
 
 
 class Store:
@@ -60,7 +61,7 @@ class Store:
         try:
             artifact = self.manifest(stage, key, kind)
         except (OSError, ValidationError) as e:
-            self._discard(folder, f"the manifest can't be read: {e}")
+            self._discard(folder, f"the manifest can't be read: {_in_a_line(e)}")
             return None
         for ref in file_refs(artifact):
             fault = _fault(folder, ref)
@@ -89,8 +90,9 @@ class Store:
 
     def _discard(self, folder: Path, fault: str) -> None:
         log.warning(
-            "stored artifact %s/%s is damaged (%s) and will be computed again", folder.parent.name, folder.name, fault
-        )
+            "stored artifact %s/%s is damaged (%s) and will be computed again",
+            folder.parent.name, folder.name, fault[: 3 * LONGEST_WORDS],
+        )  # fmt: skip
         shutil.rmtree(folder)
 
     # ---------------------------------------------------------------- writing
@@ -202,6 +204,18 @@ def _refs_in(value: object) -> Iterator[FileRef]:
     elif isinstance(value, tuple):
         for v in value:
             yield from _refs_in(v)
+
+
+def _in_a_line(e: OSError | ValidationError) -> str:
+    """Why a manifest can't be read: of many faults the first, and their number; of very many the number alone."""
+    if isinstance(e, OSError):
+        return str(e)
+    count = e.error_count()
+    if count > MOST_FAULTS:
+        return f"{count} faults"
+    first = e.errors(include_url=False, include_context=False, include_input=False)[0]
+    place = ".".join(map(str, first["loc"]))[:LONGEST_WORDS] or "the whole"
+    return f"{place}: {first['msg'][:LONGEST_WORDS]}" + (f", and {count - 1} more" if count > 1 else "")
 
 
 def _fault(folder: Path, ref: FileRef) -> str | None:

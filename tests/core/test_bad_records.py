@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 from pathlib import Path
@@ -107,3 +108,22 @@ def test_damaged_lineage_is_none(store: Store, text: str) -> None:
     path.write_text(text)
     assert lineage(path) == {}
     shutil.rmtree(store.root)
+
+
+@pytest.mark.parametrize(
+    ("entries", "says"),
+    [([7], "photos.0: Input should be"), ([7, 8, 9], "and 2 more"), ([7] * 5000, "5000 faults"),
+     ([{"path": "a.jpg", "sha256": "0" * 64, "size": "9" * 4000}], "a.jpg has 5 bytes")],
+)  # fmt: skip
+def test_a_damaged_manifest_is_told_in_a_line(
+    store: Store, caplog: pytest.LogCaptureFixture, entries: list[object], says: str
+) -> None:
+    """A warning for each of 5,000 wrong entries would be a megabyte in the log."""
+    path = store.folder("capture", KEY) / MANIFEST
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({**content, "photos": entries}))
+    with caplog.at_level("WARNING"):
+        assert store.load("capture", KEY, CaptureSource) is None
+    (message,) = [r.getMessage() for r in caplog.records if "is damaged" in r.getMessage()]
+    assert says in message and len(message) < 1300 and "\n" not in message
+    assert not path.parent.exists()
