@@ -178,11 +178,11 @@ class Config(StageConfig):
         "landmarks; auto: template where the hull hides the face",
     )
     unseen_smoothing: Metres = Field(
-        default=0.006,
+        default=0.012,
         ge=0,
         le=0.1,
-        description="length over which the surface is smoothed at the end where no photo shows it; 0: it keeps the "
-        "facets of the initial geometry",
+        description="largest length over which the surface is smoothed during the fit where the photos hardly "
+        "determine it; 0: it keeps the noise there, and the facets of the initial geometry",
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")
