@@ -9,17 +9,17 @@ p edge of a pixel on the surface; I information about the depth; S number of vie
 point lies; q length of the smoothing.
 
     I = sum c_v |d_v|^2 - |sum c_v d_v|^2 / sum c_v
-    q = min(NOISE p / sqrt(I + S), longest)
+    q = min(NOISE p / sqrt(I), longest)
 
 The line to camera v is known to about a pixel, across d_v, and a patch of the surface covers c_v as many pixels as one
 that faces the camera. Of a point on the lines of several views, least squares determine the depth with the variance
 p^2 / I: nothing is known of it from one view, or from views in one direction (I = 0), and much from a wide spread.
-Where I is different from place to place the lower values count (`QUANTILE`): a facet of a crater may face a camera. An
-outline tells its point's place along the normal to a pixel, so that silhouettes stay, and what lies between them is
-filled smoothly.
+Where I is different from place to place the lower values count (`QUANTILE`): a facet of a crater may face a camera.
 
 The SDF is replaced near the zero set by the smoothest function that stays close to it (smoothest.py), with weights
-(cell / q)^4: a ripple of wavelength 2 pi q is halved. Values where q is less than `LEAST` cells stay as they are.
+(cell / q)^4: a ripple of wavelength 2 pi q is halved. Values where q is less than `LEAST` cells stay as they are. What
+is thin, the rim of an ear, would shrink, although outlines show it. So where S > 0 and the surface went back by more
+than `SHRUNK` pixels it is held (`HELD`), and the smoothing is repeated.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
 from stages.inverse_rendering.smoothest import smoothest
 
 F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
 SMOOTH_AT = (0.45, 0.7)  # shares of the fit: then the colours follow, and the photos correct the outline
 NOISE = 1.5  # pixels that noise may move the surface for I = 1
 POINTS = 30_000  # of the surface, some 4 mm apart on a head
 NEIGHBOURS, QUANTILE = 16, 1 / 3
 TANGENT, EDGE = 0.2, 2.0  # cosine of a surface that a ray grazes; pixels of the fit from the mask's edge
-OUTLINE = 0.05  # information of an outline
+SHRUNK, HELD, ROUNDS = 1.5, 16.0, 3  # pixels; weight, of q = half a cell; smoothings at most
 BAND = 6.0  # cells around the zero set that are solved for
 LEAST = 0.7  # cells
 ITERATIONS = 80
@@ -62,30 +63,50 @@ def smooth_weakly_seen(grid: GridSdf, views: Sequence[PhotoView], side: int, lon
     looked = footprint(start, list(views), side)
     if not len(x) or looked is None:
         return 0.0
-    told = information(grid, views, x, n)
-    length = lengths(told, outlines(views, x, n, side), x, looked.pixel, longest) / grid.cell
-    values, near = start.values.astype(np.float64) / grid.cell, np.abs(start.values) < BAND * grid.cell
-    for axis in range(3):
-        near &= _inner(near.shape, axis)
-    node = np.argwhere(near)
-    own = length[cKDTree(x).query(start.lo + grid.cell * node, workers=-1)[1]]
-    node, own = node[own >= LEAST], own[own >= LEAST]
-    if not len(node):
+    length = lengths(information(grid, views, x, n), x, looked.pixel, longest) / grid.cell
+    node = np.argwhere(_band(start.values, grid.cell))
+    nearest = cKDTree(x).query(start.lo + grid.cell * node, workers=-1)[1]
+    weak = length[nearest] >= LEAST
+    if not weak.any():
         return 0.0
-    inside = np.zeros(near.shape, np.bool_)
-    inside[tuple(node.T)] = True
-    before = values[inside]
-    values[inside] = smoothest(inside, values, own**-4, before, before, ITERATIONS)
-    grid.replace(torch.from_numpy((values * grid.cell).astype(np.float32)))
+    outline = (outlines(views, x, n, side) > 0)[nearest[weak]]
+    values = start.values.astype(np.float64) / grid.cell
+    changed = _smoothed(values, node[weak], length[nearest[weak]] ** -4, outline, SHRUNK * looked.pixel / grid.cell)
+    grid.replace(torch.from_numpy((changed * grid.cell).astype(np.float32)))
     return float((length >= LEAST).mean())
 
 
-def lengths(information: F64, outlines: F64, x: F64, pixel: float, longest: float) -> F64:
-    """q (N,) at points x (N, 3) with I and S (N,), in the unit of pixel and longest."""
+def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, outline: Bool, limit: float) -> F64:
+    """values (X, Y, Z), in cells, with the nodes node (N, 3) smoothed by weights (N,). outline (N,): nodes near points
+    of an outline, whose values may grow by at most limit."""
+    inside, out = np.zeros(values.shape, np.bool_), values.copy()
+    inside[tuple(node.T)] = True  # in the order of node: both are sorted
+    before = values[inside]
+    found = before
+    for _ in range(ROUNDS):
+        found = smoothest(inside, values, weight, before, found, ITERATIONS)
+        shrunk = outline & (weight < HELD) & (found - before > limit)
+        if not shrunk.any():
+            break
+        weight = np.where(shrunk, HELD, weight)
+    out[inside] = found
+    return out
+
+
+def _band(values: npt.NDArray[np.float32], cell: float) -> Bool:
+    """(X, Y, Z) nodes near the zero set and not at the grid's faces."""
+    near = np.abs(values) < BAND * cell
+    for axis in range(3):
+        near &= _inner(near.shape, axis)
+    return np.asarray(near, np.bool_)
+
+
+def lengths(information: F64, x: F64, pixel: float, longest: float) -> F64:
+    """q (N,) at points x (N, 3) with I (N,), in the unit of pixel and longest."""
     count = min(NEIGHBOURS, len(x))
     near = cKDTree(x).query(x, k=count, workers=-1)[1].reshape(len(x), count)
     low = np.sort(information[near], axis=1)[:, int(QUANTILE * (count - 1))]
-    return np.asarray(np.minimum(NOISE * pixel / np.sqrt(np.maximum(low + outlines, TINY)), longest), np.float64)
+    return np.asarray(np.minimum(NOISE * pixel / np.sqrt(np.maximum(low, TINY)), longest), np.float64)
 
 
 def information(grid: GridSdf, views: Sequence[PhotoView], x: F64, n: F64) -> F64:
@@ -105,17 +126,17 @@ def outlines(views: Sequence[PhotoView], x: F64, n: F64, side: int) -> F64:
         at, cosine, _, _ = _placed(view, x, n)
         grazed = np.flatnonzero((np.abs(cosine) < TANGENT) & (at >= 0).all(1))
         column, row = at[grazed].T
-        total[grazed] += OUTLINE * _edge(view, round(EDGE * factor_for(view.size, side)))[row, column]
+        total[grazed] += _edge(view, round(EDGE * factor_for(view.size, side)))[row, column]
     return total
 
 
-def _edge(view: PhotoView, reach: int) -> npt.NDArray[np.bool_]:
+def _edge(view: PhotoView, reach: int) -> Bool:
     """(H, W) pixels within `reach` of the mask's edge, where the mask counts."""
     subject, window = (view.alpha > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray((cv2.dilate(subject, window) > cv2.erode(subject, window)) & _counting(view))
 
 
-def _counting(view: PhotoView) -> npt.NDArray[np.bool_]:
+def _counting(view: PhotoView) -> Bool:
     """(H, W) pixels that count in the fit."""
     out = np.ones(view.alpha.shape, np.bool_) if view.asked is None else view.asked > 0.5
     return out if view.doubtful is None else out & ~view.doubtful
@@ -155,7 +176,7 @@ def _on_surface(grid: GridSdf, near: F64) -> tuple[F64, F64]:
     return x.cpu().double().numpy(), n.cpu().double().numpy()
 
 
-def _inner(shape: tuple[int, ...], axis: int) -> npt.NDArray[np.bool_]:
+def _inner(shape: tuple[int, ...], axis: int) -> Bool:
     """Nodes that are not at the grid's faces across an axis, shaped for broadcasting."""
     out = np.ones(shape[axis], np.bool_)
     out[[0, -1]] = False

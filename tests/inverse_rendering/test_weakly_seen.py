@@ -92,16 +92,14 @@ def test_pixels_that_do_not_count_do_not_see() -> None:
 
 def test_lengths_follow_the_noise_and_the_worse_neighbours() -> None:
     x = np.random.default_rng(0).random((400, 3))
-    none = np.zeros(400)
-    even = lengths(np.full(400, 4.0), none, x, 0.001, 0.012)
+    even = lengths(np.full(400, 4.0), x, 0.001, 0.012)
     assert even == pytest.approx(NOISE * 0.001 / 2)
-    assert lengths(none, none, x, 0.001, 0.012) == pytest.approx(0.012)
-    assert lengths(np.full(400, 1e30), none, x, 0.001, 0.012).max() < 1e-15
+    assert lengths(np.zeros(400), x, 0.001, 0.012) == pytest.approx(0.012)
+    assert lengths(np.full(400, 1e30), x, 0.001, 0.012).max() < 1e-15
     facet = np.zeros(400)
     facet[7] = 100.0  # one facet that faces the cameras in a place that they hardly see
-    assert lengths(facet, none, x, 0.001, 0.012)[7] == pytest.approx(0.012)
-    assert lengths(none, facet, x, 0.001, 0.012)[7] == pytest.approx(NOISE * 0.001 / 10)  # an outline counts itself
-    assert lengths(np.array([4.0]), none[:1], x[:1], 0.001, 0.012) == pytest.approx(NOISE * 0.001 / 2)
+    assert lengths(facet, x, 0.001, 0.012)[7] == pytest.approx(0.012)
+    assert lengths(np.array([4.0]), x[:1], 0.001, 0.012) == pytest.approx(NOISE * 0.001 / 2)
 
 
 def test_outlines_are_where_the_masks_end() -> None:
