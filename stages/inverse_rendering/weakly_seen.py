@@ -18,8 +18,8 @@ Where I is different from place to place the lower values count (`QUANTILE`): a 
 
 The SDF is replaced near the zero set by the smoothest function that stays close to it (smoothest.py), with weights
 (cell / q)^4: a ripple of wavelength 2 pi q is halved. Values where q is less than `LEAST` cells stay as they are. What
-is thin, the rim of an ear, would shrink, although outlines show it. So where S > 0 and the surface went back by more
-than `SHRUNK` pixels it is held (`HELD`), and the smoothing is repeated.
+is thin, the rim of an ear, would shrink, and what is hollow, behind the ear, would fill, although outlines show it. So
+where S > 0 and the surface moved by more than `MOVED` pixels it is held (`HELD`), and the smoothing is repeated.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ NOISE = 1.5  # pixels that noise may move the surface for I = 1
 POINTS = 30_000  # of the surface, some 4 mm apart on a head
 NEIGHBOURS, QUANTILE = 16, 1 / 3
 TANGENT, EDGE = 0.2, 2.0  # cosine of a surface that a ray grazes; pixels of the fit from the mask's edge
-SHRUNK, HELD, ROUNDS = 1.5, 16.0, 3  # pixels; weight, of q = half a cell; smoothings at most
+MOVED, HELD, ROUNDS = 1.5, 16.0, 3  # pixels; weight, of q = half a cell; smoothings at most
 BAND = 6.0  # cells around the zero set that are solved for
 LEAST = 0.7  # cells
 ITERATIONS = 80
@@ -71,24 +71,24 @@ def smooth_weakly_seen(grid: GridSdf, views: Sequence[PhotoView], side: int, lon
         return 0.0
     outline = (outlines(views, x, n, side) > 0)[nearest[weak]]
     values = start.values.astype(np.float64) / grid.cell
-    changed = _smoothed(values, node[weak], length[nearest[weak]] ** -4, outline, SHRUNK * looked.pixel / grid.cell)
+    changed = _smoothed(values, node[weak], length[nearest[weak]] ** -4, outline, MOVED * looked.pixel / grid.cell)
     grid.replace(torch.from_numpy((changed * grid.cell).astype(np.float32)))
     return float((length >= LEAST).mean())
 
 
 def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, outline: Bool, limit: float) -> F64:
     """values (X, Y, Z), in cells, with the nodes node (N, 3) smoothed by weights (N,). outline (N,): nodes near points
-    of an outline, whose values may grow by at most limit."""
+    of an outline, whose values may change by at most limit."""
     inside, out = np.zeros(values.shape, np.bool_), values.copy()
     inside[tuple(node.T)] = True  # in the order of node: both are sorted
     before = values[inside]
     found = before
     for _ in range(ROUNDS):
         found = smoothest(inside, values, weight, before, found, ITERATIONS)
-        shrunk = outline & (weight < HELD) & (found - before > limit)
-        if not shrunk.any():
+        moved = outline & (weight < HELD) & (np.abs(found - before) > limit)
+        if not moved.any():
             break
-        weight = np.where(shrunk, HELD, weight)
+        weight = np.where(moved, HELD, weight)
     out[inside] = found
     return out
 
