@@ -178,11 +178,11 @@ class Config(StageConfig):
         "landmarks; auto: template where the hull hides the face",
     )
     unseen_smoothing: Metres = Field(
-        default=0.012,
+        default=0.006,
         ge=0,
         le=0.1,
         description="largest length over which the surface is smoothed during the fit where the photos hardly "
-        "determine it; 0: it keeps the noise there, and the facets of the initial geometry",
+        "determine it, but at most three cells of the grid; 0: no smoothing there",
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")

@@ -18,13 +18,14 @@ Where I is different from place to place the lower values count (`QUANTILE`): a 
 
 The SDF is replaced near the zero set by the smoothest function that stays close to it (smoothest.py), with weights
 (cell / q)^4: a ripple of wavelength 2 pi q is halved. Values where q is less than `LEAST` cells stay as they are. What
-is thin, the rim of an ear, would shrink, and what is hollow, behind the ear, would fill, although outlines show it. So
-where S > 0 and the surface moved by more than `MOVED` pixels it is held (`HELD`), and the smoothing is repeated.
+is thin, the rim of an ear, would shrink, and what is hollow, above a shoulder, would fill, although masks show it. So
+the surface is held (`HELD`) where S > 0 and it went back by more than `BACK` pixels, and where it came to lie outside
+of the masks by more than `EDGE` pixels, and the smoothing is repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -48,10 +49,10 @@ NOISE = 1.5  # pixels that noise may move the surface for I = 1
 POINTS = 30_000  # of the surface, some 4 mm apart on a head
 NEIGHBOURS, QUANTILE = 16, 1 / 3
 TANGENT, EDGE = 0.2, 2.0  # cosine of a surface that a ray grazes; pixels of the fit from the mask's edge
-MOVED, HELD, ROUNDS = 1.5, 16.0, 3  # pixels; weight, of q = half a cell; smoothings at most
+BACK, MISSED, HELD, ROUNDS = 1.5, 2, 16.0, 3  # pixels; views; weight, of q = half a cell; smoothings at most
 BAND = 6.0  # cells around the zero set that are solved for
-LEAST = 0.7  # cells
-ITERATIONS = 80
+LEAST, MOST = 0.7, 3.0  # cells; a longer q takes far more iterations
+ITERATIONS = 120
 TINY = 1e-9
 
 
@@ -63,6 +64,7 @@ def smooth_weakly_seen(grid: GridSdf, views: Sequence[PhotoView], side: int, lon
     looked = footprint(start, list(views), side)
     if not len(x) or looked is None:
         return 0.0
+    longest = min(longest, MOST * grid.cell)
     length = lengths(information(grid, views, x, n), x, looked.pixel, longest) / grid.cell
     node = np.argwhere(_band(start.values, grid.cell))
     nearest = cKDTree(x).query(start.lo + grid.cell * node, workers=-1)[1]
@@ -70,25 +72,33 @@ def smooth_weakly_seen(grid: GridSdf, views: Sequence[PhotoView], side: int, lon
     if not weak.any():
         return 0.0
     outline = (outlines(views, x, n, side) > 0)[nearest[weak]]
-    values = start.values.astype(np.float64) / grid.cell
-    changed = _smoothed(values, node[weak], length[nearest[weak]] ** -4, outline, MOVED * looked.pixel / grid.cell)
+    values, limit = start.values.astype(np.float64) / grid.cell, BACK * looked.pixel / grid.cell
+
+    def wrong(before: F64, found: F64) -> Bool:
+        """(N,) nodes at which the surface must not move so."""
+        grown = np.flatnonzero((before > 0) & (found < 0))
+        out = outline & (found - before > limit)
+        out[grown] |= outside(views, start.lo + grid.cell * node[weak][grown], side) >= MISSED
+        return np.asarray(out, np.bool_)
+
+    changed = _smoothed(values, node[weak], length[nearest[weak]] ** -4, wrong)
     grid.replace(torch.from_numpy((changed * grid.cell).astype(np.float32)))
     return float((length >= LEAST).mean())
 
 
-def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, outline: Bool, limit: float) -> F64:
-    """values (X, Y, Z), in cells, with the nodes node (N, 3) smoothed by weights (N,). outline (N,): nodes near points
-    of an outline, whose values may change by at most limit."""
+def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, wrong: Callable[[F64, F64], Bool]) -> F64:
+    """values (X, Y, Z), in cells, with the nodes node (N, 3) smoothed by weights (N,). wrong: says of values before
+    and after which nodes must be held."""
     inside, out = np.zeros(values.shape, np.bool_), values.copy()
     inside[tuple(node.T)] = True  # in the order of node: both are sorted
     before = values[inside]
     found = before
     for _ in range(ROUNDS):
         found = smoothest(inside, values, weight, before, found, ITERATIONS)
-        moved = outline & (weight < HELD) & (np.abs(found - before) > limit)
-        if not moved.any():
+        held = (weight < HELD) & wrong(before, found)
+        if not held.any():
             break
-        weight = np.where(moved, HELD, weight)
+        weight = np.where(held, HELD, weight)
     out[inside] = found
     return out
 
@@ -127,6 +137,19 @@ def outlines(views: Sequence[PhotoView], x: F64, n: F64, side: int) -> F64:
         grazed = np.flatnonzero((np.abs(cosine) < TANGENT) & (at >= 0).all(1))
         column, row = at[grazed].T
         total[grazed] += _edge(view, round(EDGE * factor_for(view.size, side)))[row, column]
+    return total
+
+
+def outside(views: Sequence[PhotoView], x: F64, side: int) -> npt.NDArray[np.int64]:
+    """(N,) number of views in which points x (N, 3) lie more than `EDGE` pixels outside of a mask that counts."""
+    total = np.zeros(len(x), np.int64)
+    for view in views:
+        at = _placed(view, x, x)[0]
+        framed = np.flatnonzero((at >= 0).all(1))
+        column, row = at[framed].T
+        reach = round(EDGE * factor_for(view.size, side))
+        near = cv2.dilate((view.alpha > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+        total[framed] += (~near & _counting(view))[row, column]
     return total
 
 

@@ -11,7 +11,7 @@ import torch
 
 from pipeline.fields.geometry import GridSdf
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.weakly_seen import NOISE, information, lengths, outlines, smooth_weakly_seen
+from stages.inverse_rendering.weakly_seen import NOISE, information, lengths, outlines, outside, smooth_weakly_seen
 
 F64 = npt.NDArray[np.float64]
 SIDE = 320
@@ -121,6 +121,40 @@ def test_outlines_are_where_the_masks_end() -> None:
     assert not counted(alpha=np.ones_like(disc)).any()
     assert not counted(asked=np.zeros_like(disc)).any()
     assert not counted(doubtful=disc >= 0).any()
+
+
+def test_points_outside_of_the_masks_are_counted() -> None:
+    """A disc of 80 pixels in three views: at its middle, beside it, and beyond the photo."""
+    view = camera(np.array([1.0, 0, 0]), 50.0)
+    v, u = np.mgrid[:SIDE, :SIDE] + 0.5
+    disc = (np.hypot(u - SIDE / 2, v - SIDE / 2) < 80).astype(np.float32)
+    a_pixel = 50 / 1.5 / SIDE
+    x = np.array([[0, 0, 0], [0, 81, 0], [0, 84, 0], [0, 0, -90], [0, 900, 0]]) * a_pixel
+    views = [replace(view, alpha=disc)] * 3
+    assert outside(views, x, SIDE).tolist() == [0, 0, 3, 3, 0]
+    assert not outside([replace(v, asked=np.zeros_like(disc)) for v in views], x, SIDE).any()
+    assert outside([], x, SIDE).tolist() == [0] * 5
+
+
+def test_the_rim_of_a_thin_disc_stays_where_masks_show_it() -> None:
+    """A disc of six cells, whose rim no photo determines but by its outline: smoothed without masks it shrinks by
+    more than a cell, with them by less."""
+    cell, radius = 0.005, 0.1
+    axis = (torch.arange(65) - 32) * cell
+    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+    inside = torch.stack([torch.hypot(y, z) - radius, x.abs() - 3 * cell]).max(0).values
+    lo, front = torch.full((3,), -32 * cell), camera(np.array([1.0, 0, 0]), 0.8)
+
+    def reach(view: PhotoView) -> float:
+        grid = GridSdf(inside.clone(), lo, cell)
+        smooth_weakly_seen(grid, [view], SIDE, 0.02)
+        y = torch.linspace(0, 0.14, 2000)
+        return float(y[(grid(torch.stack([0 * y, y, 0 * y], 1))[0] < 0)].max())
+
+    v, u = np.mgrid[:SIDE, :SIDE] + 0.5
+    mask = (np.hypot(u - SIDE / 2, v - SIDE / 2) < 1.5 * SIDE * radius / 0.8).astype(np.float32)
+    assert reach(front) < radius - cell
+    assert reach(replace(front, alpha=mask)) == pytest.approx(radius, abs=cell)
 
 
 def radii(grid: GridSdf, azimuth: torch.Tensor, radius: float) -> torch.Tensor:
