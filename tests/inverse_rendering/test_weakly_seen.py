@@ -157,6 +157,36 @@ def test_the_rim_of_a_thin_disc_stays_where_masks_show_it() -> None:
     assert reach(replace(front, alpha=mask)) == pytest.approx(radius, abs=cell)
 
 
+def test_a_slot_that_masks_show_open_is_not_filled() -> None:
+    """A block with a slot of four cells: smoothed without masks its bottom rises, with the masks of two views that
+    look through it hardly."""
+    cell, half, slot = 0.005, 0.1, 2
+    axis = (torch.arange(65) - 32) * cell
+    x, y, z = torch.meshgrid(axis, axis, axis, indexing="ij")
+    block = torch.stack([x.abs() - 6 * cell, y.abs() - half, z.abs() - half]).max(0).values
+    open_above = torch.stack([z.abs() - slot * cell, -y]).max(0).values
+    values, lo, front = (
+        torch.maximum(block, -open_above),
+        torch.full((3,), -32 * cell),
+        camera(np.array([1.0, 0, 0]), 5),
+    )
+
+    def bottom(view: PhotoView) -> float:
+        grid = GridSdf(values.clone(), lo, cell)
+        smooth_weakly_seen(grid, [view, view], SIDE, 0.015)
+        up = torch.linspace(-0.02, 0.09, 1000)
+        return float(up[grid(torch.stack([0 * up, up, 0 * up], 1))[0] < 0].max())
+
+    lens = front.K * np.array([[8], [8], [1]]) + np.array([[0, 0, -7 * SIDE / 2], [0, 0, -7 * SIDE / 2], [0, 0, 0]])
+    front = replace(front, K=lens)
+    v, u = (np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2) * 5 / (12 * SIDE)  # of the plane x = 0
+    right, down = (front.world_from_cam[:3, k] for k in range(2))
+    at = u[..., None] * right + v[..., None] * down
+    hole = (np.abs(at[..., 2]) < slot * cell) & (at[..., 1] > 0)
+    assert bottom(front) > 1.5 * cell
+    assert bottom(replace(front, alpha=(~hole).astype(np.float32))) < 1.2 * cell
+
+
 def radii(grid: GridSdf, azimuth: torch.Tensor, radius: float) -> torch.Tensor:
     """Distance of the zero set from the z axis, by bisection, over the radius."""
     d = torch.stack([torch.cos(azimuth), torch.sin(azimuth), torch.zeros_like(azimuth)], -1)
