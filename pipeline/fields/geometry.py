@@ -25,7 +25,6 @@ BAND = 4.0
 BETAS = (0.9, 0.99)
 DAMPING = 1.0  # of the band's typical gradient, added to the root of each coefficient's second moment
 TYPICAL_EVERY = 20  # steps
-CLIPPED_AT = 2.5  # standard deviations of a blur at which distances are clipped: beyond, they are coarse
 
 
 class GridSdf(nn.Module):
@@ -124,26 +123,14 @@ class GridSdf(nn.Module):
             self.values.copy_(torch.from_numpy(merged))
         self.find_band()
 
-    def smooth_untouched(self, width: float) -> None:
-        """Smooth the surface over `width` (asset units) where no ray has touched it since the last refinement.
-
-        No photo shows it there: it still has the facets of the visual hull. The values are blurred by a Gaussian of
-        that standard deviation, which moves a sphere's surface of radius R inwards by width^2 / R; towards what rays
-        touched, the blur fades over twice the width, so that there is no step.
-        """
-        cells = width / self.cell
-        touched = torch.zeros_like(self.values, dtype=torch.bool).view(-1)
-        touched[self.active] = self.v.view(-1)[self.active] > 0
-        if not bool(touched.any()):
-            return
-        away = ndimage.distance_transform_edt(~touched.view(self.values.shape).cpu().numpy())
-        share = np.clip(away / (2 * cells) - 0.5, 0, 1).astype(np.float32)
-        values = self.values.detach().cpu().numpy()
-        limit = np.float32(CLIPPED_AT * width)
-        near = values.clip(-limit, limit)
-        change = share * (ndimage.gaussian_filter(near, cells, mode="nearest") - near)
+    def replace(self, values: Tensor) -> None:
+        """Continue with other values (X, Y, Z). Coefficients that changed start without momentum."""
         with torch.no_grad():
-            self.values += torch.from_numpy(np.where(np.abs(values) < limit, change, 0)).to(self.values)
+            new = values.to(self.values)
+            changed = new != self.values
+            self.m[changed] = 0
+            self.values.copy_(new)
+        self.redistance()
 
     def refine(self) -> None:
         """Halve the cell: the same function on a grid with eight times as many coefficients."""

@@ -117,8 +117,9 @@ class Baker:
             step(0, 1, "standard material")
             seen = self._known.unseen < 0.5
             fitted = standard_material(
-                field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material"), hair
-            )
+                field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material"), hair,
+                self._known.albedo, region,
+            )  # fmt: skip
             if fitted.plausible:
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
             else:

@@ -20,6 +20,7 @@ from stages.bake import detail_kernels as kernels
 from stages.bake import standard_fit
 from stages.bake.detail import Detail, shade
 from stages.bake.regions import Poll
+from stages.bake.skin import skin_of
 from stages.bake.smooth import continued
 
 DOME_WIDTH = 256  # columns of the picture that is cut into lamps
@@ -28,12 +29,14 @@ MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradi
 
 def standard_material(
     field: Field, mesh: Mesh, views: Sequence[FittedPhoto], skin_code: int, seen: Mask, found: Detail,
-    check: Callable[[], None], hair: Mask | None = None,
+    check: Callable[[], None], hair: Mask | None = None, look: F32 | None = None, region: Indices | None = None,
 ) -> standard_fit.Fitted:  # fmt: skip
-    """The fitted material at the vertices. skin_code: label of skin in the photos, -1 for none; seen, hair (V,)."""
+    """The fitted material at the vertices. skin_code: label of the face in the photos, -1 for none; seen, hair (V,);
+    look (V, 3): the albedo with what photos do not show filled, region (V,): of the head (skin.skin_of)."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
-    observations, view, skin = _observed(field, mesh, normals, albedo, views, skin_code, found)
+    observations, view, face = _observed(field, mesh, normals, albedo, views, skin_code, found)
+    skin = skin_of(face, albedo if look is None else look.astype(np.float64), region)
     moving = field.moving_light
     at: standard_fit.Lit | Arrivals
     if moving is None:
@@ -77,7 +80,7 @@ def field_normals(field: Field, mesh: Mesh) -> F64:
 def _observed(
     field: Field, mesh: Mesh, normals: F64, albedo: F64, views: Sequence[FittedPhoto], skin_code: int, found: Detail
 ) -> tuple[standard_fit.Seen, Indices, Mask]:
-    """The observations, the number of each one's photo, and where the vertices are skin."""
+    """The observations, the number of each one's photo, and which vertices the photos label as the face."""
     photos, x = found.photos, mesh.vertices.astype(np.float64)
     colour, cosines = np.zeros((len(views), len(x), 3)), np.zeros((len(views), len(x)))
     kernels.observed(photos.cameras, photos.pixels, photos.depth, photos.clipped, x, normals, colour, cosines)
@@ -88,11 +91,11 @@ def _observed(
     own = found.relative[view, vertex] if len(found.relative) else 1.0
     predicted = base[vertex] * own + found.gloss[view, vertex]
     observations = standard_fit.Seen(vertex, wo, colour[view, vertex], predicted)
-    return observations, view, _skin(views, x, cosines, skin_code)
+    return observations, view, _face(views, x, cosines, skin_code)
 
 
-def _skin(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask:
-    """(V,) where the photos' labels vote for skin."""
+def _face(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask:
+    """(V,) where the photos' labels vote for the face."""
     poll = Poll(len(x))
     for view, cosine in zip(views, cosines, strict=True):
         pose = inverse_rigid(matrix(view.camera.world_from_cam))

@@ -3,7 +3,8 @@
 A photo that sees the surface at a grazing angle mixes it with what lies behind, so that the last seen rim has wrong
 colours, and continuing them gives smears; and a mean over the whole head makes the back of a dark-haired head bald.
 Hence only well seen vertices are kept, and others are drawn, over the length L, to the median of the seen albedo of
-their region of the head template (scalp, neck, ears, face; the rest): smooth.continued.
+their region of the head template (scalp, ears, face, bands of the neck; the rest): smooth.continued. The neck is
+divided by height, because a collar or long hair ends at about one height all around it.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
@@ -21,11 +22,13 @@ GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, fr
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices: at the hair's outline the wall shines through
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
-# Metres from the head template within which a vertex belongs to its region: hair is thick; a collar is no neck.
-NEAR = {"scalp": 0.04, "neck": 0.012, "ears": 0.02, "face": 0.02}
+# Metres from the head template within which a vertex belongs to its region: hair is thick; so is a collar.
+NEAR = {"scalp": 0.04, "neck": 0.06, "ears": 0.02, "face": 0.02}
 REGIONS = tuple(NEAR)
+NECK = REGIONS.index("neck")
 REST = len(REGIONS)
 HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
+FIRST_BAND, BANDS, BAND_HEIGHT = HAIR + 1, 32, 0.012  # codes of the neck's bands, the lowest first; metres of each
 
 
 def replaced_share(cosine: F64) -> F64:
@@ -36,14 +39,18 @@ def replaced_share(cosine: F64) -> F64:
 
 
 def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
-    """(V,) index into REGIONS of the nearest region of the placed template; REST far from the head and in all other
-    regions (lids, lips), which photos of a face show."""
+    """(V,) index into REGIONS of the nearest region of the placed template, for the neck the code of its band; REST far
+    from the head and in all other regions (lids, lips), which photos of a face show."""
     quads = {name: template.quads[template.regions[name]] for name in REGIONS if name in template.regions}
     points = np.concatenate([head.vertices[q].mean(1) for q in quads.values()])
     names = np.concatenate([np.full(len(q), REGIONS.index(name)) for name, q in quads.items()])
     distance, nearest = cKDTree(points).query(vertices)
     reach = np.array(list(NEAR.values()))[names[nearest]] * head.scale
-    return np.where(distance <= reach, names[nearest], REST).astype(np.int64)
+    found = np.where(distance <= reach, names[nearest], REST).astype(np.int64)
+    up = head.world_from_template[:3, 1] / head.scale**2  # height in metres of the template
+    lowest = float((points[names == NECK] @ up).min()) if NECK in names else 0.0
+    band = np.floor((vertices @ up - lowest) / BAND_HEIGHT).clip(0, BANDS - 1).astype(np.int64)
+    return np.where(found == NECK, FIRST_BAND + band, found)
 
 
 def with_hair(region: Indices, hair: Mask) -> Indices:
@@ -54,13 +61,20 @@ def with_hair(region: Indices, hair: Mask) -> Indices:
 
 def region_colours(albedo: F64, region: Indices, cosine: F64) -> F64:
     """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): those with the
-    largest cosines (V,), the upper BEST of all that are seen well."""
-    seen = cosine >= CLEAR
-    out = np.broadcast_to(_median(albedo, cosine, seen), albedo.shape).copy()
+    largest cosines (V,), the upper BEST of all that are seen well. A band that is not seen takes the nearest band's
+    colour, other regions that of the whole head."""
+    seen, known = cosine >= CLEAR, {}
     for code in np.unique(region):
         mine = region == code
         if (mine & seen).sum() >= max(MIN_SHARE * mine.sum(), 1):
-            out[mine] = _median(albedo, cosine, mine & seen)
+            known[int(code)] = _median(albedo, cosine, mine & seen)
+    whole, bands = _median(albedo, cosine, seen), [c for c in known if c >= FIRST_BAND]
+    out = np.broadcast_to(whole, albedo.shape).copy()
+    for code in map(int, np.unique(region)):
+        if code >= FIRST_BAND and code not in known and bands:
+            out[region == code] = known[min(bands, key=lambda b: abs(b - code))]
+        elif code in known:
+            out[region == code] = known[code]
     return out
 
 

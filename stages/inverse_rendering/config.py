@@ -181,8 +181,8 @@ class Config(StageConfig):
         default=0.006,
         ge=0,
         le=0.1,
-        description="length over which the surface is smoothed at the end where no photo shows it; 0: it keeps the "
-        "facets of the initial geometry",
+        description="largest length over which the surface is smoothed during the fit where the photos hardly "
+        "determine it, but at most three cells of the grid; 0: no smoothing there",
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")

@@ -7,8 +7,7 @@ keeps the hull's shape. The result never exceeds the hull.
 
 Symbols: f distance at the nodes in the hull, t and W the depth maps' mean distance and its weight, s the hull's
 distance, all in cells; L the Laplacian of the grid. Minimised: sum W (f - t)^2 + SCREEN (f - s)^2 + |L f|^2.
-Sources: Curless and Levoy, A volumetric method for building complex models (1996); Calakli and Taubin, SSD: smooth
-signed distance surface reconstruction (2011), for the closing.
+Source: Curless and Levoy, A volumetric method for building complex models (1996); smoothest.py for the closing.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import LinearOperator, cg
+from scipy import ndimage
 
 from pipeline import transforms
 from stages.inverse_rendering.dense_stereo import DepthMaps
 from stages.inverse_rendering.depth_kernels import integrate
 from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.smoothest import smoothest
 from stages.inverse_rendering.stereo import distances
 
 F32 = npt.NDArray[np.float32]
@@ -36,7 +35,6 @@ MIN_VOTES = 0.3  # smaller sums are a single view's: not used
 SUPPORT = 5  # nodes: side of the cube whose nodes must mostly have votes, too, so that stray ones weigh little
 DATA, SCREEN = 20.0, 7.7e-4  # weights of data and hull; SCREEN^(-1/4) = 6 cells: larger holes keep the hull's shape
 REACH = 6.0  # cells from the nearest data: from there on the hull's own distance takes over, fully at twice of it
-ITERATIONS, TOLERANCE = 80, 1e-4  # of conjugate gradients on each grid
 COARSEST = 24  # nodes of the longest side at which no coarser grid is used
 
 
@@ -109,39 +107,8 @@ def _doubled(x: F64, shape: tuple[int, ...]) -> F64:
 
 def _solved(level: F64, inside: Bool, mean: F64, weight: F64, first: F64, factor: float) -> F64:
     """The minimum on one grid, from `first`, by conjugate gradients."""
-    laplacian, border = _laplacian(inside, level)
     data, screen = factor * DATA * weight[inside], factor * SCREEN
-    right = data * mean[inside] + screen * level[inside] - laplacian.T @ border
-    diagonal = data + screen + np.asarray(laplacian.multiply(laplacian).sum(0)).ravel()
-    n = len(data)
-    product = LinearOperator((n, n), lambda f: (data + screen) * f + laplacian.T @ (laplacian @ f), dtype=np.float64)
-    jacobi = LinearOperator((n, n), lambda f: f / diagonal, dtype=np.float64)
-    found, _ = cg(product, right, first[inside], rtol=TOLERANCE, maxiter=ITERATIONS, M=jacobi)
+    target = (data * mean[inside] + screen * level[inside]) / (data + screen)
     out = level.copy()
-    out[inside] = np.clip(found, -2 * BAND, 2 * BAND)
+    out[inside] = np.clip(smoothest(inside, level, data + screen, target, first[inside]), -2 * BAND, 2 * BAND)
     return out
-
-
-def _laplacian(inside: Bool, level: F64) -> tuple[sparse.csr_matrix, F64]:
-    """L (N, N) for the nodes of `inside`, and (N,) the part of L f that their neighbours outside contribute. Nodes at
-    the grid's faces have only the neighbours that exist."""
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(int(inside.sum()))
-    node = np.argwhere(inside)
-    own, n = number[inside], len(node)
-    border, degree = np.zeros(n), np.zeros(n)
-    rows, columns = [], []
-    for axis in range(3):
-        for step in (-1, 1):
-            at = node.copy()
-            at[:, axis] += step
-            exists = (at[:, axis] >= 0) & (at[:, axis] < inside.shape[axis])
-            there = tuple(at[exists].T)
-            degree[exists] += 1
-            other = number[there]
-            border[exists] += np.where(other < 0, level[there], 0)
-            rows.append(own[exists][other >= 0])
-            columns.append(other[other >= 0])
-    row, column = np.concatenate([*rows, own]), np.concatenate([*columns, own])
-    value = np.concatenate([np.ones(len(row) - n), -degree])
-    return sparse.csr_matrix((value, (row, column)), (n, n)), border

@@ -32,6 +32,7 @@ from stages.inverse_rendering.ray_sampling import Batch, PixelTable
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
+from stages.inverse_rendering.weakly_seen import SMOOTH_AT, smooth_weakly_seen
 
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
 BAND_EVERY = 250
@@ -58,6 +59,8 @@ class Trainer(TrainingLoop):
         "skin_asked",
         "skin_tells",
         "refinements",
+        "smoothings",
+        "smoothed",
     )
 
     prior: Start | None = None
@@ -65,6 +68,8 @@ class Trainer(TrainingLoop):
     level: int = 0
     shadows_solved: int = 0
     refinements: int = 0  # of the camera poses
+    smoothings: int = 0  # of surface that the photos hardly determine
+    smoothed: float = 0.0  # share of the surface that the last of them reached
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     validation: tuple[int, ...] = field(init=False)
@@ -150,6 +155,7 @@ class Trainer(TrainingLoop):
             self.select_model()
         rate = self.set_rates()
         self.refine_poses()
+        self.smooth()
         due = sum(self.share() >= s for s in SHADOWS_AT)
         if self.shadows_solved < due:
             self.model.solve_shadows()
@@ -170,6 +176,15 @@ class Trainer(TrainingLoop):
         self.pixels.place(self.views)
         self.refinements = due
 
+    def smooth(self) -> None:
+        """Smooth the surface where the photos hardly determine it, when it is due."""
+        due = sum(self.share() >= s for s in SMOOTH_AT)
+        longest = self.settings.unseen_smoothing
+        if longest <= 0 or self.smoothings >= due or self.geometry_frozen:
+            return
+        self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)
+        self.smoothings = due
+
     def refined_cameras(self, widths: Mapping[int, int]) -> tuple[RefinedCamera, ...]:
         """The cameras that the fit moved. widths: of the whole photos in pixels, by the views' index."""
         return self.poses.cameras(self.views, widths)
@@ -177,6 +192,10 @@ class Trainer(TrainingLoop):
     def pose_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the fit moved the cameras."""
         return self.poses.facts(self.views, self.settings.refine_poses)
+
+    def surface_facts(self) -> dict[str, str | float | bool]:
+        """For the report: the share of the surface that was smoothed, because the photos hardly determine it."""
+        return {"smoothed_share": round(self.smoothed, 4)}
 
     def ask_skin(self, choices: Choices) -> None:
         """Correct the light by the skin, if photos show a face."""
@@ -241,9 +260,7 @@ class Trainer(TrainingLoop):
             self.grid.find_band()
 
     def finish(self) -> None:
-        """Smooth what no photo shows, and make the SDF a distance again, after the last step."""
-        if self.settings.unseen_smoothing > 0:
-            self.grid.smooth_untouched(self.settings.unseen_smoothing)
+        """Make the SDF a distance again, after the last step."""
         self.grid.redistance()
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:

@@ -49,7 +49,7 @@ class Footprint:
 
 def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | None:
     """The footprint of photos fitted at `side` pixels on the initial geometry; None if no view faces the surface."""
-    points, normals, area = _surface_of(start)
+    points, normals, area = surface_of(start)
     best = np.full(len(points), np.inf)
     for view in views:
         block = factor_for(view.size, side)
@@ -59,13 +59,13 @@ def footprint(start: Start, views: list[PhotoView], side: int) -> Footprint | No
     return Footprint(float(np.median(known)), area) if len(known) else None
 
 
-def _surface_of(start: Start) -> tuple[F64, F64, float]:
-    """Points (N, 3) on the initial zero set, their normals (N, 3), and its area (voxel faces times 2 / 3, the mean
-    ratio over directions of a slope to its staircase)."""
+def surface_of(start: Start, most: int = MAX_POINTS) -> tuple[F64, F64, float]:
+    """Points (N, 3) on the zero set, not many more than `most`, their normals (N, 3), and its area (voxel faces times
+    2 / 3, the mean ratio over directions of a slope to its staircase)."""
     values = start.values
     inner = np.abs(values[1:-1, 1:-1, 1:-1]) < 0.75 * start.cell
     near = np.argwhere(inner) + 1
-    near = near[:: max(len(near) // MAX_POINTS, 1)]
+    near = near[:: max(len(near) // most, 1)]
     i, j, k = near.T
     sides = [
         values[i + 1, j, k] - values[i - 1, j, k],

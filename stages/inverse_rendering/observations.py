@@ -130,7 +130,7 @@ def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Te
     chosen = np.flatnonzero(inside & ((wo * normals).sum(1) > MIN_COSINE))
     value, least = _look_up(shot, at[chosen])
     chosen, value = chosen[least > WHOLE], value[least > WHOLE]
-    free = _free(geometry, centre, wo[chosen], distance[chosen], x)
+    free = unoccluded(geometry, centre, wo[chosen], distance[chosen], x)
     return chosen[free], value[free], wo[chosen[free]]
 
 
@@ -148,7 +148,7 @@ def _look_up(shot: Picture, at: F64) -> tuple[F64, F64]:
     return value, least
 
 
-def _free(geometry: Geometry, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
+def unoccluded(geometry: Geometry, centre: F64, wo: F64, distance: F64, x: Tensor) -> npt.NDArray[np.bool_]:
     """(N,) whether the points are not occluded. centre: (3,) of the camera; wo (N, 3); distance (N,)."""
     d = torch.from_numpy(-wo).to(x)
     o = torch.from_numpy(centre).to(x).expand_as(d).contiguous()

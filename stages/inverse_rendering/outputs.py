@@ -108,7 +108,7 @@ def model_facts(
     return {
         **decided,
         **start,
-        "geometry": {**start["geometry"], "cell_mm": round(model.geometry.cell * 1e3, 4)},
+        "geometry": {**start["geometry"], **trainer.surface_facts(), "cell_mm": round(model.geometry.cell * 1e3, 4)},
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
         "cameras": trainer.pose_facts(),

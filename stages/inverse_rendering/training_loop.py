@@ -118,6 +118,10 @@ class TrainingLoop(ABC):
         """For the report: how the fit moved the cameras."""
         return {"refined": False, "why": "the method has no refinement"}
 
+    def surface_facts(self) -> dict[str, str | float | bool]:
+        """For the report: what the fit did to the surface beside its steps."""
+        return {}
+
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""
         return True

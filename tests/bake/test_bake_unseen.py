@@ -10,7 +10,9 @@ from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.load import load_template
 from stages.bake.smooth import continued
 from stages.bake.unseen import (
+    BAND_HEIGHT,
     CLEAR,
+    FIRST_BAND,
     GRAZING,
     HAIR,
     LENGTH,
@@ -62,10 +64,38 @@ def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_regions_are_those_of_the_placed_template(scale: float) -> None:
-    for name in ("scalp", "neck", "ears"):
+    for name in ("scalp", "ears"):
         middle = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions[name]]].mean(1)
         assert (region_of(middle * scale, TEMPLATE, placed(scale)) == REGIONS.index(name)).all()
     assert (region_of(np.array([[0.0, -0.5, 0.0]]) * scale, TEMPLATE, placed(scale)) == REST).all()
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_neck_is_divided_by_height(scale: float) -> None:
+    """Bands rise with the template's y, also where the head is turned; a collar of four centimetres belongs to them."""
+    middle = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions["neck"]]].mean(1)
+    out = middle * [1, 0, 1]
+    collar = middle + 0.03 * out / np.linalg.norm(out, axis=1, keepdims=True)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # up becomes -x
+    world = np.eye(4)
+    world[:3, :3] = scale * turn
+    head = PlacedHead(world, np.zeros(0), scale * TEMPLATE.vertices @ turn.T, np.zeros(0), 0.0)
+    for points in (middle, collar):
+        band = region_of(scale * points @ turn.T, TEMPLATE, head) - FIRST_BAND
+        ours = band >= 0  # near the jaw and behind the ears other regions are nearer
+        assert ours.mean() > 0.7
+        expected = np.floor((points[:, 1] - middle[:, 1].min()) / BAND_HEIGHT)
+        assert (np.abs(band - expected)[ours] <= 1).all()
+
+
+def test_a_band_that_is_not_seen_takes_the_nearest_bands_colour() -> None:
+    """Skin above, a collar below, both seen in front; the band between is not seen, nor is one far above."""
+    region = FIRST_BAND + np.repeat([0, 2, 3, 9], 50)
+    cosine = np.where(np.isin(region - FIRST_BAND, [0, 3]), 0.9, 0.0)
+    albedo = np.where((region == FIRST_BAND)[:, None], 0.1, 0.6) * np.ones((200, 3))
+    albedo[cosine == 0] = 9.0
+    found = region_colours(albedo, region, cosine)[:, 0]
+    np.testing.assert_allclose(found, np.repeat([0.1, 0.6, 0.6, 0.6], 50))
 
 
 def test_the_seen_rim_fades_over_the_length() -> None:
