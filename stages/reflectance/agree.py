@@ -40,7 +40,7 @@ def ways(
     (K,): ascending, equally spaced.
     """
     cost = np.stack([_cost(vertices + d * normals, seen, maps) for d in tried], 1)
-    known = np.isfinite(cost).all(1)
+    known = np.asarray(np.isfinite(cost).all(1), np.bool_)
     total, share = np.where(known[:, None], cost, 0), known.astype(np.float64)
     for _ in range(AVERAGES):
         total, share = mean @ total, mean @ share

@@ -51,7 +51,7 @@ class AnswerMap:
     def _between(self, points: F64) -> F64:
         camera, (height, width) = self.camera, self.values.shape[:2]
         uv, depth = project(camera.K, inverse_rigid(camera.world_from_cam), camera.distortion, points)
-        uv = np.where((depth > 0)[:, None] & np.isfinite(uv), uv - 0.5, -2)
+        uv = np.where((depth[:, None] > 0) & np.isfinite(uv), uv - 0.5, -2)
         corner = np.floor(uv)
         out = np.zeros((len(points), self.values.shape[2]))
         for dx in (0, 1):
