@@ -57,7 +57,7 @@ class AnswerMap:
         for dx in (0, 1):
             for dy in (0, 1):
                 at = corner + (dx, dy)
-                inside = ((at >= 0) & (at < (width, height))).all(1)
+                inside = np.asarray(((at >= 0) & (at < (width, height))).all(1), np.bool_)
                 column, row = np.where(inside[:, None], at, 0).astype(np.int64).T
                 weight = (1 - np.abs(uv - at)).prod(1) * inside
                 out += weight[:, None] * self.values[row, column]
