@@ -32,6 +32,7 @@ from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
 from stages.reflectance.judge import judge
 from stages.reflectance.paint import marked, read_masks, replaced
+from stages.reflectance.reshape import reshaped
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.samples import Step, gather
 from stages.reflectance.score import Score, decibels, score
@@ -81,14 +82,19 @@ def build(
     left_out = [i for i in range(len(whole.index)) if config.every and i % config.every == OFFSET % config.every]
     fitted = [i for i in range(len(whole.index)) if i not in left_out]
     _enough(len(fitted), FEWEST_LIGHTS, "lights")
-    pairs = pairs_of(points, fitted_cameras, caster)
     rig = rig_of([stage.lights[i] for i in fitted], fitted_cameras, world, at)
+    given = mesh
+    if config.reshape:
+        pictures = _pictures(capture, stage, rig)
+        mesh = reshaped(mesh, rig, pictures, context.scratch, context.check, step)
+        points, caster = points_of(mesh, charts, config.size), RayCaster(mesh.vertices, mesh.faces)
+    pairs = pairs_of(points, fitted_cameras, caster)
     field, parts = _field(capture, stage, mesh, charts, points, pairs, rig, config, context, step)
     motion = {str(f): rows(m.round(9)) for f, m in sorted(at.items())}
     record = {"lights": rig.index, "left_out": [whole.index[i] for i in left_out], "motion": motion}
     save(field, context.workdir / FOLDER, record)
     write_rest(context.workdir / FOLDER / REST, mesh, charts)
-    figures = _figures(field, parts, points, pairs, six)
+    figures = _figures(field, parts, points, pairs, six) | {"moved_mm": _moved(given, mesh)}
     shots = _pictures(capture, stage, whole)
     unseen = [n for n, c in enumerate(cameras) if c.index in kept_out]
     found = _predicted(field, whole, shots, fitted, left_out, step)
@@ -227,6 +233,12 @@ def _figures(field: Field, parts: Fitted, points: Points, pairs: Pairs, six: Map
         "error": float(np.sqrt(np.mean(parts.error[seen] ** 2))) if seen.any() else 0.0,
     }
     return {k: round(v, 5) for k, v in figures.items()}
+
+
+def _moved(given: meshes.Mesh, mesh: meshes.Mesh) -> float:
+    """Millimetres by which the farther tenth of the vertices was moved at least."""
+    far = np.linalg.norm((mesh.vertices - given.vertices).astype(np.float64), axis=1)
+    return round(1000 * float(np.quantile(far, 0.9)), 3) if far.size else 0.0
 
 
 def _predicted(

@@ -31,6 +31,10 @@ class Config(StageConfig):
         exclude=True,
     )
     paint_digest: ContentHash = Field(default="", description="sha256 of the masks in paint, set automatically")
+    reshape: bool = Field(
+        True,
+        description="move the surface to where all cameras see the same answer to the lights, and to their normals",
+    )
     motion: bool = Field(True, description="measure how the head moved, from the tracking pictures")
 
     @model_validator(mode="before")

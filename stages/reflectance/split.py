@@ -78,7 +78,7 @@ def chosen_widths(
     best = [w[1] for w in WIDTHS]
     if not len(few):
         return best[0], best[1], best[2]
-    work = _Texels(points, pairs, table, rig, arrives, few)
+    work = TexelFit(points, pairs, table, rig, arrives, few)
     for j, tried in enumerate(WIDTHS):
         step(j, len(WIDTHS), "widths of the lobes")
         errors = []
@@ -116,7 +116,7 @@ def split(
     for begin in range(0, len(seen), RUN):
         step(begin, len(seen), "splitting")
         texels = seen[begin : begin + RUN]
-        work = _Texels(points, pairs, table, rig, arrives, texels)
+        work = TexelFit(points, pairs, table, rig, arrives, texels)
         work.begin()
         work.fit(np.array(alphas), FIRST_STEPS, prior)
         work.start_again_from_brightest(np.array(alphas))
@@ -131,7 +131,7 @@ def split(
     return out
 
 
-class _Texels:
+class TexelFit:
     """The samples of some texels in memory, and the state of their fit."""
 
     def __init__(

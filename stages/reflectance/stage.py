@@ -25,7 +25,7 @@ class Inputs:
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
-    """Measure the motion, sample the pictures, split them into the field, fill what no camera saw, and score it.
+    """Measure the motion, mend the surface, sample and split the pictures, fill what no camera saw, score the field.
 
     Raises:
         StageError: too few lights or cameras are left for the fit, or the head moved too far.
@@ -37,4 +37,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
     return build(inputs.capture, inputs.poses, inputs.uv, config, context)
 
 
-STAGE = Stage(name="reflectance", version=4, inputs=Inputs, config=Config, output=ReflectanceField, run=run)
+STAGE = Stage(name="reflectance", version=5, inputs=Inputs, config=Config, output=ReflectanceField, run=run)

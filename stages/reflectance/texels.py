@@ -128,10 +128,12 @@ def arriving(points: Points, caster: RayCaster, target: F64, axis: F64 | None, r
     return out
 
 
-def arriving_of_all(points: Points, caster: RayCaster, lamps: F64, axes: F64, check: Callable[[], None]) -> U8:
+def arriving_of_all(
+    points: Points, caster: RayCaster, lamps: F64, axes: F64, check: Callable[[], None], rays: int = RAYS
+) -> U8:
     """(T, L) `arriving` of all lamps, 255 for all of the light."""
     out = np.zeros((len(points.texel), len(lamps)), np.uint8)
     for i, (lamp, axis) in enumerate(zip(lamps, axes, strict=True)):
         check()
-        out[:, i] = np.round(255 * arriving(points, caster, lamp, axis))
+        out[:, i] = np.round(255 * arriving(points, caster, lamp, axis, rays))
     return out
