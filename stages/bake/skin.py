@@ -31,7 +31,7 @@ def skin_of(face: Mask, albedo: F64, region: Indices | None) -> Mask:
     y = np.log(np.maximum(albedo @ LUMA, 1e-4))
     seen = np.stack([y, colour[:, 0] - colour[:, 1], colour[:, 2] - colour[:, 1]], 1)
     middle = np.median(seen[face], axis=0)
-    bright = face & (y - middle[0] > DARKER)
+    bright = np.asarray(face & (y - middle[0] > DARKER), np.bool_)
     if region is None:
         return bright
     spread = np.maximum(1.4826 * np.median(np.abs(seen[bright] - middle), axis=0), FLOOR)

@@ -126,7 +126,7 @@ def information(grid: GridSdf, views: Sequence[PhotoView], x: F64, n: F64) -> F6
         seen, cosine, toward = _seen(grid, view, x, n)
         total[seen] += cosine
         mean[seen] += cosine[:, None] * toward
-    return np.maximum(total - (mean**2).sum(1) / np.maximum(total, TINY), 0.0)
+    return np.asarray(np.maximum(total - (mean**2).sum(1) / np.maximum(total, TINY), 0.0), np.float64)
 
 
 def outlines(views: Sequence[PhotoView], x: F64, n: F64, side: int) -> F64:
