@@ -44,7 +44,7 @@ from stages.inverse_rendering.smoothest import smoothest
 
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
-SMOOTH_AT = (0.45, 0.7)  # shares of the fit: then the colours follow, and the photos correct the outline
+SMOOTH_AT = (0.35, 0.55)  # shares of the fit: then the colours follow, and the photos correct the outline
 NOISE = 1.5  # pixels that noise may move the surface for I = 1
 POINTS = 30_000  # of the surface, some 4 mm apart on a head
 NEIGHBOURS, QUANTILE = 16, 1 / 3
