@@ -184,7 +184,8 @@ def loss_at(k: float) -> float:
         v.world_from_cam[:3, 3] *= k
     b = ball_start()
     start = Start((b.values * k).astype(np.float32), (b.lo * k).astype(np.float32), b.cell * k)
-    t = trainer(SHORT.changed(steps=20, hash_fine=SHORT.hash_fine * k), views, start)
+    lengths = {name: getattr(SHORT, name) * k for name in ("hash_fine", "unseen_smoothing")}
+    t = trainer(SHORT.changed(steps=20, **lengths), views, start)
     run_fit(t, Hooks(lambda *a, **k: None, lambda: False))
     finite(t)
     assert t.guard.dropped == 0
