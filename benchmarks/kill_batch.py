@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -29,7 +28,6 @@ from benchmarks.generated import print_or_write
 from benchmarks.kill_matrix import (
     AT_ONCE,
     LAST,
-    LIMIT,
     MARK,
     ONE_THREAD,
     PATIENCE,
@@ -41,6 +39,7 @@ from benchmarks.kill_matrix import (
     Column,
     column_in,
     not_ignored,
+    struck,
     survivors,
     table,
 )
@@ -120,26 +119,12 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         process.wait(moment.wait or 0.05)
     if process.poll() is not None:
         return Cell(None)
-    number = signal.SIGTERM if name == "TWICE" else signal.Signals[f"SIG{name}"]
-    struck = time.monotonic()
-    process.send_signal(number)
-    if name == "TWICE":
-        time.sleep(0.5)
-        process.send_signal(number)
-    cell = Cell(process.wait(PATIENCE), time.monotonic() - struck)
-    cell.faults = list(_faults(folder, out, cell, number, name, mark, before))
+    cell = struck(process, name)
+    cell.faults += _faults(folder, out, name, mark, before)
     return cell
 
 
-def _faults(
-    folder: Path, out: Path, cell: Cell, number: signal.Signals, name: str, mark: str, before: set[Path]
-) -> Iterator[str]:
-    assert cell.code is not None
-    code = cell.code if cell.code >= 0 else 128 - cell.code
-    if code != 128 + number:
-        yield f"exit code {code}"
-    if cell.seconds > LIMIT:
-        yield f"{cell.seconds:.0f} s until the end"
+def _faults(folder: Path, out: Path, name: str, mark: str, before: set[Path]) -> Iterator[str]:
     said = [folder / "said.txt", *(out / "batch/logs").glob("*.log")]
     found = [m[0].strip() for f in said if (m := TRACES.search(f.read_text(errors="replace")))]
     if found:

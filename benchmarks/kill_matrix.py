@@ -182,27 +182,35 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         process.kill()
         process.wait()
         return Cell(None)
-    struck = time.monotonic()
+    cell = struck(process, name)
+    cell.faults += _faults(folder, out, name, mark, before)
+    return cell
+
+
+def struck(process: subprocess.Popen[str], name: str) -> Cell:
+    """A process that gets the signal: how it ended, with its faults of exit code and time."""
+    begun = time.monotonic()
     number = signal.SIGTERM if name == "TWICE" else signal.Signals[f"SIG{name}"]
     process.send_signal(number)
     if name == "TWICE":
         time.sleep(0.5)
         process.send_signal(number)
-    code = process.wait(PATIENCE)
-    cell = Cell(code, time.monotonic() - struck)
-    cell.faults = list(_faults(folder, out, cell, number, name, mark, before))
+    cell = Cell(process.wait(PATIENCE), time.monotonic() - begun)
+    cell.faults += ending_faults(cell, number)
     return cell
 
 
-def _faults(
-    folder: Path, out: Path, cell: Cell, number: signal.Signals, name: str, mark: str, before: tuple[bool, set[Path]]
-) -> Iterator[str]:
+def ending_faults(cell: Cell, number: signal.Signals) -> Iterator[str]:
+    """What is wrong with the exit code and the time of a process that got this signal."""
     assert cell.code is not None
     code = cell.code if cell.code >= 0 else 128 - cell.code
     if code != 128 + number:
         yield f"exit code {code}"
     if cell.seconds > LIMIT:
         yield f"{cell.seconds:.0f} s until the end"
+
+
+def _faults(folder: Path, out: Path, name: str, mark: str, before: tuple[bool, set[Path]]) -> Iterator[str]:
     found = TRACES.search((folder / "said.txt").read_text(errors="replace"))
     if found:
         yield f"says {found[0].strip()}"

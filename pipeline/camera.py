@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.transforms import inverse_rigid, project, rays
+from pipeline.artifacts import Camera
+from pipeline.transforms import inverse_rigid, matrix, project, rays
 
 F64 = npt.NDArray[np.float64]
 
@@ -22,6 +23,13 @@ class PinholeCamera:
     width: int
     height: int
     distortion: F64 = field(default_factory=lambda: np.zeros(5))
+
+    @classmethod
+    def of(cls, camera: Camera, world_from_cam: F64 | None = None) -> PinholeCamera:
+        """A manifest's camera; world_from_cam (4, 4): where it stands, if not there."""
+        pose = matrix(camera.world_from_cam) if world_from_cam is None else world_from_cam
+        lens = np.asarray(camera.distortion, np.float64)
+        return cls(matrix(camera.K), pose, camera.width, camera.height, lens)
 
     @property
     def eye(self) -> F64:

@@ -167,6 +167,11 @@ def edges(faces: Faces) -> Indices:
     return np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
 
 
+def unique_edges(faces: Faces) -> Indices:
+    """(E, 2) the vertices of each edge once, the lower first, sorted."""
+    return np.asarray(np.unique(np.sort(edges(faces), axis=1), axis=0), np.int64)
+
+
 def paired_edges(faces: Faces, count: int) -> tuple[Indices, Indices, int]:
     """Rows (P,), (P,) of `edges`: the two sides of each edge that two faces share, sorted by the edge's lower, then its
     higher vertex; and the largest number of faces at one edge. Row r belongs to face r % F. `count`: vertices."""

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from pipeline.colour import srgb_from_linear
+from pipeline.colour import LUMA, srgb_from_linear
 from pipeline.meshes import F32, F64, Indices, Mask, triangles_of
 from pipeline.raster import in_texels, rasterise
 from pipeline.registration.head import Head
@@ -33,7 +33,6 @@ NOISE = 1e-4  # metres: residuals below this are noise
 GROUPS = {"eyes": "lids", "lips": "lips", "brows": "brows"}  # group of landmarks -> region that holds their corners
 DISC = 0.015  # of a tile: radius around a landmark in which edges count
 BLUR = 1 / 512  # of a tile: standard deviation of the Gaussian
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec.709
 LEAST_WEIGHT = 1e-3  # weight of a texel that a map has but its photos do not show
 
 
@@ -130,7 +129,7 @@ def _uv_of(template: Template) -> F64:
 
 def edge_energy(albedo: F32) -> F64:
     """(size, size) squared gradient of an albedo's (size, size, 3) lightness, per texel. Linear Rec.709."""
-    light = srgb_from_linear((albedo.astype(np.float64) @ LUMINANCE).clip(0, 1))
+    light = srgb_from_linear((albedo.astype(np.float64) @ np.array(LUMA)).clip(0, 1))
     light = cv2.GaussianBlur(light, (0, 0), max(BLUR * len(light), 0.5))
     return np.asarray(sum(g * g for g in np.gradient(light)), np.float64)
 

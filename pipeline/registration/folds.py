@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, triangles_of, unit
+from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, triangles_of, unique_edges, unit
 from pipeline.ray_casting import RayCaster
 
 LEAST = 0.1  # cosine between the corner's normal and that of the turned rest
@@ -42,8 +42,7 @@ def piercing_edges(vertices: F64, faces: Faces) -> Indices:
     """(N, 2) edges of triangles (F, 3) that pass through a triangle that they do not touch. Two triangles that cross do
     so at an edge of one of them. Coplanar overlaps are not found."""
     f = np.asarray(faces, np.int64)
-    ends = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-    ends = np.unique(ends, axis=0)
+    ends = unique_edges(faces)
     caster = RayCaster(vertices, faces)
     way = vertices[ends[:, 1]] - vertices[ends[:, 0]]
     length = np.linalg.norm(way, axis=1)

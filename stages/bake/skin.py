@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.colour import LUMA
 from pipeline.meshes import F64, Indices, Mask
-from stages.bake.unseen import FIRST_BAND, REGIONS
+from stages.bake.unseen import HAIR, REST
 
 DARKER = -1.0  # y against the face's: brows, beards and fringes are darker than a third of it
 FLOOR = np.array([0.25, 0.08, 0.12])  # of y, r, b
 ALIKE = 3.0  # spreads
 MIN_FACE = 50  # vertices: fewer tell no colour
-LUMA = np.array([0.2126, 0.7152, 0.0722])
 
 
 def skin_of(face: Mask, albedo: F64, region: Indices | None) -> Mask:
@@ -28,7 +28,7 @@ def skin_of(face: Mask, albedo: F64, region: Indices | None) -> Mask:
     if face.sum() < MIN_FACE:
         return face
     colour = np.log(np.maximum(albedo, 1e-4))
-    y = np.log(np.maximum(albedo @ LUMA, 1e-4))
+    y = np.log(np.maximum(albedo @ np.array(LUMA), 1e-4))
     seen = np.stack([y, colour[:, 0] - colour[:, 1], colour[:, 2] - colour[:, 1]], 1)
     middle = np.median(seen[face], axis=0)
     bright = np.asarray(face & (y - middle[0] > DARKER), np.bool_)
@@ -36,5 +36,5 @@ def skin_of(face: Mask, albedo: F64, region: Indices | None) -> Mask:
         return bright
     spread = np.maximum(1.4826 * np.median(np.abs(seen[bright] - middle), axis=0), FLOOR)
     alike = (((seen - middle) / spread) ** 2).sum(1) < ALIKE**2
-    bare = (region < len(REGIONS)) | (region >= FIRST_BAND)
+    bare = (region != REST) & (region != HAIR)
     return np.asarray(bright | (bare & ~face & alike), np.bool_)

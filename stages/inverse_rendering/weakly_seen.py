@@ -105,10 +105,9 @@ def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, wrong: Call
 
 def _band(values: npt.NDArray[np.float32], cell: float) -> Bool:
     """(X, Y, Z) nodes near the zero set and not at the grid's faces."""
-    near = np.abs(values) < BAND * cell
-    for axis in range(3):
-        near &= _inner(near.shape, axis)
-    return np.asarray(near, np.bool_)
+    near = np.zeros(values.shape, np.bool_)
+    near[1:-1, 1:-1, 1:-1] = np.abs(values[1:-1, 1:-1, 1:-1]) < BAND * cell
+    return near
 
 
 def lengths(information: F64, x: F64, pixel: float, longest: float) -> F64:
@@ -133,10 +132,10 @@ def outlines(views: Sequence[PhotoView], x: F64, n: F64, side: int) -> F64:
     """S (N,) at points x with unit normals n, (N, 3)."""
     total = np.zeros(len(x))
     for view in views:
-        at, cosine, _, _ = _placed(view, x, n)
-        grazed = np.flatnonzero((np.abs(cosine) < TANGENT) & (at >= 0).all(1))
-        column, row = at[grazed].T
-        total[grazed] += _edge(view, round(EDGE * factor_for(view.size, side)))[row, column]
+        subject, window = _reached(view, side)
+        edge = (cv2.dilate(subject, window) > cv2.erode(subject, window)) & _counting(view)
+        cosine = (_directions(view, x)[0] * n).sum(1)
+        total += (np.abs(cosine) < TANGENT) & _looked_up(edge, view, x)
     return total
 
 
@@ -144,19 +143,15 @@ def outside(views: Sequence[PhotoView], x: F64, side: int) -> npt.NDArray[np.int
     """(N,) number of views in which points x (N, 3) lie more than `EDGE` pixels outside of a mask that counts."""
     total = np.zeros(len(x), np.int64)
     for view in views:
-        at = _placed(view, x, x)[0]
-        framed = np.flatnonzero((at >= 0).all(1))
-        column, row = at[framed].T
-        reach = round(EDGE * factor_for(view.size, side))
-        near = cv2.dilate((view.alpha > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
-        total[framed] += (~near & _counting(view))[row, column]
+        beyond = (cv2.dilate(*_reached(view, side)) == 0) & _counting(view)
+        total += _looked_up(beyond, view, x)
     return total
 
 
-def _edge(view: PhotoView, reach: int) -> Bool:
-    """(H, W) pixels within `reach` of the mask's edge, where the mask counts."""
-    subject, window = (view.alpha > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    return np.asarray((cv2.dilate(subject, window) > cv2.erode(subject, window)) & _counting(view))
+def _reached(view: PhotoView, side: int) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """(H, W) 1 on the subject, and the window that reaches `EDGE` pixels of the fit."""
+    reach = round(EDGE * factor_for(view.size, side))
+    return (view.alpha > 0.5).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
 
 
 def _counting(view: PhotoView) -> Bool:
@@ -165,25 +160,27 @@ def _counting(view: PhotoView) -> Bool:
     return out if view.doubtful is None else out & ~view.doubtful
 
 
-def _placed(view: PhotoView, x: F64, n: F64) -> tuple[npt.NDArray[np.int64], F64, F64, F64]:
-    """Of points x with normals n, (N, 3): the pixel (N, 2), -1 outside of the photo; cosine to the camera (N,), unit
-    direction (N, 3) and distance (N,)."""
-    away = view.world_from_cam[:3, 3] - x
-    distance = np.linalg.norm(away, axis=1)
-    toward = away / np.maximum(distance, TINY)[:, None]
+def _looked_up(pixels: Bool, view: PhotoView, x: F64) -> Bool:
+    """(N,) the values of a picture (H, W) at points x (N, 3); False outside of it."""
     uv, depth = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, x)
     at = np.floor(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
-    outside = (depth <= 0) | (at < 0).any(1) | (at >= view.size).any(1)
-    at[outside] = -1
-    return at, (toward * n).sum(1), toward, distance
+    framed = (depth > 0) & (at >= 0).all(1) & (at < view.size).all(1)
+    column, row = np.where(framed[:, None], at, 0).T
+    return np.asarray(framed & pixels[row, column], np.bool_)
+
+
+def _directions(view: PhotoView, x: F64) -> tuple[F64, F64]:
+    """Unit directions (N, 3) from points x (N, 3) to the camera, and distances (N,)."""
+    away = view.world_from_cam[:3, 3] - x
+    distance = np.linalg.norm(away, axis=1)
+    return away / np.maximum(distance, TINY)[:, None], distance
 
 
 def _seen(grid: GridSdf, view: PhotoView, x: F64, n: F64) -> tuple[npt.NDArray[np.int64], F64, F64]:
     """Indices of the points that a view sees where it counts, their c and d."""
-    at, cosine, toward, distance = _placed(view, x, n)
-    seen = np.flatnonzero((cosine > 0) & (at >= 0).all(1))
-    column, row = at[seen].T
-    seen = seen[((view.alpha > 0.5) & _counting(view))[row, column]]
+    toward, distance = _directions(view, x)
+    cosine = (toward * n).sum(1)
+    seen = np.flatnonzero((cosine > 0) & _looked_up((view.alpha > 0.5) & _counting(view), view, x))
     if len(seen):
         seen = seen[unoccluded(grid, view.world_from_cam[:3, 3], toward[seen], distance[seen], grid.lo)]
     return seen, cosine[seen], toward[seen]
@@ -197,10 +194,3 @@ def _on_surface(grid: GridSdf, near: F64) -> tuple[F64, F64]:
         x = x - s[:, None] * g / (g * g).sum(-1, keepdim=True).clamp(min=0.25)
         n = unit(grid(x)[1])
     return x.cpu().double().numpy(), n.cpu().double().numpy()
-
-
-def _inner(shape: tuple[int, ...], axis: int) -> Bool:
-    """Nodes that are not at the grid's faces across an axis, shaped for broadcasting."""
-    out = np.ones(shape[axis], np.bool_)
-    out[[0, -1]] = False
-    return out.reshape([-1 if a == axis else 1 for a in range(3)])

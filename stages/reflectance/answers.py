@@ -18,7 +18,7 @@ from pipeline.artifacts import Camera
 from pipeline.camera import PinholeCamera
 from pipeline.meshes import Mesh
 from pipeline.ray_casting import RayCaster
-from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project
+from pipeline.transforms import F64, inverse_rigid, pixel_centres, project
 from stages.reflectance.relight import barycentric
 from stages.reflectance.rig import Rig
 from stages.reflectance.samples import Step, gather
@@ -66,9 +66,7 @@ class AnswerMap:
 
 def view_of(camera: Camera, width: int) -> PinholeCamera:
     """A camera at rest with `width` columns."""
-    lens = np.array(camera.distortion, np.float64)
-    whole = PinholeCamera(matrix(camera.K), matrix(camera.world_from_cam), camera.width, camera.height, lens)
-    return whole.scaled(width)
+    return PinholeCamera.of(camera).scaled(width)
 
 
 def answer_maps(

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
-from pipeline.meshes import Faces, Indices, Mesh, unit, vertex_normals
+from pipeline.meshes import Faces, Indices, Mesh, unique_edges, unit, vertex_normals
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, inverse_rigid, pixel_centres, project
 from stages.reflectance.agree import ways
@@ -115,7 +115,7 @@ def moved(mesh: Mesh, first: Mesh, maps: Sequence[AnswerMap], views: Sequence[An
     if not any(m.values[..., 6].any() for m in maps):
         return mesh
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces
-    pairs = edge_pairs(faces)
+    pairs = unique_edges(faces)
     mean = neighbour_mean(pairs, len(vertices))
     normals = vertex_normals(vertices, faces).astype(np.float64)
     seen, well = _seen(vertices, normals, faces, maps)
@@ -137,11 +137,6 @@ def moved(mesh: Mesh, first: Mesh, maps: Sequence[AnswerMap], views: Sequence[An
         vertices = vertices + np.clip(system.solved(), -FARTHEST, FARTHEST)[:, None] * normals
     vertices, _ = relaxed(vertices, faces, mean)
     return Mesh(vertices.astype(np.float32), vertex_normals(vertices, faces), faces)
-
-
-def edge_pairs(faces: Faces) -> Indices:
-    """(E, 2) vertices of each edge once."""
-    return np.asarray(np.unique(np.sort(meshes.edges(faces).reshape(-1, 2), axis=1), axis=0), np.int64)
 
 
 def neighbour_mean(pairs: Indices, count: int) -> Any:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from pipeline.camera import PinholeCamera
 from pipeline.colour import srgb_from_linear
 from pipeline.images import F32, read_linear
-from pipeline.transforms import F64, matrix
+from pipeline.transforms import F64
 from stages.reflectance.field import Field, Lamp
 from stages.reflectance.relight import look_up, picture
 from stages.reflectance.rig import Rig, moved_camera
@@ -50,8 +50,7 @@ def encoded(linear: F32, gain: float) -> F64:
 def camera_at(rig: Rig, camera: int, light: int) -> PinholeCamera:
     """A camera as the head sees it at a light's frame."""
     shot = rig.cameras[camera]
-    pose = moved_camera(shot, rig.motion[light])
-    return PinholeCamera(matrix(shot.K), pose, shot.width, shot.height, np.array(shot.distortion, np.float64))
+    return PinholeCamera.of(shot, moved_camera(shot, rig.motion[light]))
 
 
 def score(

@@ -10,11 +10,11 @@ import pytest
 
 from pipeline.camera import PinholeCamera
 from pipeline.images import write_exr
-from pipeline.meshes import Mesh, unit, vertex_normals
+from pipeline.meshes import Mesh, unique_edges, unit, vertex_normals
 from pipeline.transforms import pixel_centres
 from stages.reflectance.agree import ALBEDOS, MOST, NORMALS, SHARPEST, _cost, _lowest, ways
 from stages.reflectance.answers import AnswerMap, answer_maps
-from stages.reflectance.reshape import _System, edge_pairs, folded, moved, neighbour_mean, outline, relaxed
+from stages.reflectance.reshape import _System, folded, moved, neighbour_mean, outline, relaxed
 from stages.reflectance.rig import Rig, rig_of
 from tests.reflectance.test_rig_and_motion import cameras_of, lights_of
 from tests.reflectance.test_split import silent
@@ -106,7 +106,7 @@ def test_cameras_agree_on_the_ball(way: float, plain: bool) -> None:
     mesh = globe()
     vertices = mesh.vertices.astype(float) * (1 + way / RADIUS)
     seen = np.stack([(unit(v.eye - vertices) * unit(vertices)).sum(1) > 0.3 for v in VIEWS])
-    mean = neighbour_mean(edge_pairs(mesh.faces), len(vertices))
+    mean = neighbour_mean(unique_edges(mesh.faces), len(vertices))
     maps = [ball_map(v, plain=plain) for v in VIEWS]
     found, trust = ways(vertices, unit(vertices), seen, maps, mean, TRIED)
     told = faces_two(vertices) & (trust > 1 / 0.003**2)
@@ -119,7 +119,7 @@ def test_cameras_agree_on_the_ball(way: float, plain: bool) -> None:
 def test_one_camera_agrees_with_anything() -> None:
     mesh = globe(3)
     vertices = mesh.vertices.astype(float)
-    mean = neighbour_mean(edge_pairs(mesh.faces), len(vertices))
+    mean = neighbour_mean(unique_edges(mesh.faces), len(vertices))
     _, trust = ways(vertices, unit(vertices), np.ones((1, len(vertices)), bool), MAPS[:1], mean, TRIED)
     assert not trust.any()
 
@@ -214,7 +214,7 @@ def test_outlines_are_the_balls_circle() -> None:
 def test_folds_are_found_and_relaxed() -> None:
     """A vertex that is drawn over its neighbours folds the triangles there; the ball and a sharp cube have no folds."""
     mesh = globe(3)
-    mean = neighbour_mean(edge_pairs(mesh.faces), len(mesh.vertices))
+    mean = neighbour_mean(unique_edges(mesh.faces), len(mesh.vertices))
     vertices = mesh.vertices.astype(float)
     assert not folded(vertices, unit(vertices), mesh.faces, mean).any()
     same, whole = relaxed(vertices, mesh.faces, mean)
@@ -251,7 +251,7 @@ def test_rows_are_least_squares() -> None:
 
 def test_means_are_over_a_vertex_and_its_neighbours() -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    pairs = edge_pairs(faces)
+    pairs = unique_edges(faces)
     assert sorted(map(tuple, pairs)) == [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)]
     found = neighbour_mean(pairs, 5) @ np.array([4.0, 8, 0, 12, 7])
     np.testing.assert_allclose(found, [24 / 4, 12 / 3, 24 / 4, 16 / 3, 7])

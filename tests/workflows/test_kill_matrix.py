@@ -85,7 +85,7 @@ def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None
 
 def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of what a batch may leave, put there by hand."""
-    from benchmarks import kill_batch
+    from benchmarks import kill_batch, kill_matrix
 
     out = tmp_path / "out"
     (out / "batch/logs").mkdir(parents=True)
@@ -95,7 +95,8 @@ def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     cell = Cell(143, 1.0)
 
     def found(name: str = "TERM") -> list[str]:
-        return list(kill_batch._faults(tmp_path, out, cell, signal.SIGTERM, name, "mark", set()))
+        ended = kill_matrix.ending_faults(cell, signal.SIGTERM)
+        return [*ended, *kill_batch._faults(tmp_path, out, name, "mark", set())]
 
     assert found() == []
     cell.code = 1

@@ -16,7 +16,6 @@ from pipeline.colour import as_photographed, srgb_from_linear
 from pipeline.contract import Context
 from pipeline.fitted_cameras import cameras_of
 from pipeline.images import read_linear, write_exr, write_png
-from pipeline.transforms import matrix
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.carried import Captured
 from stages.usd.render.exported import load_exported
@@ -29,17 +28,6 @@ SIDES = {"left": -55.0, "front": 0.0, "right": 55.0}  # degrees of azimuth
 THUMBNAIL_SIDE, THUMBNAIL_TURN = 256, 25.0  # pixels, degrees
 GREY_LIGHT = np.array([[2.0] * 3, [1.2] * 3, [1.2] * 3, [0.7] * 3], np.float32)
 """A soft light from above, front and the subject's left: orders 0 and 1, for pictures of the shape."""
-
-
-def view_of(camera: Camera) -> PinholeCamera:
-    """Convert a manifest's camera for the renderer."""
-    return PinholeCamera(
-        matrix(camera.K),
-        matrix(camera.world_from_cam),
-        camera.width,
-        camera.height,
-        np.asarray(camera.distortion, np.float64),
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +61,7 @@ def render_held_out(
         context.check()
         context.progress(number, len(wanted), f"asset view {index}")
         response = responses.get(index, UNCHANGED)
-        view = view_of(by_index[index])
+        view = PinholeCamera.of(by_index[index])
         shown = scene.renderer.render(view, factor=scale, samples=samples, light=scene.light)
         rgba = as_photographed(shown, response)
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
