@@ -20,6 +20,7 @@ from pipeline.transforms import F64, inverse_rigid, project, rigid
 from stages.poses.bundle_adjustment import Refine, adjust
 from stages.poses.features import Features
 from stages.poses.matching import Pair, Verified
+from stages.poses.merge import merged
 from stages.poses.well_supported import well_supported
 
 DEFAULT_FOCAL = 1.2  # of the longest edge: COLMAP's own guess, a 43 mm lens on full frame
@@ -103,6 +104,7 @@ def reconstruct(
             _remove_poorly_supported(reconstruction)
     # the most photos; if equal, the most points
     ranked = sorted(found.values(), key=lambda r: (r.num_reg_images(), r.num_points3D()), reverse=True)
+    ranked = merged(ranked, database, scratch / "merged", seed)
     largest, of_lens = ranked[0], np.array(lens_of, np.int64)
     determined = _determines_principal_points(largest, numbers, of_lens)
     # a lens that the photos hardly determine drifts under a robust loss, which ignores a part of the observations

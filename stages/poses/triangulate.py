@@ -19,6 +19,7 @@ from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, matrix
 from stages.poses.bundle_adjustment import adjust_near
 from stages.poses.features import Features
+from stages.poses.known_poses import with_points, with_poses
 from stages.poses.mapper import GLOG_ERROR, Model, model_of, write_database
 from stages.poses.matching import Pair, Verified
 
@@ -41,23 +42,25 @@ def triangulate(
     lenses = [_lens(c) for c in cameras]
     unskewed = [Features(_without_skew(f.uv, c), f.descriptors) for f, c in zip(features, cameras, strict=True)]
     numbers = write_database(database, lenses, range(len(cameras)), unskewed, verified)
-    found = _with_poses(database, [inverse_rigid(matrix(c.world_from_cam)) for c in cameras])
+    given = [matrix(c.world_from_cam) for c in cameras]
+    poses = {name: inverse_rigid(given[n]) for name, n in numbers.items()}
+    found = with_poses(database, poses)
     centres = {n: np.asarray(i.projection_center(), np.float64) for n, i in found.images.items()}
     turns = {n: np.asarray(i.cam_from_world().matrix()[:, :3], np.float64) for n, i in found.images.items()}
     for limit in ROUNDS if refine else ROUNDS[-1:]:
-        found = pycolmap.triangulate_points(found, database, scratch, scratch, options=_options(limit, seed))
+        found = with_points(found, database, scratch, limit, seed)
         if not found.num_points3D():
             return None
         if refine:
             adjust_near(found, centres, deviation)
             _restore_orientation(found, turns)
-    model, given = model_of(found, numbers), [matrix(c.world_from_cam) for c in cameras]
+    model = model_of(found, numbers)
     seen = {numbers[i.name]: i.num_points3D for i in found.images.values()}
     doubtful = [n for n, p in model.poses.items()
                 if refine and (seen[n] < MIN_OBSERVATIONS or _turn(given[n], p.world_from_cam) > TURN)]  # fmt: skip
-    poses = {n: replace(p, K=matrix(cameras[n].K), world_from_cam=given[n] if n in doubtful else p.world_from_cam)
+    own = {n: replace(p, K=matrix(cameras[n].K), world_from_cam=given[n] if n in doubtful else p.world_from_cam)
              for n, p in model.poses.items()}  # fmt: skip
-    return replace(model, poses=poses), doubtful
+    return replace(model, poses=own), doubtful
 
 
 def _restore_orientation(found: Any, turns: Mapping[int, F64]) -> None:
@@ -80,29 +83,6 @@ def _restore_orientation(found: Any, turns: Mapping[int, F64]) -> None:
 def _turn(a: F64, b: F64) -> float:
     """Angle in radians between two rigid poses (4, 4)."""
     return float(np.arccos(np.clip((np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2, -1, 1)))
-
-
-def _with_poses(database: Path, poses: Sequence[F64]) -> Any:
-    """A COLMAP reconstruction with the poses cam_from_world (4, 4) and without points."""
-    found, opened = pycolmap.Reconstruction(), pycolmap.Database.open(database)
-    for camera in opened.read_all_cameras():
-        found.add_camera_with_trivial_rig(camera)
-    for image in opened.read_all_images():
-        pose = poses[int(image.name)]
-        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
-    opened.close()
-    return found
-
-
-def _options(limit: float, seed: int) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    options.extract_colors = False
-    options.ba_refine_focal_length = options.ba_refine_extra_params = options.ba_refine_principal_point = False
-    options.mapper.filter_max_reproj_error = limit
-    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = limit
-    return options
 
 
 def _lens(c: Camera) -> Any:
