@@ -71,7 +71,7 @@ def choose_start(
         if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
             return ChosenStart(start, hull, _facts("hull", why, known, stereo))
-    cut = carved_by_template(hull, template, head, np.stack([v.world_from_cam[:3, 3] for v in views]))
+    cut = carved_by_template(hull, template, head, views, check)
     # on smooth skin, longer sweeps find depths at random, and remove hair
     start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])
     known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)

@@ -144,7 +144,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=26,
+    version=27,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -7,6 +7,8 @@ goes on (pipeline.registration.carve). The hull remains the outer limit; the tem
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 
@@ -15,6 +17,8 @@ from pipeline.registration.carve import possible_space
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.model import Template
 from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.keep_silhouettes import bound_with_silhouettes
+from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.stereo import distances
 
 # Metres of the template: median distance of the landmarks from a surface that does not have the face. Measured: 1 to
@@ -31,8 +35,17 @@ def landmarks_off(start: Start, landmarks: F64, unit: float) -> float:
     return float(values.detach().abs().median()) / unit
 
 
-def carved_by_template(start: Start, template: Template, head: PlacedHead, centres: F64) -> Start:
-    """The start without what no person with this head fills. centres (N, 3): of the cameras."""
+def carved_by_template(
+    start: Start,
+    template: Template,
+    head: PlacedHead,
+    views: list[PhotoView],
+    check: Callable[[], None] = lambda: None,
+) -> Start:
+    """The start without what no person with this head fills and no silhouette needs."""
     x, y, z = start.values.shape
+    centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
+    front = head.world_from_template[:3, 2] / head.scale
+    space = bound_with_silhouettes(start, space, front, views, check)
     return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)

@@ -1,6 +1,5 @@
 """Choice of the initial geometry, with landmarks of the template itself and without stereo."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,16 @@ from pipeline.template.load import load_template
 from stages.inverse_rendering.choose_start import ChosenStart, choose_start
 from stages.inverse_rendering.config import PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.template_start import FAR, landmarks_off
 
 TEMPLATE = load_template()
 CELL, SHAPE = 0.006, (56, 76, 62)
 LO = np.array([-0.17, -0.26, -0.19])
-CAMERAS: Any = [SimpleNamespace(world_from_cam=np.block([[np.eye(3), np.array([[x], [0.0], [0.9]])], [0, 0, 0, 1]]))
-                for x in (-0.3, 0.0, 0.3)]  # fmt: skip
+EMPTY = np.zeros((4, 4), np.float32)  # a mask that asks for nothing
+CAMERAS = [PhotoView(i, np.zeros((4, 4, 3), np.float32), EMPTY, np.eye(3),
+                     np.block([[np.eye(3), np.array([[x], [0.0], [0.9]])], [0, 0, 0, 1]]), np.zeros(5))
+           for i, x in enumerate((-0.3, 0.0, 0.3))]  # fmt: skip
 
 
 def marks() -> F64:

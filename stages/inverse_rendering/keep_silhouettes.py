@@ -1,0 +1,92 @@
+"""Long hair, a hat, headphones: what stands further out of the template than is allowed, where silhouettes show it.
+
+The space that a person with a placed head can fill (pipeline.registration.carve) is a guess. Where it leaves a ray of a
+silhouette empty although the hull does not, the guess is wrong, and one place on that ray is kept: within the hull,
+near the template, rather beside or behind it than in front, because hair hangs there. Stereo and the fit move it.
+
+Symbols: S the signed bound of the possible space, negative inside; u metres ahead of the head, along the direction that
+the face looks to; p the point of a lost ray within the hull at which S + BEHIND u is least. The bound becomes
+min(S, |x - p| - RADIUS) over all p, smoothed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+
+from pipeline.fields.geometry import GridSdf
+from pipeline.maths.tracing import box_interval
+from stages.inverse_rendering.dense_stereo import pixel_rays
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, evenly_spaced
+from stages.inverse_rendering.stereo import distances, without_distortion
+
+F32 = npt.NDArray[np.float32]
+F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+SIDE, VIEWS = 160, 32  # pixels of a silhouette's longest side; silhouettes, evenly spaced over the views
+BEHIND = 0.5  # metres from the template that count like a metre further to the front
+RADIUS, BLUR = 1.5, 0.7  # cells that are kept around p; smoothing of that, because every view has its own p
+BORDER = 2  # pixels of the silhouette's border that need not be kept: there the hull itself is uncertain
+
+
+def bound_with_silhouettes(
+    hull: Start, bound: F32, front: F64, views: list[PhotoView], check: Callable[[], None] = lambda: None
+) -> F32:
+    """The bound S (X, Y, Z) on the hull's grid, widened where it would empty rays of the silhouettes. front (3,): unit
+    direction that the face looks to."""
+    cut = Start(distances(np.maximum(hull.values, bound), hull.lo, hull.cell), hull.lo, hull.cell)
+    whole, left = hull.surface("cpu"), cut.surface("cpu")
+    free = np.ones(bound.shape, bool)
+    axes = [BEHIND * hull.cell * f * np.arange(n) for f, n in zip(front, bound.shape, strict=True)]
+    cost = bound + axes[0][:, None, None] + axes[1][None, :, None] + axes[2][None, None, :]
+    for i in evenly_spaced(len(views), min(VIEWS, len(views))):
+        check()
+        points = _lost(whole, left, hull, cost, views[i])
+        free[tuple(np.rint((points - hull.lo) / hull.cell).astype(np.intp).T)] = False
+    if free.all():
+        return bound
+    near = ndimage.gaussian_filter(ndimage.distance_transform_edt(free), BLUR) - RADIUS
+    return np.asarray(np.minimum(bound, near * hull.cell), np.float32)
+
+
+def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView) -> F64:
+    """Points (N, 3) in the hull, on the rays of a view that meet `whole` but not `left`, at which `cost` is least."""
+    K, shown = _silhouette(view)
+    rows, columns = np.nonzero(shown)
+    o, d, _ = pixel_rays(K, view.world_from_cam, rows, columns)
+    near, far = box_interval(o, d, *left.box())
+    lost = ~left.trace(o, d, near, far)[1]
+    o, d, near, far = (x[lost].contiguous() for x in (o, d, near, far))
+    t, hit, _ = whole.trace(o, d, near, far)
+    origin, direction, first, last = (x[hit].double().numpy() for x in (o, d, t, far))
+    least, place = np.full(len(first), np.inf), np.zeros((len(first), 3))
+    for at in np.arange(0.0, float((last - first).max(initial=0.0)), 0.5 * hull.cell):
+        x = origin + (first + at)[:, None] * direction
+        node = ((x - hull.lo) / hull.cell).T
+        inside = (first + at < last) & (ndimage.map_coordinates(hull.values, node, order=1, mode="nearest") < 0)
+        value = ndimage.map_coordinates(cost, node, order=1, mode="nearest")
+        better = inside & (value < least)
+        least[better], place[better] = value[better], x[better]
+    return np.asarray(place[np.isfinite(least)], np.float64)
+
+
+def _silhouette(view: PhotoView) -> tuple[F64, Bool]:
+    """K and (h, w) certain pixels of the subject within its extent, without distortion."""
+    scale = min(1.0, SIDE / max(view.size))
+    w, h = (max(round(n * scale), 2) for n in view.size)
+    K = view.K.copy()
+    K[:2] *= np.array([[w / view.size[0]], [h / view.size[1]]])
+    certain = view.alpha.astype(np.float32)
+    if view.asked is not None:
+        certain = certain * (view.asked > WHOLE)
+    if view.doubtful is not None:
+        certain = certain * ~view.doubtful
+    small = np.asarray(cv2.resize(certain, (w, h), interpolation=cv2.INTER_AREA), np.float32)
+    full = (without_distortion(small, K, view.distortion) > WHOLE).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
+    return K, np.asarray(cv2.erode(full, disc, borderValue=1)) > 0
