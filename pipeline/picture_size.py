@@ -33,7 +33,7 @@ def declared_size(data: Data) -> tuple[int, int] | None:
             return _exr(data)
         if data[:2] == b"#?":
             return _radiance(data)
-    except (struct.error, ValueError, IndexError):  # the header is truncated: the decoder will report it
+    except (struct.error, ValueError, IndexError, OverflowError):  # the header is damaged: the decoder will report it
         return None
     return None
 

@@ -44,13 +44,21 @@ def test_a_header_that_is_cut_off_has_no_size_or_the_right_one(tmp_path: Path, s
         assert declared_size(data[:end]) in (None, (W, H))
 
 
-@given(st.sampled_from([b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", b"MM\0*", b"\x76\x2f\x31\x01"]), st.binary())
+HEADS = [b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"\x76\x2f\x31\x01", b"#?"]
+
+
+@given(st.sampled_from(HEADS), st.binary())
 def test_no_bytes_make_it_fail(head: bytes, rest: bytes) -> None:
     """None, or the numbers that stand in the bytes; a PNG's are where its standard puts them."""
     found = declared_size(head + rest)
     assert found is None or all(isinstance(n, int) for n in found)
     if head[:1] == b"\x89":
         assert found == (struct.unpack(">II", rest[8:16]) if len(rest) >= 16 else None)
+
+
+@pytest.mark.parametrize("first", [2**63 - 1, 2**63, 2**64 - 1])
+def test_a_big_tiff_whose_offset_is_beyond_any_memory_has_no_size(first: int) -> None:
+    assert declared_size(b"II+\0\x08\0\0\0" + struct.pack("<Q", first)) is None
 
 
 def test_a_progressive_jpeg_and_one_with_a_long_comment() -> None:
