@@ -87,8 +87,9 @@ class Pool:
 
 
 @contextmanager
-def running(folder: Path, mark: str, lost_after: str = "60s") -> Iterator[Pool]:
-    """A pool below `folder`, with its deployment; it ends with the block. mark: of its processes but Postgres."""
+def running(folder: Path, mark: str, **more: str) -> Iterator[Pool]:
+    """A pool below `folder`, with its deployment; it ends with the block. mark: of its processes but Postgres; more:
+    for their environment."""
     with _database() as (named, database):
         home, port = folder / "home", free_port()
         kept = {k: v for k, v in os.environ.items() if not k.startswith("PREFECT_") and k != "NEUFACE_STORE"}
@@ -96,10 +97,9 @@ def running(folder: Path, mark: str, lost_after: str = "60s") -> Iterator[Pool]:
             **kept, **ONE_THREAD, **database, MARK: mark, "PYTHONPATH": str(ROOT), "DO_NOT_TRACK": "1",
             "PATH": f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}",
             "PREFECT_HOME": str(folder / "prefect"), "NEUFACE_ROOTS": str(folder),
-            "PREFECT_WORKER_QUERY_SECONDS": "2",
+            "PREFECT_WORKER_QUERY_SECONDS": "2", **more,
         }  # fmt: skip
-        command = [sys.executable, "-m", "workflows.cli", "serve", "--server-only", "--port", port, "--home", home,
-                   "--lost-after", lost_after]  # fmt: skip
+        command = (sys.executable, "-m", "workflows.cli", "serve", "--server-only", "--port", port, "--home", home)
         with Process(environment, folder / "server.log", folder, *command) as server:
             pool = Pool(folder, port, named, server)
             wait_healthy(pool.url)
