@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 
 from benchmarks.kill_matrix import MARK, ONE_THREAD
 from tests.support.servers import PREFECT, Process, ask, free_port, postgres, postgres_programs, wait_healthy
@@ -25,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ENTRY = "tests.support.toy_pool."
 ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
 POLL = 0.2  # seconds between two questions
+PATIENCE = 600.0  # seconds until a server that is away is given up
 
 
 @dataclass
@@ -43,8 +45,17 @@ class Pool:
         return f"http://127.0.0.1:{self.port}/api"
 
     def ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """One call with the server's login."""
-        return ask(self.url, path, body, self.environment["PREFECT_API_AUTH_STRING"])
+        """One call with the server's login; repeated while the server is away or does not come to answer."""
+        end = time.monotonic() + PATIENCE
+        while True:
+            try:
+                return ask(self.url, path, body, self.environment["PREFECT_API_AUTH_STRING"])
+            except HTTPError:
+                raise
+            except OSError:
+                if time.monotonic() > end:
+                    raise
+            time.sleep(POLL)
 
     def call(self, *words: object) -> str:
         """One of Prefect's commands. Returns what it says."""

@@ -34,7 +34,7 @@ from benchmarks.pool import Pool, running, wait_until
 from benchmarks.soak_record import PAGE, RECORD, Found, faults_in, page, processor_time, temporary_faults
 from tests.support.clock import compiler, jumping_clock
 from tests.support.facescape_tree import write_tree
-from tests.support.servers import Process, descendants
+from tests.support.servers import Process, descendants, wait_healthy
 from workflows.bench.captures import commit
 from workflows.run import host_info
 
@@ -48,6 +48,7 @@ TARGETS, SIGNALS = ("a worker", "a run", "the batch"), ("KILL", "TERM", "HUP")
 SPECIALS = ("the disk runs full", "the server is killed", "the clock jumps")
 LATEST = 6.0  # seconds after a capture's end at which something happens
 BACK, WRONG = 3600, 20.0  # seconds by which the clock is behind, and for which
+AGAIN = 3
 AWAY = 5.0  # seconds without a server
 PATIENCE = 2400.0  # seconds until a soak counts as hanging
 
@@ -64,7 +65,7 @@ class Event:
 
 @dataclass
 class Soak:
-    """A soak under way."""
+    """A soak under way. again: how often a batch that gave up may still be started again."""
 
     pool: Pool
     names: list[str]
@@ -74,6 +75,7 @@ class Soak:
     place: Path
     sign: Path
     can_jump: bool
+    again: int = AGAIN
     events: list[tuple[int, str]] = field(default_factory=list)
 
     @property
@@ -165,7 +167,10 @@ def restart_server(soak: Soak) -> str:
     soak.pool.server.kill()
     time.sleep(AWAY)
     soak.pool.server.start()
-    return f"the server: SIGKILL, {AWAY:.0f} s later started again"
+    begun = time.monotonic()
+    wait_healthy(soak.pool.url, PATIENCE)
+    took = time.monotonic() - begun
+    return f"the server: SIGKILL, {AWAY:.0f} s later started again; it answers after {took:.0f} s more"
 
 
 def jump(soak: Soak) -> str:
@@ -203,14 +208,31 @@ def undisturbed(folder: Path, names: Sequence[str], environment: dict[str, str])
 def disturb(soak: Soak, planned: Sequence[Event]) -> int:
     """Let everything happen. Returns the exit code of the batch at its end."""
     for event in planned:
-        wait_until(lambda at=event.at: soak.finished() >= at or ended(soak.batch), PATIENCE)  # type: ignore[misc]
+        if not wait_until(lambda at=event.at: kept(soak).finished() >= at, PATIENCE):  # type: ignore[misc]
+            break
         time.sleep(event.delay)
-        done = soak.finished()
-        said = happen(soak, event)
-        soak.events.append((done, said))
-        print(f"{done:3} {said}", flush=True)
-    assert soak.batch.child is not None
-    return soak.batch.child.wait(PATIENCE)
+        note(soak, happen(soak, event))
+    wait_until(lambda: kept(soak).finished() == len(soak.names) and ended(soak.batch), PATIENCE)
+    return -1 if soak.batch.child is None or soak.batch.child.poll() is None else soak.batch.child.returncode
+
+
+def kept(soak: Soak) -> Soak:
+    """Start again what ended by itself: workers, as systemd does, and a batch that gave up, as its user does."""
+    for name, worker in zip(WORKERS, soak.workers, strict=True):
+        if ended(worker):
+            worker.start()
+            note(soak, f"worker {name} had ended by itself: started again")
+    if ended(soak.batch) and soak.batch.child is not None and soak.batch.child.returncode != 0 and soak.again:
+        soak.again -= 1
+        note(soak, f"the batch had ended with exit code {soak.batch.child.returncode}: started again")
+        soak.batch.start()
+    return soak
+
+
+def note(soak: Soak, said: str) -> None:
+    """Write down what happened, with the captures finished by now."""
+    soak.events.append((soak.finished(), said))
+    print(f"{soak.finished():3} {said}", flush=True)
 
 
 def ended(process: Process) -> bool:
