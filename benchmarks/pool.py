@@ -77,9 +77,15 @@ class Pool:
         """`prefect deployment run`. The run's id."""
         known = {r["id"] for r in self.runs()}
         words = [f"capture={capture}", f"out={out}", f"store={store}", f"sets={json.dumps(settings)}"]
-        self.call("deployment", "run", "capture-to-asset/local", *(x for w in words for x in ("--param", w)))
-        (new,) = [r["id"] for r in self.runs() if r["id"] not in known]
-        return str(new)
+        end = time.monotonic() + PATIENCE
+        while True:  # on a busy machine the client gives up, and the run may be there all the same
+            try:
+                self.call("deployment", "run", "capture-to-asset/local", *(x for w in words for x in ("--param", w)))
+            except SystemExit:
+                if time.monotonic() > end:
+                    raise
+            if new := [str(r["id"]) for r in self.runs() if r["id"] not in known]:
+                return new[0]
 
     def runs(self) -> list[dict[str, Any]]:
         """The last 200 runs that the server knows."""
