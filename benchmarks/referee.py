@@ -20,6 +20,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from pipeline.camera import PinholeCamera
 from pipeline.images import read_exr, write_exr
 from stages.usd.layout import map_file
 from stages.usd.render.exported import read_cameras, read_usd_mesh
@@ -28,6 +29,7 @@ from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0
 from stages.usd.write.maps import vertex_image
 from stages.usd.write.shading import ior_from_f0
 
+mi.set_variant("scalar_rgb")
 TOP = 0.16
 
 
@@ -59,6 +61,68 @@ def tint(asset: Path, name: str, eye: np.ndarray) -> np.ndarray:
     return np.asarray((coefficients.reshape(-1, 3) * bilinear(table, at)).sum(1)).reshape(s.shape)
 
 
+def rendered(asset: Path, index: int, look: str, env: Path | None, side: int, spp: int) -> np.ndarray:
+    """(H, W, 4) linear RGBA of an asset's folder from a camera of lookdev.usda, `side` pixels wide. env: None is the
+    captured light."""
+    name = next(asset.glob("*.obj")).stem
+    textures = asset / "textures"
+    f0 = read_exr(textures / f"{name}_f0.exr")[0][..., :1]
+    covered = read_exr(map_file(asset, name, "coverage", "exr"))[0][..., 0] > 0.5
+    view = read_cameras(asset / "lookdev.usda")[index][0]
+    if look == "standard":
+        bsdf = surface(textures, name, eta=ior_from_f0(float(f0[covered].mean())))
+    else:
+        top, share = TOP, f0 / TOP
+        if look == "neuface_basis":
+            top, share = REFERENCE_F0, tint(asset, name, view.world_from_cam[:3, 3])[..., None]
+        weight = np.repeat(share.clip(0, 1), 3, 2).astype(np.float32)
+        bsdf = {
+            "type": "blendbsdf",
+            "weight": {"type": "bitmap", "bitmap": mi.Bitmap(weight), "raw": True, "wrap_mode": "clamp"},
+            "none": surface(textures, name, eta=1.0001),
+            "full": surface(textures, name, eta=ior_from_f0(top)),
+        }
+    normal = {"type": "normalmap", "normalmap": bitmap(textures / f"{name}_normal.png", True), "bsdf": bsdf}
+    head = {
+        "type": "obj",
+        "filename": str(asset / f"{name}.obj"),
+        "bsdf": {"type": "twosided", "bsdf": normal},
+    }
+    return traced(view, {"light": envmap(env or asset / "environment.exr"), "head": head}, side, spp)
+
+
+def envmap(path: Path) -> dict[str, Any]:
+    """A lat-long picture as the light."""
+    return {"type": "envmap", "filename": str(path)}
+
+
+def traced(view: PinholeCamera, scene: dict[str, Any], side: int, spp: int, depth: int = 6) -> np.ndarray:
+    """(H, W, 4) of a scene from a camera without distortion and with its principal point in the middle."""
+    to_world = view.world_from_cam @ np.diag([-1.0, -1, 1, 1])  # Mitsuba's cameras have +x to the left, +y up
+    made = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": depth, "hide_emitters": True},
+            "sensor": {
+                "type": "perspective",
+                "fov_axis": "x",
+                "fov": float(np.degrees(2 * np.arctan(0.5 * view.width / view.K[0, 0]))),
+                "to_world": mi.ScalarTransform4f(to_world.tolist()),
+                "sampler": {"type": "multijitter", "sample_count": spp},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": side,
+                    "height": round(side * view.height / view.width),
+                    "pixel_format": "rgba",
+                    "rfilter": {"type": "box"},
+                },
+            },
+            **scene,
+        }
+    )
+    return np.array(mi.render(made))
+
+
 def main() -> None:
     """See the module."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -70,55 +134,8 @@ def main() -> None:
     p.add_argument("--side", type=int, default=256)
     p.add_argument("--spp", type=int, default=64)
     options = p.parse_args()
-    mi.set_variant("scalar_rgb")
     asset = options.run / "asset"
-    name = next(asset.glob("*.obj")).stem
-    textures = asset / "textures"
-    f0 = read_exr(textures / f"{name}_f0.exr")[0][..., :1]
-    covered = read_exr(map_file(asset, name, "coverage", "exr"))[0][..., 0] > 0.5
-    view = read_cameras(asset / "lookdev.usda")[options.index][0]
-    if options.look == "standard":
-        bsdf = surface(textures, name, eta=ior_from_f0(float(f0[covered].mean())))
-    else:
-        top, share = TOP, f0 / TOP
-        if options.look == "neuface_basis":
-            top, share = REFERENCE_F0, tint(asset, name, view.world_from_cam[:3, 3])[..., None]
-        weight = np.repeat(share.clip(0, 1), 3, 2).astype(np.float32)
-        bsdf = {
-            "type": "blendbsdf",
-            "weight": {"type": "bitmap", "bitmap": mi.Bitmap(weight), "raw": True, "wrap_mode": "clamp"},
-            "none": surface(textures, name, eta=1.0001),
-            "full": surface(textures, name, eta=ior_from_f0(top)),
-        }
-    normal = {"type": "normalmap", "normalmap": bitmap(textures / f"{name}_normal.png", True), "bsdf": bsdf}
-    to_world = view.world_from_cam @ np.diag([-1.0, -1, 1, 1])  # Mitsuba's cameras have +x to the left, +y up
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "path", "max_depth": 6, "hide_emitters": True},
-            "sensor": {
-                "type": "perspective",
-                "fov_axis": "x",
-                "fov": float(np.degrees(2 * np.arctan(0.5 * view.width / view.K[0, 0]))),
-                "to_world": mi.ScalarTransform4f(to_world.tolist()),
-                "sampler": {"type": "multijitter", "sample_count": options.spp},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": options.side,
-                    "height": round(options.side * view.height / view.width),
-                    "pixel_format": "rgba",
-                    "rfilter": {"type": "box"},
-                },
-            },
-            "light": {"type": "envmap", "filename": str(options.env or asset / "environment.exr")},
-            "head": {
-                "type": "obj",
-                "filename": str(asset / f"{name}.obj"),
-                "bsdf": {"type": "twosided", "bsdf": normal},
-            },
-        }
-    )
-    image = np.array(mi.render(scene))
+    image = rendered(asset, options.index, options.look, options.env, options.side, options.spp)
     write_exr(options.out.with_suffix(".exr"), image.astype(np.float32))
 
 

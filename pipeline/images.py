@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pipeline.colour import REC709, Chromaticities, linear_from_srgb, srgb_from_linear
 from pipeline.errors import StageError
-from pipeline.picture_size import declared_size_of
+from pipeline.picture_size import PNG, declared_size_of, png_claims_more
 
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps have equal bytes
@@ -87,11 +87,13 @@ def _too_large(path: Path, value: str) -> StageError:
 def _decoded(path: Path) -> npt.NDArray[Any] | None:
     """(H, W) or (H, W, C) in OpenCV's channel order, or None. OpenCV's wheel can't read EXR: OpenEXR does it here."""
     if path.suffix.lower() != ".exr":
-        data = np.fromfile(path, np.uint8)
-        if not bytes(data[:4]).startswith(MARKS):  # OpenCV supports more formats, but their size was not checked
+        data = path.read_bytes()
+        if not data.startswith(MARKS):  # OpenCV supports more formats, but their size was not checked
+            return None
+        if data.startswith(PNG) and png_claims_more(data):
             return None
         try:
-            return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             return None
     try:

@@ -12,6 +12,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 
 Data = bytes | mmap
+PNG = b"\x89PNG\r\n\x1a\n"
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others in that range are tables
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
@@ -21,7 +22,7 @@ _MAX_TAGS, _HEAD = 1000, 65_536
 def declared_size(data: Data) -> tuple[int, int] | None:
     """(width, height) in the header of a PNG, JPEG, TIFF, EXR or Radiance file; None if it is not found."""
     try:
-        if data[:8] == b"\x89PNG\r\n\x1a\n":
+        if data[:8] == PNG:
             return struct.unpack_from(">II", data, 16)
         if data[:2] == b"\xff\xd8":
             return _jpeg(data)
@@ -33,7 +34,7 @@ def declared_size(data: Data) -> tuple[int, int] | None:
             return _exr(data)
         if data[:2] == b"#?":
             return _radiance(data)
-    except (struct.error, ValueError, IndexError):  # the header is truncated: the decoder will report it
+    except (struct.error, ValueError, IndexError, OverflowError):  # the header is damaged: the decoder will report it
         return None
     return None
 
@@ -44,6 +45,19 @@ def declared_size_of(path: Path) -> tuple[int, int] | None:
         return None
     with path.open("rb") as f, mmap(f.fileno(), 0, access=ACCESS_READ) as data:
         return declared_size(data)
+
+
+def png_claims_more(data: Data) -> bool:
+    """Whether a chunk of a PNG is longer than what is left of the file. A decoder may make room for it: up to 4 GB."""
+    at = 8
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        if at + 12 + length > len(data):
+            return True
+        if data[at + 4 : at + 8] == b"IEND":
+            return False
+        at += 12 + length
+    return False
 
 
 def _jpeg(data: Data) -> tuple[int, int] | None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.capture_artifacts import CaptureSource, GivenCamera
+from pipeline.errors import StageError
 from stages.capture.quality import blurred
 from stages.capture.readers import describe
 from stages.capture.readers.described import indices_of
 
 if TYPE_CHECKING:
     from stages.capture.import_photo import ImportedPhoto
+
+MOST_COPIES = 0.5  # share of photos with given cameras that may be copies of another: more is no slip of one name
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +82,15 @@ def _of(by_stem: dict[str, FileRef], name: str) -> FileRef | None:
 
 def without_duplicates(selection: Selection, given: bool) -> list[Candidate]:
     """The candidates without duplicate files. Duplicates with given cameras are kept, with a warning: one of the
-    cameras is wrong, and it is unknown which."""
+    cameras is wrong, and it is unknown which.
+
+    Raises:
+        StageError: most photos with given cameras are copies. Copies agree with each other, so that the comparison of
+            cameras with photos would find nothing wrong.
+    """
     first: dict[str, str] = {}
+    if given:
+        _not_mostly_copies(selection.candidates)
     kept = []
     for c in selection.candidates:
         other = first.setdefault(c.ref.sha256, c.name)
@@ -93,6 +104,24 @@ def without_duplicates(selection: Selection, given: bool) -> list[Candidate]:
         else:
             selection.leave_out(c, f"it is the same file as {other}; replace it by the correct photo, or remove it")
     return kept
+
+
+def _not_mostly_copies(candidates: list[Candidate]) -> None:
+    copies = len(candidates) - len({c.ref.sha256 for c in candidates})
+    if copies > MOST_COPIES * len(candidates):
+        raise StageError(
+            "most photos are copies of others, but have cameras of their own",
+            where=_most_copied(candidates),
+            value=f"{copies} of {len(candidates)} photos are copies",
+            limit=f"at most {MOST_COPIES:.0%}",
+            remedy="copy the right photos into the folder, each with the name that its camera gives",
+        )
+
+
+def _most_copied(candidates: list[Candidate]) -> str:
+    """Name of the photo that stands there most often."""
+    most = Counter(c.ref.sha256 for c in candidates).most_common(1)[0][0]
+    return next(c.name for c in candidates if c.ref.sha256 == most)
 
 
 def useful(

@@ -163,6 +163,19 @@ def test_the_same_photo_under_two_cameras_is_told(facescape, gather) -> None:
     assert len(capture.views) == 6 and "4.jpg is the same file as 1.jpg" in capture.warnings[0]
 
 
+@pytest.mark.parametrize(("copies", "refused_"), [(3, False), (4, True), (5, True)])
+def test_most_photos_the_same_under_other_cameras_is_refused(facescape, gather, copies: int, refused_: bool) -> None:
+    """Copies agree with each other: the comparison of cameras with photos called them good."""
+    folder, _ = facescape
+    for number in range(1, copies + 1):
+        (folder / f"{number}.jpg").write_bytes((folder / "0.jpg").read_bytes())
+    if not refused_:
+        assert len(gather(folder).artifact.views) == 6
+        return
+    fault = refused(gather, folder)
+    assert "copies of others" in fault.what and str(fault.where) == "0.jpg" and f"{copies} of 6" in str(fault.value)
+
+
 def test_a_black_frame_is_left_out_and_named(facescape, gather) -> None:
     folder, _ = facescape
     cv2.imwrite(str(folder / "3.jpg"), np.zeros((SIZE[1], SIZE[0], 3), np.uint8))

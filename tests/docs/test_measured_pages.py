@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import kill_batch, kill_matrix
+from benchmarks import kill_batch, kill_matrix, kill_pool, soak_record
 from workflows.bench import speed, tradeoff
 from workflows.bench.captures import read_table
 from workflows.bench.captures_table import markdown
@@ -62,6 +62,24 @@ def test_the_table_of_a_batch_is_made_of_its_record_and_has_no_fault() -> None:
     for column in columns.values():
         assert list(column.cells) == [*(m.name for m in kill_batch.MOMENTS), kill_batch.LAST]
         assert not any(cell.is_fault() for cell in column.cells.values())
+
+
+def test_the_table_of_a_pool_s_workers_is_made_of_its_record_and_has_no_fault() -> None:
+    """Made by: python -m benchmarks.kill_pool FOLDER --write"""
+    columns = kill_pool.recorded()
+    assert kill_pool.part(columns) in kill_pool.PAGE.read_text()
+    assert {"TERM", "KILL"} <= set(columns)
+    names = {*(m.name for m in kill_pool.MOMENTS), kill_pool.LAST}
+    for column in columns.values():
+        assert set(column.cells) <= names and kill_pool.LAST in column.cells
+        assert not any(cell.is_fault() for cell in column.cells.values())
+
+
+def test_the_soak_is_that_of_its_record_and_has_no_fault() -> None:
+    """Made by: python -m benchmarks.soak FOLDER --write"""
+    found = soak_record.recorded()
+    assert soak_record.PAGE.read_text() == soak_record.page(found)
+    assert not found.faults and found.captures >= 40 and found.stored == 3 * found.captures
 
 
 # ------------------------------------------------------------------ the README

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.clock import compiler, jumping_clock
 from tests.support.facescape_tree import write_tree
 from tests.support.points import PATIENCE, hold, read_until, wait_for
 from workflows.run.request import RunRequest
@@ -245,31 +246,11 @@ def test_two_batches_into_one_folder_at_once(tree: Path, environment: dict[str, 
 
 
 # ------------------------------------------------------------------ clocks
-CLOCK = r"""
-#define _GNU_SOURCE
-#include <dlfcn.h>
-#include <time.h>
-#include <unistd.h>
-/* The wall clock jumps back a year as soon as the file named by CLOCK_JUMP is there. Other clocks go on. */
-#include <stdlib.h>
-int clock_gettime(clockid_t which, struct timespec *t) {
-  static int (*real)(clockid_t, struct timespec *);
-  if (!real) real = (int (*)(clockid_t, struct timespec *))dlsym(RTLD_NEXT, "clock_gettime");
-  int done = real(which, t);
-  const char *sign = getenv("CLOCK_JUMP");
-  if (which == CLOCK_REALTIME && sign && access(sign, F_OK) == 0) t->tv_sec -= 31536000;
-  return done;
-}
-"""
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler to make a clock that jumps")
+@pytest.mark.skipif(compiler() is None, reason="no C compiler to make a clock that jumps")
 def test_the_wall_clock_jumps_back_a_year_in_mid_stage(tree: Path, tmp_path: Path, environment: dict[str, str]) -> None:
     """Time limits and retries go by a clock that does not jump; keys know no time."""
-    (tmp_path / "clock.c").write_text(CLOCK)
-    library, sign = tmp_path / "clock.so", tmp_path / "jump"
-    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "clock.c", "-ldl"], check=True)
-    jumping = {**environment, "LD_PRELOAD": str(library), "CLOCK_JUMP": str(sign)}
+    sign = tmp_path / "jump"
+    jumping = {**environment, **jumping_clock(tmp_path, sign, 365 * 86400)}
     probe = [sys.executable, "-c", "import time; print(time.time())"]
     before = float(subprocess.run(probe, env=jumping, capture_output=True, check=True).stdout)
     point = hold("work.checkpoint@3", tmp_path / "signs")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pipeline import images
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_exr
-from pipeline.picture_size import declared_size
+from pipeline.picture_size import declared_size, png_claims_more
 
 W, H = 37, 23
 
@@ -44,13 +44,50 @@ def test_a_header_that_is_cut_off_has_no_size_or_the_right_one(tmp_path: Path, s
         assert declared_size(data[:end]) in (None, (W, H))
 
 
-@given(st.sampled_from([b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", b"MM\0*", b"\x76\x2f\x31\x01"]), st.binary())
+HEADS = [b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"\x76\x2f\x31\x01", b"#?"]
+
+
+@given(st.sampled_from(HEADS), st.binary())
 def test_no_bytes_make_it_fail(head: bytes, rest: bytes) -> None:
     """None, or the numbers that stand in the bytes; a PNG's are where its standard puts them."""
     found = declared_size(head + rest)
     assert found is None or all(isinstance(n, int) for n in found)
     if head[:1] == b"\x89":
         assert found == (struct.unpack(">II", rest[8:16]) if len(rest) >= 16 else None)
+
+
+@pytest.mark.parametrize("first", [2**63 - 1, 2**63, 2**64 - 1])
+def test_a_big_tiff_whose_offset_is_beyond_any_memory_has_no_size(first: int) -> None:
+    assert declared_size(b"II+\0\x08\0\0\0" + struct.pack("<Q", first)) is None
+
+
+@pytest.mark.parametrize("length", [2**30, 2**31 - 1, 2**32 - 1])
+def test_a_png_whose_chunk_claims_gigabytes_is_never_given_to_the_decoder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, length: int
+) -> None:
+    """OpenCV makes room for the chunk before it reads it."""
+    path = tmp_path / "a.png"
+    data = picture(path)
+    at = data.index(b"IDAT") - 4
+    path.write_bytes(data[:at] + struct.pack(">I", length) + data[at + 4 :])
+    monkeypatch.setattr(images.cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(StageError, match="can't be decoded"):
+        read_encoded(path)
+
+
+def test_a_whole_png_claims_no_more_than_it_has(tmp_path: Path) -> None:
+    """With bytes behind its end, or between, that a decoder passes over; and cut off at every place."""
+    data = picture(tmp_path / "a.png")
+    text = b"".join((struct.pack(">I", 300), b"tEXt", bytes(300), struct.pack(">I", zlib.crc32(b"tEXt" + bytes(300)))))
+    at = data.index(b"IDAT") - 4
+    for whole in (data, data + b"\xff" * 40, data[:at] + text + data[at:]):
+        assert not png_claims_more(whole)
+        (tmp_path / "b.png").write_bytes(whole)
+        assert read_encoded(tmp_path / "b.png").shape == (H, W, 3)
+    at = data.index(b"IDAT") - 4
+    (length,) = struct.unpack_from(">I", data, at)
+    for end in range(at, len(data)):
+        assert png_claims_more(data[:end]) == (at + 12 <= end < at + 12 + length)
 
 
 def test_a_progressive_jpeg_and_one_with_a_long_comment() -> None:

@@ -47,13 +47,26 @@ def reach(name: str, stopped: Callable[[], bool] = lambda: False) -> None:
 
 def instrument() -> None:
     """Let the real stages and the fit's checkpoints reach their points."""
-    from pipeline.store import Store
     from stages.inverse_rendering import training_loop
     from stages.inverse_rendering.fit import Trainer
 
     if os.environ.get("NEUFACE_TEST_POINT", "").startswith("fit.checkpoint"):
         training_loop.CHECKPOINT_SHARE = 1e9  # after each step: how often one is due goes by the clock otherwise
-    begin, finish, save = Store.begin, Store.finish, Trainer.save
+    save = Trainer.save
+
+    def saved(self: Trainer, *rest: Any) -> None:
+        save(self, *rest)
+        reach("fit.checkpoint")
+
+    instrument_store()
+    Trainer.save = saved  # type: ignore[method-assign]
+
+
+def instrument_store() -> None:
+    """Let the begin and the end of every stage, real or not, reach their points."""
+    from pipeline.store import Store
+
+    begin, finish = Store.begin, Store.finish
 
     def begun(self: Store, stage: str, *rest: Any) -> Any:
         out = begin(self, stage, *rest)
@@ -65,11 +78,7 @@ def instrument() -> None:
         reach(f"{stage}.end")
         return out
 
-    def saved(self: Trainer, *rest: Any) -> None:
-        save(self, *rest)
-        reach("fit.checkpoint")
-
-    Store.begin, Store.finish, Trainer.save = begun, finished, saved  # type: ignore[method-assign]
+    Store.begin, Store.finish = begun, finished  # type: ignore[method-assign]
 
 
 # ------------------------------------------------------------------ in the test

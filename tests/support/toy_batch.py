@@ -48,6 +48,7 @@ class UsdInputs:
 
 class WorkConfig(StageConfig):
     steps: int = 4
+    pause: float = 0.0  # seconds after each step
     fault: str = ""
     doubted_width: int = 0  # a capture whose photos are so wide is judged `doubted`
     doubted: Level = "unusable"
@@ -67,6 +68,7 @@ def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked
         reach("work.step")
         write_whole(checkpoint, str(step + 1))  # as the fit's: SIGKILL leaves the old one or the new one
         reach("work.checkpoint", context.cancelled)
+        time.sleep(config.pause)
     if config.fault == "hangs":
         reach("work.hangs")
         while True:

@@ -12,11 +12,12 @@ from uuid import UUID, uuid4
 import httpx
 import pytest
 from prefect.client.schemas.objects import StateType
+from prefect.exceptions import ObjectNotFound
 
 from workflows.server import life
 from workflows.server.environment import SLOTS_ON_DISK
 from workflows.server.guard import SIGN, Guard, Signs
-from workflows.server.lost import SLOW_START, Lost
+from workflows.server.lost import LOOK, QUICK_START, SLOW_START, Lost
 from workflows.server.own_server import names_of, prepare, reachable
 
 OWN = "127.0.0.1:4200"
@@ -163,9 +164,14 @@ class Server:
         self.marked[run] = state.message
         next(r for r in self.runs if r.id == run).state_type = StateType.CRASHED
 
+    def read_work_pool(self, name: str) -> Any:
+        if name == "deleted":
+            raise ObjectNotFound(Exception())
+        return SimpleNamespace(type=name)
 
-def a_run(state: StateType = StateType.RUNNING) -> SimpleNamespace:
-    return SimpleNamespace(id=uuid4(), name="x", state_type=state)
+
+def a_run(state: StateType = StateType.RUNNING, pool: str | None = "docker") -> SimpleNamespace:
+    return SimpleNamespace(id=uuid4(), name="x", state_type=state, work_pool_name=pool)
 
 
 def watched(server: Server) -> tuple[Lost, Signs]:
@@ -200,6 +206,26 @@ def test_a_run_that_waits_for_its_process_gets_more_time_and_then_starts_anew() 
     ):
         server.now, run.state_type = second, state
         assert bool(lost.look()) == marked, second
+
+
+@pytest.mark.parametrize(
+    ("pool", "times"),
+    [("process", QUICK_START), (None, QUICK_START), ("docker", SLOW_START), ("kubernetes", SLOW_START),
+     ("deleted", SLOW_START)],
+)  # fmt: skip
+def test_a_run_that_a_worker_took_is_lost_after_the_time_that_its_kind_of_pool_needs(
+    pool: str | None, times: float
+) -> None:
+    """In a pool of processes within two minutes, with the default of 60 s and a look every 5 s."""
+    assert 60.0 * QUICK_START + LOOK < 120.0
+    run = a_run(StateType.PENDING, pool)
+    server = Server(run)
+    lost, _ = watched(server)
+    for second in (0.0, 60.0 * times):
+        server.now = second
+        assert lost.look() == [], second
+    server.now = 60.0 * times + 1.0
+    assert lost.look() == [run.id]
 
 
 def test_nothing_is_judged_by_the_time_in_which_the_server_was_away() -> None:

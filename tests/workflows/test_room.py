@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import resource
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import pytest
 from pipeline.artifacts import FileRef, Located
 from pipeline.capture_artifacts import CaptureSource
 from pipeline.contract import StageConfig
-from pipeline.errors import DiskError, stage_error_from_os_error
+from pipeline.errors import DiskError, StageError, stage_error_from_os_error
 from stages.bake.stage import Config as BakeConfig
 from tests.support.toy_stages import SECOND
 from workflows.run.plan import make_plan
@@ -90,3 +91,18 @@ def test_copies_need_their_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_other_faults_of_disks_have_words(number: int) -> None:
     found = stage_error_from_os_error(OSError(number, "as the system says", "/some/file"), "/fallback")
     assert found is not None and "/some/file" in str(found)
+
+
+@pytest.mark.parametrize(("limit", "refused"), [(3e9, True), (5.999e9, True), (6e9, False), (-1, False)])
+def test_too_small_an_address_space_is_told_before_anything_runs(
+    photos: Path, toys: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: float, refused: bool
+) -> None:
+    """With 3 GB a library ended the process by a segmentation fault. -1 is no limit."""
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (int(limit), -1))
+    request = RunRequest(capture=str(photos), out=str(tmp_path / "out"))
+    if refused:
+        with pytest.raises(StageError, match="too little memory") as e:
+            make_plan(request)
+        assert "ulimit -v" in str(e.value) and e.value.exit_code == 1
+    else:
+        make_plan(request)

@@ -18,6 +18,7 @@ from stages.presets import DEFAULT_PRESET, Settings, configs_for, known, parse_s
 from stages.registry import FIT
 from workflows.run.published import FOLDERS
 from workflows.run.request import RunRequest
+from workflows.run.room import check_addresses
 
 DEVICES = ("auto", "cpu", "cuda")
 
@@ -45,6 +46,7 @@ def make_plan(request: RunRequest) -> Plan:
     """
     from stages.capture.scan import scan_capture
 
+    check_addresses()
     chosen, anew = _choose(request.until, request.from_stage)
     configs = check_settings(request)
     _check_template(configs)

@@ -1,4 +1,4 @@
-"""Is there enough room on a disk? Asked before a stage and before results are copied, not after minutes of work.
+"""Is there enough room, on a disk and of addresses? Asked before the work, not after minutes of it.
 
 What is asked for is the least that will surely be written: sizes of files that are copied, and a few bytes a texel. A
 disk that fills up all the same is reported when a write fails (`pipeline/errors.py`).
@@ -7,17 +7,19 @@ disk that fills up all the same is reported when a write fails (`pipeline/errors
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from pipeline.contract import Stage, StageConfig, key
-from pipeline.errors import DiskError
+from pipeline.errors import DiskError, StageError
 from pipeline.store import MANIFEST, Store, file_refs
 
 SPARE = 4 << 20  # bytes: manifests, records, and a stage's small files
 BYTES_A_TEXEL = 8  # of all maps together; those of the demo's head have 67
+ADDRESSES = 6e9  # bytes: libraries end the process, without a word, where they get none. A draft uses up to 5e9
 COPIED = {"capture": ("source",), "usd": ("bake",)}  # stage -> inputs whose files it copies
 
 
@@ -38,6 +40,19 @@ def least(stage: str, inputs: Any, config: StageConfig) -> int:
     size = sum(ref.size for located in copied if located is not None for ref in file_refs(located.artifact))
     texels = int(getattr(config, "size", 0)) ** 2 if stage == "bake" else 0
     return SPARE + size + BYTES_A_TEXEL * texels
+
+
+def check_addresses() -> None:
+    """Raises StageError where the shell limits a process's address space (ulimit -v) below what a run needs."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < ADDRESSES:
+        raise StageError(
+            "this process may use too little memory",
+            where="the shell's limit of the address space (ulimit -v)",
+            value=f"{limit / 1e9:.1f} GB",
+            limit=f"at least {ADDRESSES / 1e9:.0f} GB, or none",
+            remedy="ulimit -v unlimited; to limit memory, use a control group (systemd-run -p MemoryMax=8G)",
+        )
 
 
 def size_of(folder: Path) -> int:

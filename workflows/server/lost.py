@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, suppress
 from uuid import UUID
 
 import httpx
@@ -24,6 +24,7 @@ from prefect.client.schemas.filters import (
     FlowRunFilterStateType,
 )
 from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.exceptions import ObjectNotFound
 from prefect.states import Crashed
 
 from workflows.server.guard import Signs
@@ -31,7 +32,9 @@ from workflows.server.guard import Signs
 log = logging.getLogger(__name__)
 FLOWS = ["capture-to-asset", "facescape-batch"]  # the flows whose runs give signs
 PATIENCE = 60.0  # seconds without a sign after which a run is lost
-SLOW_START = 10.0  # times `patience` for a run that a worker took until its process starts: an image may be fetched
+# Times `patience` for a run that a worker took until its process gives a sign: a process of the worker's own machine,
+# and a container or a job, for which an image may have to be fetched.
+QUICK_START, SLOW_START = 1.5, 10.0
 LOOK = 5.0  # seconds between two looks
 AT_A_TIME = 200  # runs in one answer of the server
 
@@ -59,8 +62,10 @@ class Lost:
         runs, now, marked = _under_way(client), self.signs.clock(), []
         self._since = {(r.id, r.state_type): self._since.get((r.id, r.state_type), now) for r in runs}
         self.signs.forget_all_but(r.id for r in runs)
+        quick = _quick_pools(client, {r.work_pool_name for r in runs if r.state_type == StateType.PENDING})
         for run in runs:
-            patience = self.patience * (SLOW_START if run.state_type == StateType.PENDING else 1.0)
+            start = QUICK_START if run.work_pool_name in quick else SLOW_START
+            patience = self.patience * (start if run.state_type == StateType.PENDING else 1.0)
             quiet = now - max(self._since[run.id, run.state_type], self.signs.last(run.id))
             if quiet > patience:
                 text = (
@@ -86,6 +91,17 @@ def _under_way(client: SyncPrefectClient) -> list[FlowRun]:
         found += some
         if len(some) < AT_A_TIME:
             return found
+
+
+def _quick_pools(client: SyncPrefectClient, names: Iterable[str | None]) -> set[str | None]:
+    """Those of the pools whose workers start a process of their machine. Runs without a pool are of `neuface serve`,
+    which does so too."""
+    quick: set[str | None] = {None}
+    for name in names:
+        with suppress(ObjectNotFound):  # it was deleted: nothing is known of it
+            if name is not None and client.read_work_pool(name).type == "process":
+                quick.add(name)
+    return quick
 
 
 def watch(lost: Lost, stop: threading.Event) -> None:
