@@ -23,6 +23,7 @@ MAX_BYTES = 1 << 32  # that many pixels of RGBA in 32-bit floats, uncompressed
 SMALL, DENSEST = 1 << 22, 10_000  # pixels; per byte: a white PNG of one bit a pixel has 8,000
 KINDS = (np.uint8, np.uint16, np.float32, np.float64)
 MARKS = (b"\x89PNG", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"RIFF", b"#?")  # RIFF: WebP is 16383 wide
+HALF_MAX = 65504.0  # largest 16-bit float; suns are often stored with more, or as infinite
 MAX_PIXELS = 1 << 28  # the largest map; no camera has more. A larger file is a mistake or a decompression bomb
 
 
@@ -174,19 +175,19 @@ def write_exr(
 ) -> None:
     """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ...
 
-    primaries: recorded in pictures with channels R, G, B; None if they are not a colour (normals). units: recorded if
-    given ("mm").
+    half: as 16-bit floats; a larger value becomes the largest of them, 65504. primaries: recorded in pictures with
+    channels R, G, B; None if they are not a colour (normals). units: recorded if given ("mm").
     """
     import OpenEXR
 
-    data = np.atleast_3d(np.asarray(image, np.float16 if half else np.float32))
+    data = np.atleast_3d(np.asarray(image, np.float32))
     count = data.shape[2]
     names = channels or {1: ("Y",), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}.get(
         count, tuple(f"c{i}" for i in range(count))
     )
     if len(names) != count:
         raise ValueError(f"{len(names)} channel names for {count} channels")
-    planes = {n: np.ascontiguousarray(data[..., i]) for i, n in enumerate(names)}
+    planes = {n: _plane(data[..., i], half=half) for i, n in enumerate(names)}
     header: dict[str, Any] = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
@@ -202,6 +203,11 @@ def write_exr(
         OpenEXR.File(header, planes).write(str(path))
     finally:
         OpenEXR.set_global_thread_count(0)  # after a fork, the threads of a pool would be missing
+
+
+def _plane(values: F32, *, half: bool) -> npt.NDArray[Any]:
+    """One channel as the writer needs it, in 16 or 32 bits a value."""
+    return np.ascontiguousarray(values.clip(-HALF_MAX, HALF_MAX).astype(np.float16) if half else values)
 
 
 def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:

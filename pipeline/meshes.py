@@ -65,7 +65,7 @@ def save(path: Path, mesh: Mesh, charts: Charts | None = None) -> None:
     if charts is not None:
         arrays |= {"uvs": charts.uvs, "uv_faces": charts.faces}
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(path, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
 
 
 def load(path: Path) -> Mesh:

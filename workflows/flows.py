@@ -16,12 +16,12 @@ from prefect.states import Completed
 from pipeline.errors import Cancelled
 from workflows.batch.request import BatchRequest
 from workflows.live.publisher import told_live
+from workflows.run.changes import run_as_asked
 from workflows.run.interrupt import PARENT, end_with, interruptible
 from workflows.run.plan import make_plan
 from workflows.run.publish import publish
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
-from workflows.run.runner import run_stages
 from workflows.run.session import Session
 from workflows.run.verdict import last_lines, level_in, state_name
 from workflows.server.access import check_folders
@@ -66,7 +66,7 @@ def _run_capture(asked: Mapping[str, Any], watch: Session | None) -> Any:
         plan, note = make_plan(request), watched.observer.note
         lock = exclusive_run(plan.store.root, plan.out, watched.stopped, note)
         with lock, told_live(plan, watched) as told:
-            done = run_stages(plan, told, execute_as_task, with_slot(plan, told.stopped))
+            plan, done = run_as_asked(plan, told, execute_as_task, with_slot(plan, told.stopped))
             record = publish(plan, done, told.observer.note, told.asked_to_stop)
     publish_result(Path(request.out), record)
     name = state_name(level_in(record))

@@ -114,7 +114,7 @@ class FaceModel(nn.Module):
         """Write the file that `load_model` reads."""
         spec = {"format": FORMAT, "cell": self.geometry.cell, **self.spec.stored()}
         arrays = {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
-        np.savez(path, spec=np.frombuffer(json.dumps(spec).encode(), np.uint8), **arrays)
+        np.savez_compressed(path, spec=np.frombuffer(json.dumps(spec).encode(), np.uint8), **arrays)
 
 
 def load_model(path: Path, device: str = "cpu") -> FaceModel:

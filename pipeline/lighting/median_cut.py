@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from pipeline.colour import LUMA
 from pipeline.errors import StageError
+from pipeline.images import HALF_MAX
 from pipeline.maths.latlong import latlong_directions, latlong_weights
 
 F32 = npt.NDArray[np.float32]
@@ -22,7 +23,6 @@ F64 = npt.NDArray[np.float64]
 Piece = tuple[int, int, int, int]  # rows y0..y1 and columns x0..x1
 
 LARGEST = 1024  # columns: a finer picture is first reduced, with the same energy
-HALF_MAX = 65504.0  # largest 16-bit float; suns are often stored with more, or as infinite
 
 
 def checked_environment(image: F32, name: str) -> F32:

@@ -51,6 +51,11 @@ class MapKind:
     colour: bool = False
     units: str = ""
 
+    @property
+    def half(self) -> bool:
+        """Whether 16-bit floats hold it: lengths and numbered channels are stored in 32 bits."""
+        return not (self.units or self.numbered)
+
     def values(self, samples: Samples, rows: Any = slice(None)) -> F32:
         """(N, channels) values of all samples, or of some rows."""
         found = np.asarray(self.function(*(getattr(samples, s)[rows] for s in self.sources)), np.float32)
@@ -184,7 +189,7 @@ def _store(name: str, image: F32, figures: tuple[float, float, float], kind: Map
     exr, png = (tiles.form(k, place.tile, place.count) for k in ("exr", "png"))
     channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
     primaries = REC709 if kind.colour else None
-    write_exr(folder / f"{name}.{exr}", image, channels, primaries=primaries, units=kind.units)
+    write_exr(folder / f"{name}.{exr}", image, channels, half=kind.half, primaries=primaries, units=kind.units)
     files: dict[str, FileRef] = {exr: place.context.file(f"{FOLDER}/{name}.{exr}")}
     if kind.png:
         path = folder / f"{name}.{png}"

@@ -80,7 +80,7 @@ def predict_held_out(
         response = responses[c.index]
         rgba = as_photographed(predict_view(model, view, factor, samples, context.device), response)
         exr, png = f"views/{c.index}.exr", f"views/{c.index}.png"
-        write_exr(context.workdir / exr, rgba)
+        write_exr(context.workdir / exr, rgba, half=True)
         write_png_from_linear(context.workdir / png, rgba[..., :3])
         files = {"exr": context.file(exr), "png": context.file(png)}
         out.append(HeldOutView(index=c.index, **files, scale=factor, response=response))

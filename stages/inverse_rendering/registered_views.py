@@ -56,7 +56,7 @@ def registered_views(
         moved = camera_only(camera.model_copy(update={"world_from_cam": rows(pose)}))
         rgba = as_photographed(predict_view(model, moved, held.scale, config.samples, context.device), held.response)
         exr = f"registered/{held.index}.exr"
-        write_exr(context.workdir / exr, rgba)
+        write_exr(context.workdir / exr, rgba, half=True)
         factor = camera.width / view.size[0] * pair.factor
         refined = RefinedCamera(
             index=held.index, world_from_cam=rows(pose), pixels=round(factor * found.pixels(six), 4)

@@ -20,18 +20,17 @@ import numpy.typing as npt
 from markupsafe import Markup
 
 from pipeline import tiles
-from pipeline.images import read_encoded, read_exr, shrink
-from pipeline.lighting.median_cut import HALF_MAX
+from pipeline.images import HALF_MAX, read_exr, shrink
 from pipeline.maths import studio_lights
 from stages.report.collect import Results
-from stages.report.pictures import U8, png_uri, scale_colours
+from stages.report.pictures import png_uri, scale_colours
 from stages.report.viewer_cameras import cameras_shown
+from stages.report.viewer_maps import maps_shown, scan_look
 from stages.report.viewer_marks import landmarks
+from stages.report.viewer_meshes import ShownMesh, shown_meshes
 
 F32 = npt.NDArray[np.float32]
-MAP_SIDE = 1024  # texels of a map that only the view shows
 LIGHT_WIDTH = 128  # columns of a light: more than the captured light's order 10 or a rough surface can show
-MAPS = ("ambient_occlusion", "irradiance_ratio", "confidence", "coverage", "region")
 LABELS = {"key": "studio, key lamp", "overcast": "overcast sky", "sunset": "sunset"}
 MODULES = (  # in the order of their imports, by the name under which others import them
     ("./three.core.js", "three/three.core.js"),
@@ -45,6 +44,7 @@ MODULES = (  # in the order of their imports, by the name under which others imp
     ("./lights.js", "viewer/lights.js"),
     ("./cameras.js", "viewer/cameras.js"),
     ("./marks.js", "viewer/marks.js"),
+    ("./meshes.js", "viewer/meshes.js"),
     ("./main.js", "viewer/main.js"),
 )
 # Colours that differ for every kind of colour vision [Okabe and Ito 2008], after a grey for "none".
@@ -62,6 +62,7 @@ class Viewer:
     boot_hash: str
     style: Markup
     bar: str
+    meshes: tuple[ShownMesh, ...]
 
 
 def viewer(r: Results) -> Viewer | None:
@@ -72,16 +73,18 @@ def viewer(r: Results) -> Viewer | None:
         return None
     boot = _text("viewer/boot.js")
     digest = base64.b64encode(hashlib.sha256(boot.encode()).digest()).decode()
+    meshes = tuple(shown_meshes(r))
     return Viewer(
-        _data(r), _base64(r.usd.path(glb).read_bytes()), _modules(), Markup(boot), f"sha256-{digest}",
+        _data(r, meshes), _base64(r.usd.path(glb).read_bytes()), _modules(), Markup(boot), f"sha256-{digest}",
         Markup(_text("templates/viewer.css")), png_uri(np.repeat(scale_colours()[None], 10, 0)),
+        meshes,
     )  # fmt: skip
 
 
-def _data(r: Results) -> dict[str, Any]:
+def _data(r: Results, meshes: tuple[ShownMesh, ...]) -> dict[str, Any]:
     """What the view knows besides the glb."""
     bake, name = r.bake.artifact, r.usd.artifact.name
-    maps = {n: _map(r, n) for n in MAPS if n in bake.maps and _has_png(r, n)}
+    maps = maps_shown(r.bake)
     return {
         "texels": bake.size,
         "materials": [name if bake.tiles == 1 else f"{name}_{tiles.FIRST + t}" for t in range(bake.tiles)],
@@ -91,6 +94,11 @@ def _data(r: Results) -> dict[str, Any]:
         "lights": list(_lights(r)),
         "cameras": cameras_shown(r),
         "landmarks": landmarks(r),
+        "asset": f"asset: {name}.glb",
+        "meshes": [
+            {"name": m.name, "label": m.label, "smooth": m.smooth, "scan": m.scan, **m.packed.head()} for m in meshes
+        ],
+        "scan": scan_look(r.bake) if any(m.scan for m in meshes) else None,
     }
 
 
@@ -128,26 +136,6 @@ def _codes(name: str, label: str, colours: list[str], names: list[str]) -> dict[
     legend = colours if len(colours) == len(names) else list(dict.fromkeys(colours))
     return {"name": name, "label": label, "kind": "code", "map": name, "colours": colours, "names": names,
             "legend": legend}  # fmt: skip
-
-
-def _has_png(r: Results, name: str) -> bool:
-    kinds = {tiles.form("png", t, r.bake.artifact.tiles) for t in range(r.bake.artifact.tiles)}
-    return kinds <= r.bake.artifact.maps[name].files.keys()
-
-
-def _map(r: Results, name: str) -> list[str]:
-    """A map as PNG, one address a tile; every second, third, ... texel of a larger one, which keeps codes whole."""
-    texture, count = r.bake.artifact.maps[name], r.bake.artifact.tiles
-    out = []
-    for t in range(count):
-        image = read_encoded(r.bake.path(texture.files[tiles.form("png", t, count)]))
-        step = -(-max(image.shape[:2]) // MAP_SIDE)
-        out.append(png_uri(_bytes(image[::step, ::step])))
-    return out
-
-
-def _bytes(image: npt.NDArray[Any]) -> U8:
-    return np.asarray(image >> 8 if image.dtype == np.uint16 else image, np.uint8)
 
 
 def _lights(r: Results) -> Iterator[dict[str, Any]]:

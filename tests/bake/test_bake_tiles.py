@@ -108,7 +108,7 @@ def test_files_and_figures_of_all_tiles(written: tuple[Path, list[Baked], dict[s
     albedo = [read_exr(folder / f"textures/albedo.{1001 + t}.exr")[0] for t in range(COUNT)]
     inside = np.concatenate([a[c] for a, c in zip(albedo, covered, strict=True)])
     assert maps["albedo"].mean == pytest.approx(float(inside.mean()), rel=1e-5)  # type: ignore[attr-defined]
-    assert maps["albedo"].maximum == pytest.approx(float(inside.max()))  # type: ignore[attr-defined]
+    assert maps["albedo"].maximum == pytest.approx(float(inside.max()), rel=2**-11)  # type: ignore[attr-defined]
     coverage = [read_encoded(folder / f"textures/coverage.{1001 + t}.png") for t in range(COUNT)]
     assert maps["coverage"].mean == pytest.approx(np.mean(coverage) / 255, abs=2e-3)  # type: ignore[attr-defined]
     whole = statistics.together([b.statistics for b in baked])

@@ -90,6 +90,15 @@ def test_half_exr_is_close(tmp_path: Path) -> None:
     assert 0 < np.abs(back - data).max() < 4 * 2**-11
 
 
+def test_half_floats_never_become_infinite(tmp_path: Path) -> None:
+    """65504 is the largest; below 6e-5 the steps no longer shrink, and a NaN stays one."""
+    data = np.array([[1e9, -np.inf, 65504, 1e-7], [np.nan, 0, 0.1, -2]], np.float32)[..., None]
+    images.write_exr(tmp_path / "a.exr", data, half=True)
+    found = images.read_exr(tmp_path / "a.exr")[0][..., 0]
+    assert found[0].tolist() == pytest.approx([65504, -65504, 65504, 1e-7], rel=1e-3, abs=6e-8)
+    assert np.isnan(found[1, 0]) and found[1, 1:].tolist() == pytest.approx([0, 0.1, -2], rel=2**-11)
+
+
 def test_exr_is_what_another_reader_finds(tmp_path: Path) -> None:
     data = np.random.default_rng(3).uniform(0, 1, (4, 3, 3)).astype(np.float32)
     images.write_exr(tmp_path / "a.exr", data)

@@ -14,11 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pxr import Sdf, Usd, UsdGeom
 from support.browser import Tab, installed, tab
 from support.synthetic_results import SyntheticResults, write_results
 
-from pipeline.artifacts import FileRef, Located
+from pipeline.artifacts import FileRef, Located, TextureMap
 from pipeline.contract import Context
+from pipeline.images import write_exr, write_png
 from pipeline.maths.latlong import latlong_directions
 from pipeline.transforms import project, rows
 from pipeline.verdict import Limits, judged
@@ -26,10 +28,25 @@ from stages.report.stage import STAGE, Config, Inputs
 from stages.report.viewer import MODULES, light_data
 from stages.report.viewer_cameras import chosen, straightened
 from stages.usd.write.gltf import write_glb
-from stages.usd.write.mesh import read_mesh
+from stages.usd.write.mesh import UvSurface, read_mesh
 from stages.usd.write.shading import Look
 
-SHOWN = ["look", "albedo", "f0", "roughness", "normal", "confidence", "coverage", "checker", "density", "wireframe"]
+SHOWN = [
+    "look",
+    "albedo",
+    "f0",
+    "roughness",
+    "normal",
+    "ambient_occlusion",
+    "confidence",
+    "coverage",
+    "region",
+    "checker",
+    "density",
+    "wireframe",
+]
+
+OUT_MM = 5.0  # of the displacement map: everywhere
 
 
 def with_glb(results: SyntheticResults) -> SyntheticResults:
@@ -39,15 +56,46 @@ def with_glb(results: SyntheticResults) -> SyntheticResults:
     path = usd.folder / "asset/head.glb"
     write_glb(path, "head", mesh, look, results.bake.folder, {})
     path.write_bytes(with_expression(path.read_bytes()))
-    files = (*usd.artifact.files, FileRef.of(usd.folder, "asset/head.glb"))
+    write_levels(usd.folder / "asset", mesh)
+    added = ("head.glb", "payload.usdc", "high.usdc")
+    files = (*usd.artifact.files, *(FileRef.of(usd.folder, f"asset/{name}") for name in added))
     masks = results.masks
     np.savez(masks.folder / "landmarks.npz", xyz=[[0.0, 0.1, 0.09], [0.03, 0, 0.1], [np.nan] * 3])
-    marks = {"landmarks": FileRef.of(masks.folder, "landmarks.npz")}
+    marks = {"landmarks": FileRef.of(masks.folder, "landmarks.npz"), "label_names": ("none", "skin", "hair")}
+    plain = results.bake.artifact
+    write_exr(results.bake.folder / "out.exr", np.full((64, 64, 1), OUT_MM, np.float32))
+    exr = {"exr": FileRef.of(results.bake.folder, "out.exr")}
+    level = {"minimum": OUT_MM, "mean": OUT_MM, "maximum": OUT_MM}
+    out = TextureMap(name="displacement", channels=1, files=exr, space="raw", **level)
+    write_png(results.bake.folder / "open.png", np.linspace(0.2, 1, 64)[:, None].repeat(64, 1))
+    halves = np.repeat([[1, 2]], [32, 32], 1).repeat(64, 0) / 255  # codes of two labels, left and right
+    write_png(results.bake.folder / "region.png", halves)
+    region = out.model_copy(update={"name": "region", "files": {"png": FileRef.of(results.bake.folder, "region.png")}})
+    shade = {"name": "ambient_occlusion", "files": {"png": FileRef.of(results.bake.folder, "open.png")}}
+    more = {"displacement": out, "region": region, "ambient_occlusion": out.model_copy(update=shade)}
+    baked = plain.model_copy(update={"scan": plain, "maps": {**plain.maps, **more}})
     return replace(
         results,
+        bake=Located(baked, results.bake.folder),
         usd=Located(usd.artifact.model_copy(update={"files": files}), usd.folder),
         masks=Located(masks.artifact.model_copy(update=marks), masks.folder),
     )
+
+
+def write_levels(folder: Path, mesh: UvSurface) -> None:
+    """payload.usdc with a proxy that equals the mesh and a smaller scan, and high.usdc with a larger one."""
+    for file, sizes in (("payload.usdc", {"proxy": 1.0, "scan": 0.8}), ("high.usdc", {"high": 1.2})):
+        stage = Usd.Stage.CreateNew(str(folder / file))
+        for name, size in sizes.items():
+            made = UsdGeom.Mesh.Define(stage, f"/head/geo/{name}" if name != "high" else "/high")
+            made.CreatePointsAttr((size * mesh.vertices).astype(np.float32).tolist())
+            made.CreateFaceVertexCountsAttr([3] * len(mesh.faces))
+            made.CreateFaceVertexIndicesAttr(mesh.faces.ravel().tolist())
+            kind, each = Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+            st = UsdGeom.PrimvarsAPI(made).CreatePrimvar("st", kind, each)
+            st.Set(mesh.uvs.tolist())
+            st.SetIndices(mesh.uv_faces.ravel().tolist())
+        stage.Save()
 
 
 def with_expression(glb: bytes) -> bytes:
@@ -262,6 +310,61 @@ def test_expressions_move_the_surface(opened: Tab) -> None:
                " e.dispatchEvent(new Event('input')); })()")  # fmt: skip
     assert opened.run("document.querySelector('#viewer-expressions label').textContent") == "jawOpen"
     assert changed(before, drawn(opened)) > 0.05
+    opened.run("(() => { const e = document.querySelector('#viewer-expressions input'); e.value = 0;"
+               " e.dispatchEvent(new Event('input')); })()")  # fmt: skip
+    assert changed(before, drawn(opened)) < 0.001
+
+
+@pytest.mark.slow
+def test_every_mesh_is_unpacked_and_shown_in_every_channel(opened: Tab) -> None:
+    """The proxy equals the glb's mesh; the scan is smaller, the dense one larger, the displaced one is moved."""
+    choose(opened, "camera", "")
+    asset = drawn(opened)
+    names = opened.run("[...document.getElementById('viewer-mesh').options].map(o => o.value)")
+    assert names == ["asset", "proxy", "scan", "displaced", "high"]
+    size = {"asset": seen(asset)}
+    for name in names[1:]:
+        choose(opened, "mesh", name)
+        opened.until(f"document.getElementById('viewer-mesh').dataset.shown === '{name}'")
+        pictures = [drawn(opened)]
+        size[name] = seen(pictures[0])
+        for channel in [*SHOWN[1:], "look"]:
+            choose(opened, "channel", channel)
+            opened.until(f"document.getElementById('viewer-channel').dataset.shown === '{channel}'")
+            pictures.append(drawn(opened))
+            assert channel == "look" or changed(pictures[0], pictures[-1]) > 0.01, (name, channel)
+        assert changed(pictures[0], pictures[-1]) < 0.001
+        if name == "proxy":
+            assert changed(asset, pictures[0]) < 0.03
+        assert opened.run("document.getElementById('viewer-expressions').hidden")
+    assert size["scan"] < 0.8 * size["asset"] < 0.9 * size["high"] and abs(size["proxy"] / size["asset"] - 1) < 0.01
+    assert size["asset"] < size["displaced"] < size["high"]
+    choose(opened, "mesh", "asset")
+    opened.until("document.getElementById('viewer-mesh').dataset.shown === 'asset'")
+    assert changed(asset, drawn(opened)) < 0.001
+    assert not opened.run("document.getElementById('viewer-expressions').hidden")
+
+
+def seen(picture: np.ndarray) -> float:
+    """Share of the picture that the head covers."""
+    return changed(picture, np.broadcast_to(picture[20, 20], picture.shape))
+
+
+@pytest.mark.slow
+def test_the_difference_is_that_of_photo_and_render(opened: Tab) -> None:
+    choose(opened, "camera", 3)
+    opened.run("document.getElementById('viewer-photo').decode()")
+    choose(opened, "split", 100, "input")
+    photo = drawn(opened)
+    choose(opened, "split", 0, "input")
+    render = drawn(opened)
+    choose(opened, "compare", "difference")
+    choose(opened, "split", 100, "input")
+    frame = np.abs(photo - render)
+    assert np.abs(drawn(opened) - frame).max(-1)[frame.max(-1) > 4].mean() < 3  # outside of the photo it stays the view
+    choose(opened, "compare", "photo")
+    assert changed(photo, drawn(opened)) < 0.001
+    choose(opened, "camera", "")
 
 
 def tick(page: Tab, control: str, on: bool) -> None:

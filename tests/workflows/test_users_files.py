@@ -37,6 +37,7 @@ def usd(plan: Plan, text: str, files: tuple[str, ...] = ("head.usd", "textures/a
     folder = plan.store.folder("usd", key)
     for name in (*(f"asset/{f}" for f in files), "views/7.exr", "views/7.png"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).unlink(missing_ok=True)  # a store never writes into a finished file
         (folder / name).write_text(f"{text} {name}")
     exr, png = (FileRef.of(folder, f"views/7.{kind}") for kind in ("exr", "png"))
     refs = tuple(FileRef.of(folder, f"asset/{f}") for f in files)
@@ -97,6 +98,33 @@ def test_an_edited_file_is_kept_aside_and_told(plan: Plan) -> None:
     put(plan, usd(plan, "two"))  # the same asset again
     found = listing(plan.out)
     assert found["asset/head.usd.yours-1"] == "edited" and found["asset/head.usd.yours-2"] == "edited again"
+
+
+def test_the_asset_shares_its_bytes_with_outs_own_store_and_with_no_other(plan: Plan, tmp_path: Path) -> None:
+    """The views are copies everywhere: an edit in place must not cost a fit."""
+    done = usd(plan, "one")
+    put(plan, done)
+    stored = done.located.folder
+    assert (plan.out / "asset/head.usd").samefile(stored / "asset/head.usd")
+    assert not (plan.out / "report/asset_views/7.exr").samefile(stored / "views/7.exr")
+    shared = make_plan(plan.request.model_copy(update={"out": str(tmp_path / "b"), "store": str(plan.store.root)}))
+    shared.out.mkdir()
+    put(shared, done)
+    assert not (shared.out / "asset/head.usd").samefile(stored / "asset/head.usd")
+    (plan.out / "asset/head.usd").write_text("edited")
+    assert (shared.out / "asset/head.usd").read_text() == "one asset/head.usd"
+
+
+def test_an_edit_in_place_is_kept_and_the_stored_result_is_known_as_damaged(plan: Plan) -> None:
+    done = usd(plan, "one")
+    put(plan, done)
+    assert plan.store.load("usd", done.key, UsdAsset) is not None
+    (plan.out / "asset/textures/a.png").write_text("edited")
+    assert plan.store.load("usd", done.key, UsdAsset) is None  # so that the stage makes it again
+    put(plan, usd(plan, "one"))
+    found = listing(plan.out)
+    assert found["asset/textures/a.png"] == "one asset/textures/a.png"
+    assert found["asset/textures/a.png.yours-1"] == "edited"
 
 
 def test_an_edited_file_that_is_published_no_more_stays(plan: Plan) -> None:

@@ -10,9 +10,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from support.browser import installed, tab
 
 from pipeline.errors import StageError
 from pipeline.store import LOCKS
+from tests.support.points import wait_for
 from workflows.cli.view import server_of
 from workflows.live.folder import LiveFolder
 from workflows.live.look import check_is_run, look_at
@@ -114,12 +116,40 @@ def test_a_wish_reaches_the_run_at_work(run: Path, served: str, tmp_path: Path) 
         LiveFolder(run).state({**STATE, "store": str(store)})
         wishes = Wishes(run, "abc")
         assert wishes() is None
-        for wish in ("pause", "go on", "stop after stage", "stop"):
+        for wish in ("pause", "go on", "stop after stage", "preset studio", "budget 600", "stop"):
             assert post(served, wish) == 200
             assert (wishes(), wishes()) == (wish, None)
         other = Wishes(run, "another run")
         assert post(served, "stop") == 200 and other() is None
         assert wishes() == "stop"
+
+
+@pytest.mark.slow
+def test_the_page_chooses_another_time_and_asks_first(run: Path, served: str, tmp_path: Path) -> None:
+    """In a browser: the present preset is chosen; another one is asked for when the user agrees, and not before."""
+    if installed() is None:
+        pytest.skip("no Chromium is installed")
+    state = {**STATE, "preset": "draft", "budget": None, "presets": ["draft", "studio"], "elapsed": 1}
+    with exclusive_run(run / ".store", run, lambda: False, print), tab(tmp_path / "profile") as page:
+        folder, wishes = LiveFolder(run), Wishes(run, "abc")
+        folder.state({**state, "store": str(run / ".store"), "changeable": False, "updated": 0})
+        page.call("Page.navigate", url=f"{served}page/live.html")
+        page.until("document.documentElement.dataset.status === 'running'")
+        assert page.run("document.getElementById('change').hidden")  # a batch's capture has the batch's setting
+        folder.state({**state, "store": str(run / ".store"), "changeable": True, "updated": 0})
+        page.until("!document.getElementById('change').hidden")
+        assert page.run("document.getElementById('time').value") == "preset draft"
+        for agrees, wanted in ((False, None), (True, "budget 600")):
+            page.run(f"window.confirm = () => {str(agrees).lower()}")
+            page.run("(() => { const e = document.getElementById('time');"
+                     " e.value = 'budget 600'; e.dispatchEvent(new Event('change')); })()")  # fmt: skip
+            if wanted is not None:
+                wait_for(lambda wanted=wanted: wishes() == wanted)
+            page.until("document.getElementById('time').value === 'preset draft'")  # as the run tells
+            assert wishes() is None
+        folder.state({**state, "store": str(run / ".store"), "changeable": True, "updated": 0, "budget": 600})
+        page.until("document.getElementById('time').value === 'budget 600'")
+        assert page.troubles == []
 
 
 def test_only_the_servers_own_page_may_ask(run: Path, served: str) -> None:
@@ -134,7 +164,7 @@ def test_only_the_servers_own_page_may_ask(run: Path, served: str) -> None:
         assert post(served[:-1] + "x/", "stop") == 404
         for bad in ({"Content_Type": "text/plain"}, {"Content_Length": "100000"}):
             assert post(served, "stop", **bad) == 400
-        for wish in ("fly", None, ["stop"], {"a": 1}):
+        for wish in ("fly", None, ["stop"], {"a": 1}, "preset none", "budget 1"):
             assert post(served, wish) == 400
         assert not (run / "live/ask.json").exists()
 

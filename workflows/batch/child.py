@@ -12,6 +12,7 @@ import json
 import os
 import sys
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 from pipeline.contract import Done
@@ -54,6 +55,9 @@ class Events:
 
     def paused(self, waits: bool) -> None:
         """Not shown: whoever paused the capture's run sees it there."""
+
+    def replanned(self, seconds: Mapping[str, float | None], request: RunRequest) -> None:
+        """Never told: captures of a batch have the batch's setting."""
 
     def note(self, text: str) -> None:
         """Into the capture's log."""

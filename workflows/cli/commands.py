@@ -19,6 +19,7 @@ from workflows.cli.view import server_of
 from workflows.live.look import REPORT, check_is_run
 from workflows.live.publisher import told_live
 from workflows.run import output_dirs
+from workflows.run.changes import run_as_asked
 from workflows.run.estimate import expected
 from workflows.run.interrupt import Interrupted, interruptible
 from workflows.run.owned import write_owned
@@ -27,7 +28,6 @@ from workflows.run.publish import publish
 from workflows.run.published import TRUTH
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run
-from workflows.run.runner import run_stages
 from workflows.run.session import Session
 from workflows.run.verdict import exit_code
 from workflows.server import environment
@@ -58,7 +58,8 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
         exclusive_run(plan.store.root, plan.out, watch.stopped, console.note),
         told_live(plan, watch) as told,
     ):
-        record = publish(plan, run_stages(plan, told), told.observer.note, told.asked_to_stop)
+        plan, done = run_as_asked(plan, told)
+        record = publish(plan, done, told.observer.note, told.asked_to_stop)
     if caught.number is not None:  # it came when the results were being put in place
         console.note(f"the results are in {plan.out}, complete")
         raise Interrupted(caught.number)

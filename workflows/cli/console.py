@@ -9,12 +9,15 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from pipeline.contract import Done
 from workflows.cli.events import PROGRESS_EVERY, Events
 from workflows.cli.screen import Screen, bar, can_redraw
 from workflows.run.forecast import Forecast, in_words
+
+if TYPE_CHECKING:
+    from workflows.run.request import RunRequest
 
 PLAIN_EVERY = 5.0  # seconds between two lines of one stage
 DRAWN_EVERY = 0.2  # seconds between two drawings
@@ -116,6 +119,14 @@ class Console:
                 self.events.tell("paused" if waits else "went_on", stage=self.stage)
             elif self.screen is None:
                 self.note(f"{self.label}: {'paused' if waits else 'goes on'}")
+            self._draw()
+
+    def replanned(self, seconds: Mapping[str, float | None], request: RunRequest) -> None:
+        """The run begins again with another preset or budget."""
+        with self._lock:
+            self.expect(seconds, request.budget)
+            if self.events is not None:
+                self.events.tell("changed", preset=request.preset, budget=request.budget)
             self._draw()
 
     def note(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Keys in the terminal of a run: p pauses, space goes on, s stops after the stage.
+"""Keys in the terminal of a run: p pauses, space goes on, s stops after the stage, b and a digit choose another time.
 
 Keys are read while this process is in the foreground of the terminal: one in the background would be stopped by the
 kernel when it reads. Ctrl-C and Ctrl-Z do what they always do.
@@ -20,12 +20,20 @@ from workflows.cli.console import Console
 from workflows.run.steering import Steering
 
 WISHES = {"p": "pause", " ": "go on", "s": "stop after stage"}
-HELP = "keys: p pause, space go on, s stop after this stage, Ctrl-C stop"
+HELP = "keys: p pause, space go on, s stop after this stage, b another time, Ctrl-C stop"
 SAID = {
     "pause": "pausing at the next checkpoint; space goes on",
     "go on": "going on",
     "stop after stage": "stopping after this stage; space takes it back",
 }
+TIMES = {  # after b
+    "1": "preset draft", "2": "preset studio", "3": "preset film",
+    "4": "budget 300", "5": "budget 600", "6": "budget 1200", "7": "budget 3600",
+}  # fmt: skip
+ASKED = (
+    "another time; the fit starts again: 1 draft, 2 studio, 3 film, 4 5 min from now, 5 10 min, 6 20 min, 7 60 min; "
+    "any other key: as it is"
+)
 LOOK = 0.2  # seconds between two looks
 
 
@@ -34,7 +42,7 @@ class Keys:
 
     def __init__(self, steering: Steering, console: Console, descriptor: int | None) -> None:
         self.steering, self.console, self.descriptor = steering, console, descriptor
-        self._ends = threading.Event()
+        self._ends, self._choosing = threading.Event(), False
         self._before: list[Any] | None = None  # the terminal's settings, while ours are in force
         self._lock = threading.Lock()
 
@@ -66,6 +74,14 @@ class Keys:
 
     def press(self, key: str) -> None:
         """What a key asks for; others ask for nothing."""
+        if self._choosing:
+            self._choosing = False
+            self._choose(key)
+            return
+        if key.lower() == "b" and self.steering.changeable:
+            self._choosing = True
+            self.console.note(ASKED)
+            return
         wish = WISHES.get(key.lower())
         if wish is None:
             return
@@ -73,6 +89,12 @@ class Keys:
         self.steering.wish(wish)
         if wish != "go on" or asked:
             self.console.note(SAID[wish])
+
+    def _choose(self, key: str) -> None:
+        change = TIMES.get(key)
+        self.console.note("nothing is changed" if change is None else f"{change}: at the next checkpoint")
+        if change is not None:
+            self.steering.wish(change)
 
     def end(self) -> None:
         """Read no more."""

@@ -9,7 +9,8 @@ other is refused.
     GET TOKEN/state           what the page shows, as JSON
     GET TOKEN/page/NAME       the page's script and style
     GET TOKEN/live/NAME, report/..., asset/..., reflectance/..., run.json    files of the run
-    POST TOKEN/ask            {"wish": "pause" | "go on" | "stop after stage" | "stop"}
+    POST TOKEN/ask            {"wish": "pause" | "go on" | "stop after stage" | "stop" |
+                                 "preset NAME" | "budget SECONDS"}
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from urllib.parse import unquote, urlsplit
 from workflows.live.folder import FOLDER, PICTURES
 from workflows.live.look import REPORT, look_at
 from workflows.live.wishes import ask
-from workflows.run.steering import WISHES
+from workflows.run.steering import WISHES, is_wish
 
 LOOPBACK = "127.0.0.1"
 SERVED = ("report", "asset", "reflectance")  # folders of a run
@@ -144,7 +145,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
             return HTTPStatus.FORBIDDEN, "not from a page of this server"
         wish = self._wish()
         if wish is None:
-            return HTTPStatus.BAD_REQUEST, f"a wish is one of {', '.join(WISHES)}"
+            return HTTPStatus.BAD_REQUEST, f"a wish is one of {', '.join(WISHES)}, preset NAME, budget SECONDS"
         try:
             taken = look_at(self.root).alive and ask(self.root, wish)
         except OSError:
@@ -165,7 +166,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         except (ValueError, RecursionError):
             return None
         wish = found.get("wish") if isinstance(found, dict) else None
-        return wish if isinstance(wish, str) and wish in WISHES else None
+        return wish if isinstance(wish, str) and is_wish(wish) else None
 
     # ------------------------------------------------------------------ all answers
     def end_headers(self) -> None:

@@ -19,12 +19,14 @@ from typing import Any
 from pipeline.artifacts import Located
 from pipeline.contract import Done, Picture
 from pipeline.errors import Cancelled, NeufaceError
+from stages.presets import PRESETS
 from workflows.live.folder import LiveFolder
 from workflows.live.pictures import drawn, jpeg
 from workflows.live.wishes import Wishes
 from workflows.run.estimate import expected
 from workflows.run.forecast import Forecast
 from workflows.run.plan import Plan
+from workflows.run.request import RunRequest
 from workflows.run.session import Observer, Session
 
 log = logging.getLogger(__name__)
@@ -33,6 +35,7 @@ PREVIEW_EVERY = 10.0  # seconds of the fit between two pictures of it
 PREVIEW_SHARE = 0.03  # largest share of the fit's time for them
 CURVE = 300  # points of the curve; then every second one is left out
 NOTES = 30
+OFFERED = [p for p in PRESETS if p != "paper"]  # on the page; paper is another model
 
 
 @contextmanager
@@ -79,9 +82,10 @@ class Live:
         self.forecast = Forecast(seconds, self._now(), plan.request.budget)
         self.state: dict[str, Any] = {
             "run": self.run, "out": str(plan.out.resolve()), "store": str(plan.store.root.resolve()),
-            "capture": plan.request.capture, "preset": plan.request.preset, "began": time.time(), "status": "running",
+            "capture": plan.request.capture, "preset": plan.request.preset, "budget": plan.request.budget,
+            "began": time.time(), "status": "running",
             "stages": [{"name": s.name, "state": "waiting", "share": 0.0, "seconds": None} for s in plan.stages],
-            "message": "", "figures": {}, "curve": [], "notes": [], "warnings": [], "pictures": {},
+            "message": "", "figures": {}, "presets": OFFERED, "curve": [], "notes": [], "warnings": [], "pictures": {},
         }  # fmt: skip
         self._write()
 
@@ -135,6 +139,16 @@ class Live:
         with self._lock:
             self._write()
         self.inner.paused(waits)
+
+    def replanned(self, seconds: Mapping[str, float | None], request: RunRequest) -> None:
+        """The run begins again with another preset or budget; pictures of finished stages stay."""
+        with self._lock:
+            self.forecast = Forecast(seconds, self._now(), request.budget)
+            stages = [{**s, "state": "waiting", "share": 0.0, "seconds": None} for s in self.state["stages"]]
+            new = {"preset": request.preset, "budget": request.budget, "stages": stages}
+            self.state |= {**new, "curve": [], "message": "", "figures": {}}
+            self._write()
+        self.inner.replanned(seconds, request)
 
     def note(self, text: str) -> None:
         """A message for the user."""
@@ -211,6 +225,7 @@ class Live:
                 self.state["status"] = "stops after the stage"
         rest = self.forecast.remaining(now)
         self.state |= {
+            "changeable": self.steering.changeable,
             "percent": round(100 * self.forecast.share_of_run(now), 1),
             "remaining": None if rest is None else round(rest, 1),
             "elapsed": round(now - self.forecast.begun, 1),

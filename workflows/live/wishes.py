@@ -11,7 +11,7 @@ import secrets
 from pathlib import Path
 
 from workflows.live.folder import ASK, FOLDER, STATE, is_state, put_whole, read_small
-from workflows.run.steering import WISHES
+from workflows.run.steering import WISHES, is_wish
 
 
 class Wishes:
@@ -33,7 +33,7 @@ class Wishes:
         self._seen = found.st_mtime_ns, found.st_ino
         asked = read_small(self.path)
         number, wish = asked.get("number"), asked.get("wish")
-        if asked.get("run") != self.run or wish not in WISHES or not isinstance(number, str) or number == self._last:
+        if asked.get("run") != self.run or not is_wish(wish) or not isinstance(number, str) or number == self._last:
             return None
         self._last = number
         return str(wish)
@@ -46,8 +46,8 @@ def ask(out: Path, wish: str) -> bool:
         ValueError: no such wish.
         OSError: the folder can't be written.
     """
-    if wish not in WISHES:
-        raise ValueError(f"{wish!r} is none of {', '.join(WISHES)}")
+    if not is_wish(wish):
+        raise ValueError(f"{wish!r} is none of {', '.join(WISHES)}, a preset or a budget")
     state = read_small(out / FOLDER / STATE)
     if not is_state(state) or not isinstance(state.get("run"), str):
         return False

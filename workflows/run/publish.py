@@ -13,12 +13,14 @@ from typing import Any
 from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Done, versions
 from pipeline.errors import Cancelled, stage_error_from_os_error
+from pipeline.store import link_or_copy
 from workflows.run.owned import write_owned
 from workflows.run.pack import packed, write_pack
 from workflows.run.plan import Plan
 from workflows.run.published import is_record, note_published, published
 from workflows.run.replace import Replacement, drop, prepare, put, tidy
 from workflows.run.report_timing import TIMED, with_seconds
+from workflows.run.request import OWN_STORE
 from workflows.run.room import check_room_for_copies
 from workflows.run.verdict import verdict_of_done
 from workflows.store.roots import note_root
@@ -86,15 +88,17 @@ def _replace_folders(
         "report": report_files(stages, exr=not plan.request.no_exr_views),
         "reflectance": reflectance_files(stages),
     }
+    linked = frozenset(_linked(plan, assets))
     zipped = [assets[p] for p in packed(assets)] if plan.request.pack else []
     for name in wanted:
         moved |= tidy(out, name, known)
-    check_room_for_copies(out, (*(p for copies in wanted.values() for p in copies.values()), *zipped))
+    copied = (p for copies in wanted.values() for p in copies.values() if p not in linked)
+    check_room_for_copies(out, (*copied, *zipped))
     made: list[Replacement] = []
     try:
         for name, copies in wanted.items():
             if copies:
-                made.append(prepare(out, name, partial(_fill, name, copies, timing), known))
+                made.append(prepare(out, name, partial(_fill, name, copies, timing, linked), known))
         _stop_if(stopped)
         new = {p: h for m in made for p, h in m.hashes.items()}
         note_published(out, {**known, **{p: known.get(p, frozenset()) | {h} for p, h in new.items()}})
@@ -115,12 +119,21 @@ def _stop_if(stopped: Callable[[], bool]) -> None:
         raise Cancelled("stopped by the user; finished stages are kept, nothing was published")
 
 
-def _fill(name: str, copies: Copies, timing: Mapping[str, float], folder: Path) -> None:
+def _linked(plan: Plan, assets: Copies) -> Iterable[Path]:
+    """Files of the store that get a second name in OUT instead of a copy: those of the asset, where the store is OUT's
+    own. An edit in place then damages a result that takes a minute to make again, which its hash tells; the views of
+    the fit are copied, and so is everything of a store that several folders share."""
+    return assets.values() if plan.store.root.resolve() == (plan.out / OWN_STORE).resolve() else ()
+
+
+def _fill(name: str, copies: Copies, timing: Mapping[str, float], linked: frozenset[Path], folder: Path) -> None:
     for path, source in copies.items():
         target = folder / path
         target.parent.mkdir(parents=True, exist_ok=True)
         if name == "report" and path in TIMED:
             target.write_bytes(with_seconds(path, source.read_bytes(), timing))
+        elif source in linked:
+            link_or_copy(source, target)
         else:
             shutil.copyfile(source, target)
 

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from stages.presets import DEFAULT_PRESET
 
+OWN_STORE = ".store"  # in OUT, where none is named
 Seconds = Annotated[float, Field(gt=0)]
 
 
@@ -67,4 +68,4 @@ class RunRequest(BaseModel):
     @property
     def store_path(self) -> Path:
         """Where finished artifacts are kept."""
-        return Path(self.store) if self.store else Path(self.out) / ".store"
+        return Path(self.store) if self.store else Path(self.out) / OWN_STORE

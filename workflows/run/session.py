@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pipeline.contract import Done, Show, no_show
 from workflows.run.steering import Steering
+
+if TYPE_CHECKING:
+    from workflows.run.request import RunRequest
 
 
 class Observer(Protocol):
@@ -30,6 +34,10 @@ class Observer(Protocol):
         """The stage at work waits, because the user paused the run; or it goes on."""
         ...
 
+    def replanned(self, seconds: Mapping[str, float | None], request: RunRequest) -> None:
+        """The user chose another preset or budget: the stages begin again. seconds: expected of each."""
+        ...
+
     def note(self, text: str) -> None:
         """A message for the user."""
         ...
@@ -42,6 +50,7 @@ class Silent:
     def progress(self, done: int, total: int, message: str = "", **figures: float) -> None: ...
     def finished(self, done: Done[Any]) -> None: ...
     def paused(self, waits: bool) -> None: ...
+    def replanned(self, seconds: Mapping[str, float | None], request: RunRequest) -> None: ...
     def note(self, text: str) -> None: ...
 
 
@@ -61,9 +70,10 @@ class Session:
     show: Show = no_show
 
     def stopped(self) -> bool:
-        """Whether the running stage has to end: the user stopped it, or its time is over. Waits while it is paused."""
+        """Whether the running stage has to end: the user stopped it, its time is over, or it is to
+        go on with another setting. Waits while it is paused."""
         self.steering.wait(self._ended)
-        return self._ended() or self.steering.stops
+        return self._ended() or self.steering.stops or self.steering.change is not None
 
     def _ended(self) -> bool:
         return self.stop.is_set() or self.late.is_set()

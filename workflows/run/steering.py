@@ -1,4 +1,4 @@
-"""What a user asks of a run while it goes on: pause, go on, stop after this stage, stop now.
+"""What a user asks of a run while it goes on: pause, go on, stop after this stage, stop now, another time.
 
 A stage asks at its checkpoints whether it has to stop (pipeline.contract.Context.check). While the run is paused it
 waits there: the process lives and keeps its locks, and the wait counts for no time limit. A signal ends the wait as it
@@ -13,10 +13,30 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, get_args
 
+from stages.presets import PRESETS
+
 Wish = Literal["pause", "go on", "stop after stage", "stop"]
 WISHES: tuple[str, ...] = get_args(Wish)
+PRESET, BUDGET = "preset", "budget"  # "preset studio", "budget 600": see workflows/run/changes.py
+SHORTEST, LONGEST = 60.0, 7 * 86400.0  # seconds of a budget
 LOOK = 0.25  # seconds between two looks for wishes
 WAIT = 0.1  # seconds between two looks while paused
+
+
+def is_change(wish: str) -> bool:
+    """Whether a wish names another preset, or a budget in seconds."""
+    kind, _, value = wish.partition(" ")
+    if kind == PRESET:
+        return value in PRESETS
+    try:
+        return kind == BUDGET and SHORTEST <= float(value) <= LONGEST
+    except ValueError:
+        return False
+
+
+def is_wish(wish: object) -> bool:
+    """Whether a run understands it."""
+    return isinstance(wish, str) and (wish in WISHES or is_change(wish))
 
 
 class Steering:
@@ -28,6 +48,8 @@ class Steering:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock, self.ask = clock, _nobody
         self.ends_after_stage = threading.Event()
+        self.changeable = False  # whether the run takes another setting of time
+        self.change: str | None = None  # the one that is asked for
         self._stop = threading.Event()
         self._pausing = threading.Event()
         self._lock = threading.Lock()
@@ -46,6 +68,24 @@ class Steering:
             self.ends_after_stage.set()
         elif wish == "stop":
             self._stop.set()
+        elif self.changeable and is_change(wish):
+            self._pausing.clear()
+            self.change = wish
+
+    @contextmanager
+    def open_to_changes(self) -> Iterator[None]:
+        """While the block runs, take another preset or budget."""
+        self.changeable = True
+        try:
+            yield
+        finally:
+            self.changeable, self.change = False, None
+
+    def take_change(self) -> str | None:
+        """The latest change that was asked for since the last call."""
+        with self._lock:
+            change, self.change = self.change, None
+        return change
 
     @property
     def pausing(self) -> bool:

@@ -92,25 +92,35 @@ export class Channels {
     root.traverse((o) => {
       if (!o.isMesh) return;
       const tile = data.materials.indexOf(o.material.name.replace(/_(eyes|hair)$/, "")); // both have the maps of their tile
-      const state = { arriving: { value: null }, hasArriving: { value: 0 }, darkenSpecular: { value: 0 } };
-      if (tile >= 0 && o.material.map) occlude(o.material, state);
-      this.parts.push({ mesh: o, look: o.material, tile, state, lines: null });
+      this.add(o, tile, data.maps);
     });
   }
 
-  async load(name, nearest) {
-    if (!this.maps.has(name)) {
-      const uris = this.data.maps[name] || [];
-      this.maps.set(name, await Promise.all(uris.map((uri) => textureOf(uri, { nearest }))));
-    }
-    return this.maps.get(name);
+  // A mesh with its own material. maps: addresses of its maps by name, one for each tile.
+  add(mesh, tile, maps) {
+    const state = { arriving: { value: null }, hasArriving: { value: 0 }, darkenSpecular: { value: 0 } };
+    if (tile >= 0 && mesh.material.map) occlude(mesh.material, state);
+    this.parts.push({ mesh, look: mesh.material, tile, maps, state, lines: null });
+  }
+
+  // The material of a tile's skin or cloth.
+  lookOf(tile) {
+    const own = this.parts.filter((p) => p.tile === tile && p.maps === this.data.maps);
+    return (own.find((p) => !p.look.name.endsWith("_eyes")) || own[0] || this.parts[0]).look;
+  }
+
+  async load(maps, name, nearest) {
+    if (!this.maps.has(maps)) this.maps.set(maps, {});
+    const known = this.maps.get(maps);
+    known[name] ??= await Promise.all((maps[name] || []).map((uri) => textureOf(uri, { nearest })));
+    return known[name];
   }
 
   // Which map darkens the light that arrives: the captured light's own, or plain occlusion for any other.
   async arriving(captured) {
-    const own = captured && this.data.maps.irradiance_ratio;
-    const textures = await this.load(own ? "irradiance_ratio" : "ambient_occlusion", false);
-    for (const { tile, state } of this.parts) {
+    for (const { tile, state, maps } of this.parts) {
+      const own = captured && maps.irradiance_ratio;
+      const textures = await this.load(maps, own ? "irradiance_ratio" : "ambient_occlusion", false);
       state.arriving.value = textures[tile] || null;
       state.hasArriving.value = textures[tile] ? 1 : 0;
       state.darkenSpecular.value = own ? 0 : 1;
@@ -118,8 +128,8 @@ export class Channels {
   }
 
   async show(channel) {
-    if (channel.map) await this.load(channel.map, channel.kind === "code");
     for (const part of this.parts) {
+      if (channel.map) await this.load(part.maps, channel.map, channel.kind === "code");
       const key = `${channel.name} ${part.mesh.id}`;
       if (!this.made.has(key)) this.made.set(key, this.material(channel, part));
       part.mesh.material = this.made.get(key);
@@ -128,8 +138,8 @@ export class Channels {
   }
 
   material(channel, part) {
-    const { look, tile, mesh } = part;
-    const texture = channel.map ? this.maps.get(channel.map)[tile] : look[channel.of];
+    const { look, tile, mesh, maps } = part;
+    const texture = channel.map ? this.maps.get(maps)[channel.map][tile] : look[channel.of];
     const range = { low: channel.low, high: channel.high, key: channel.name };
     switch (channel.kind) {
       case "look": return look;

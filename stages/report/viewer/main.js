@@ -6,6 +6,7 @@ import { Channels } from './channels.js';
 import { Lights } from './lights.js';
 import { cameraAt, frameOf, frusta, lookThrough } from './cameras.js';
 import { landmarkDots, Turning } from './marks.js';
+import { geometriesOf, reliefFree, scanMaterial } from './meshes.js';
 
 const $ = (id) => document.getElementById(`viewer-${id}`);
 const STEP = Math.PI / 24; // radians per press of an arrow key
@@ -18,6 +19,8 @@ class Viewer {
     this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     this.scene = new THREE.Scene();
     this.scene.add(gltf.scene);
+    this.asset = gltf.scene;
+    this.meshes = new Map([["asset", gltf.scene]]);
     this.channels = new Channels(data, gltf.scene);
     this.lights = new Lights(this.renderer, this.scene, data.lights);
     const box = new THREE.Box3().setFromObject(gltf.scene);
@@ -35,6 +38,24 @@ class Viewer {
     const { clientWidth, clientHeight } = this.canvas.parentElement;
     this.view.aspect = clientWidth / clientHeight;
     this.home();
+  }
+
+  // Shows one of the page's meshes, or "asset", the glb. text: of its data.
+  async show(name, text) {
+    if (!this.meshes.has(name)) {
+      const kind = this.data.meshes.find((m) => m.name === name), group = new THREE.Group();
+      const geometries = await geometriesOf(text, kind);
+      for (const [i, geometry] of geometries.entries()) {
+        const { tile } = kind.parts[i], look = this.channels.lookOf(tile);
+        const material = kind.scan ? await scanMaterial(this.data.scan, tile) : kind.smooth ? reliefFree(look) : look.clone();
+        const mesh = new THREE.Mesh(geometry, material);
+        this.channels.add(mesh, tile, kind.scan ? this.data.scan.maps : this.data.maps);
+        group.add(mesh);
+      }
+      this.scene.add(group);
+      this.meshes.set(name, group);
+    }
+    for (const [other, group] of this.meshes) group.visible = other === name;
   }
 
   home() {
@@ -122,7 +143,27 @@ function connectChannels(viewer) {
     $("channel").dataset.shown = channel.name;
   };
   $("channel").addEventListener("change", show);
-  return show();
+  return show;
+}
+
+// Which mesh is shown: the glb, or another of the page. refresh: gives it the present channel and light.
+function connectMeshes(viewer, refresh) {
+  const select = $("mesh");
+  options(select, [["asset", viewer.data.asset], ...viewer.data.meshes.map((m) => [m.name, m.label])]);
+  select.parentElement.hidden = viewer.data.meshes.length === 0;
+  select.addEventListener("change", async () => {
+    const name = select.value;
+    $("mesh-words").textContent = "";
+    try {
+      await viewer.show(name, name === "asset" ? "" : $(`mesh-${name}`).textContent);
+      await refresh();
+      $("expressions").hidden = name !== "asset" || $("expressions").querySelector("input") === null;
+      select.dataset.shown = name;
+    } catch (error) {
+      $("mesh-words").textContent = `can't be shown: ${error.message || error}`;
+    }
+    viewer.draw();
+  });
 }
 
 function connectLight(viewer) {
@@ -138,7 +179,7 @@ function connectLight(viewer) {
     viewer.draw();
   };
   for (const id of ["light", "turn", "exposure", "background", "tone"]) $(id).addEventListener("input", set);
-  return set();
+  return set;
 }
 
 function connectCameras(viewer) {
@@ -160,13 +201,14 @@ function connectCameras(viewer) {
   const choose = () => {
     const camera = cameras[$("camera").value];
     const shown = Boolean(camera && camera.photo);
-    photo.hidden = $("edge").hidden = $("split-row").hidden = !shown;
+    photo.hidden = $("edge").hidden = $("split-row").hidden = $("compare-row").hidden = !shown;
     if (!camera) return viewer.home();
     if (shown) photo.src = camera.photo;
     viewer.through(camera);
     return place();
   };
   split.addEventListener("input", cut);
+  $("compare").addEventListener("change", () => { photo.classList.toggle("difference", $("compare").value === "difference"); });
   $("camera").addEventListener("change", choose);
   $("frusta").addEventListener("input", () => {
     viewer.frusta.visible = $("frusta").checked;
@@ -236,8 +278,10 @@ function connectMarks(viewer, choose) {
 export async function start(data, glb) {
   const gltf = await new GLTFLoader().parseAsync(glb, "");
   const viewer = new Viewer(data, gltf);
-  await connectChannels(viewer);
-  await connectLight(viewer);
+  const channel = connectChannels(viewer), light = connectLight(viewer);
+  await channel();
+  await light();
+  connectMeshes(viewer, async () => { await channel(); await light(); });
   const choose = connectCameras(viewer);
   connectKeys(viewer, choose);
   connectMarks(viewer, choose);

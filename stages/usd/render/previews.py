@@ -65,7 +65,7 @@ def render_held_out(
         shown = scene.renderer.render(view, factor=scale, samples=samples, light=scene.light)
         rgba = as_photographed(shown, response)
         exr, png = (context.workdir / f"asset_views/{index}.{e}" for e in ("exr", "png"))
-        write_exr(exr, rgba)
+        write_exr(exr, rgba, half=True)
         write_rgba_png(png, rgba)
         files = {"exr": context.file(exr), "png": context.file(png)}
         out.append(HeldOutView(index=index, **files, scale=scale, response=response))

@@ -116,7 +116,7 @@ def export(
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
     dome = environment(light, config.environment_width)
-    write_exr(folder / "environment.exr", dome)
+    write_exr(folder / "environment.exr", dome, half=True)
     domes = [] if moving is None else write_domes(moving, folder, config.environment_width)
     figures = maps.figures | environment_figures(light, dome)
     (folder / LIGHT).write_text(light_json(light, face.artifact.attenuation, moving))

@@ -105,7 +105,7 @@ def _derived(
     if acescg:
         written.append(map_file(asset, name, "albedo_acescg", exr))
         albedo = read_exr(map_file(asset, name, "albedo", exr))[0][..., :3]
-        write_exr(written[-1], acescg_from_linear(albedo), primaries=ACESCG)
+        write_exr(written[-1], acescg_from_linear(albedo), half=True, primaries=ACESCG)
     coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]))
     for i, picture in enumerate(in_groups(coefficients)):
         written.append(map_file(asset, name, f"coefficients_rgb{i}", exr))
@@ -175,10 +175,10 @@ def divided_albedo(
         albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
         image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
         exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
-        write_exr(map_file(asset, name, "albedo", exr), albedo)
+        write_exr(map_file(asset, name, "albedo", exr), albedo, half=True)
         write_png_from_linear(map_file(asset, name, "albedo", png), albedo)
         written.append(map_file(asset, name, "occlusion", exr))
-        write_exr(written[-1], image)
+        write_exr(written[-1], image, half=True)
         shown.append(image[covered_texels(bake, tile)][::count])  # in total as many as in one tile
     found = np.concatenate(shown)
     figures = {

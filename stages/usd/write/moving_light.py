@@ -38,7 +38,7 @@ def write_domes(moving: MovingLight, folder: Path, width: int) -> list[Path]:
     if moving.frame != FLASH:
         pictures[MOVING_FILE] = sh.rotated(moving.coefficients.astype(np.float64), UPRIGHT).astype(np.float32)
     for name, light in pictures.items():
-        write_exr(folder / name, environment(light, width))
+        write_exr(folder / name, environment(light, width), half=True)
     return [folder / name for name in pictures]
 
 

@@ -91,6 +91,19 @@ function showCurve(curve) {
   $("curve-words").textContent = `PSNR of the fitted pixels, dB: ${values[values.length - 1].toFixed(1)} after step ${steps[steps.length - 1]}`;
 }
 
+// Another preset or budget: the fit starts again, so that the choice asks first.
+function showTimes(state) {
+  $("change").hidden = !look.alive || !state.changeable;
+  const now = typeof state.budget === "number" ? `budget ${state.budget}` : `preset ${state.preset}`;
+  const times = [...(state.presets || []).map((p) => [`preset ${p}`, `preset ${p}`]),
+    ...[5, 10, 20, 60].map((m) => [`budget ${60 * m}`, `${m} min from now`])];
+  if (!times.some((t) => t[0] === now)) times.push([now, typeof state.budget === "number" ? `${state.budget / 60} min` : now]);
+  const key = JSON.stringify([now, times]);
+  if ($("time").dataset.shown === key) return;
+  $("time").dataset.shown = key;
+  $("time").replaceChildren(...times.map(([value, words]) => new Option(words, value, false, value === now)));
+}
+
 function showVerdict(verdict) {
   $("verdict").hidden = !verdict.level;
   if (verdict.level) $("verdict").replaceChildren(text("h2", `Verdict: ${verdict.level}`));
@@ -109,6 +122,7 @@ function show() {
   $("steer").hidden = !works;
   const on = state.status === "running";
   for (const b of document.querySelectorAll("[data-wish]")) b.disabled = b.dataset.wish === "pause" ? !on : b.dataset.wish === "go on" ? on : false;
+  showTimes(state);
   list("troubles", (look.troubles || []).map((t) => text("li", t)));
   list("links", look.alive ? [] : (look.links || []).map((l) => {
     const item = document.createElement("li"), link = text("a", `${l.words} (${l.path})`);
@@ -130,10 +144,16 @@ async function wish(what) {
   if (!answer.ok) $("status").textContent = `Not taken: ${answer.statusText}`;
 }
 
+$("time").addEventListener("change", () => {
+  const chosen = $("time").value, words = $("time").selectedOptions[0].textContent;
+  delete $("time").dataset.shown; // drawn again from what the run tells
+  if (confirm(`Go on with ${words}? The fit starts again from the beginning; finished stages before it are reused.`)) wish(chosen);
+});
 for (const b of document.querySelectorAll("[data-wish]")) b.addEventListener("click", () => wish(b.dataset.wish));
 document.addEventListener("keydown", (e) => {
+  if (e.key === "b" && !$("change").hidden && !e.ctrlKey && !e.metaKey && !e.altKey) { $("time").focus(); return; }
   const what = { p: "pause", " ": "go on", s: "stop after stage" }[e.key];
-  if (!what || $("steer").hidden || e.ctrlKey || e.metaKey || e.altKey || e.target.closest("button, a")) return;
+  if (!what || $("steer").hidden || e.ctrlKey || e.metaKey || e.altKey || e.target.closest("button, a, select")) return;
   e.preventDefault();
   wish(what);
 });
