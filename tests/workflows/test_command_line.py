@@ -198,7 +198,7 @@ def test_a_second_ctrl_c_stops_at_once(photos: Path, child_environment: dict[str
 def test_the_way_from_main_to_the_first_stage_is_short(
     photos: Path, toys: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Five calls, as docs/architecture.md shows them."""
+    """Six calls, as docs/architecture.md shows them."""
     first, *rest = TOYS
     stack: list[str] = []
 
@@ -208,4 +208,4 @@ def test_the_way_from_main_to_the_first_stage_is_short(
 
     monkeypatch.setattr(registry, "REGISTRY", [dataclasses.replace(first, run=noted), *rest])
     assert main(["run", str(photos), "--out", str(tmp_path / "out")]) == 0
-    assert stack[: stack.index("main")] == ["noted", "execute", "run_stages", "run", "run_command"]
+    assert stack[: stack.index("main")] == ["noted", "execute", "run_stages", "run_as_asked", "run", "run_command"]
