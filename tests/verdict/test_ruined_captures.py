@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from pipeline.demo.capture import write_demo_capture
+from pipeline.errors import StageError
 from pipeline.transforms import inverse_rigid
 from pipeline.verdict import Level, worst
 from tests.support import ruined as r
@@ -168,7 +169,6 @@ CASES = (
     Case("exposure steps", painted(r.brighter(0.35), (0, 4, 8, 12)), "capture", "exposure_steps", "unusable",
          "stops", ("4.png", "8.png")),
     Case("twice", picture_again, "capture", "same_photo_twice", "usable", "1 of 20", ("12.png = 7.png",)),
-    Case("one picture only", one_picture, "capture", "same_photo_twice", "unusable", "19 of 20"),
     Case("two people", two_faces, "capture", "two_people", "usable", "2 of 20", ("9.png", "10.png")),
     Case("a format that is not read", heic, "capture", "formats", "usable", "1 file", ("IMG_0007.HEIC",)),
     Case("a wall", wall, "capture", "subject", "unusable", "neither a face nor any structure"),
@@ -230,6 +230,14 @@ def test_each_ruin_is_found_and_named(case: Case, demo: Path, tmp_path: Path) ->
     assert set(case.views) <= set(finding.views), finding
     if case.views and len(case.views) == 1:
         assert finding.views[0] == case.views[0], finding
+
+
+def test_one_picture_under_all_cameras_is_refused(demo: Path, tmp_path: Path) -> None:
+    copy = r.copied(demo, tmp_path / "c")
+    one_picture(demo, copy)
+    with pytest.raises(StageError, match="most photos are copies") as told:
+        r.run_early(copy, tmp_path / "w", "capture")
+    assert "19 of 20" in str(told.value)
 
 
 # ------------------------------------------------------------------ photos held against their cameras: needs texture
