@@ -21,10 +21,9 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.generated import print_or_write
 from benchmarks.kill_matrix import (
     AT_ONCE,
     LAST,
@@ -39,6 +38,8 @@ from benchmarks.kill_matrix import (
     Column,
     column_in,
     not_ignored,
+    shown,
+    store,
     struck,
     survivors,
     table,
@@ -50,7 +51,7 @@ from workflows.run import host_info
 from workflows.run.run_lock import is_held
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, RECORD = ROOT / "docs/benchmarks/signals.md", ROOT / "docs/benchmarks/signals_batch.json"
+RECORD = ROOT / "docs/benchmarks/signals_batch.json"
 BEGIN, END = "<!-- made by benchmarks/kill_batch.py -->", "<!-- end of the batch -->"
 TOY = ROOT / "tests/support/toy_batch.py"
 CAPTURES = ("1/1_neutral", "2/1_neutral")
@@ -184,10 +185,8 @@ def main(arguments: Sequence[str]) -> int:
     for name in given.signals:
         found[name] = column(folder, name, whole)
         if given.write:  # at once: a call that is stopped has not worked for nothing
-            found = {n: found[n] for n in SIGNALS if n in found}
-            RECORD.write_text(json.dumps({n: asdict(c) for n, c in found.items()}, indent=1) + "\n")
-    print_or_write(["--write"] if given.write else [], PAGE, part(found))
-    return 1 if any(cell.is_fault() for c in found.values() for cell in c.cells.values()) else 0
+            found = store(RECORD, found, SIGNALS)
+    return shown(found, part(found), write=given.write)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -290,6 +290,19 @@ def recorded() -> dict[str, Column]:
     return {name: column_in(c) for name, c in json.loads(RECORD.read_text()).items()}
 
 
+def store(record: Path, found: Mapping[str, Any], signals: Sequence[str]) -> dict[str, Any]:
+    """Write columns, dataclasses by the signal's name, in the order of `signals`, in which they are returned."""
+    kept = {n: found[n] for n in signals if n in found}
+    record.write_text(json.dumps({n: asdict(c) for n, c in kept.items()}, indent=1) + "\n")
+    return kept
+
+
+def shown(found: Mapping[str, Any], part: str, *, write: bool) -> int:
+    """Print the table of columns, or write it into the page; the exit code: 1 with a fault in a cell."""
+    print_or_write(["--write"] if write else [], PAGE, part)
+    return 1 if any(cell.is_fault() for c in found.values() for cell in c.cells.values()) else 0
+
+
 def table(columns: dict[str, Column]) -> str:
     """Markdown: a row for each moment, a column for each signal; below, how each column was made."""
     heads = [n if n == "TWICE" else f"SIG{n}" for n in columns]
@@ -318,11 +331,8 @@ def main(arguments: Sequence[str]) -> int:
     files = {n: folder / f"{n}.json" for n in SIGNALS}
     found = {n: column_in(json.loads(f.read_text())) for n, f in files.items() if f.is_file()}
     if given.write:
-        merged = {**recorded(), **found}
-        found = {n: merged[n] for n in SIGNALS if n in merged}
-        RECORD.write_text(json.dumps({n: asdict(c) for n, c in found.items()}, indent=1) + "\n")
-    print_or_write(["--write"] if given.write else [], PAGE, table(found))
-    return 1 if any(cell.is_fault() for c in found.values() for cell in c.cells.values()) else 0
+        found = store(RECORD, {**recorded(), **found}, SIGNALS)
+    return shown(found, table(found), write=given.write)
 
 
 if __name__ == "__main__":

@@ -21,14 +21,13 @@ import time
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.generated import print_or_write
 from benchmarks.kill_batch import GONE
-from benchmarks.kill_matrix import LAST, MARK, SAME, not_ignored, survivors
+from benchmarks.kill_matrix import LAST, MARK, SAME, not_ignored, shown, store, survivors
 from benchmarks.pool import ENDED, Pool, running, wait_until
 from tests.support.facescape_tree import write_tree
 from tests.support.points import Point, hold
@@ -38,7 +37,7 @@ from workflows.run import host_info
 from workflows.run.run_lock import is_held
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE, RECORD = ROOT / "docs/benchmarks/signals.md", ROOT / "docs/benchmarks/signals_pool.json"
+RECORD = ROOT / "docs/benchmarks/signals_pool.json"
 BEGIN, END = "<!-- made by benchmarks/kill_pool.py -->", "<!-- end of the pool -->"
 SIGNALS = ("INT", "TERM", "HUP", "KILL")
 CAPTURE, STEPS = "1/1_neutral", 6
@@ -301,10 +300,8 @@ def main(arguments: Sequence[str]) -> int:
         for name in given.signals:
             found[name] = column(pool, name, moments, asset)
             if given.write:  # at once: a call that is stopped has not worked for nothing
-                found = {n: found[n] for n in SIGNALS if n in found}
-                RECORD.write_text(json.dumps({n: asdict(c) for n, c in found.items()}, indent=1) + "\n")
-    print_or_write(["--write"] if given.write else [], PAGE, part(found))
-    return 1 if any(cell.is_fault() for c in found.values() for cell in c.cells.values()) else 0
+                found = store(RECORD, found, SIGNALS)
+    return shown(found, part(found), write=given.write)
 
 
 if __name__ == "__main__":

@@ -144,7 +144,7 @@ MUTATIONS = (
     Mutation("stages/bake/standard_fit.py", "found.pull * found.f0)", "found.pull)",
              "tests/bake/test_standard_fit.py"),
     Mutation("stages/bake/standard_fit.py", ">= MIN_VIEWS", ">= 0 * MIN_VIEWS", "tests/bake/test_standard_fit.py"),
-    Mutation("stages/bake/dilate.py", "+ low * width", "", "tests/bake/test_bake_maps.py"),
+    Mutation("stages/bake/dilate.py", "+ low * width", "", "tests/bake/test_dilate.py"),
     # ---------------------------------------------------------------- light around the mesh
     Mutation("pipeline/lighting/dome.py", "max(positive, negative, 1e-30)", "max(positive, 1e-30)",
              "tests/usd/test_usd_light.py"),

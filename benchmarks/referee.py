@@ -22,9 +22,9 @@ import numpy as np
 
 from pipeline.camera import PinholeCamera
 from pipeline.images import read_exr, write_exr
+from pipeline.map_lookup import bilinear
 from stages.usd.layout import map_file
 from stages.usd.render.exported import read_cameras, read_usd_mesh
-from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0
 from stages.usd.write.maps import vertex_image
 from stages.usd.write.shading import ior_from_f0

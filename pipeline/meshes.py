@@ -161,6 +161,14 @@ def fans(counts: Indices) -> Indices:
     return np.asarray(np.stack([first, first + turn + 1, first + turn + 2], 1), np.int64)
 
 
+def split_at_seams(faces: Faces, uv_faces: Faces) -> tuple[Indices, Indices, Indices]:
+    """Each pair of a vertex and a uv that a corner uses, once, sorted: (N,) vertices, (N,) uvs; and faces (F, 3) of
+    pairs. faces, uv_faces (F, 3)."""
+    most = int(uv_faces.max(initial=0)) + 1
+    pairs, index = np.unique(faces.ravel().astype(np.int64) * most + uv_faces.ravel(), return_inverse=True)
+    return pairs // most, pairs % most, np.asarray(index.reshape(faces.shape), np.int64)
+
+
 def edges(faces: Faces) -> Indices:
     """(3 F, 2) directed edges, in the order of the faces' sides 0-1, 1-2, 2-0 (all first sides first)."""
     f = np.asarray(faces, np.int64)

@@ -19,6 +19,7 @@ from pipeline.colmap import pycolmap
 from pipeline.transforms import F64, inverse_rigid, project, rigid
 from stages.poses.bundle_adjustment import Refine, adjust
 from stages.poses.features import Features
+from stages.poses.known_poses import seeded
 from stages.poses.matching import Pair, Verified
 from stages.poses.merge import merged
 from stages.poses.well_supported import well_supported
@@ -209,12 +210,9 @@ def _remove_poorly_supported(reconstruction: Any) -> None:
 
 
 def _options(refine: Refine, seed: int, loose: bool) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = 1
-    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    options = seeded(seed)
     options.min_model_size = MIN_MODEL
     options.max_num_models = MAX_MODELS
-    options.extract_colors = False
     options.ba_refine_focal_length = refine.focal
     options.ba_refine_extra_params = refine.distortion
     options.ba_refine_principal_point = refine.principal_point == "yes"

@@ -15,7 +15,8 @@ import numpy.typing as npt
 from pipeline import meshes, tiles
 from pipeline.artifacts import Located, TextureSet
 from pipeline.images import read_exr
-from pipeline.meshes import Charts, Mesh, vertex_normals
+from pipeline.map_lookup import bilinear
+from pipeline.meshes import Charts, Faces, Mesh, vertex_normals
 from stages.report.collect import Results
 from stages.report.viewer_pack import Packed, pack
 
@@ -77,20 +78,12 @@ def usd_mesh(r: Results, file: str, name: str) -> tuple[Mesh, Charts] | None:
             mesh, st = UsdGeom.Mesh(prim), UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
             if not st or not st.IsIndexed():
                 return None
-            corners = fan(np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64))
+            corners = meshes.fans(np.asarray(mesh.GetFaceVertexCountsAttr().Get(), np.int64))
             vertices = np.array(mesh.GetPointsAttr().Get(), np.float32)
             faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int32)[corners]
             charts = Charts(np.array(st.Get(), np.float32), np.array(st.GetIndices(), np.int32)[corners])
             return Mesh(vertices, vertex_normals(vertices, faces), faces), charts
     return None
-
-
-def fan(counts: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(T, 3) corners of the triangles of convex faces with `counts` corners: (0, 1, 2), (0, 2, 3), ... of each."""
-    first = np.cumsum(counts) - counts
-    start = np.repeat(first, counts - 2)
-    number = np.arange(len(start)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
-    return np.stack([start, start + number + 1, start + number + 2], 1)
 
 
 # ------------------------------------------------------------------ displacement
@@ -126,13 +119,13 @@ def quartered(mesh: Mesh, charts: Charts) -> tuple[Mesh, Charts]:
     return cut, Charts(np.concatenate([charts.uvs, charts.uvs[pairs].mean(1)]).astype(np.float32), faces)
 
 
-def _cut(faces: npt.NDArray[np.integer], count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+def _cut(faces: Faces, count: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
     """Ends (E, 2) of the edges of triangles between `count` points, and four triangles for each: point count + e is the
     middle of edge e."""
-    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), 1)
+    ends = np.sort(meshes.edges(faces), axis=1)
     edges, index = np.unique(ends[:, 0] * count + ends[:, 1], return_inverse=True)
     a, b, c = faces.T
-    ab, bc, ca = (count + index.reshape(-1, 3)).T
+    ab, bc, ca = (count + index).reshape(3, -1)
     four = np.stack([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], 1)
     return np.stack([edges // count, edges % count], 1), four.reshape(-1, 3).astype(np.int32)
 
@@ -144,19 +137,7 @@ def heights(bake: Located[TextureSet], charts: Charts) -> F64:
     tile[charts.faces] = tiles.of_face(charts).clip(0, count - 1)[:, None]  # a coordinate on the border of two tiles
     out = np.zeros(len(charts.uvs))
     for t in range(count):
-        image = read_exr(bake.path(files[tiles.form("exr", t, count)]))[0][..., 0]
+        image = read_exr(bake.path(files[tiles.form("exr", t, count)]))[0][..., :1]
         own = tile == t
-        out[own] = MM * sampled(image, charts.uvs[own] - np.array([t, 0], np.float32))
+        out[own] = MM * bilinear(image, charts.uvs[own] - np.array([t, 0], np.float32))[:, 0]
     return out
-
-
-def sampled(image: F32, uvs: F32) -> F64:
-    """(N,) values of a map (H, W), row 0 on top, at texture coordinates (N, 2), v upwards; linear between centres."""
-    h, w = image.shape
-    x = (uvs[:, 0].astype(np.float64) * w - 0.5).clip(0, w - 1)
-    y = ((1 - uvs[:, 1].astype(np.float64)) * h - 0.5).clip(0, h - 1)
-    left, top = np.minimum(x.astype(np.int64), max(w - 2, 0)), np.minimum(y.astype(np.int64), max(h - 2, 0))
-    right, below, p, q = np.minimum(left + 1, w - 1), np.minimum(top + 1, h - 1), x - left, y - top
-    upper = (1 - p) * image[top, left] + p * image[top, right]
-    lower = (1 - p) * image[below, left] + p * image[below, right]
-    return np.asarray((1 - q) * upper + q * lower, np.float64)

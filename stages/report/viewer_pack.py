@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import tiles
-from pipeline.meshes import Charts, Mesh
+from pipeline.meshes import Charts, Mesh, split_at_seams
 
 POSITION_STEPS, NORMAL_STEPS, UV_STEPS = (1 << 14) - 1, 511, (1 << 15) - 1
 F64 = npt.NDArray[np.float64]
@@ -49,7 +49,7 @@ def pack(mesh: Mesh, charts: Charts) -> Packed:
     for tile in range(tiles.count(charts)):
         own, laid = tiles.single_tile(mesh, charts, tile)
         if len(own.faces):
-            vertex, uv, faces = split_corners(own.faces, laid.faces)
+            vertex, uv, faces = split_at_seams(own.faces, laid.faces)
             parts.append({"tile": tile, "vertices": len(vertex), "faces": len(faces)})
             flat = laid.uvs[uv].astype(np.float64).clip(0, 1) * [1, -1] + [0, 1]
             content += [
@@ -69,13 +69,3 @@ def planes(values: npt.NDArray[Any]) -> bytes:
     steps = np.diff(unsigned, axis=0, prepend=np.zeros((1, values.shape[1]), unsigned.dtype))
     columns = np.ascontiguousarray(steps.T).view(np.uint8).reshape(values.shape[1], len(values), values.itemsize)
     return np.ascontiguousarray(columns.transpose(0, 2, 1)).tobytes()
-
-
-def split_corners(
-    faces: npt.NDArray[np.integer], uv_faces: npt.NDArray[np.integer]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Rows of the vertices and of the uvs of each pair that a face's corner (F, 3) uses, and faces (F, 3) of pairs."""
-    most = int(uv_faces.max()) + 1
-    pairs = faces.ravel().astype(np.int64) * most + uv_faces.ravel()
-    unique, index = np.unique(pairs, return_inverse=True)
-    return unique // most, unique % most, np.asarray(index.reshape(-1, 3), np.int64)

@@ -17,7 +17,6 @@ from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake.ambient import ambient
 from stages.bake.build import Baked, Baker
-from stages.bake.dilate import nearest_rows
 from stages.bake.lut import basis_lut
 from stages.bake.write import write_maps
 from stages.surface.build import build as surface_build
@@ -258,24 +257,6 @@ def test_each_empty_texel_repeats_the_nearest_chart(baked: Baked) -> None:
         square = (rows - r) ** 2 + (columns - c) ** 2
         source = baked.texel[baked.nearest[r, c]]
         assert (source // SIZE - r) ** 2 + (source % SIZE - c) ** 2 == square.min()
-
-
-def test_nearest_texels_are_found_across_bands_and_holes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Band by band as over the whole picture; and where a band's surroundings are empty, further away."""
-    rng = np.random.default_rng(2)
-    covered = rng.random((96, 64)) < 0.02
-    covered[40:70] = False
-    rows, columns = np.nonzero(covered)
-    for halo in (512, 4):
-        monkeypatch.setattr("stages.bake.dilate.HALO", halo)
-        for first in range(0, 96, 8):
-            got = nearest_rows(covered, first, first + 8)
-            for r, c in ((0, 0), (3, 31), (7, 63)):
-                away = (rows - first - r) ** 2 + (columns - c) ** 2
-                y, x = divmod(int(got[r, c]), 64)
-                assert covered[y, x]
-                if halo == 512:
-                    assert (y - first - r) ** 2 + (x - c) ** 2 == away.min()
 
 
 def test_ambient_occlusion_of_a_groove() -> None:

@@ -57,7 +57,7 @@ def test_the_table_of_signals_is_made_of_its_record_and_has_no_fault() -> None:
 def test_the_table_of_a_batch_is_made_of_its_record_and_has_no_fault() -> None:
     """Made by: python -m benchmarks.kill_batch FOLDER --write"""
     columns = kill_batch.recorded()
-    assert kill_batch.part(columns) in kill_batch.PAGE.read_text()
+    assert kill_batch.part(columns) in kill_matrix.PAGE.read_text()
     assert {"INT", "TERM", "KILL"} <= set(columns)
     for column in columns.values():
         assert list(column.cells) == [*(m.name for m in kill_batch.MOMENTS), kill_batch.LAST]
@@ -67,7 +67,7 @@ def test_the_table_of_a_batch_is_made_of_its_record_and_has_no_fault() -> None:
 def test_the_table_of_a_pool_s_workers_is_made_of_its_record_and_has_no_fault() -> None:
     """Made by: python -m benchmarks.kill_pool FOLDER --write"""
     columns = kill_pool.recorded()
-    assert kill_pool.part(columns) in kill_pool.PAGE.read_text()
+    assert kill_pool.part(columns) in kill_matrix.PAGE.read_text()
     assert {"TERM", "KILL"} <= set(columns)
     names = {*(m.name for m in kill_pool.MOMENTS), kill_pool.LAST}
     for column in columns.values():

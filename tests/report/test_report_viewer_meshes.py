@@ -13,11 +13,12 @@ from pxr import Sdf, Usd, UsdGeom
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.images import write_exr
-from pipeline.meshes import Charts, Mesh, areas, volume
+from pipeline.map_lookup import bilinear
+from pipeline.meshes import Charts, Mesh, areas, fans, split_at_seams, volume
 from stages.report import viewer_meshes
 from stages.report.viewer_maps import scan_look
-from stages.report.viewer_meshes import fan, heights, moved_out, quartered, sampled, shown_meshes, usd_mesh
-from stages.report.viewer_pack import NORMAL_STEPS, POSITION_STEPS, UV_STEPS, Packed, pack, split_corners
+from stages.report.viewer_meshes import heights, moved_out, quartered, shown_meshes, usd_mesh
+from stages.report.viewer_pack import NORMAL_STEPS, POSITION_STEPS, UV_STEPS, Packed, pack
 
 
 def octahedron(radius: float = 1.0, times: int = 0) -> tuple[Mesh, Charts]:
@@ -92,7 +93,7 @@ def test_extreme_sizes_are_packed(size: float) -> None:
 
 
 def test_corners_are_split_where_their_coordinates_differ() -> None:
-    vertex, uv, faces = split_corners(np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0, 1, 2], [2, 4, 3]]))
+    vertex, uv, faces = split_at_seams(np.array([[0, 1, 2], [2, 1, 3]]), np.array([[0, 1, 2], [2, 4, 3]]))
     assert len(vertex) == 5 and vertex[faces].tolist() == [[0, 1, 2], [2, 1, 3]]
     assert uv[faces].tolist() == [[0, 1, 2], [2, 4, 3]]
 
@@ -142,14 +143,16 @@ def test_heights_are_read_between_texels_of_the_right_tile(tmp_path: Path) -> No
     found = heights(Located(bake, tmp_path), Charts(uvs, np.array([[0, 1, 2], [3, 4, 5]])))  # type: ignore[type-var]
     wanted = np.array([0, 0, 0, 10, 10, 10]) + 2 * (uvs[:, 0] % 1) + 3 * uvs[:, 1]
     assert found == pytest.approx(1e-3 * wanted, abs=1e-7)
-    edge = sampled(np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), np.array([[0, 0], [1, 1], [0.5, 0.5]], np.float32))
-    assert edge == pytest.approx([3, 2, 2.5])
-    assert sampled(np.full((1, 1), 7, np.float32), np.array([[0.2, 0.9]], np.float32)) == pytest.approx([7])
+    edge = bilinear(
+        np.array([[[1.0], [2.0]], [[3.0], [4.0]]], np.float32), np.array([[0, 0], [1, 1], [0.5, 0.5]], np.float32)
+    )
+    assert edge[:, 0] == pytest.approx([3, 2, 2.5])
+    assert bilinear(np.full((1, 1, 1), 7, np.float32), np.array([[0.2, 0.9]], np.float32))[:, 0] == pytest.approx([7])
 
 
 # ------------------------------------------------------------------ levels
 def test_faces_with_more_corners_become_fans() -> None:
-    assert fan(np.array([4, 3, 5])).tolist() == [[0, 1, 2], [0, 2, 3], [4, 5, 6], [7, 8, 9], [7, 9, 10], [7, 10, 11]]
+    assert fans(np.array([4, 3, 5])).tolist() == [[0, 1, 2], [0, 2, 3], [4, 5, 6], [7, 8, 9], [7, 9, 10], [7, 10, 11]]
 
 
 def written(folder: Path, *, indexed: bool = True) -> SimpleNamespace:

@@ -8,9 +8,9 @@ from support.render_stand_ins import asset, sphere_points
 from support.synthetic_asset import RADIUS, smooth_light, texture_arrays, write_inputs
 
 from pipeline.camera import PinholeCamera
+from pipeline.map_lookup import bilinear, lookup
 from pipeline.transforms import inverse_rigid, project
 from stages.usd.render.camera import orbit_camera
-from stages.usd.render.map_lookup import bilinear, lookup
 from stages.usd.render.render import Renderer, tangents
 from stages.usd.write.mesh import UvSurface, read_mesh, uv_fault, with_uvs_from
 

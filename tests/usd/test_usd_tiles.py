@@ -17,10 +17,10 @@ from support.synthetic_asset import RADIUS, ball, cut_in_two, run_stage, write_i
 from pipeline.artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
+from pipeline.map_lookup import bilinear
 from stages.usd.check.validate import validate
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
-from stages.usd.render.map_lookup import bilinear
 from stages.usd.render.relight import vertex_values
 from stages.usd.render.render import Renderer
 from stages.usd.write.mesh import UvSurface, half_gap, on_tile, tile_count, with_uvs_from, without_overlap

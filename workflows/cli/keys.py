@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from workflows.cli.console import Console
-from workflows.run.steering import Steering
+from workflows.run.steering import BUDGET, OFFERED_MINUTES, OFFERED_PRESETS, PRESET, Steering
 
 WISHES = {"p": "pause", " ": "go on", "s": "stop after stage"}
 HELP = "keys: p pause, space go on, s stop after this stage, b another time, Ctrl-C stop"
@@ -26,12 +26,12 @@ SAID = {
     "go on": "going on",
     "stop after stage": "stopping after this stage; space takes it back",
 }
-TIMES = {  # after b
-    "1": "preset draft", "2": "preset studio", "3": "preset film",
-    "4": "budget 300", "5": "budget 600", "6": "budget 1200", "7": "budget 3600",
-}  # fmt: skip
+OFFERED = {f"{PRESET} {p}": p for p in OFFERED_PRESETS} | {
+    f"{BUDGET} {60 * m}": f"{m} min from now" for m in OFFERED_MINUTES
+}  # wish -> its words
+TIMES = {str(n): wish for n, wish in enumerate(OFFERED, 1)}  # after b
 ASKED = (
-    "another time; the fit starts again: 1 draft, 2 studio, 3 film, 4 5 min from now, 5 10 min, 6 20 min, 7 60 min; "
+    f"another time; the fit starts again: {', '.join(f'{n}: {OFFERED[wish]}' for n, wish in TIMES.items())}; "
     "any other key: as it is"
 )
 LOOK = 0.2  # seconds between two looks

@@ -19,7 +19,6 @@ from typing import Any
 from pipeline.artifacts import Located
 from pipeline.contract import Done, Picture
 from pipeline.errors import Cancelled, NeufaceError
-from stages.presets import PRESETS
 from workflows.live.folder import LiveFolder
 from workflows.live.pictures import drawn, jpeg
 from workflows.live.wishes import Wishes
@@ -28,6 +27,7 @@ from workflows.run.forecast import Forecast
 from workflows.run.plan import Plan
 from workflows.run.request import RunRequest
 from workflows.run.session import Observer, Session
+from workflows.run.steering import OFFERED_MINUTES, OFFERED_PRESETS
 
 log = logging.getLogger(__name__)
 EVERY = 1.0  # seconds between two writings of state.json
@@ -35,7 +35,6 @@ PREVIEW_EVERY = 10.0  # seconds of the fit between two pictures of it
 PREVIEW_SHARE = 0.03  # largest share of the fit's time for them
 CURVE = 300  # points of the curve; then every second one is left out
 NOTES = 30
-OFFERED = [p for p in PRESETS if p != "paper"]  # on the page; paper is another model
 
 
 @contextmanager
@@ -85,7 +84,8 @@ class Live:
             "capture": plan.request.capture, "preset": plan.request.preset, "budget": plan.request.budget,
             "began": time.time(), "status": "running",
             "stages": [{"name": s.name, "state": "waiting", "share": 0.0, "seconds": None} for s in plan.stages],
-            "message": "", "figures": {}, "presets": OFFERED, "curve": [], "notes": [], "warnings": [], "pictures": {},
+            "message": "", "figures": {}, "presets": OFFERED_PRESETS, "minutes": OFFERED_MINUTES,
+            "curve": [], "notes": [], "warnings": [], "pictures": {},
         }  # fmt: skip
         self._write()
 

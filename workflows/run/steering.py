@@ -19,6 +19,8 @@ Wish = Literal["pause", "go on", "stop after stage", "stop"]
 WISHES: tuple[str, ...] = get_args(Wish)
 PRESET, BUDGET = "preset", "budget"  # "preset studio", "budget 600": see workflows/run/changes.py
 SHORTEST, LONGEST = 60.0, 7 * 86400.0  # seconds of a budget
+OFFERED_PRESETS = tuple(p for p in PRESETS if p != "paper")  # on the page and by keys; paper is another model
+OFFERED_MINUTES = (5, 10, 20, 60)  # of a budget
 LOOK = 0.25  # seconds between two looks for wishes
 WAIT = 0.1  # seconds between two looks while paused
 

@@ -19,10 +19,10 @@ from pipeline.errors import StageError
 from pipeline.images import read_encoded, read_exr
 from pipeline.lighting.dome import read_light, read_moving
 from pipeline.lighting.moving import MovingLight
+from pipeline.map_lookup import bilinear
 from pipeline.meshes import fans, vertex_normals
 from pipeline.transforms import apply
 from stages.usd.layout import existing, light_file
-from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.mesh import UvSurface, tile_count
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Compiled inner loops of the renderer: map lookup at many points, and shading under many lamps."""
+"""Compiled inner loops of the renderer: points on triangles, and shading under many lamps."""
 
 # mypy: disable-error-code=no-untyped-def
 from __future__ import annotations
@@ -29,25 +29,6 @@ def hit_weights(corners, face, origin, directions, out):
         w = max(1.0 - u - v, 0.0)
         total = u + v + w
         out[i, 0], out[i, 1], out[i, 2] = w / total, u / total, v / total
-
-
-@njit(parallel=True, error_model="numpy", cache=True)
-def bilinear(image, tiles, uv, out):
-    """(N, C) values of (H, W, C), `tiles` squares side by side, at uv (N, 2): texel centres at +0.5, v up, clamped at
-    the border of each tile."""
-    h, w, channels = image.shape[0], image.shape[1] // tiles, image.shape[2]
-    for i in prange(len(uv)):
-        tile = min(max(int(uv[i, 0]), 0), tiles - 1)
-        x = min(max((uv[i, 0] - tile) * w - 0.5, 0.0), w - 1.0)
-        y = min(max((1.0 - uv[i, 1]) * h - 0.5, 0.0), h - 1.0)
-        x0, y0 = int(x), int(y)
-        x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
-        fx, fy = np.float32(x - x0), np.float32(y - y0)
-        x0, x1 = x0 + tile * w, x1 + tile * w
-        for k in range(channels):
-            top = image[y0, x0, k] * (1 - fx) + image[y0, x1, k] * fx
-            low = image[y1, x0, k] * (1 - fx) + image[y1, x1, k] * fx
-            out[i, k] = top * (1 - fy) + low * fy
 
 
 @njit(parallel=True, error_model="numpy", cache=True)

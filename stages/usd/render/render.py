@@ -17,12 +17,12 @@ import numpy.typing as npt
 import torch
 
 from pipeline.camera import PinholeCamera
+from pipeline.map_lookup import bilinear, lookup
 from pipeline.maths import brdf
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, project, rays
 from stages.usd.render import kernels
 from stages.usd.render.exported import ExportedAsset
-from stages.usd.render.map_lookup import bilinear, lookup
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]

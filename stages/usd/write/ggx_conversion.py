@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.map_lookup import lookup
 from pipeline.maths import ggx_width, microfacet
-from stages.usd.render.map_lookup import lookup
 
 F32 = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]

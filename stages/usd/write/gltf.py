@@ -29,7 +29,7 @@ from pipeline import tiles
 from pipeline.colour import srgb_from_linear
 from pipeline.eyes.material import IOR, ROUGHNESS
 from pipeline.images import read_encoded, read_exr
-from pipeline.meshes import F32, Indices, Mask, vertex_normals
+from pipeline.meshes import F32, Indices, Mask, split_at_seams, vertex_normals
 from stages.usd.write.eyes import EYES
 from stages.usd.write.mesh import UvSurface, tile_count
 from stages.usd.write.package import bounded_png
@@ -96,13 +96,6 @@ class _Binary:
         return self.last[1]
 
 
-def corners(mesh: UvSurface) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
-    """Vertices split at seams: (N,) indices into the vertices and into the uvs, and faces (F, 3) into these."""
-    pairs = np.stack([mesh.faces.ravel(), mesh.uv_faces.ravel()], -1).astype(np.int64)
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    return unique[:, 0], unique[:, 1], inverse.reshape(-1, 3).astype(np.uint32)
-
-
 def write_glb(
     path: Path,
     name: str,
@@ -131,7 +124,7 @@ def write_glb(
             wet.append(piece.tile)
         made = _primitive(part, count + len(wet) - 1 if piece.eyes else piece.tile, binary)
         if rig is not None and part.faces.max() < len(rig.weights):
-            made["targets"] = _targets(corners(part)[0], rig, bent, binary)
+            made["targets"] = _targets(split_at_seams(part.faces, part.uv_faces)[0], rig, bent, binary)
         is_hair = hair is not None and piece.tile == count - 1
         (hairs if is_hair else moving if "targets" in made else still).append(made)
     if moving and rig is not None:
@@ -183,7 +176,7 @@ def write_glb(
 
 
 def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any]:
-    vertex, uv, faces = corners(mesh)
+    vertex, uv, faces = split_at_seams(mesh.faces, mesh.uv_faces)
     points, normals = mesh.vertices[vertex].astype(np.float32), mesh.normals[vertex].astype(np.float64)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     st = mesh.uvs[uv].clip(0, 1).astype(np.float32)
@@ -193,7 +186,7 @@ def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any
             "NORMAL": binary.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER),
             "TEXCOORD_0": binary.accessor(np.stack([st[:, 0], 1 - st[:, 1]], -1), "VEC2", ARRAY_BUFFER),
         },
-        "indices": binary.accessor(faces.ravel(), "SCALAR", ELEMENT_BUFFER),
+        "indices": binary.accessor(faces.ravel().astype(np.uint32), "SCALAR", ELEMENT_BUFFER),
         "material": material,
     }
 

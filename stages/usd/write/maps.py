@@ -19,13 +19,13 @@ from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_pn
 from pipeline.lighting.dome import environment
 from pipeline.lighting.median_cut import lamps
 from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
+from pipeline.map_lookup import bilinear
 from pipeline.maths import microfacet, sh
 from pipeline.meshes import Charts
 from pipeline.nearest import filled
 from pipeline.store import link_or_copy
 from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
-from stages.usd.render.map_lookup import bilinear
 from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0

@@ -96,7 +96,7 @@ function showTimes(state) {
   $("change").hidden = !look.alive || !state.changeable;
   const now = typeof state.budget === "number" ? `budget ${state.budget}` : `preset ${state.preset}`;
   const times = [...(state.presets || []).map((p) => [`preset ${p}`, `preset ${p}`]),
-    ...[5, 10, 20, 60].map((m) => [`budget ${60 * m}`, `${m} min from now`])];
+    ...(state.minutes || []).map((m) => [`budget ${60 * m}`, `${m} min from now`])];
   if (!times.some((t) => t[0] === now)) times.push([now, typeof state.budget === "number" ? `${state.budget / 60} min` : now]);
   const key = JSON.stringify([now, times]);
   if ($("time").dataset.shown === key) return;
