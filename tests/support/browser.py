@@ -23,6 +23,10 @@ def installed() -> str | None:
     return next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
+class ScriptError(RuntimeError):
+    """What an expression raised in the page."""
+
+
 class Tab:
     """One page. `troubles`: errors and warnings of its console, and uncaught exceptions."""
 
@@ -76,17 +80,24 @@ class Tab:
         """The value of an expression; promises are waited for."""
         found = self.call("Runtime.evaluate", expression=code, awaitPromise=True, returnByValue=True)
         if "exceptionDetails" in found:
-            raise RuntimeError(str(found["exceptionDetails"])[:600])
+            raise ScriptError(str(found["exceptionDetails"])[:600])
         return found["result"].get("value")
 
     def until(self, code: str, seconds: float = 60) -> float:
-        """Wait until an expression is true; returns the seconds that it took."""
-        start = time.monotonic()
-        while not self.run(code):
+        """Wait until an expression is true; returns the seconds that it took.
+
+        While a page loads its document has no elements yet, so an expression may raise: that is not true yet.
+        """
+        start, raised = time.monotonic(), ""
+        while True:
+            try:
+                if self.run(code):
+                    return time.monotonic() - start
+            except ScriptError as error:
+                raised = str(error)
             if time.monotonic() - start > seconds:
-                raise TimeoutError(f"{code} after {seconds} s; {self.troubles}")
+                raise TimeoutError(f"{code} after {seconds} s; {self.troubles} {raised}")
             time.sleep(0.05)
-        return time.monotonic() - start
 
     def size(self, width: int, height: int, *, phone: bool = False) -> None:
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)

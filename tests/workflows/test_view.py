@@ -129,7 +129,7 @@ def test_the_page_chooses_another_time_and_asks_first(run: Path, served: str, tm
     """In a browser: the present preset is chosen; another one is asked for when the user agrees, and not before."""
     if installed() is None:
         pytest.skip("no Chromium is installed")
-    state = {**STATE, "preset": "draft", "budget": None, "presets": ["draft", "studio"], "elapsed": 1}
+    state = {**STATE, "preset": "draft", "budget": None, "presets": ["draft", "studio"], "minutes": [10], "elapsed": 1}
     with exclusive_run(run / ".store", run, lambda: False, print), tab(tmp_path / "profile") as page:
         folder, wishes = LiveFolder(run), Wishes(run, "abc")
         folder.state({**state, "store": str(run / ".store"), "changeable": False, "updated": 0})
