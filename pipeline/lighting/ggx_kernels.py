@@ -5,9 +5,19 @@
     F     = F0 (1 - c) + c,   c = (1 - h.v)^5
 
 D is Trowbridge and Reitz' (GGX), V the height-correlated masking of Smith, F Schlick's. s is a lamp's spread: a lamp is
-an area of the sky, whose variance widens the lobe; a half vector turns by half of what the light turns, over h.v.
-[Walter 2007; Heitz 2014; Schlick 1994] The loops over lamps are in parts: lamps below the horizon, about half, are left
-out first; then a loop has no sums, so that it vectorises under strict arithmetic.
+an area of the sky, whose variance widens the lobe; a half vector turns by half of what the light turns, over h.v. A
+lobe narrower than the lamps' distance would show them as dots: q is at least SMOOTH s / (h.v)^2.
+[Walter 2007; Heitz 2014; Schlick 1994]
+
+A sum over lamps of solid angles W is a rough quadrature of a narrow lobe, above all at grazing angles. Under a sky of
+radiance 1 its result is known: the shares F0 a + b that the layer reflects (maths/microfacet.py). So both parts are
+scaled to that,
+
+    plain part   times a / sum_k D V n.l (1 - c) W_k,      rim   times b / sum_k D V n.l c W_k,
+
+each factor between 1 / MOST and MOST. Lamps without a solid angle (points) are not scaled. The loops over lamps are
+in parts: lamps below the horizon, about half, are left out first; then a loop has no sums, so that it vectorises
+under strict arithmetic.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -18,6 +28,8 @@ from numba import njit, prange
 
 ONE, ZERO, HALF, TWO = np.float32(1), np.float32(0), np.float32(0.5), np.float32(2)
 PI = np.float32(np.pi)
+SMOOTH = np.float32(1)
+MOST = np.float32(4)
 LEAST_COSINE = np.float32(1e-3)  # of n.v: the masking's limit at 0 is finite, its terms are not
 
 
@@ -48,19 +60,27 @@ def _half(nl, nv, lv):
 @njit(error_model="numpy", cache=True)
 def _reflected(nl, nv, nh, hv, a2, spread):
     """D V n.l of one lamp."""
-    q = a2 + spread / (TWO * hv * hv)
+    q = max(a2 + spread / (TWO * hv * hv), SMOOTH * spread / (hv * hv))
     t = nh * nh * (q - ONE) + ONE
     masked = nl * np.sqrt(nv * nv * (ONE - a2) + a2) + nv * np.sqrt(nl * nl * (ONE - a2) + a2)
     return q / (PI * t * t) * HALF / masked * nl
 
 
+@njit(error_model="numpy", cache=True)
+def _scale(share, total):
+    """Factor that takes the sum over a uniform sky to what it should be; 1 for point lamps."""
+    if not total > ZERO:
+        return ONE
+    return min(max(share / total, ONE / MOST), MOST)
+
+
 @njit(parallel=True, error_model="numpy", cache=True)
-def lobes(vertex, normal, wo, arriving, lamp, alphas, out):
+def lobes(vertex, normal, wo, arriving, lamp, alphas, share, out):
     """Write the specular radiance of each of M observations for K widths, in two parts: out (M, K, 2, 3), such that the
     layer of F0 reflects F0 out[:, :, 0] + out[:, :, 1].
 
-    vertex (M,); normal, wo (M, 3) unit; arriving (V, N, 3) flux of each lamp at the vertices; lamp (4, N): direction
-    and spread; alphas (K,). All float32.
+    vertex (M,); normal, wo (M, 3) unit; arriving (V, N, 3) flux of each lamp at the vertices; lamp (5, N): direction,
+    spread, solid angle; alphas (K,); share (2, M, K): a and b. All float32.
     """
     count = lamp.shape[1]
     for m in prange(len(vertex)):
@@ -81,22 +101,24 @@ def lobes(vertex, normal, wo, arriving, lamp, alphas, out):
             for j in range(lit):
                 w, c = _reflected(cosine[j], nv, nh[j], hv[j], a2, lamp[3, which[j]]), fresnel[j]
                 plain[j], rim[j] = w * (ONE - c), w * c
-            p0, p1, p2, c0, c1, c2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+            p0, p1, p2, c0, c1, c2, ps, cs = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
             for j in range(lit):
                 i = which[j]
-                e0, e1, e2 = own[i, 0], own[i, 1], own[i, 2]
+                e0, e1, e2, solid = own[i, 0], own[i, 1], own[i, 2], lamp[4, i]
+                ps, cs = ps + plain[j] * solid, cs + rim[j] * solid
                 p0, p1, p2 = p0 + plain[j] * e0, p1 + plain[j] * e1, p2 + plain[j] * e2
                 c0, c1, c2 = c0 + rim[j] * e0, c1 + rim[j] * e1, c2 + rim[j] * e2
-            out[m, k, 0, 0], out[m, k, 0, 1], out[m, k, 0, 2] = p0, p1, p2
-            out[m, k, 1, 0], out[m, k, 1, 1], out[m, k, 1, 2] = c0, c1, c2
+            ps, cs = _scale(share[0, m, k], ps), _scale(share[1, m, k], cs)
+            out[m, k, 0, 0], out[m, k, 0, 1], out[m, k, 0, 2] = p0 * ps, p1 * ps, p2 * ps
+            out[m, k, 1, 0], out[m, k, 1, 1], out[m, k, 1, 2] = c0 * cs, c1 * cs, c2 * cs
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, diffuse, specular):
+def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, share, diffuse, specular):
     """Write irradiance and specular radiance (M, 3) of M points inside triangles.
 
-    corner (M, 3) vertices of each point's triangle, weights (M, 3) barycentric; f0, alpha (M,); the others as in
-    `lobes`.
+    corner (M, 3) vertices of each point's triangle, weights (M, 3) barycentric; f0, alpha (M,); share (2, M): a and b;
+    the others as in `lobes`.
     """
     count = lamp.shape[1]
     for m in prange(len(normal)):
@@ -108,12 +130,18 @@ def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, diffuse, specu
         a2 = alpha[m] * alpha[m]
         which, cosine = np.empty(count, np.int64), np.empty(count, np.float32)
         lit = _above(normal[m], lamp, which, cosine)
-        glossy = np.empty(lit, np.float32)
+        plain, rim = np.empty(lit, np.float32), np.empty(lit, np.float32)
+        ps, cs = ZERO, ZERO
         for j in range(lit):
             i = which[j]
             lv = vx * lamp[0, i] + vy * lamp[1, i] + vz * lamp[2, i]
             nh, hv, c = _half(cosine[j], nv, lv)
-            glossy[j] = _reflected(cosine[j], nv, nh, hv, a2, lamp[3, i]) * (f0[m] * (ONE - c) + c)
+            w = _reflected(cosine[j], nv, nh, hv, a2, lamp[3, i])
+            plain[j], rim[j] = w * (ONE - c), w * c
+        for j in range(lit):
+            solid = lamp[4, which[j]]
+            ps, cs = ps + plain[j] * solid, cs + rim[j] * solid
+        ps, cs = f0[m] * _scale(share[0, m], ps), _scale(share[1, m], cs)
         d0, d1, d2, s0, s1, s2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
         for j in range(lit):
             i = which[j]
@@ -121,6 +149,7 @@ def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, diffuse, specu
             e1 = wa * pa[i, 1] + wb * pb[i, 1] + wc * pc[i, 1]
             e2 = wa * pa[i, 2] + wb * pb[i, 2] + wc * pc[i, 2]
             d0, d1, d2 = d0 + cosine[j] * e0, d1 + cosine[j] * e1, d2 + cosine[j] * e2
-            s0, s1, s2 = s0 + glossy[j] * e0, s1 + glossy[j] * e1, s2 + glossy[j] * e2
+            glossy = ps * plain[j] + cs * rim[j]
+            s0, s1, s2 = s0 + glossy * e0, s1 + glossy * e1, s2 + glossy * e2
         diffuse[m, 0], diffuse[m, 1], diffuse[m, 2] = d0, d1, d2
         specular[m, 0], specular[m, 1], specular[m, 2] = s0, s1, s2

@@ -64,8 +64,9 @@ class MovingLamps:
         for at, p in zip(self._lamps, self._turned(x, n, eye), strict=True):
             if at is not None:
                 unused, own = (np.empty((len(x), 3), np.float32) for _ in range(2))
+                share = standard.shares((p.normal * p.wo).sum(1), alpha)
                 kernels.shade(
-                    p.normal, p.wo, corner, weights, f0.astype(np.float32), alpha, at.flux, at.lamp, unused, own
+                    p.normal, p.wo, corner, weights, f0.astype(np.float32), alpha, at.flux, at.lamp, share, unused, own
                 )
                 specular += own * p.strength
         away = eye.centre - x
@@ -88,5 +89,5 @@ def _arrivals(coefficients: F32, count: int) -> standard.Arrivals | None:
     if not picture.max() > 0:
         return None
     lit = lamps(picture, count)
-    lamp = np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32)
-    return standard.Arrivals(np.ascontiguousarray(lit.flux[None], np.float32), lamp, np.zeros((1, 3), np.float32))
+    flux = np.ascontiguousarray(lit.flux[None], np.float32)
+    return standard.Arrivals(flux, standard.table(lit), np.zeros((1, 3), np.float32))

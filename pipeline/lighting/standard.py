@@ -40,7 +40,7 @@ LEAST_ALPHA = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Arrivals:
-    """flux (V, N, 3) of each lamp's direction at the vertices; lamp (4, N): direction and spread; irradiance (V, 3)."""
+    """flux (V, N, 3) of each lamp's direction at the vertices; lamp (5, N): `table` of the lamps; irradiance (V, 3)."""
 
     flux: F32
     lamp: F32
@@ -75,14 +75,25 @@ def arrivals(
         more = [np.bincount(row, sent[:, i] * cosine[row, lamp], len(n)) for i in range(3)]
         total = direct + np.stack(more, 1).astype(np.float32)
     flux[row, lamp] = sent
-    return Arrivals(flux, np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32), total)
+    return Arrivals(flux, table(lit), total)
+
+
+def table(lit: Lamps) -> F32:
+    """(5, N) direction, spread and solid angle of lamps."""
+    return np.concatenate([lit.directions.T, lit.spread[None], lit.solid[None]]).astype(np.float32)
 
 
 def lobes(at: Arrivals, vertex: npt.NDArray[np.int64], normal: F64, wo: F64, alphas: F32) -> F32:
     """(M, K, 2, 3) specular radiance of M observations at vertices, for K widths: F0 [:, :, 0] + [:, :, 1]."""
     out = np.empty((len(vertex), len(alphas), 2, 3), np.float32)
-    kernels.lobes(vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), out)
+    share = shares((normal * wo).sum(1)[:, None], np.asarray(alphas)[None])
+    kernels.lobes(vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), share, out)
     return out
+
+
+def shares(cosine: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating]) -> F32:
+    """(2, ...) a and b of the layer's reflected share F0 a + b, bilinear in a table."""
+    return _f32(np.stack([_looked_up(t, cosine, alpha) for t in _tables()]))
 
 
 def layer(cosine: npt.NDArray[np.floating], f0: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating]) -> F64:
@@ -98,8 +109,12 @@ def radiance(
     (M,); corner, weights (M, 3)."""
     alpha = np.maximum(roughness**2, LEAST_ALPHA).astype(np.float32)
     diffuse, specular = (np.empty((len(normal), 3), np.float32) for _ in range(2))
-    kernels.shade(_f32(normal), _f32(wo), corner, _f32(weights), _f32(f0), alpha, at.flux, at.lamp, diffuse, specular)
-    kept = 1 - layer((normal * wo).sum(1), f0, alpha)
+    cosine = (normal * wo).sum(1)
+    kernels.shade(
+        _f32(normal), _f32(wo), corner, _f32(weights), _f32(f0), alpha, at.flux, at.lamp, shares(cosine, alpha),
+        diffuse, specular,
+    )  # fmt: skip
+    kept = 1 - layer(cosine, f0, alpha)
     return kept[:, None] * base / np.pi * diffuse, np.where(f0[:, None] > 0, specular, 0).astype(np.float64)
 
 

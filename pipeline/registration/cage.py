@@ -16,6 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from pipeline.meshes import F64, Indices, Mask, unit
+from pipeline.registration.outgrown import GROWS
 from pipeline.registration.subdivision import edges_of, limit, subdivided
 from pipeline.template.model import SKIN, Template
 
@@ -51,6 +52,7 @@ class Cage:
     across: csr_array
     shown: Mask
     loose: Mask
+    grows: Mask
     difference: csr_array
     stiffness: F64
 
@@ -74,15 +76,15 @@ def cage_of(template: Template) -> Cage:
     at = limit(fine.quads, fine.stencil.shape[0])
     difference, stiffness = _springs(quads, count, region, names)
     fine_region = np.repeat(region, 4)
-    hidden, loose = (
+    hidden, loose, grows = (
         _touches(fine.quads, fine.stencil.shape[0], np.isin(fine_region, [names.index(n) for n in which if n in names]))
-        for which in (HIDDEN, LOOSE)
+        for which in (HIDDEN, LOOSE, GROWS)
     )
     return Cage(
         np.asarray(of_template, np.int64), quads, region, names,
         finer.quads, csr_array(limit(finer.quads, finer.stencil.shape[0]).point @ finer.stencil),
         csr_array(at.point @ fine.stencil), csr_array(at.along @ fine.stencil), csr_array(at.across @ fine.stencil),
-        ~hidden & ~at.rough, loose, difference, stiffness,
+        ~hidden & ~at.rough, loose, grows & ~hidden & ~at.rough, difference, stiffness,
     )  # fmt: skip
 
 

@@ -12,17 +12,22 @@ import numpy as np
 
 from pipeline.meshes import F64, Indices, Mask, triangles_of
 from pipeline.registration.folds import piercing_edges
+from pipeline.registration.lips import meeting
 from pipeline.registration.scan import Scan
 
 REACH = 0.003  # metres of the template: largest displacement
 AGREE, CLOSE = 2.0, 2e-4  # the latter in metres of the template
 SPREAD = 2  # rings of quads over which it fades to its borders
+HALVED = 8  # rounds of halving what closes lips
 TAKEN_BACK = 6  # rounds of taking it back
 
 
-def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float) -> tuple[F64, F64]:
+def displacement(
+    points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float, lips: Mask | None = None
+) -> tuple[F64, F64]:
     """(n,) metres along normals (n, 3) from points (n, 3), and (n,) how well the place is seen. quads (Q, 4); free
-    (Q,): those that may be displaced. unit: world units per metre of the template."""
+    (Q,): those that may be displaced. unit: world units per metre of the template. lips (Q,): quads of lips that are
+    closed, which then meet."""
     signed, seen = scan.along(points, normals, REACH * unit)
     pairs = scan.pairs(points, normals, 2 * REACH * unit)
     agrees = np.isfinite(signed) & (np.abs(np.nan_to_num(signed)) <= AGREE * pairs.distance + CLOSE * unit)
@@ -41,7 +46,30 @@ def displacement(points: F64, normals: F64, quads: Indices, free: Mask, scan: Sc
         bad = np.zeros(len(points), np.bool_)
         bad[hit] = True
         moved = moved * _faded(~bad, quads)
+    if lips is not None:
+        moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, lips, unit)
     return moved, np.where(use, seen, 0.0)
+
+
+def _met(points: F64, normals: F64, quads: Indices, free: Mask, lips: Mask, unit: float) -> F64:
+    """(n,) what closes lips (Q,) after everything else; less where they would pass through each other."""
+    faces, inner = triangles_of(quads[free]), np.zeros(len(points), np.bool_)
+    inner[quads[~free]] = True
+    more = np.where(inner, 0.0, _smooth(np.where(inner, 0.0, meeting(points, normals, quads[lips], unit)), quads[lips]))
+    before = np.unique(piercing_edges(points, faces))
+    for turn in range(HALVED):
+        hit = np.setdiff1d(piercing_edges(points + more[:, None] * normals, faces), before)
+        if not len(hit):
+            return more
+        more[hit] *= 0.5 if turn < HALVED - 2 else 0.0
+    return np.zeros(len(points))
+
+
+def _smooth(values: F64, quads: Indices) -> F64:
+    """(n,) the mean over the quads around each vertex."""
+    corners, count = quads.ravel(), len(values)
+    total = np.bincount(corners, np.repeat(values[quads].mean(1), 4), count)
+    return np.asarray(total / np.maximum(np.bincount(corners, minlength=count), 1))
 
 
 def _faded(use: Mask, quads: Indices) -> F64:

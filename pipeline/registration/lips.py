@@ -13,7 +13,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from pipeline.meshes import F64, Indices
+from pipeline.meshes import F64, Indices, triangles_of
+from pipeline.meshes import unit as unit_normals
+from pipeline.ray_casting import RayCaster
 from pipeline.registration.cage import Cage
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.subdivision import limit
@@ -24,6 +26,9 @@ INNER = (13, 14)  # the network's landmarks in the middle of the upper and the l
 CLOSED = 0.0025  # metres of the template between them: more is an open mouth
 RING = 1  # of vertices from the border with the mouth's inside: where closed lips touch
 LOWER = 0.25  # of the largest drop in `jawOpen`: what drops by more belongs to the lower lip
+SLIT = 0.0015  # metres of the template: wider is no slit of closed lips
+SHARE, MEETINGS = 0.4, 3  # of the way that each lip goes in a round, and rounds: they don't pass through each other
+FACING = 0.5  # cosine
 GAP = 1e-4  # metres of the template
 
 
@@ -84,3 +89,23 @@ def touching(template: Template) -> Indices:
 def _has_mouth(template: Template) -> bool:
     names = template.expressions.names if template.expressions else ()
     return OPENS in names and {LIPS, INSIDE} <= set(template.regions)
+
+
+def meeting(points: F64, normals: F64, quads: Indices, unit: float) -> F64:
+    """(n,) how far points (n, 3) of closed lips go along unit normals (n, 3) so that the lips meet: towards the
+    other lip, where that is at most SLIT away and faces them. quads (Q, 4): those of the lips. unit: world units
+    per metre of the template.
+
+    Closed lips touch along a line. Registered ones leave a slit behind it, which no light reaches: a black line.
+    """
+    out = np.zeros(len(points))
+    rows, faces = np.unique(quads), triangles_of(quads)
+    lift = 1e-3 * SLIT * unit
+    for _ in range(MEETINGS if len(rows) else 0):
+        at = points + out[:, None] * normals
+        far, hit = RayCaster(at, faces).hits(at[rows] + lift * normals[rows], normals[rows])
+        far, corners = far + lift, at[faces[hit]]
+        there = unit_normals(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+        meets = (far < SLIT * unit) & ((there * normals[rows]).sum(1) < -FACING)
+        out[rows[meets]] += SHARE * far[meets]
+    return out

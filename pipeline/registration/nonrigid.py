@@ -27,6 +27,7 @@ from pipeline.meshes import F64, Indices
 from pipeline.registration.cage import Cage
 from pipeline.registration.cage_kernels import solved
 from pipeline.registration.folds import folded_quads, pierced_quads
+from pipeline.registration.outgrown import outgrown
 from pipeline.registration.scan import Scan
 
 # stiffness c, and metres of the template within which a pair counts; each for ROUNDS turns
@@ -134,8 +135,13 @@ def _data(cage: Cage, x: F64, scan: Scan, trust: F64, reach: float, unit: float)
     weight = trust * pairs.weight / (1 + (pairs.distance / (SOFT * limit)) ** 2)
     weight[~cage.shown | (pairs.distance > limit)] = 0.0
     rows = np.flatnonzero(weight > 1e-5)
-    normals = pairs.normals[rows]
-    return _Data(weight[rows], normals, (normals * pairs.where[rows]).sum(1), rows)
+    more = outgrown(cage.points(x), cage.normals(x), cage.grows, scan, unit)
+    normals = np.concatenate([pairs.normals[rows], more.directions])
+    where = np.concatenate([pairs.where[rows], more.where])
+    return _Data(
+        np.concatenate([weight[rows], trust[more.rows] * more.weight]), normals, (normals * where).sum(1),
+        np.concatenate([rows, more.rows]),
+    )  # fmt: skip
 
 
 def rotations(cage: Cage, rest: F64, now: F64, around: csr_array) -> F64:

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.meshes import F64, vertex_normals
 from pipeline.registration.cage import HIDDEN, LOOSE
 from pipeline.registration.identity_fit import Data, PlacedHead, landmark_data, place
+from pipeline.registration.outgrown import GROWS, outgrown
 from pipeline.registration.scan import Scan
 from pipeline.template.model import SKIN, Template
 
@@ -26,7 +27,7 @@ def refined(template: Template, landmarks: F64, head: PlacedHead, scan: Scan) ->
     for reach in REACHES:
         pairs = surface_data(template, head, scan, reach)
         if len(pairs.where):
-            head = place(template, (own, pairs), head)
+            head = place(template, (own, pairs, outgrown_data(template, head, scan)), head)
     return head
 
 
@@ -43,6 +44,18 @@ def surface_data(template: Template, head: PlacedHead, scan: Scan, reach: float)
     weights = np.tile([1.0, 0.0, 0.0], (len(use), 1))
     sigma = SIGMA / np.sqrt(pairs.weight[use])
     return Data(corners, weights, pairs.where[use], sigma, pairs.normals[use])
+
+
+def outgrown_data(template: Template, head: PlacedHead, scan: Scan) -> Data:
+    """Data of the vertices that the surface outgrows."""
+    vertex = _outer(template)
+    normals = vertex_normals(head.vertices, template.triangles()).astype(np.float64)[vertex]
+    grows = sum((template.region_weights(n) for n in GROWS if n in template.regions), np.zeros(len(template.vertices)))
+    found = outgrown(head.vertices[vertex], normals, grows[vertex] > 0, scan, head.scale)
+    use = np.flatnonzero(found.weight > 0)
+    corners = np.repeat(vertex[found.rows[use], None], 3, axis=1)
+    weights = np.tile([1.0, 0.0, 0.0], (len(use), 1))
+    return Data(corners, weights, found.where[use], SIGMA / np.sqrt(found.weight[use]), found.directions[use])
 
 
 def _outer(template: Template) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -1,8 +1,10 @@
 """Colours of the fitted eyes: what the photos show between the lids, completed where they show nothing.
 
-Symbols: I radiance that the photos show (a low quantile, without the lamps' reflections), S radiance of a surface of
-albedo 1 there (stages/bake/detail.py); a = I / S. What no photo shows of the iris takes the median of its ring around
-the gaze; the sclera behind the lids that of the sclera that is seen. Seen and completed fade over FADE.
+Symbols: I radiance that the photos show (a low quantile, without the lamps' reflections), G what the wet surface
+reflects of the captured light towards a photo (pipeline/eyes/material.py), S radiance of a surface of albedo 1 there
+(stages/bake/detail.py); a = (I - G) / S, at least LEAST of I / S. Renderers of the asset add G again. What no photo
+shows of the iris takes the median of its ring around the gaze; the sclera behind the lids that of the sclera that is
+seen. Seen and completed fade over FADE.
 """
 
 from __future__ import annotations
@@ -12,14 +14,17 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 
 from pipeline.artifacts import Located
 from pipeline.eyes.ball import Eye
 from pipeline.eyes.iris import angle_from
+from pipeline.eyes.material import F0, ROUGHNESS
 from pipeline.eyes.picture import REACH, Sights, directions_at, looked_up, places_of, plane, sights
 from pipeline.fields.protocol import Field
 from pipeline.head_artifacts import FittedEye, RegisteredHead
 from pipeline.lighting.moving import Standpoint
+from pipeline.maths import brdf
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh
 from pipeline.registration.head import load_head, of_triangles
 from pipeline.transforms import matrix
@@ -30,6 +35,8 @@ SIDE = 256  # pixels of an eye's picture: 0.12 mm
 FADE = 0.0008  # metres
 LIMBUS = 1.1  # angles of the iris from which on the ball is sclera
 RINGS = 24  # of the iris
+LEAST = 0.2
+WIDTH, ATTENUATION = ROUGHNESS**4 / 2, "exponential"  # 1 / kappa of a lobe of alpha = ROUGHNESS^2: nearly a mirror
 PLAIN = (0.62, 0.56, 0.52)  # albedo of a sclera that no photo shows
 
 
@@ -80,21 +87,39 @@ def painted_eyes(
     return Eyes(of_vertex, eyes, pictures)
 
 
-def painted(eye: Eye, seen: Sights, field: Field, responses: F64, views: Sequence[FittedPhoto] = ()) -> F32:
-    """(SIDE, SIDE, 3) albedo of an eye. views: the photos, which a light that moves needs."""
+def painted(eye: Eye, seen: Sights, field: Field, responses: F64, views: Sequence[FittedPhoto]) -> F32:
+    """(SIDE, SIDE, 3) albedo of an eye. views: the photos."""
     side, moving = seen.side, field.moving_light
     directions = directions_at(plane(side).reshape(-1, 2))
     x, n = eye.points(directions).astype(np.float32), (directions @ eye.axes).astype(np.float32)
     ratio = np.asarray(field.irradiance_ratio(x), np.float32)
-    lit = shade(field.light, n, ratio).reshape(side, side, 3)
+    lit = shade(field.light, n, ratio)
     plain = np.empty_like(seen.colour)
     for i, view in enumerate(seen.views):
         plain[i] = seen.colour[i] @ np.linalg.inv(responses[view]).T.astype(np.float32)
+        station = Standpoint.of(matrix(views[view].camera.world_from_cam))
+        wet = reflected(field, x, n, station) * ratio
+        plain[i] = np.maximum(plain[i] - wet, LEAST * plain[i])
         if moving is not None:
-            station = Standpoint.of(matrix(views[view].camera.world_from_cam))
-            plain[i] *= lit / lit_at_least(moving.irradiance(x, n, station), field.light).reshape(lit.shape)
+            plain[i] *= lit / lit_at_least(moving.irradiance(x, n, station), field.light)
     shown, weight = Sights(plain, seen.weight, seen.pixels, seen.views, side).combined()
-    return completed(shown / lit, weight > 0, eye)
+    return completed(shown / lit.reshape(side, side, 3), weight > 0, eye)
+
+
+def reflected(field: Field, x: F32, n: F32, eye: Standpoint) -> F32:
+    """(N, 3) radiance that the wet surface at x with unit normals n (N, 3) reflects towards a camera: Schlick's share
+    of the captured light in the mirror direction, as the exported material does."""
+    away = (eye.centre - x).astype(np.float32)
+    wo = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    share = F0 + (1 - F0) * (1 - (wo * n).sum(1, keepdims=True).clip(0, 1)) ** 5
+    width = np.full(len(x), WIDTH, np.float32)
+    if field.moving_light is not None:
+        light = field.moving_light.reflected(x, n, width, eye, ATTENUATION)
+    else:
+        mirror = brdf.reflect(torch.from_numpy(wo), torch.from_numpy(np.ascontiguousarray(n, np.float32)))
+        of_sky = torch.from_numpy(np.asarray(field.light, np.float32))
+        light = brdf.light_integral(mirror, torch.from_numpy(width), of_sky, ATTENUATION).numpy()
+    return np.asarray(share * light, np.float32)
 
 
 def completed(albedo: F32, seen: Mask, eye: Eye) -> F32:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline import meshes, tiles
-from pipeline.meshes import F64, Charts, Indices, Mask, Mesh, joined, triangles_of
+from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh, joined, triangles_of
 from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
@@ -29,6 +29,7 @@ from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
 SHARE = 2  # of uv.target_faces, for what is beside the head, and for hair
+EARS = "ears"  # the region
 NEAR = 0.004  # metres: parts of the head further from the fitted surface are hair or clothes, and are not compared
 
 
@@ -49,7 +50,8 @@ def build_registered(
     shown = _shown(head, regions, fine)
     whole, laid, hairs = mesh, charts, 0
     if config.rest:
-        others, hairs = _others(mesh, charts, shown, dense, hair, config)
+        ears = mesh.vertices[np.unique(mesh.faces[_of_region(head, regions, fine, EARS)])]
+        others, hairs = _others(mesh, charts, shown, ears, dense, hair, config)
         whole, laid = joined([(mesh, charts), *others])
     face = np.concatenate([face, np.zeros(len(whole.faces) - len(face), np.bool_)])
     with ThreadPoolExecutor(1) as beside:
@@ -65,11 +67,11 @@ def build_registered(
 
 
 def _others(
-    mesh: Mesh, charts: Charts, shown: Mask, dense: Mesh, hair: Mask | None, config: Config
+    mesh: Mesh, charts: Charts, shown: Mask, ears: F32, dense: Mesh, hair: Mask | None, config: Config
 ) -> tuple[list[tuple[Mesh, Charts]], int]:
     """What the scan shows beside the head, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
-    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces))
+    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces), ears, hair)
     own = None if hair is None else hair_faces(dense, hair, beside)
     out, tile, hairs = list[tuple[Mesh, Charts]](), tiles.count(charts), 0
     for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
@@ -103,6 +105,12 @@ def _charts(uvs: F64, quads: Indices) -> Charts:
 def _shown(head: Head, regions: tuple[str, ...], fine: Mask) -> Mask:
     """(F,) triangles of the skin's outside."""
     return np.asarray(np.repeat(np.repeat(outer_quads(head.region, regions), 4**head.levels)[fine], 2), np.bool_)
+
+
+def _of_region(head: Head, regions: tuple[str, ...], fine: Mask, name: str) -> Mask:
+    """(F,) triangles of a region."""
+    own = head.region == regions.index(name) if name in regions else np.zeros(len(head.region), np.bool_)
+    return np.asarray(np.repeat(np.repeat(own, 4**head.levels)[fine], 2), np.bool_)
 
 
 def _skin_share(quality: Quality, charts: Charts, face: Mask) -> Quality:

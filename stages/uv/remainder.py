@@ -3,6 +3,8 @@ mesh of its own, with charts on a tile of its own.
 
 Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with normal n. p is left over if it lies outside
 (n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end) and |p - q| > JOINT.
+Around an ear (AROUND_EARS from its skin) nothing is left over but hair: photos from the front leave a web of the visual
+hull behind it, and the template has the back of an ear.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from pipeline.meshes import F64, Mask, Mesh
 AWAY = 0.003  # metres: nearer, the head's skin stands for it
 JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
 OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not left over
+AROUND_EARS = 0.02  # metres
 SMALL = 0.01  # of the dense mesh's area: smaller pieces are dropped
 
 
@@ -36,15 +39,20 @@ def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
     return Mesh(parted.astype(np.float32), normals, own)
 
 
-def beside_head(dense: Mesh, skin: Mesh) -> Mask:
-    """(V,) vertices of the dense mesh that the head's skin does not stand for."""
+def beside_head(dense: Mesh, skin: Mesh, ears: F64 | None = None, hair: Mask | None = None) -> Mask:
+    """(V,) vertices of the dense mesh that the head's skin does not stand for. ears (n, 3): points of the skin; hair
+    (V,): vertices that are hair."""
     from scipy.spatial import cKDTree
 
     points: F64 = dense.vertices.astype(np.float64)
     away, nearest = cKDTree(skin.vertices.astype(np.float64)).query(points)
     out = ((points - skin.vertices[nearest]) * skin.normals[nearest]).sum(1)
     at_border = _border(skin)[nearest]
-    return np.asarray(np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away)))
+    beside = np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away))
+    if ears is not None and len(ears):
+        close = np.isfinite(cKDTree(ears).query(points, distance_upper_bound=AROUND_EARS)[0])
+        beside &= ~close if hair is None else ~close | hair
+    return np.asarray(beside, np.bool_)
 
 
 def _border(mesh: Mesh) -> Mask:

@@ -11,8 +11,9 @@ from pipeline import raster, tangents
 from pipeline.artifacts import FileRef, Located, UvMesh
 from pipeline.eyes import material
 from pipeline.eyes.ball import Eye, turned
-from pipeline.eyes.picture import directions_at, plane, sights
+from pipeline.eyes.picture import Sights, directions_at, plane, sights
 from pipeline.head_artifacts import FittedEye, RegisteredHead
+from pipeline.lighting.moving import MovingLight
 from pipeline.meshes import Charts, Mesh, triangles_of
 from pipeline.registration.head import Head
 from pipeline.visibility import Occluder
@@ -51,7 +52,7 @@ def test_the_albedo_is_what_the_photos_show_over_the_light(tmp_path: Path, respo
     field = AnalyticField(sphere(0.012))
     views = photographed(EYE, tmp_path, VIEWS)
     seen = sights(EYE, views, Occluder(slit(EYE)), SIDE)
-    made = painted(EYE, seen, field, np.tile(response * np.eye(3), (len(views), 1, 1)))
+    made = painted(EYE, seen, field, np.tile(response * np.eye(3), (len(views), 1, 1)), views)
     normals = directions_at(plane(SIDE).reshape(-1, 2)) @ EYE.axes
     lit = shade(field.light, normals, np.ones_like(normals, np.float32)).reshape(SIDE, SIDE, 3)
     shown = (seen.weight > 0).any(0).reshape(SIDE, SIDE) & (np.abs(plane(SIDE)[..., 1]) < 0.15)
@@ -59,6 +60,46 @@ def test_the_albedo_is_what_the_photos_show_over_the_light(tmp_path: Path, respo
         own = shown & (angles() > low) & (angles() < high)
         assert own.sum() > 20
         np.testing.assert_allclose(made[own], (wanted / lit[own] / response).clip(0, 1), atol=0.06)
+
+
+SKY = 0.8  # radiance from everywhere
+UNIFORM = np.array([[SKY * np.sqrt(4 * np.pi)] * 3] + [[0.0] * 3] * 120, np.float32)
+
+
+class UnderSky(AnalyticField):
+    """A ball under a uniform sky; `carried`: the same as the still part of a light that moves."""
+
+    carried = False
+
+    @property
+    def light(self) -> np.ndarray:
+        return UNIFORM
+
+    @property
+    def moving_light(self) -> MovingLight | None:  # type: ignore[override]
+        return MovingLight("camera", 1.0, 0 * UNIFORM, UNIFORM) if self.carried else None
+
+
+@pytest.mark.parametrize("carried", [False, True])
+def test_what_the_wet_surface_reflects_is_not_its_colour(tmp_path: Path, carried: bool) -> None:
+    """Photos by the formula, a L + F L under a uniform sky of radiance L: Schlick's F at each photo's own angle."""
+    field = UnderSky(sphere(0.012))
+    field.carried = carried
+    views = photographed(EYE, tmp_path, [(-40, 0), (40, 0)])
+    directions = directions_at(plane(SIDE).reshape(-1, 2))
+    x, n = EYE.points(directions), directions @ EYE.axes
+    albedo = np.where(np.arange(SIDE * SIDE)[:, None] % 2 == 0, 0.05, 0.4) * np.ones(3)
+    colours = []
+    for view in views:
+        way = np.asarray(view.camera.world_from_cam).reshape(4, 4)[:3, 3] - x
+        cosine = ((way / np.linalg.norm(way, axis=1, keepdims=True)) * n).sum(1).clip(0, 1)
+        f0 = ((1.376 - 1) / (1.376 + 1)) ** 2
+        colours.append(albedo * SKY + (f0 + (1 - f0) * (1 - cosine) ** 5)[:, None] * SKY)
+    shape = (len(views), SIDE * SIDE)
+    seen = Sights(np.array(colours, np.float32), np.ones(shape, np.float32), np.ones(len(views)), (0, 1), SIDE)
+    made = painted(EYE, seen, field, np.tile(np.eye(3), (len(views), 1, 1)), views)
+    inner = np.s_[20:-20, 20:-20]
+    np.testing.assert_allclose(made[inner], albedo.reshape(SIDE, SIDE, 3)[inner], atol=4e-3)
 
 
 def test_only_the_eye_s_texels_get_its_surface() -> None:

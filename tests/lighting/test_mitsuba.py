@@ -50,7 +50,7 @@ def ours(view: PinholeCamera, base: float, f0: float, roughness: float) -> tuple
     """(H, W, 3) diffuse and specular radiance of a ball, on which nothing shades another part."""
     n, wo, inside = sphere_points(view, SIDE)
     lit = lamps(sky(), standard.COUNT)
-    lamp = np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32)
+    lamp = standard.table(lit)
     at = standard.Arrivals(lit.flux[None].astype(np.float32), lamp, np.ones((1, 3), np.float32))
     count = int(inside.sum())
     corner, weights = np.zeros((count, 3), np.int32), np.full((count, 3), 1 / 3, np.float32)

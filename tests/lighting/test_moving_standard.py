@@ -49,7 +49,7 @@ def test_in_a_still_frame_it_is_the_still_renderer(ambient: bool) -> None:
 
     lit = lamps(environment(coefficients, 256), 384)
     at = standard.Arrivals(
-        np.repeat(lit.flux[None], 200, 0), np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32),
+        np.repeat(lit.flux[None], 200, 0), standard.table(lit),
         np.zeros((200, 3), np.float32),
     )  # fmt: skip
     corner = np.tile(np.arange(200, dtype=np.int32)[:, None], (1, 3))

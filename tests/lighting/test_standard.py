@@ -23,7 +23,7 @@ def sky(width: int = 256) -> np.ndarray:
 def free(count: int, lit: Lamps) -> standard.Arrivals:
     """The lamps without anything in their way, at `count` vertices."""
     flux = np.broadcast_to(lit.flux, (count, *lit.flux.shape)).astype(np.float32)
-    lamp = np.concatenate([lit.directions.T, lit.spread[None]]).astype(np.float32)
+    lamp = standard.table(lit)
     return standard.Arrivals(np.ascontiguousarray(flux), lamp, np.ones((count, 3), np.float32))
 
 
@@ -73,6 +73,42 @@ def test_lamps_reflect_as_quadrature_does(cosine: float, roughness: float, limit
     np.testing.assert_allclose(diffuse[0], (1 - f0 * a - b) * 0.5 / np.pi * irradiance, rtol=0.01)
 
 
+@pytest.mark.parametrize("cosine", [1.0, 0.7, 0.35])
+def test_a_wet_surface_shows_no_dots(cosine: float) -> None:
+    """A lobe that is narrower than the lamps' distance, against a fine quadrature: within a tenth of a smooth sky."""
+    directions, weights = latlong_directions(2048, 1024), latlong_weights(2048, 1024)
+    bright = np.exp(directions @ np.array([0.4, 1.1, 0.7])) * weights
+    at, alpha = free(1, lamps(sky(), standard.COUNT)), 0.01
+    for seed in range(4):
+        n = np.random.default_rng(seed).normal(size=3)
+        n /= np.linalg.norm(n)
+        across = np.cross(n, [0.0, 1.0, 0.0])
+        v = cosine * n + np.sqrt(1 - cosine**2) * across / np.linalg.norm(across)
+        wanted = (bright * ggx(n, v, directions, 0.025, alpha)).sum()
+        parts = standard.lobes(at, np.zeros(1, np.int64), n[None], v[None], np.array([alpha], np.float32))[0, 0, :, 0]
+        assert 0.025 * parts[0] + parts[1] == pytest.approx(wanted, rel=0.1)
+
+
+@pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("cosine", [1.0, 0.5, 0.15])
+def test_a_uniform_sky_is_reflected_as_the_layer_says(roughness: float, cosine: float) -> None:
+    """In every direction: F0 a + b of the layer, which is checked by itself."""
+    at = free(1, lamps(np.ones((64, 128, 3), np.float32), standard.COUNT))
+    n = np.random.default_rng(0).normal(size=(200, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    across = np.cross(n, [0.3, 0.5, 0.8])
+    v = cosine * n + np.sqrt(1 - cosine**2) * across / np.linalg.norm(across, axis=1, keepdims=True)
+    alpha = np.float32(max(roughness**2, standard.LEAST_ALPHA))
+    parts = standard.lobes(at, np.zeros(200, np.int64), n, v, alpha[None])[:, 0, :, 0]
+    a, b = microfacet.split_albedo(cosine, float(alpha))
+    np.testing.assert_allclose(parts[:, 0], a, rtol=0.04)  # 0.03 at the table's end, roughness 1
+    np.testing.assert_allclose(parts[:, 1], b, rtol=0.03, atol=2e-4)
+    corner, weights = np.zeros((200, 3), np.int32), np.full((200, 3), 1 / 3, np.float32)
+    values = (np.ones((200, 3), np.float32), np.full(200, 0.04, np.float32), np.full(200, roughness, np.float32))
+    shown = standard.radiance(at, corner, weights, n, v, *values)[1]
+    np.testing.assert_allclose(shown[:, 1], 0.04 * parts[:, 0] + parts[:, 1], rtol=1e-4)
+
+
 def test_without_a_layer_there_is_no_rim() -> None:
     n, v = tilted(0.1)
     at = free(1, lamps(sky(64), 64))
@@ -110,7 +146,9 @@ def test_a_single_sharp_lamp_reflects_by_the_formula(f0: float, cosine: float) -
     n, v = tilted(cosine)
     w = 2 * (n @ v) * n - v
     one = np.ones((1, 1, 3), np.float32)
-    at = standard.Arrivals(one, np.concatenate([w, [0.0]]).astype(np.float32)[:, None], np.ones((1, 3), np.float32))
+    at = standard.Arrivals(
+        one, np.concatenate([w, [0.0, 0.0]]).astype(np.float32)[:, None], np.ones((1, 3), np.float32)
+    )
     corner, weights = np.zeros((1, 3), np.int32), np.full((1, 3), 1 / 3, np.float32)
     base, values = np.zeros((1, 3), np.float32), [np.full(1, x, np.float32) for x in (f0, 0.6)]
     shown = standard.radiance(at, corner, weights, n[None], v[None], base, *values)[1]

@@ -10,7 +10,7 @@ from support.ball_head import ball_template
 
 from pipeline.registration.cage import cage_of
 from pipeline.registration.identity_fit import PlacedHead
-from pipeline.registration.lips import CLOSED, GAP, INNER, closing_lips, lips_closed, touching
+from pipeline.registration.lips import CLOSED, GAP, INNER, SLIT, closing_lips, lips_closed, meeting, touching
 from pipeline.registration.subdivision import limit
 from pipeline.template.load import load_template
 
@@ -76,3 +76,34 @@ def test_an_open_mouth_is_left_open(apart: float, closed: bool) -> None:
 
 def test_a_template_without_a_mouth_is_never_closed() -> None:
     assert not lips_closed(ball_template(4), landmarks(0.0), 1.0)
+
+
+def sheets(gap: float, tilt: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, normals and quads of two square sheets that face each other across `gap`; the upper one is tilted."""
+    g = np.linspace(-0.01, 0.01, 9)
+    x, z = (a.ravel() for a in np.meshgrid(g, g, indexing="ij"))
+    at = np.arange(81).reshape(9, 9)
+    patch = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
+    low = np.stack([x, np.zeros(81), z], 1)
+    high = np.stack([x, gap + tilt * (z + 0.01), z], 1)
+    down = np.array([0.0, -1.0, tilt]) / np.hypot(1, tilt)
+    normals = np.concatenate([np.tile([0.0, 1.0, 0.0], (81, 1)), np.tile(down, (81, 1))])
+    return np.concatenate([low, high]), normals, np.concatenate([patch[:, ::-1], patch + 81])
+
+
+@pytest.mark.parametrize("unit", [1.0, 30.0])
+@pytest.mark.parametrize(("gap", "closes"), [(0.5 * SLIT, True), (0.05 * SLIT, True), (1.2 * SLIT, False)])
+def test_a_slit_between_lips_is_closed_and_a_mouth_is_not(unit: float, gap: float, closes: bool) -> None:
+    points, normals, quads = sheets(gap * unit)
+    points[:, [0, 2]] *= unit
+    moved = meeting(points, normals, quads, unit)
+    left = gap * unit - moved[:81] - moved[81:]
+    inner = np.abs(points[:81, [0, 2]]).max(1) < 0.009 * unit
+    assert (left > 0).all()
+    np.testing.assert_allclose(left[inner], 0.008 * gap * unit if closes else gap * unit, rtol=0.05)
+
+
+def test_lips_that_face_away_do_not_meet() -> None:
+    points, normals, quads = sheets(0.5 * SLIT)
+    assert not meeting(points, -normals, quads[:, ::-1], 1.0).any()
+    assert not meeting(points, normals, quads[:0], 1.0).any()

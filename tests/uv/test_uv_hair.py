@@ -59,3 +59,18 @@ def test_the_told_hair_must_be_that_of_the_surface(tmp_path: Path) -> None:
     assert hair_vertices(head, 10).tolist() == (np.arange(10) > 6).tolist()  # type: ignore[union-attr]
     with pytest.raises(ValueError, match="10 vertices.*12"):
         hair_vertices(head, 12)
+
+
+def test_around_an_ear_only_hair_is_left_over() -> None:
+    """A web behind an ear and a knob far from it: the web goes, hair there and the knob stay."""
+    ball = ball_scan(RADIUS)
+    at = ball.vertices / RADIUS
+    web, knob = at[:, 0] > 0.95, at[:, 2] < -0.95
+    dense = Mesh(ball.vertices * np.where(web | knob, 1.1, 1)[:, None].astype(np.float32), ball.normals, ball.faces)
+    ears = ball.vertices[at[:, 0] > 0.9]
+    told = web & (at[:, 1] > 0)
+    plain = beside_head(dense, ball)
+    assert plain[web].all() and plain[knob].all()
+    left = beside_head(dense, ball, ears, told)
+    assert not left[web & ~told].any() and left[told].all() and left[knob].all()
+    assert not beside_head(dense, ball, ears)[web].any()

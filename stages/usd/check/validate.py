@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
+from pxr import Ar, Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
 
 from pipeline.errors import StageError
 from stages.usd.check import tile_checks
@@ -125,24 +125,33 @@ def metadata(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 def paths(stage: Usd.Stage, path: Path) -> list[Finding]:
     """Every path must be relative and inside the asset's folder, and every file must exist."""
-    layers, _, unresolved = UsdUtils.ComputeAllDependencies(str(path), _but_tiles)
-    out = [Finding("error", "missing_file", "does not resolve", _shown(str(u), path)) for u in unresolved]
-    for layer in layers:
-        copy, name = Sdf.Layer.CreateAnonymous(), Path(layer.realPath or layer.identifier).name
-        copy.TransferContent(layer)
-        seen: list[str] = []
-        UsdUtils.ModifyAssetPaths(copy, lambda p, seen=seen: seen.append(p) or p)
-        for p in dict.fromkeys(seen):
+    out, missing = list[Finding](), list[Finding]()
+    todo, known = [Sdf.Layer.FindOrOpen(str(path))], {str(path.resolve())}
+    while todo:
+        layer = todo.pop(0)
+        name = Path(layer.realPath or layer.identifier).name
+        for p in _asset_paths(layer):
             if ABSOLUTE.match(p):
                 out.append(Finding("error", "absolute_path", p, name))
             elif os.path.normpath(p).startswith(".."):
                 out.append(Finding("error", "path_outside", f"{p} is outside the asset's folder", name))
-    return out
+            if tile_checks.is_tiled(p):  # `textures` checks them
+                continue
+            there = layer.ComputeAbsolutePath(p)
+            if not Ar.GetResolver().Resolve(there):
+                missing.append(Finding("error", "missing_file", "does not resolve", _shown(there, path)))
+            elif Sdf.FileFormat.FindByExtension(there) and there not in known:
+                known.add(there)
+                todo.append(Sdf.Layer.FindOrOpen(there))
+    return missing + out
 
 
-def _but_tiles(layer: Sdf.Layer, found: UsdUtils.DependencyInfo) -> UsdUtils.DependencyInfo:
-    """Skip paths with <UDIM>: `textures` checks them, and the library would print an error for each."""
-    return UsdUtils.DependencyInfo() if tile_checks.is_tiled(found.assetPath) else found
+def _asset_paths(layer: Sdf.Layer) -> list[str]:
+    """The paths of other files that a layer names, in its order."""
+    copy, seen = Sdf.Layer.CreateAnonymous(), list[str]()
+    copy.TransferContent(layer)
+    UsdUtils.ModifyAssetPaths(copy, lambda p: seen.append(p) or p)
+    return list(dict.fromkeys(seen))
 
 
 def _shown(text: str, path: Path) -> str:
