@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from support.ball_head import RADIUS, ball_quads
 
+from pipeline.meshes import triangles_of
 from pipeline.registration import displacement as module
 from pipeline.registration.displacement import AGREE, CLOSE, SPREAD, displacement
+from pipeline.registration.folds import piercing_edges
+from pipeline.registration.lips import meeting
 
 
 def rings_from(outside: np.ndarray, quads: np.ndarray) -> np.ndarray:
@@ -47,3 +50,36 @@ def test_a_normal_that_meets_another_part_moves_nothing(unit: float, beyond: flo
     found, seen = displacement(RADIUS * unit * n, n, quads, np.ones(len(quads), bool), scan, unit)  # type: ignore[arg-type]
     np.testing.assert_allclose(found, t if moves else 0.0)
     assert (seen == (1.0 if moves else 0.0)).all()
+
+
+def test_closed_lips_meet_and_do_not_pass_through_each_other() -> None:
+    """Two sheets with normals that point anywhere within 40 degrees: half of the way at each would make them cross."""
+    n = 13
+    g = np.linspace(-0.006, 0.006, n)
+    x, z = (a.ravel() for a in np.meshgrid(g, g, indexing="ij"))
+    at = np.arange(n * n).reshape(n, n)
+    patch = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
+    gap = 4e-4 + 2e-4 * np.sin(900 * x) * np.cos(700 * z)
+    points = np.concatenate([np.stack([x, 0 * x, z], 1), np.stack([x, gap, z], 1)])
+    random = np.random.default_rng(1).uniform(-0.8, 0.8, (2 * n * n, 2))
+    way = np.repeat([1.0, -1.0], n * n)
+    normals = np.stack([random[:, 0], way, random[:, 1]], 1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    quads = np.concatenate([patch[:, ::-1], patch + n * n])
+    nothing = np.zeros(len(points))
+    scan = SimpleNamespace(
+        along=lambda points, normals, reach: (nothing + np.nan, nothing),
+        pairs=lambda points, normals, reach: SimpleNamespace(distance=nothing),
+        over=lambda points, normals, reach: nothing,
+    )
+    every = np.ones(len(quads), bool)
+    alone, _ = displacement(points, normals, quads, every, scan, 1.0)  # type: ignore[arg-type]
+    moved, _ = displacement(points, normals, quads, every, scan, 1.0, every)  # type: ignore[arg-type]
+    assert not alone.any()
+    inner = np.tile(np.maximum(np.abs(x), np.abs(z)) < 0.004, 2)
+    height = (points + moved[:, None] * normals)[:, 1]
+    left = (height[n * n :] - height[: n * n])[inner[: n * n]]
+    assert np.median(left) < 0.5 * np.median(gap)
+    faces = triangles_of(quads)
+    assert not len(piercing_edges(points + moved[:, None] * normals, faces))
+    assert len(piercing_edges(points + meeting(points, normals, quads, 1.0)[:, None] * normals, faces))
