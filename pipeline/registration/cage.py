@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from pipeline.meshes import F64, Indices, Mask, unit
-from pipeline.registration.outgrown import GROWS
+from pipeline.registration.outgrown import GROWS, growing
 from pipeline.registration.subdivision import edges_of, limit, subdivided
 from pipeline.template.model import SKIN, Template
 
@@ -76,15 +76,16 @@ def cage_of(template: Template) -> Cage:
     at = limit(fine.quads, fine.stencil.shape[0])
     difference, stiffness = _springs(quads, count, region, names)
     fine_region = np.repeat(region, 4)
-    hidden, loose, grows = (
+    hidden, loose, ears = (
         _touches(fine.quads, fine.stencil.shape[0], np.isin(fine_region, [names.index(n) for n in which if n in names]))
         for which in (HIDDEN, LOOSE, GROWS)
     )
+    points = np.asarray(at.point @ fine.stencil @ template.vertices[of_template], np.float64)
     return Cage(
         np.asarray(of_template, np.int64), quads, region, names,
         finer.quads, csr_array(limit(finer.quads, finer.stencil.shape[0]).point @ finer.stencil),
         csr_array(at.point @ fine.stencil), csr_array(at.along @ fine.stencil), csr_array(at.across @ fine.stencil),
-        ~hidden & ~at.rough, loose, grows & ~hidden & ~at.rough, difference, stiffness,
+        ~hidden & ~at.rough, loose, growing(points, ears) & ~hidden & ~at.rough, difference, stiffness,
     )  # fmt: skip
 
 

@@ -3,7 +3,8 @@
 Pairs from the template to its nearest place on the surface do not show that: a small ear lies well on a large one.
 Here the surface's points look for the template instead. Symbols: q a point of the surface that photos see, p the
 nearest point of the template with unit normal n, d = (q - p) / |q - p|. q counts if p is on a region that may grow, if
-|q - p| lies between COVERED and REACH, and if n . d is at least OUTSIDE: not what is behind or inside of the template.
+|q - p| lies between COVERED and REACH, and if n . d is at least OUTSIDE: not what is behind or inside of the template,
+and not its relief.
 The points of one p are drawn together, the far ones more, to one place y: p is pulled along y - p.
 """
 
@@ -18,8 +19,9 @@ from pipeline.meshes import F64, Indices, Mask, unit
 from pipeline.registration.scan import Scan
 
 GROWS = ("ears",)  # regions; elsewhere what reaches further is hair or clothes
-COVERED, REACH = 0.0005, 0.015  # metres of the template
-OUTSIDE = 0.5  # cosine
+ROOT = 0.008  # metres from the rest of the template
+COVERED, REACH = 0.0015, 0.015  # metres of the template
+OUTSIDE = 0.6  # cosine
 SEEN = 0.05  # least sum of cosines of a point that counts
 MOST = 20_000  # points of the surface that are asked
 
@@ -54,6 +56,14 @@ def outgrown(points: F64, normals: F64, grows: Mask, scan: Scan, scale: float) -
     where = np.stack([np.bincount(of_row, share * q[:, k], len(rows)) for k in range(3)], 1) / total[:, None]
     weight = np.bincount(of_row, share * np.minimum(scan.seen[asked], 1.0), len(rows)) / total
     return Outgrown(np.asarray(rows, np.int64), where, unit(where - points[rows]), weight)
+
+
+def growing(points: F64, ears: Mask) -> Mask:
+    """(M,) those of an ear's points (M,) that are away from the rest of the template (M, 3): hair beside the root of an
+    ear stands out too. points: of the template itself, metres."""
+    if not ears.any() or ears.all():
+        return ears
+    return np.asarray(ears & (cKDTree(points[~ears]).query(points)[0] > ROOT), np.bool_)
 
 
 def _around(points: F64, scan: Scan, reach: float) -> Indices:

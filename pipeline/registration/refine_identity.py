@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.meshes import F64, vertex_normals
 from pipeline.registration.cage import HIDDEN, LOOSE
 from pipeline.registration.identity_fit import Data, PlacedHead, landmark_data, place
-from pipeline.registration.outgrown import GROWS, outgrown
+from pipeline.registration.outgrown import GROWS, growing, outgrown
 from pipeline.registration.scan import Scan
 from pipeline.template.model import SKIN, Template
 
@@ -51,7 +51,8 @@ def outgrown_data(template: Template, head: PlacedHead, scan: Scan) -> Data:
     vertex = _outer(template)
     normals = vertex_normals(head.vertices, template.triangles()).astype(np.float64)[vertex]
     grows = sum((template.region_weights(n) for n in GROWS if n in template.regions), np.zeros(len(template.vertices)))
-    found = outgrown(head.vertices[vertex], normals, grows[vertex] > 0, scan, head.scale)
+    may = growing(template.vertices[vertex], grows[vertex] > 0)
+    found = outgrown(head.vertices[vertex], normals, may, scan, head.scale)
     use = np.flatnonzero(found.weight > 0)
     corners = np.repeat(vertex[found.rows[use], None], 3, axis=1)
     weights = np.tile([1.0, 0.0, 0.0], (len(use), 1))

@@ -18,7 +18,8 @@ AWAY = 0.003  # metres: nearer, the head's skin stands for it
 JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
 OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not left over
 AROUND_EARS = 0.02  # metres
-SMALL = 0.01  # of the dense mesh's area: smaller pieces are dropped
+SMALL = 0.01  # of the dense mesh's area: a piece up to this size that touches hair is hair
+CRUMB = 0.002  # of the same: smaller pieces are dropped; a fringe that stands off has .003
 
 
 def left_over(dense: Mesh, beside: Mask, without: Mask | None = None) -> Mesh | None:
@@ -82,4 +83,4 @@ def _large(dense: Mesh, keep: Mask) -> meshes.Faces:
     piece = meshes.component_of_face(faces, len(dense.vertices))
     area = np.bincount(piece, meshes.areas(dense.vertices, faces))
     whole = float(meshes.areas(dense.vertices, dense.faces).sum())
-    return np.asarray(faces[area[piece] > SMALL * whole], np.int32)
+    return np.asarray(faces[area[piece] > CRUMB * whole], np.int32)

@@ -106,4 +106,6 @@ def test_a_slit_between_lips_is_closed_and_a_mouth_is_not(unit: float, gap: floa
 def test_lips_that_face_away_do_not_meet() -> None:
     points, normals, quads = sheets(0.5 * SLIT)
     assert not meeting(points, -normals, quads[:, ::-1], 1.0).any()
+    turned = np.concatenate([quads[:64], quads[64:, ::-1]])  # the upper sheet shows the lower one its back
+    assert not meeting(points, normals, turned, 1.0)[:81].any()
     assert not meeting(points, normals, quads[:0], 1.0).any()

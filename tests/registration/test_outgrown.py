@@ -14,7 +14,7 @@ from pipeline.registration import refine_identity
 from pipeline.registration.cage import cage_of
 from pipeline.registration.identity_fit import Data, PlacedHead
 from pipeline.registration.nonrigid import Guides, fitted
-from pipeline.registration.outgrown import COVERED, OUTSIDE, REACH, outgrown
+from pipeline.registration.outgrown import COVERED, OUTSIDE, REACH, ROOT, growing, outgrown
 from pipeline.registration.scan import Scan
 from pipeline.template.model import Template
 
@@ -36,7 +36,7 @@ def eared(n: int = 10) -> Template:
     return replace(template, regions={"face": np.flatnonzero(~ear), "ears": np.flatnonzero(ear)})
 
 
-@pytest.mark.parametrize("scale", [1.0, 40.0])
+@pytest.mark.parametrize("scale", [0.2, 1.0, 40.0])
 def test_the_places_are_those_that_stand_out(scale: float) -> None:
     """By a search of every point of the surface for its nearest of the template."""
     mesh = lug(0.008, scale)
@@ -66,6 +66,16 @@ def test_what_is_unseen_or_covered_or_inside_does_not_pull() -> None:
         assert not len(outgrown(points, N, ~grows, at, 1.0).rows)
     unseen = lug(0.008)
     assert not len(outgrown(points, N, grows, Scan(unseen, np.zeros(len(unseen.vertices))), 1.0).rows)
+
+
+def test_the_root_of_an_ear_does_not_grow() -> None:
+    """By the distance to every other point; a template that is all ear grows everywhere."""
+    n = ball_quads(30)[0]
+    points, ears = RADIUS * n, n[:, 0] > 0.7
+    away = np.linalg.norm(points[:, None] - points[~ears][None], axis=2).min(1)
+    may = growing(points, ears)
+    assert (may == (ears & (away > ROOT))).all() and 0 < may.sum() < ears.sum()
+    assert growing(points, np.ones(len(n), bool)).all() and not growing(points, np.zeros(len(n), bool)).any()
 
 
 def test_a_small_ear_grows_to_the_one_that_photos_show() -> None:
