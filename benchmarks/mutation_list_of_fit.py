@@ -194,7 +194,7 @@ OF_FIT = (
              "np.asarray(v, np.float64) * SIDE",
              "tests/lighting/test_standard.py::test_the_layers_table_is_exact_where_it_was_made_and_linear_between"),
     Mutation("pipeline/lighting/ggx_kernels.py", "max(a2 + spread / (TWO * hv * hv), SMOOTH", "max(a2, SMOOTH",
-             "tests/lighting/test_standard.py"),
+             "tests/lighting/test_standard.py::test_the_spread_of_a_lamp_widens_the_lobe"),
     Mutation("pipeline/lighting/ggx_kernels.py", "SMOOTH * spread / (hv * hv))", "ZERO * spread / (hv * hv))",
              "tests/lighting/test_standard.py"),
     Mutation("pipeline/lighting/ggx_kernels.py", "return min(max(share / total, ONE / MOST), MOST)", "return ONE",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from support.synthetic_asset import ball
@@ -153,6 +155,23 @@ def test_a_single_sharp_lamp_reflects_by_the_formula(f0: float, cosine: float) -
     base, values = np.zeros((1, 3), np.float32), [np.full(1, x, np.float32) for x in (f0, 0.6)]
     shown = standard.radiance(at, corner, weights, n[None], v[None], base, *values)[1]
     np.testing.assert_allclose(shown, float(ggx(n, v, w, f0, 0.36)), rtol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "wanted"), [(0.5, lambda s, hv: 0.25 + s / (2 * hv**2)), (0.05, lambda s, hv: s / hv**2)]
+)
+def test_the_spread_of_a_lamp_widens_the_lobe(alpha: float, wanted: Callable[[float, float], float]) -> None:
+    """In the mirror direction n.h = 1, so D = 1 / (pi q): its ratio to that of a point is alpha^2 / q."""
+    n, v = tilted(0.8)
+    w = 2 * (n @ v) * n - v
+    found = []
+    for spread in (0.0, 0.03):
+        lamp = np.concatenate([w, [spread, 0.0]]).astype(np.float32)[:, None]
+        at = standard.Arrivals(np.ones((1, 1, 3), np.float32), lamp, np.ones((1, 3), np.float32))
+        found.append(
+            standard.lobes(at, np.zeros(1, np.int64), n[None], v[None], np.array([alpha], np.float32))[0, 0, 0, 0]
+        )
+    assert found[1] / found[0] == pytest.approx(alpha**2 / wanted(0.03, 0.8), rel=1e-3)
 
 
 def test_the_layers_table_is_exact_where_it_was_made_and_linear_between() -> None:
