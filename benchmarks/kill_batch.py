@@ -4,10 +4,10 @@
 
 As benchmarks/kill_matrix.py for one run, whose cells these are. The batch has two captures of three small photos, and
 toy stages behind the real capture (tests/support/toy_batch.py). No clock decides where a capture is: its process is
-held at a named point, and the signal goes to the batch; then the capture goes on. While it starts up it is `neuface` itself, up to the stage
-capture, in a folder of its own: the toy's program imports more before it can heed a signal. The batch is started again
-and again into the same folder; at the end it goes through undisturbed, and each asset must have the bytes of a batch
-that nothing disturbed.
+held at a named point, and the signal goes to the batch; then the capture goes on. While it starts up it is `neuface`
+itself, up to the stage capture, in a folder of its own: the toy's program imports more before it can heed a signal. The
+batch is started again and again into the same folder; at the end it goes through undisturbed, and each asset must have
+the bytes of a batch that nothing disturbed.
 """
 
 from __future__ import annotations
