@@ -112,7 +112,7 @@ def _not_placed(total: int, placed: int, why: Mapping[str, str]) -> StageError:
     return StageError(
         "the photos do not fit together" if placed else "the photos have no matches",
         where="poses",
-        value=f"{placed} of {total} that are not held out have a camera; without a camera: {named}",
+        value=f"{placed} of {total} have a camera; without a camera: {named}",
         limit=f"at least {MIN_FITTED} that are not held out",
         remedy="take sharp photos around one still subject, each overlapping the next by two thirds (15 degrees or "
         "less apart), with the lens at one zoom; remove the listed photos if they show something else; or give the "
