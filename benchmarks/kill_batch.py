@@ -4,10 +4,10 @@
 
 As benchmarks/kill_matrix.py for one run, whose cells these are. The batch has two captures of three small photos, and
 toy stages behind the real capture (tests/support/toy_batch.py). No clock decides where a capture is: its process is
-held at a named checkpoint, and the signal goes to the batch. While it starts up it is `neuface` itself, up to the stage
-capture, in a folder of its own: the toy's program imports more before it can heed a signal. The batch is started again
-and again into the same folder; at the end it goes through undisturbed, and each asset must have the bytes of a batch
-that nothing disturbed.
+held at a named point, and the signal goes to the batch; then the capture goes on. While it starts up it is `neuface`
+itself, up to the stage capture, in a folder of its own: the toy's program imports more before it can heed a signal. The
+batch is started again and again into the same folder; at the end it goes through undisturbed, and each asset must have
+the bytes of a batch that nothing disturbed.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from collections.abc import Iterator, Sequence
@@ -57,24 +58,36 @@ TOY = ROOT / "tests/support/toy_batch.py"
 CAPTURES = ("1/1_neutral", "2/1_neutral")
 STEPS = 60  # of the toy stage: each start of the batch takes up to two further
 STEPPED = ("--set", f"work.steps={STEPS}")
-HELD = "work.checkpoint@2"
+CHECKPOINT = "work.checkpoint@2"
+LET_GO = 0.2  # seconds from the signal until the held capture goes on: a point that is no checkpoint heeds no signal
 GONE = 5.0  # seconds in which the captures' processes must follow a batch that was killed
 
 
 @dataclass(frozen=True)
 class Moment:
-    """When a signal comes: `wait` seconds after the start, or when a capture's process is held. finished: this person's
-    capture is finished before."""
+    """When a signal comes: `wait` seconds after the start, or when a capture's process is held at a point. finished:
+    this person's capture is finished before."""
 
     name: str
     wait: float | None = None
+    point: str = ""
     finished: str = ""
 
 
 MOMENTS = (
     *(Moment(f"{wait:g} s after the start", wait) for wait in START_UP),
-    Moment("first capture, at a checkpoint"),
-    Moment("second capture, at a checkpoint", finished="1"),
+    Moment("first capture, before its first stage", point="child.begin"),
+    Moment("first capture, first stage, begin", point="capture.begin"),
+    Moment("first capture, first stage, stored", point="capture.end"),
+    Moment("first capture, second stage, begin", point="work.begin"),
+    Moment("first capture, at a checkpoint", point=CHECKPOINT),
+    Moment("first capture, second stage, stored", point="work.end"),
+    Moment("first capture, last stage, begin", point="usd.begin"),
+    Moment("first capture, last stage, stored", point="usd.end"),
+    Moment("first capture, before results are replaced", point="publish.ready"),
+    Moment("first capture, results are published", point="publish.done"),
+    Moment("second capture, at a checkpoint", point=CHECKPOINT, finished="1"),
+    Moment("second capture, before results are replaced", point="publish.ready", finished="1"),
 )
 
 
@@ -108,7 +121,7 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
     """One batch that gets the signal at this moment, and what it left."""
     mark, before = uuid.uuid4().hex, {*left_in(out), *left_in(out.with_name(f"{out.name}-start"))}
     if moment.wait is None:
-        point = hold(HELD, folder / f"signs-{mark[:8]}")
+        point = hold(moment.point, folder / f"signs-{mark[:8]}")
         process = start(folder, out, mark, point, *STEPPED)
     else:
         point, out = None, out.with_name(f"{out.name}-start")
@@ -120,6 +133,8 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         process.wait(moment.wait or 0.05)
     if process.poll() is not None:
         return Cell(None)
+    if point is not None:
+        threading.Timer(LET_GO, point.release).start()
     cell = struck(process, name)
     cell.faults += _faults(folder, out, name, mark, before)
     return cell

@@ -241,7 +241,7 @@ def again(pool: Pool, left: Sequence[Struck]) -> Cell:
     cell = Cell(None, SAME)
     runs = [submit(pool, one.out) for one in left]
     with pool.worker(f"last-{uuid.uuid4().hex[:6]}") as worker:
-        if not wait_until(lambda: all(pool.run(r)["state_type"] in ENDED for r in runs), PATIENCE):
+        if not wait_until(lambda: all(pool.run(r)["state_type"] in ENDED for r in runs), PATIENCE * max(1, len(runs))):
             cell.faults.append("did not end")
         stop(worker)
     return cell

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from benchmarks.mutation import Mutation
 from benchmarks.mutation_list_of_asset import OF_ASSET
+from benchmarks.mutation_list_of_cameras import OF_CAMERAS
 from benchmarks.mutation_list_of_fit import OF_FIT
 
 MUTATIONS = (
@@ -204,4 +205,5 @@ MUTATIONS = (
              "tests/workflows/test_budget.py"),
     *OF_FIT,
     *OF_ASSET,
+    *OF_CAMERAS,
 )  # fmt: skip

@@ -56,6 +56,10 @@ class DiskError(StageError):
     """The disk is full, read-only or failing, or access is denied; somebody must correct this. Exit code 1."""
 
 
+class MemoryLimitError(StageError):
+    """A stage does not fit into the memory. Exit code 1."""
+
+
 class TimeLimitError(StageError):
     """A stage exceeded its time limit. Exit code 1."""
 

@@ -1,4 +1,4 @@
-"""Settings of the thread pools. Import this before torch, numba or scikit-image.
+"""Settings of the thread pools, and of torch's temporary files. Import this before torch, numba or scikit-image.
 
 libgomp reads its environment once, when it is loaded. By default idle threads spin: if another process uses the same
 cores, a step of the fit takes forty times as long. Passive threads sleep instead, and are as fast on a free machine.
@@ -13,6 +13,10 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # load of the machine and the alignment of arrays.
 os.environ.setdefault("MKL_DYNAMIC", "FALSE")
 os.environ.setdefault("MKL_CBWR", "AUTO")
+
+# torch makes a folder torchinductor_USER in TMPDIR when an optimiser is made, for a compiler that is not used here, and
+# leaves it there. This names one that exists, so that none is made.
+os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.environ.get("TMPDIR") or "/tmp")
 
 # What sets the number of threads of PyTorch (OpenMP), of compiled loops, and of the matrix library.
 NAMES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import TYPE_CHECKING
@@ -125,11 +126,13 @@ def _most_copied(candidates: list[Candidate]) -> str:
 
 
 def useful(
-    candidates: list[Candidate], photos: list[ImportedPhoto], selection: Selection, drop_blurred: bool
-) -> tuple[list[Candidate], list[ImportedPhoto]]:
-    """Candidates and photos without the blank and the blurred ones, whose copies are deleted."""
-    seen = [p.detail for p in photos if p.detail is not None]
-    soft = iter(blurred(seen) if drop_blurred and seen else [False] * len(seen))
+    candidates: list[Candidate], photos: list[ImportedPhoto], selection: Selection, drop_blurred: bool,
+    held: Set[int] = frozenset(),
+) -> tuple[list[Candidate], list[ImportedPhoto]]:  # fmt: skip
+    """Candidates and photos without the blank and the blurred ones, whose copies are deleted. held: indices of the
+    photos that are held out; the limit for blurred photos is that of the others."""
+    seen = [(p.detail, c.index not in held) for c, p in zip(candidates, photos, strict=True) if p.detail is not None]
+    soft = iter(blurred(*zip(*seen, strict=True)) if drop_blurred and seen else [False] * len(seen))
     kept = []
     for candidate, photo in zip(candidates, photos, strict=True):
         if photo.detail is None:

@@ -39,8 +39,9 @@ def is_blank(grey: npt.NDArray[np.uint8]) -> bool:
     return bool(high - low <= BLANK)
 
 
-def blurred(details: Sequence[float]) -> list[bool]:
-    """Which photos have far less detail than the median; none if that would be half of them."""
-    values = np.array(details)
-    found = values < BLURRED * np.median(values)
-    return [bool(f) for f in found] if found.mean() < MAX_BLURRED else [False] * len(details)
+def blurred(details: Sequence[float], fitted: Sequence[bool]) -> list[bool]:
+    """Which photos have far less detail than the median of the fitted ones; none if that would be half of these."""
+    values, own = np.array(details), np.array(fitted, bool)
+    own = own if own.any() else ~own
+    found = values < BLURRED * np.median(values[own])
+    return [bool(f) for f in found] if found[own].mean() < MAX_BLURRED else [False] * len(details)

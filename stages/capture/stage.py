@@ -63,7 +63,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     candidates = without_duplicates(selection, given=source.artifact.cameras != ())
     look = config.colour_checker != "off"
     photos = [made.photo_of(source, c, (n, len(candidates)), look, context) for n, c in enumerate(candidates)]
-    candidates, photos = useful(candidates, photos, selection, config.drop_blurred)
+    held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
+    candidates, photos = useful(candidates, photos, selection, config.drop_blurred, held)
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
     if config.holdout != "none" and not held:
         selection.warnings.append(f"the hold-out rule {config.holdout} matches no view that is used")
@@ -118,4 +119,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=8, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)
+STAGE = Stage(name="capture", version=9, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)

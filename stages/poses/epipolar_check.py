@@ -6,7 +6,7 @@ Symbols: x_i (N, 2) undistorted positions on camera i's plane z = 1; E the essen
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -46,11 +46,12 @@ class Verdict:
 
 def check_cameras(
     cameras: Sequence[Camera], features: Sequence[Features], seed: int, tick: Callable[[int, int], None],
-    far: float = FAR,
+    far: float = FAR, held: Set[int] = frozenset(),
 ) -> Verdict:  # fmt: skip
     """Compare each view with its nearest ones. The worst view is excluded first, with its pairs, so that it does not
-    make its neighbours look wrong. tick: done, total. far: as a share of the longest edge, see FAR."""
-    pairs = near_pairs(cameras)
+    make its neighbours look wrong. tick: done, total. far: as a share of the longest edge, see FAR. held: views that
+    are held out; they are compared with the others that are right, and say nothing about these."""
+    pairs = near_pairs(cameras, held)
     counts: dict[tuple[int, int], tuple[int, int]] = {}
     for n, (i, j) in enumerate(pairs):
         tick(n, len(pairs))
@@ -63,7 +64,11 @@ def check_cameras(
         uv_j = np.asarray(features[j].uv[pair.matches[:, 1]], np.float64)
         good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < far * edge
         counts[i, j] = (int(good.sum()), len(good))
-    return Verdict(_shares(counts, len(cameras)))
+    share = _shares({p: c for p, c in counts.items() if not held.intersection(p)}, len(cameras))
+    right = {i for i in range(len(cameras)) if share[i] >= AGREE}
+    for view in held:
+        share[view] = _share(c for p, c in counts.items() if view in p and right.intersection(p))
+    return Verdict(share)
 
 
 class Picture(Protocol):
@@ -94,13 +99,15 @@ def features_of(photos: Sequence[Picture], tick: Callable[[int, int], None]) -> 
     return found
 
 
-def near_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Pairs of each view with the PARTNERS views of the most similar direction, first < second."""
+def near_pairs(cameras: Sequence[Camera], held: Set[int] = frozenset()) -> list[tuple[int, int]]:
+    """Pairs of each view with the PARTNERS fitted views of the most similar direction, first < second."""
     axes = np.stack([matrix(c.world_from_cam)[:3, 2] for c in cameras])
     likeness = axes @ axes.T
     np.fill_diagonal(likeness, -np.inf)
+    likeness[:, sorted(held)] = -np.inf
     order = np.argsort(-likeness, axis=1, kind="stable")[:, :PARTNERS]
-    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(order) for j in row if i != j})
+    found = {(i, int(j)) for i, row in enumerate(order) for j in row if np.isfinite(likeness[i, j])}
+    return sorted({(min(p), max(p)) for p in found})
 
 
 def epipolar_pixels(a: Camera, b: Camera, uv_a: F64, uv_b: F64) -> F64:
@@ -121,6 +128,12 @@ def _on_plane(camera: Camera, uv: F64) -> F64:
     flat = np.asarray(np.linalg.solve(K[:2, :2], (uv - K[:2, 2]).T).T, np.float64)
     xy = undistort(flat, np.array(camera.distortion, np.float64))
     return np.concatenate([xy, np.ones((len(xy), 1))], 1)
+
+
+def _share(counts: Iterable[tuple[int, int]]) -> float:
+    """Share of consistent matches over pairs of (consistent, all); NaN if all are fewer than MIN_MATCHES."""
+    good, every = np.sum([(0, 0), *counts], axis=0)
+    return float(good / every) if every >= MIN_MATCHES else float("nan")
 
 
 def _shares(counts: dict[tuple[int, int], tuple[int, int]], views: int) -> F64:

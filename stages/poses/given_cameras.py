@@ -33,7 +33,8 @@ UNITS: dict[CaptureKind, Unit] = {"facescape": "guess", "olat": "metres"}
 
 def given_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
     """The capture's cameras in asset coordinates, without views whose photos contradict them. If most views are
-    contradicted, it is unknown which are right: all are kept, and the finding is unusable.
+    contradicted, it is unknown which are right: all are kept, and the finding is unusable. Held-out photos have no part
+    in points or refinement; they keep their given cameras.
 
     Raises:
         StageError: the photos share no point under these cameras.
@@ -51,9 +52,12 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
     cameras = [cameras[i] for i in right]
     warnings = [f"{n} is left out: its photo contradicts its camera; check its file name and its pose"
                 for n in names]  # fmt: skip
-    model = None
+    model, own = None, [n for n, i in enumerate(right) if not capture.artifact.views[i].holdout]
     if config.given != "keep":
-        model, cameras, doubtful = _triangulated(capture, right, cameras, config, context)
+        some = [cameras[n] for n in own]
+        model, some, doubtful = _triangulated(capture, [right[n] for n in own], some, config, context)
+        for n, camera in zip(own, some, strict=True):
+            cameras[n] = camera
         if doubtful:
             warnings.append(
                 "too few points to refine the cameras of " + ", ".join(doubtful) + "; they are used as given"
@@ -71,7 +75,7 @@ def given_cameras(capture: Located[Capture], config: Config, context: Context) -
         cameras, given=True, unit=unit, known=known, axes=axes, head=head, guess=lambda: size_of_head(face)
     )
     all_warnings = (*warnings, *found.warnings)
-    result = camera_set("given", cameras, found, model, [c.name for c in cameras], names, all_warnings, context)
+    result = camera_set("given", cameras, found, model, [cameras[n].name for n in own], names, all_warnings, context)
     return result.model_copy(update={"findings": findings})
 
 
@@ -117,7 +121,10 @@ def _contradicted(
     photos = photos_of(capture)
     features = features_of(photos, lambda n, m: progress(n, m, "detecting features"))
     far = IMPERFECT if config.given == "refine" else FAR
-    verdict = check_cameras(cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far)
+    held = {i for i, v in enumerate(capture.artifact.views) if v.holdout}
+    verdict = check_cameras(
+        cameras, features, config.seed, lambda n, m: progress(n, m, "checking the cameras"), far, held
+    )
     right = [i for i in range(len(cameras)) if verdict.share[i] >= AGREE]
     silent = [i for i in range(len(cameras)) if not np.isfinite(verdict.share[i])]  # a mirror image has no matches
     flipped = find_mirrored(photos, [*verdict.wrong, *silent], right, config.seed)

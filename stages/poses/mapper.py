@@ -8,7 +8,7 @@ a parallel sum is not fixed. COLMAP has the first pixel's centre at (0.5, 0.5), 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -58,7 +58,8 @@ class Pose:
 @dataclass(frozen=True, slots=True)
 class Model:
     """The largest reconstruction. poses, view_error_px: by photo index. points (M, 3); error_px (M,); track (M,) photos
-    per point. others: photos of each other reconstruction: of another subject, or not linked to this one.
+    per point. others: photos of each other reconstruction: of another subject, or not linked to this one. seen: (L, 2)
+    by photo index: which of its features is an observation of which point.
     """
 
     poses: dict[int, Pose]
@@ -68,6 +69,7 @@ class Model:
     reprojection_error_px: float
     view_error_px: dict[int, float]
     others: tuple[tuple[int, ...], ...] = ()
+    seen: Mapping[int, npt.NDArray[np.int64]] = field(default_factory=dict)
 
 
 def reconstruct(
@@ -250,7 +252,8 @@ def write_database(
 
 def model_of(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[Any] = ()) -> Model:
     """The model of a COLMAP reconstruction. numbers: photo indices by image name. others: smaller reconstructions."""
-    poses, errors = {}, {}
+    poses, errors, seen_at = {}, {}, {}
+    place = {k: n for n, k in enumerate(sorted(reconstruction.points3D))}
     for image in reconstruction.images.values():
         if not image.has_pose:
             continue
@@ -262,11 +265,13 @@ def model_of(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[A
             distortion=opencv_distortion(camera.model_name, list(camera.params)),
         )
         ids, uv = _observations(image)
+        at = [(n, place[p.point3D_id]) for n, p in enumerate(image.points2D) if p.has_point3D()]
+        seen_at[numbers[image.name]] = np.array(at, np.int64).reshape(-1, 2)
         xyz = np.array([reconstruction.points3D[k].xyz for k in ids]).reshape(-1, 3)
         pose = poses[numbers[image.name]]
         seen, _ = project(pose.K, inverse_rigid(pose.world_from_cam), np.array(pose.distortion), xyz)
         errors[numbers[image.name]] = float(np.linalg.norm(seen - uv, axis=1).mean()) if len(ids) else float("nan")
-    points = [reconstruction.points3D[k] for k in sorted(reconstruction.points3D)]
+    points = [reconstruction.points3D[k] for k in place]
     return Model(
         poses=dict(sorted(poses.items())),
         points=np.array([p.xyz for p in points], np.float64).reshape(-1, 3),
@@ -275,4 +280,5 @@ def model_of(reconstruction: Any, numbers: Mapping[str, int], others: Sequence[A
         reprojection_error_px=float(reconstruction.compute_mean_reprojection_error()),
         view_error_px=errors,
         others=tuple(tuple(sorted(numbers[i.name] for i in o.images.values() if i.has_pose)) for o in others),
+        seen=seen_at,
     )

@@ -31,18 +31,18 @@ NEEDS = {
 def known_scale(
     capture: Located[Capture], cameras: list[Camera], config: Config, eyes: Eyes | None, warnings: list[str]
 ) -> Scale | None:  # fmt: skip
-    """Metres per unit of the cameras' world from settings or photos, or None.
+    """Metres per unit of the cameras' world from settings or photos, or None. Held-out photos are not asked.
 
     Raises:
         UsageError: a setting of poses.distance is wrong. StageError: the source of poses.scale gives no scale.
     """
-    wanted = config.scale
+    wanted, fitted = config.scale, fitted_of(capture, cameras)
     if wanted == "distance" or (wanted == "auto" and config.distance):
         return by_distance(config.distance, cameras)
     why = ""
     if wanted == "markers" or (wanted == "auto" and config.marker_mm):
         photos = {v.index: v for v in capture.artifact.views}
-        seen = [(c, find_markers(_grey(capture, photos[c.index]), config.marker_kind)) for c in cameras]
+        seen = [(c, find_markers(_grey(capture, photos[c.index]), config.marker_kind)) for c in fitted]
         found = by_markers(seen, config.marker_mm / 1e3) if config.marker_mm else None
         if found is not None:
             return found
@@ -54,7 +54,7 @@ def known_scale(
         why = "no three photos agree on a face" if config.pupils_mm else "poses.pupils_mm is not set"
     places = {v.index: v.place_m for v in capture.artifact.views if v.place_m is not None}
     if wanted == "gps" or (wanted == "auto" and not why and places):
-        found, why = by_positions(cameras, places)
+        found, why = by_positions(fitted, places)
         if found is not None:
             return found
     if wanted in NEEDS:
@@ -101,10 +101,15 @@ def size_of_head(landmarks: F64 | None) -> Scale | None:
     return Scale(HEAD_SIZE / head.scale, f"guessed from the shape of the face, within about {HEAD_DEVIATION:.0%}")
 
 
+def fitted_of(capture: Located[Capture], cameras: list[Camera]) -> list[Camera]:
+    """The cameras of fitted photos."""
+    held = {v.index for v in capture.artifact.views if v.holdout}
+    return [c for c in cameras if c.index not in held]
+
+
 def some_of(capture: Located[Capture], cameras: list[Camera]) -> list[Camera]:
     """At most LOOKED_AT of the cameras of fitted photos, evenly spaced."""
-    held = {v.index for v in capture.artifact.views if v.holdout}
-    fitted = [c for c in cameras if c.index not in held] or cameras
+    fitted = fitted_of(capture, cameras)
     return fitted[:: -(-len(fitted) // LOOKED_AT)]
 
 

@@ -1,28 +1,25 @@
 """Cameras from photos alone by structure from motion: features, matches, mappers, and further attempts.
 
-Held-out views are solved too, because scoring needs their cameras; no pixel of theirs reaches the fit.
+Only fitted photos are solved; held-out ones are registered afterwards (`held_out.py`).
 """
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence, Set
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts import Camera
 from pipeline.errors import StageError
 from pipeline.sharpness import detail
 from stages.poses.bundle_adjustment import Refine
 from stages.poses.config import Config
-from stages.poses.features import ASIFT, DENOISED, MORE_ASIFT, PLAIN, Effort, Features, detect, grey8
+from stages.poses.detect import Photo, Progress, detect_all, match_all, match_pairs
+from stages.poses.features import ASIFT, DENOISED, MORE_ASIFT, PLAIN, Effort, Features, grey8
 from stages.poses.mapper import MIN_POINTS, Lens, Mapper, Model, reconstruct
 from stages.poses.matching import (
     MIN_INLIERS,
@@ -30,66 +27,34 @@ from stages.poses.matching import (
     Verified,
     homography_share,
     joined,
-    match,
     promising_pairs,
-    verify,
     without_repeats,
 )
 from stages.poses.quality import GOOD_SCORE, better, quality, score
 from stages.poses.triangulate import triangulate
 from stages.poses.unregistered import disjoint, linked, reasons
 
-WORKERS = 2  # the result does not depend on it: each photo, and each pair, is a separate task
 SEEDS = 2  # further seeds for the mapper if the first solution has a trust below 1
 POOR_SCORE = 0.75  # below this score, a separate lens for each photo is tried
 REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends count as one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
-CHUNK = 64  # pairs between two checks for cancellation
 DETAIL_EDGE = 1000  # pixels, longest edge at which the photos' sharpness is compared
 GLOBAL_FROM = 200  # photos: from here on the global mapper, which takes minutes instead of hours
 BETTER_BY = 1.05  # a solution with a lens for each photo has more freedom, so its score must be better by this factor
 
 
-class Photo(Protocol):
-    """One photo with its focal length, if known, and its lens group. width, height: pixels."""
-
-    @property
-    def width(self) -> int: ...
-
-    @property
-    def height(self) -> int: ...
-
-    @property
-    def focal(self) -> float | None:
-        """Pixels, if known."""
-        ...
-
-    @property
-    def group(self) -> str:
-        """Equal for photos of one lens."""
-        ...
-
-    def pixels(self) -> npt.NDArray[np.generic]:
-        """(H, W, C) as stored."""
-        ...
-
-    def inside(self) -> npt.NDArray[np.float32] | None:
-        """(H, W) alpha of the subject, or None."""
-        ...
-
-
-Progress = Callable[[int, int, str], None]  # done, total, message; raises to stop
-
-
 @dataclass(frozen=True, slots=True)
 class Solution:
     """The best model, None if no two photos fit together. left_out: reasons by index of each photo without a camera.
-    groups: of photos that fit together; the first is the model's, the others follow by size.
+    groups: of photos that fit together; the first is the model's, the others follow by size. features: of every photo,
+    from which the model was made; effort: with which they were detected.
     """
 
     model: Model | None
     left_out: dict[int, str]
     groups: tuple[tuple[int, ...], ...]
+    features: tuple[Features, ...]
+    effort: Effort
 
 
 def solve(
@@ -102,39 +67,42 @@ def solve(
         StageError: the photos were taken from one spot.
     """
     best: Model | None = None
+    used: tuple[list[Features], Effort] = ([], PLAIN)  # of the best model
     counts = [0] * len(photos)
     for effort in (PLAIN, DENOISED)[: config.attempts]:
         features = detect_all(photos, config, effort, progress)
         counts = counts if any(counts) else [len(f.uv) for f in features]
         verified = match_all(photos, features, config, effort, progress, in_order)
-        best = better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
+        before, best = best, better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
+        used = (features, effort) if best is not before else used
         if score(best, photos) >= GOOD_SCORE:
             break
     if config.attempts >= 3 and score(best, photos) < GOOD_SCORE:
         lost = [i for i in range(len(photos)) if best is None or i not in best.poses]
         features, verified = _oblique(photos, features, verified, config, progress, lost)
-        best = better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
+        before, best = best, better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
+        used = (features, effort) if best is not before else used
     if score(best, photos) < POOR_SCORE:
         separate = _place(photos, features, verified, config, False, scratch, progress)
         if best is None or score(separate, photos) >= BETTER_BY * score(best, photos):
-            best = separate
+            best, used = separate, (features, effort)
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
         _not_from_one_spot(photos, features, verified, config.seed)
-    return _explained(best, photos, counts, verified)
+    return Solution(best, *_explained(best, photos, counts, verified), tuple(used[0]), used[1])
 
 
 def _explained(
     model: Model | None, photos: Sequence[Photo], counts: Sequence[int], verified: dict[Pair, Verified]
-) -> Solution:
-    """The model, and a reason for each photo without a camera."""
+) -> tuple[dict[int, str], tuple[tuple[int, ...], ...]]:
+    """A reason for each photo without a camera, and the groups of photos that fit together."""
     placed = sorted(model.poses) if model is not None else []
     missing = [i for i in range(len(photos)) if i not in placed]
     groups = disjoint([placed, *(model.others if model is not None else ())])
     if not missing:
-        return Solution(model, {}, tuple(map(tuple, groups)))
+        return {}, tuple(map(tuple, groups))
     details = [detail(grey8(p.pixels(), DETAIL_EDGE)) for p in photos]
     others = groups[1:] if placed else groups
-    return Solution(model, reasons(missing, placed, others, counts, details, verified), tuple(map(tuple, groups)))
+    return reasons(missing, placed, others, counts, details, verified), tuple(map(tuple, groups))
 
 
 def triangulate_given(
@@ -212,61 +180,6 @@ def _not_from_one_spot(
         )
 
 
-def detect_all(photos: Sequence[Photo], config: Config, effort: Effort, progress: Progress) -> list[Features]:
-    """Features of every photo."""
-
-    def one(photo: Photo) -> Features:
-        grey = grey8(photo.pixels(), config.max_image_size)
-        alpha = photo.inside()
-        inside = None
-        if alpha is not None:
-            inside = (cv2.resize(alpha, grey.shape[::-1], interpolation=cv2.INTER_AREA) > 0.5).astype(np.uint8)
-        return detect(grey, (photo.width, photo.height), config.max_features, effort, inside)
-
-    found = []
-    with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
-        tasks = [pool.submit(one, p) for p in photos]
-        try:
-            for i, task in enumerate(tasks):
-                progress(i, len(photos), "detecting features")
-                found.append(task.result())
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return found
-
-
-def match_all(
-    photos: Sequence[Photo], features: Sequence[Features], config: Config, effort: Effort, progress: Progress,
-    in_order: bool = False,
-) -> dict[Pair, Verified]:  # fmt: skip
-    """Verified matches by pair of photos. in_order: the photos are in order, as frames of a video."""
-    pairs = promising_pairs(features, effort.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"),
-                            in_order)  # fmt: skip
-    return match_pairs(photos, features, pairs, config, effort, progress)
-
-
-def match_pairs(
-    photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair], config: Config, effort: Effort,
-    progress: Progress,
-) -> dict[Pair, Verified]:  # fmt: skip
-    """Verified matches of the given pairs."""
-
-    def one(pair: Pair) -> Verified | None:
-        i, j = pair
-        matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
-        edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
-        return verify(features[i], features[j], matches, edge, config.seed)
-
-    found = {}
-    with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:
-        for n in range(0, len(pairs), CHUNK):
-            progress(n, len(pairs), "matching photos")
-            some = pairs[n : n + CHUNK]
-            found.update({p: v for p, v in zip(some, pool.map(one, some), strict=True) if v is not None})
-    return found
-
-
 def _place(
     photos: Sequence[Photo], features: Sequence[Features], verified: dict[Pair, Verified], config: Config,
     shared: bool, scratch: Path, progress: Progress,
@@ -339,14 +252,3 @@ def mappers(photos: int, wanted: Literal["auto", "incremental", "global"]) -> tu
     if wanted != "auto":
         return (wanted,)
     return ("global", "incremental") if photos >= GLOBAL_FROM else ("incremental",)
-
-
-@contextmanager
-def _single_threaded_cv2() -> Iterator[None]:
-    """Switch off OpenCV's threads, which would compete with this module's."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

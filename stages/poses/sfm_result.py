@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from pipeline.artifacts import CameraSet, Located
 from pipeline.capture_artifacts import Capture
@@ -10,38 +10,38 @@ from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.faces.landmarks3d import head_frame
 from stages.poses.config import Config
+from stages.poses.held_out import Registered, register_all
 from stages.poses.judge import groups, mirrored
 from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import normalise
-from stages.poses.photos import photos_of
+from stages.poses.photos import StoredPhoto, photos_of
 from stages.poses.progress import progress_of
 from stages.poses.scale import eyes_of
 from stages.poses.scale_source import find_faces, known_scale, landmarks_of, size_of_head
-from stages.poses.sfm import solve
+from stages.poses.sfm import Solution, solve
 from stages.poses.write_cameras import camera_of, camera_set
 
 MIN_FITTED = 3
+NOT_REGISTERED = "held out: too few of its features match points of the finished model"
 
 
 def solved_cameras(capture: Located[Capture], config: Config, context: Context) -> CameraSet:
-    """Cameras from the photos alone.
+    """Cameras from the photos alone: those of fitted photos, and the scale and axes by these; then those of held-out
+    photos, by registration against the finished model.
 
     Raises:
         StageError: fewer than MIN_FITTED photos that are not held out have a camera. With few more, the finding
             `photos_placed` is unusable.
     """
-    views = capture.artifact.views
+    views, photos = capture.artifact.views, photos_of(capture)
+    own = [i for i, v in enumerate(views) if not v.holdout]
     in_order = capture.artifact.kind == "video"  # frames of a video are in order
-    solution = solve(photos_of(capture), config, in_order, context.scratch, progress_of(context))
+    solution = solve([photos[i] for i in own], config, in_order, context.scratch, progress_of(context))
     model = solution.model
-    placed = sorted(model.poses) if model is not None else []
-    missing = tuple(v.name for i, v in enumerate(views) if i not in placed)
-    others = solution.groups[1:]
-    why = {views[i].name: reason for i, reason in solution.left_out.items()}
-    fitted = sum(not views[i].holdout for i in placed)
-    if model is None or fitted < MIN_FITTED:
-        raise _not_placed(len(views), len(placed), fitted, why)
-    cameras = [camera_of(views[i], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
+    why = {views[own[i]].name: reason for i, reason in solution.left_out.items()}
+    if model is None or len(model.poses) < MIN_FITTED:
+        raise _not_placed(len(own), 0 if model is None else len(model.poses), why)
+    cameras = [camera_of(views[own[i]], p.K, p.world_from_cam, p.distortion) for i, p in model.poses.items()]
     warnings: list[str] = []
     faces = find_faces(capture, cameras, context.check)
     eyes = eyes_of([(c, face.pupils) for c, face in faces])
@@ -52,21 +52,49 @@ def solved_cameras(capture: Located[Capture], config: Config, context: Context) 
         cameras, model.points, given=False, known=known, eyes=eyes, head=head, guess=lambda: size_of_head(face)
     )
     warnings += found.warnings
-    if missing:
-        listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())
-        warnings.append(f"{len(missing)} of {len(views)} photos have no camera and are left out: "
-                        f"{listed}. Take sharp photos between them and the others, in steps of 15 degrees; photos of "
-                        "something else and mirror images never fit")  # fmt: skip
-    for group in others:
-        warnings.append("these photos fit together, but not with the rest: " + ", ".join(views[i].name for i in group)
-                        + "; if they show another subject, put them into a separate capture")  # fmt: skip
-    result = camera_set("colmap", cameras, found, model, [v.name for v in views], missing, warnings, context)
-    lost = [i for i in range(len(views)) if i not in placed]
-    flipped = find_mirrored(photos_of(capture), lost, placed, config.seed)
-    findings = (groups(len(placed), [[views[i].name for i in group] for group in others]),
-                mirrored([views[i].name for i in flipped], len(views)))  # fmt: skip
+    registered = _held_out(photos, own, solution, config, context)
+    why |= {views[i].name: NOT_REGISTERED for i, r in registered.items() if r is None}
+    cameras += [camera_of(views[i], r.pose.K, r.pose.world_from_cam, r.pose.distortion)
+                for i, r in registered.items() if r is not None]  # fmt: skip
+    cameras.sort(key=lambda c: c.index)
+    others = [[views[own[i]].name for i in group] for group in solution.groups[1:]]
+    warnings += _messages(why, others, len(views))
+    missing = tuple(v.name for v in views if v.name in why)
+    result = camera_set("colmap", cameras, found, model, [views[i].name for i in own], missing, warnings, context)
+    placed = {own[i] for i in model.poses}
+    lost = [i for i, v in enumerate(views) if v.name in why]
+    flipped = find_mirrored(photos, lost, sorted(placed), config.seed)
+    findings = groups(len(placed), others), mirrored([views[i].name for i in flipped], len(views))
     sizes = tuple(len(g) for g in solution.groups)
-    return result.model_copy(update={"findings": findings, "left_out": why, "groups": sizes})
+    errors = {views[i].name: round(r.error_px, 4) for i, r in registered.items() if r is not None}
+    return result.model_copy(update={"findings": findings, "left_out": why, "groups": sizes,
+                                     "view_errors_px": {**result.view_errors_px, **errors}})  # fmt: skip
+
+
+def _held_out(
+    photos: Sequence[StoredPhoto], own: Sequence[int], solution: Solution, config: Config, context: Context
+) -> dict[int, Registered | None]:
+    """Each photo that is not in `own`, by index, registered against the finished model."""
+    assert solution.model is not None
+    held = [i for i in range(len(photos)) if i not in set(own)]
+    found = register_all(
+        [photos[i] for i in own], [photos[i] for i in held], solution.model, solution.features, solution.effort, config,
+        progress_of(context),
+    )  # fmt: skip
+    return dict(zip(held, found, strict=True))
+
+
+def _messages(why: Mapping[str, str], others: Sequence[Sequence[str]], total: int) -> Iterator[str]:
+    """Warnings of photos without a camera. why: reasons by name; others: names of each group that fits together, but
+    not with the placed photos; total: number of photos."""
+    if why:
+        listed = "; ".join(f"{', '.join(names)} ({kind})" for kind, names in _by_kind(why).items())
+        yield (f"{len(why)} of {total} photos have no camera and are left out: {listed}. Take sharp photos between "
+               "them and the others, in steps of 15 degrees; photos of something else and mirror images never "
+               "fit")  # fmt: skip
+    for group in others:
+        yield ("these photos fit together, but not with the rest: " + ", ".join(group)
+               + "; if they show another subject, put them into a separate capture")  # fmt: skip
 
 
 def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
@@ -77,13 +105,14 @@ def _by_kind(why: Mapping[str, str]) -> dict[str, list[str]]:
     return out
 
 
-def _not_placed(total: int, placed: int, fitted: int, why: Mapping[str, str]) -> StageError:
+def _not_placed(total: int, placed: int, why: Mapping[str, str]) -> StageError:
+    """total: number of photos that are not held out; placed: of those that have a camera."""
     missing = list(why)
     named = ", ".join(missing[:12]) + (f" and {len(missing) - 12} more" if len(missing) > 12 else "")
     return StageError(
         "the photos do not fit together" if placed else "the photos have no matches",
         where="poses",
-        value=f"{placed} of {total} have a camera, {fitted} of them are not held out; without a camera: {named}",
+        value=f"{placed} of {total} have a camera; without a camera: {named}",
         limit=f"at least {MIN_FITTED} that are not held out",
         remedy="take sharp photos around one still subject, each overlapping the next by two thirds (15 degrees or "
         "less apart), with the lens at one zoom; remove the listed photos if they show something else; or give the "

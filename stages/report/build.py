@@ -53,6 +53,7 @@ class JudgedRow:
     registered: Scores | None = None
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
+    mask_from: str = ""
 
 
 def build_rows(view: JudgedView, side: int) -> JudgedRow:
@@ -77,6 +78,7 @@ def build_rows(view: JudgedView, side: int) -> JudgedRow:
         view.registered_scores,
         view.model_labels,
         view.asset_labels,
+        view.mask_from,
     )
 
 
@@ -111,6 +113,7 @@ def summary(rows: list[JudgedRow]) -> dict[str, Any]:
     labels = {"psnr": pooled(r.model_labels for r in rows), "asset_psnr": pooled(r.asset_labels for r in rows)}
     out["by_label"] = {k: v for k, v in labels.items() if v}
     out["per_view"] = {str(r.index): _both(r) for r in rows}
+    out["masks"] = {str(r.index): r.mask_from for r in rows}  # by which the subject was told from the rest
     return out
 
 

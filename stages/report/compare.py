@@ -25,7 +25,8 @@ class JudgedView:
 
     registered_scores: of the model from the camera that the photo's own registration to it found, None where it was not
     registered. own_colours: photos differ in exposure or white balance, and those of this photo are unknown.
-    model_labels, asset_labels: errors by the photo's labels, empty if it has none.
+    model_labels, asset_labels: errors by the photo's labels, empty if it has none. mask_from: where the mask comes
+    from, as the stage masks names it ("given": the capture's own).
     """
 
     index: int
@@ -41,6 +42,7 @@ class JudgedView:
     own_colours: bool = False
     model_labels: LabelErrors = field(default_factory=dict)
     asset_labels: LabelErrors = field(default_factory=dict)
+    mask_from: str = ""
 
     def shown(self, render: F32) -> F32:
         """A render (H, W, 4) for the page: in the photo's colours, if the fit has a colour response per photo."""
@@ -73,8 +75,9 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         ]
         errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
         yield JudgedView(
-            i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, *errors
-        )
+            i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, *errors,
+            mask_from=masks[i].source,
+        )  # fmt: skip
 
 
 def _asked(r: Results, mask: ViewMask, factor: int) -> F32:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import os
 import re
 import subprocess
 import sys
@@ -59,6 +60,15 @@ def test_entry_points_set_the_thread_policy_before_torch(module: str, repo: Path
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(repo), "HOME": "/tmp"}
     done = subprocess.run([sys.executable, "-c", code], cwd=repo, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_an_optimiser_leaves_nothing_in_tmpdir(tmp_path: Path, repo: Path) -> None:
+    code = "{}import torch; torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])"
+    kept = {k: v for k, v in os.environ.items() if k != "TORCHINDUCTOR_CACHE_DIR"}
+    environment = {**kept, "TMPDIR": str(tmp_path), "PYTHONPATH": str(repo)}
+    for before, left in (("import pipeline.threads; ", 0), ("", 1)):  # the second: what torch does by itself
+        subprocess.run([sys.executable, "-c", code.format(before)], env=environment, check=True)
+        assert len(list(tmp_path.iterdir())) == left
 
 
 def test_compiled_arithmetic_is_strict(repo: Path) -> None:

@@ -91,16 +91,18 @@ def cameras_around(distance: float) -> list[Camera]:
 @pytest.mark.parametrize(("given", "limit"), [("refine", IMPERFECT), ("triangulate", FAR)])
 def test_cameras_that_are_refined_may_be_less_exact(monkeypatch: pytest.MonkeyPatch, given: str, limit: float) -> None:
     """The check that finds a photo of another camera asks for less, where the fit of the cameras mends the rest."""
-    asked: list[float] = []
+    asked: list[tuple[float, set[int]]] = []
     cameras: Any = cameras_around(1.0)
     verdict = SimpleNamespace(share=np.ones(5), wrong=[], known=5)
     monkeypatch.setattr(given_cameras, "photos_of", lambda capture: [])
     monkeypatch.setattr(given_cameras, "progress_of", lambda context: None)
     monkeypatch.setattr(given_cameras, "features_of", lambda *a: [])
     monkeypatch.setattr(given_cameras, "find_mirrored", lambda *a: [])
-    monkeypatch.setattr(given_cameras, "check_cameras", lambda *a: asked.append(a[-1]) or verdict)
-    wrong, _ = given_cameras._contradicted(None, cameras, Config(given=given), None)  # type: ignore[arg-type]
-    assert asked == [limit] and wrong == [] and IMPERFECT > FAR
+    views = [SimpleNamespace(holdout=i == 3) for i in range(5)]
+    capture: Any = SimpleNamespace(artifact=SimpleNamespace(views=views))
+    monkeypatch.setattr(given_cameras, "check_cameras", lambda *a: asked.append(a[-2:]) or verdict)
+    wrong, _ = given_cameras._contradicted(capture, cameras, Config(given=given), None)  # type: ignore[arg-type]
+    assert asked == [(limit, {3})] and wrong == [] and IMPERFECT > FAR
 
 
 @pytest.mark.parametrize("distance", [1.0, 250.0])

@@ -13,11 +13,12 @@ import pytest
 from pipeline.transforms import inverse_rigid, project
 from stages.poses import matching, sfm
 from stages.poses.config import Config
+from stages.poses.detect import match_pairs
 from stages.poses.features import PLAIN, Features
 from stages.poses.mapper import Lens, Model, Pose, Refine, reconstruct
 from stages.poses.matching import Verified, verify
 from stages.poses.quality import GOOD_SCORE, better, quality, score
-from stages.poses.sfm import GLOBAL_FROM, SEEDS, best_of, match_pairs
+from stages.poses.sfm import GLOBAL_FROM, SEEDS, best_of
 from stages.poses.unregistered import disjoint, linked, reasons
 from stages.poses.well_supported import MIN_SHARED, well_supported
 from tests.support.textured_ball import camera_on_orbit

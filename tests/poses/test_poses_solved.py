@@ -12,11 +12,12 @@ import pytest
 from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
 from stages.poses.config import Config
+from stages.poses.detect import detect_all, match_all
 from stages.poses.features import ASIFT, DENOISED, PLAIN, detect, grey8
 from stages.poses.mapper import opencv_distortion
 from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
 from stages.poses.photos import photos_of
-from stages.poses.sfm import _oblique, detect_all, match_all
+from stages.poses.sfm import _oblique
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -45,7 +46,7 @@ def aligned(found: F64, truth: F64) -> tuple[float, F64, F64]:
 
 @pytest.mark.slow
 def test_cameras_of_a_ball_are_found(ball: Path, capture_of, place) -> None:
-    capture = capture_of(ball, holdout="every:5:2")
+    capture = capture_of(ball)
     located = place(capture)
     found = located.artifact
     assert found.source == "colmap" and not found.metric and found.unregistered == ()

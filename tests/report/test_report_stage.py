@@ -107,6 +107,18 @@ def test_metrics_have_the_keys_that_others_read(made: tuple[dict, str]) -> None:
     assert metrics["timing"] == {}
 
 
+def test_the_page_says_which_mask_each_score_used(results: SyntheticResults, tmp_path: Path) -> None:
+    masks = results.masks.artifact
+    sources = {m.index: ("given" if m.index == 3 else "person") for m in masks.masks}
+    changed = masks.model_copy(
+        update={"masks": tuple(m.model_copy(update={"source": sources[m.index]}) for m in masks.masks)}
+    )
+    metrics, page = run(replace(results, masks=Located(changed, results.masks.folder)), tmp_path / "work")
+    assert metrics["holdout"]["masks"] == {"3": "given", "9": "person"}
+    rows = {i: page.split(f"<tr><td>{i}</td>")[1].split("</tr>")[0] for i in ("3", "9")}
+    assert rows["3"].endswith("<td>given</td>") and rows["9"].endswith("<td>person</td>")
+
+
 def test_scores_are_right(made: tuple[dict, str]) -> None:
     """The photo is 0.6 to 1 of (0.4, 0.25, 0.2) in the disc; the asset shows (0.3, 0.2, 0.15) exactly there."""
     h = made[0]["holdout"]

@@ -81,6 +81,27 @@ def instrument_store() -> None:
     Store.begin, Store.finish = begun, finished  # type: ignore[method-assign]
 
 
+def before(point: str, call: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which reaches a point before its work."""
+
+    def reached(*arguments: Any, **options: Any) -> Any:
+        reach(point)
+        return call(*arguments, **options)
+
+    return reached
+
+
+def after(point: str, call: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which reaches a point after its work."""
+
+    def reaches(*arguments: Any, **options: Any) -> Any:
+        made = call(*arguments, **options)
+        reach(point)
+        return made
+
+    return reaches
+
+
 # ------------------------------------------------------------------ in the test
 @dataclass(frozen=True)
 class Point:

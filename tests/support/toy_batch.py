@@ -22,7 +22,7 @@ from pipeline.contract import Context, Stage, StageConfig
 from pipeline.verdict import Finding, Level
 from stages import registry
 from stages.capture.stage import STAGE as CAPTURE
-from tests.support.points import instrument, reach
+from tests.support.points import after, before, instrument, instrument_store, reach
 from tests.support.toy_stages import finding
 from workflows.batch import local
 from workflows.run.published import write_whole
@@ -133,9 +133,15 @@ local.CHILD = (sys.executable, str(Path(__file__).resolve()), "--child")
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
-        from workflows.batch.child import main as child
+        from workflows.batch import child
+        from workflows.run import publish
 
-        sys.exit(child(sys.argv[2:]))
+        if not REAL:  # "child.begin", "STAGE.begin", "STAGE.end", "publish.ready", "publish.done"
+            instrument_store()
+            child.make_plan = before("child.begin", child.make_plan)
+            publish._stop_if = before("publish.ready", publish._stop_if)
+            child.publish = after("publish.done", child.publish)
+        sys.exit(child.main(sys.argv[2:]))
     from workflows.cli.main import main
 
     sys.exit(main())

@@ -8,11 +8,10 @@ Each result that is stored adds a line, its stage and its key, to the file $NEUF
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.support.points import instrument_store, reach
+from tests.support.points import before, instrument_store, reach
 
 reach("flow.import")
 
@@ -20,16 +19,6 @@ from pipeline.store import Store  # noqa: E402
 from tests.support.toy_batch import capture_to_asset  # noqa: E402
 from workflows import flows  # noqa: E402
 from workflows.run import publish  # noqa: E402
-
-
-def before(point: str, call: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, which reaches a point before its work."""
-
-    def reached(*arguments: Any, **options: Any) -> Any:
-        reach(point)
-        return call(*arguments, **options)
-
-    return reached
 
 
 def finished(store: Store, stage: str, key: str, *rest: Any) -> Any:

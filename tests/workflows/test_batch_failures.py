@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.errors import Cancelled, DiskError, StageError, TimeLimitError, UsageError
+from pipeline.errors import Cancelled, DiskError, MemoryLimitError, StageError, TimeLimitError, UsageError
 from workflows.batch.failures import failure_in, failure_of, smaller
 from workflows.cli.options import seconds
 
@@ -15,6 +15,7 @@ from workflows.cli.options import seconds
         (StageError("x", where=1, value=1, limit=1, remedy="x"), "capture"),
         (UsageError("x", where=1, value=1, limit=1, remedy="x"), "capture"),
         (DiskError("x", where=1, value=1, limit=1, remedy="x"), "disk"),
+        (MemoryLimitError("x", where=1, value=1, limit=1, remedy="x"), "memory"),
         (TimeLimitError("x", where=1, value=1, limit=1, remedy="x"), "limit"),
         (Cancelled("x"), "stopped"),
         (MemoryError("x"), "memory"),

@@ -12,15 +12,22 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from pipeline.errors import Cancelled, DiskError, NeufaceError, TimeLimitError
+from pipeline.errors import Cancelled, DiskError, MemoryLimitError, NeufaceError, TimeLimitError
 
 Kind = Literal["capture", "disk", "limit", "memory", "lost", "bug", "stopped"]
 PASSES = ("lost", "memory")
 BACK_OFF, LONGEST = 5.0, 300.0  # seconds before the second attempt, doubled for each further one; and at most
 SMALLEST_BATCH = 256  # rays a step: below it memory is not what the fit runs out of
 
+OWN: tuple[tuple[type[NeufaceError], Kind], ...] = (
+    (DiskError, "disk"),
+    (MemoryLimitError, "memory"),
+    (TimeLimitError, "limit"),
+    (Cancelled, "stopped"),
+)
 _KINDS: tuple[tuple[str, Kind], ...] = (
     (r"\bDiskError\b", "disk"),
+    (r"\bMemoryLimitError\b", "memory"),
     (r"\bTimeLimitError\b", "limit"),
     (r"\bCancelled\b", "stopped"),
     (r"\b(StageError|UsageError|ParameterTypeError|ParameterBindError)\b", "capture"),
@@ -52,9 +59,9 @@ def failure_of(error: BaseException, stage: str | None = None) -> Failure:
     """The failure behind an exception."""
     if isinstance(error, NeufaceError):
         kind: Kind = "capture"
-        for of, named in ((DiskError, "disk"), (TimeLimitError, "limit"), (Cancelled, "stopped")):
+        for of, named in OWN:
             if isinstance(error, of):
-                kind = named  # type: ignore[assignment]
+                kind = named
         return Failure(kind=kind, message=str(error), stage=stage)
     return failure_in(f"{type(error).__name__}: {error}", stage)
 

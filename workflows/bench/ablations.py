@@ -21,8 +21,10 @@ import numpy.typing as npt
 from pipeline.artifacts import Artifact, Located
 from pipeline.capture_artifacts import Capture, CaptureView
 from stages.inverse_rendering.systems import paper_config
+from workflows.bench.captures import commit
 from workflows.bench.rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.cli.console import Console
+from workflows.run import host_info
 
 F32 = npt.NDArray[np.float32]
 Looks = tuple[float, float, float, float]
@@ -122,15 +124,23 @@ def run(given: argparse.Namespace, console: Console) -> int:
     path = out / "ablations.json"
     budget = budget_of(given, ("steps", "side", "batch", "holdout"))
     results, _ = kept(path, budget, "rows", Result)
+    about = made_by(f"neuface bench ablations ../shared/captures/{budget['capture']} --out DIR")
     for number, row in enumerate(chosen, 1):
         console.note(f"row {number} of {len(chosen)}: {row.name}")
         results[row.name] = measure(row, given, console)
-        path.write_text(json.dumps({"budget": budget, "rows": {k: asdict(v) for k, v in results.items()}}, indent=1))
+        rows = {k: asdict(v) for k, v in results.items()}
+        path.write_text(json.dumps({**about, "budget": budget, "rows": rows}, indent=1) + "\n")
     text = "\n".join(report(budget, results))
     (out / "ablations.md").write_text(text + "\n")
     console.close()
     print(text)
     return 0
+
+
+def made_by(command: str) -> dict[str, str]:
+    """By which command, of which commit, when and on what machine."""
+    machine = host_info.machine()
+    return {"command": command, "commit": commit(), "date": machine["date"], "machine": host_info.describe(machine)}
 
 
 def unique(tables: Iterable[Table]) -> list[Row]:

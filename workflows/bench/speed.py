@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.contract import peak_memory_mb
+from workflows.bench.captures import commit
 from workflows.cli.console import Console
 from workflows.run import host_info
 from workflows.run.calibration_scene import WHOLE, ball_trainer, ball_view
@@ -71,7 +72,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
 
     out, device = Path(given.out), device_for(given.device)
     out.mkdir(parents=True, exist_ok=True)
-    found: dict[str, Any] = {"machine": host_info.machine(), "device": device, "batch": given.batch}
+    found: dict[str, Any] = {"machine": host_info.machine(), "commit": commit(), "device": device, "batch": given.batch}
     points: list[Point] = []
     for number, setup in enumerate(setups(), 1):
         console.note(f"training {number} of {len(setups())}: {setup}")

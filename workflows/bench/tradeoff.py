@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from workflows.bench.captures import commit
 from workflows.bench.rows import budget_of, kept, rows_with, shared_options
 from workflows.bench.tradeoff_measure import Knob, Measured, measure
 from workflows.bench.tradeoff_plot import plot
@@ -62,7 +63,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
     path, begun = out / "tradeoff.json", time.monotonic()
     budget = budget_of(given, ("steps", "side", "batch", "cells", "holdout"))
     found, earlier = kept(path, budget, "points", Measured)
-    about = earlier.get("machine") or host_info.machine()
+    about, made_of = earlier.get("machine") or host_info.machine(), earlier.get("commit") or commit()
     for number, knob in enumerate(chosen, 1):
         late = given.stop_after is not None and time.monotonic() - begun > given.stop_after
         if knob.name in found or late:
@@ -71,7 +72,9 @@ def run(given: argparse.Namespace, console: Console) -> int:
         found[knob.name] = host_info.apart(measure, knob, given)
         found = {k.name: found[k.name] for k in (*KNOBS, *PRESETS) if k.name in found}
         points = {k: asdict(v) for k, v in found.items()}
-        path.write_text(json.dumps({"machine": about, "budget": budget, "points": points}, indent=1) + "\n")
+        path.write_text(
+            json.dumps({"machine": about, "commit": made_of, "budget": budget, "points": points}, indent=1) + "\n"
+        )
     text = "\n".join(report(about, budget, found))
     (out / "tradeoff.md").write_text(text + "\n")
     if found:

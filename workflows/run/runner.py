@@ -14,6 +14,7 @@ from stages import registry
 from stages.registry import FIT
 from workflows.run.budget import START_UP, planned
 from workflows.run.early import ends_early
+from workflows.run.memory import within_memory
 from workflows.run.plan import Plan, check_settings
 from workflows.run.room import check_room_for_stage
 from workflows.run.session import Session
@@ -53,7 +54,8 @@ def run_stages(
             plan.store.forget(stage.name, key(stage, inputs, config))
         check_room_for_stage(stage, inputs, config, plan.store)
         limit = time_limit(stage.name, plan.request.stage_limit, watch.late, watch.steering)
-        with around(stage, inputs, config), limit, watch.steering.telling(watch.observer.paused):
+        fits = within_memory(plan, stage, inputs, config, watch.observer.note)
+        with around(stage, inputs, config), limit, watch.steering.telling(watch.observer.paused), fits:
             result = execute_stage(
                 stage,
                 inputs,
