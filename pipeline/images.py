@@ -177,8 +177,8 @@ def write_exr(
 ) -> None:
     """Write (H, W, C) float values. `channels` names them; default Y, RGB, RGBA, else c0, c1, ...
 
-    half: as 16-bit floats; a larger value becomes the largest of them, 65504. fraction: bits of a 32-bit float's fraction
-    that are kept; the others become 0 and take no room (`rounded`). primaries: recorded in pictures with
+    half: as 16-bit floats; a larger value becomes the largest of them, 65504. fraction: bits of a 32-bit float's
+    fraction that are kept; the others become 0 and take no room (`rounded`). primaries: recorded in pictures with
     channels R, G, B; None if they are not a colour (normals). units: recorded if given ("mm").
     """
     import OpenEXR

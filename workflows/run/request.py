@@ -64,7 +64,7 @@ class RunRequest(BaseModel):
     )
     keep_all: bool = Field(
         default=False,
-        description="keep the report's page in OUT/.store as well: by default it is in OUT alone, and is taken back from "
+        description="keep the report's page in OUT/.store as well: by default it is in OUT alone, and comes back from "
         "there when it is needed",
     )
     no_live: bool = Field(default=False, description="tell `neuface view` nothing while the run goes on")
