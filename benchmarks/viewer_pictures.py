@@ -32,7 +32,8 @@ LIGHTS = ("captured", "key", "overcast", "sunset")
 # file -> the heading of a part of the page, and how many pixels of it are shown
 PARTS = {"held_out": ("Held-out views", 700), "scores": ("Scores of every view", 420),
          "shape": ("Shape and appearance", 560),
-         "maps": ("Maps and light", 760), "cameras": ("Cameras and masks", 1000)}  # fmt: skip
+         "turntable": ("Turntable", 640), "maps": ("Maps and light", 760),
+         "cameras": ("Cameras and masks", 1000)}  # fmt: skip
 
 
 def main() -> int:
@@ -168,9 +169,8 @@ def middle(picture: U8) -> U8:
     """The square in the middle, SIDE pixels along a side."""
     height, width = picture.shape[:2]
     left = (width - height) // 2
-    return np.asarray(
-        cv2.resize(picture[:, left : left + height], (SIDE, SIDE), interpolation=cv2.INTER_AREA), np.uint8
-    )
+    square = picture[:, left : left + height]
+    return np.asarray(cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def frusta(page: Tab) -> U8:
