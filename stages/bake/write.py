@@ -18,7 +18,7 @@ from pipeline import tiles
 from pipeline.artifacts import FileRef, TextureMap
 from pipeline.colour import REC709
 from pipeline.contract import Context
-from pipeline.images import write_exr, write_png, write_png_from_linear
+from pipeline.images import FRACTION, write_exr, write_png, write_png_from_linear
 from pipeline.meshes import F32
 from stages.bake.build import Baked, bands
 from stages.bake.memmap_buffer import blank
@@ -30,6 +30,7 @@ MM = 1000.0
 MIN_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value in the map `coverage` of a covered texel that no photo shows
 OPTIONAL = ("clamped", "region")  # maps that are removed if they are empty
+LOBE_BITS = 14  # of the fraction: within 1 part in 32,768, where 16-bit floats are within 1 in 2,048
 IN_MEMORY = 1 << 27  # values of a picture; a larger one is assembled in a file
 
 Function = Callable[..., npt.NDArray[Any]]
@@ -39,7 +40,7 @@ Function = Callable[..., npt.NDArray[Any]]
 class MapKind:
     """How a map is computed from arrays (N, ...) of the samples, and how it is stored. png: bits, 0 for none; encoded:
     the png contains v/2 + 1/2; codes: values are integers, also in the png; colour: the three channels are a colour;
-    units: of the values, for the EXR's header."""
+    units: of the values, for the EXR's header. fraction: bits of a 32-bit float's fraction that are kept."""
 
     sources: tuple[str, ...]
     function: Function = lambda values: values
@@ -50,6 +51,7 @@ class MapKind:
     space: Literal["srgb_png", "raw"] = "raw"
     colour: bool = False
     units: str = ""
+    fraction: int = FRACTION
 
     @property
     def half(self) -> bool:
@@ -65,8 +67,10 @@ class MapKind:
 KINDS: dict[str, MapKind] = {
     "albedo": MapKind(("base_color",), png=8, space="srgb_png", colour=True),
     "neuface_albedo": MapKind(("albedo",), png=8, space="srgb_png", colour=True),
-    "specular_coefficients": MapKind(("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True),
-    "lobe_coefficients": MapKind(("coefficients",), numbered=True),
+    "specular_coefficients": MapKind(
+        ("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True, fraction=LOBE_BITS
+    ),  # fmt: skip
+    "lobe_coefficients": MapKind(("coefficients",), numbered=True, fraction=LOBE_BITS),
     "specular_intensity": MapKind(("rho",), png=8),
     "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, MIN_INV_KAPPA)),
     "inv_kappa": MapKind(("inv_kappa",)),
@@ -189,7 +193,8 @@ def _store(name: str, image: F32, figures: tuple[float, float, float], kind: Map
     exr, png = (tiles.form(k, place.tile, place.count) for k in ("exr", "png"))
     channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
     primaries = REC709 if kind.colour else None
-    write_exr(folder / f"{name}.{exr}", image, channels, half=kind.half, primaries=primaries, units=kind.units)
+    write_exr(folder / f"{name}.{exr}", image, channels, half=kind.half, fraction=kind.fraction, primaries=primaries,
+              units=kind.units)  # fmt: skip
     files: dict[str, FileRef] = {exr: place.context.file(f"{FOLDER}/{name}.{exr}")}
     if kind.png:
         path = folder / f"{name}.{png}"

@@ -27,6 +27,7 @@ from stages.report.pictures import (
     scale_bar,
     scaled_picture,
     to_bytes,
+    webp_uri,
 )
 from stages.report.uv_layout import uv_layout
 from stages.report.verdict import verdict_shown
@@ -140,6 +141,7 @@ def build_page(
         Pictures(
             views=[x.row for x in rows],
             sides=_sides(r, side),
+            films=_films(r),
             maps=_maps(r, side // 2),
             light=_light(r, side),
             scale=data_uri(scale_bar(), 256, lossless=True),
@@ -167,6 +169,14 @@ def _sides(r: Results, side: int) -> list[Picture]:
         )
         for n in order
     ]
+
+
+def _films(r: Results) -> list[Picture]:
+    """One turn under the captured light and under a made one."""
+    files = {f.path.removeprefix("previews/turn_"): f for f in r.usd.artifact.files}
+    words = {"captured": "one turn, captured light", "sunset": "one turn, sunset"}
+    found = [(files[f"{name}.webp"], text) for name, text in words.items() if f"{name}.webp" in files]
+    return [Picture(webp_uri(r.usd.path(f).read_bytes()), text) for f, text in found]
 
 
 def _over_grey(image: np.ndarray[Any, Any]) -> np.ndarray[Any, np.dtype[np.uint8]]:

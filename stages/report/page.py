@@ -42,6 +42,7 @@ class Pictures:
 
     views: Sequence[ViewRow] = ()
     sides: Sequence[Picture] = ()
+    films: Sequence[Picture] = ()
     maps: Sequence[Picture] = ()
     light: Picture | None = None
     scale: str = ""

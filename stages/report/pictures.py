@@ -64,6 +64,11 @@ def png_uri(image: U8) -> str:
     return f"data:image/png;base64,{base64.b64encode(buffer.tobytes()).decode()}"
 
 
+def webp_uri(content: bytes) -> str:
+    """Address of a WebP, which may move."""
+    return f"data:image/webp;base64,{base64.b64encode(content).decode()}"
+
+
 def scale_bar() -> U8:
     """The heat map's colours from 0 to ERROR_RANGE, for the legend."""
     return heat(np.repeat(np.linspace(0, 1, 256, dtype=np.float32)[None], 12, 0))

@@ -48,7 +48,10 @@ class Config(StageConfig):
     samples: int = Field(
         0, ge=0, le=8, description="rays along each side of a pixel in these renders; 0: one ray, 64 on silhouettes"
     )
-    preview_size: Pixels = Field(512, ge=64, le=4096, description="side of the preview pictures")
+    preview_size: Pixels = Field(512, ge=64, le=4096, description="side of the preview pictures and films")
+    film_frames: int = Field(
+        16, ge=0, le=240, description="pictures of each film in the report, a turn of 4 s in two lights; 0: no films"
+    )
 
     def made_from(self) -> dict[str, Path]:
         """The artifact of the measured expressions."""

@@ -46,6 +46,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     from pipeline.verdict import verdict_of_inputs
     from stages.usd import judge
     from stages.usd.check.validate import checks_run, found_in
+    from stages.usd.render.films import render_films
     from stages.usd.render.previews import load_scene, render_held_out, render_previews, render_thumbnail
     from stages.usd.write.export import THUMBNAIL, export
     from stages.usd.write.mark import mark
@@ -70,7 +71,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
     context.progress(1, total, "rendering previews")
     scene = load_scene(root, context.check)
     written.append(render_thumbnail(scene, root.parent / THUMBNAIL))
-    written += render_previews(scene, config.preview_size, context.workdir / "previews", context.check)
+    folder = context.workdir / "previews"
+    written += render_previews(scene, config.preview_size, folder, context.check)
+    written += render_films(scene, config.film_frames, config.preview_size, folder, context.check)
     context.progress(2, total, "checking it")
     found = []
     for file in [f for f in written if f.parent == context.workdir / "asset" and f.name in _roots(name)]:

@@ -11,14 +11,14 @@ import trimesh
 from pipeline import meshes, raster, tangents
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.images import read_encoded, read_exr
+from pipeline.images import read_encoded, read_exr, rounded
 from pipeline.maths import microfacet
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake.ambient import ambient
 from stages.bake.build import Baked, Baker
 from stages.bake.lut import basis_lut
-from stages.bake.write import write_maps
+from stages.bake.write import LOBE_BITS, write_maps
 from stages.surface.build import build as surface_build
 from stages.uv import unwrap
 from stages.uv.config import Config
@@ -131,6 +131,9 @@ def test_material_is_that_of_the_true_surface(folder: Path, checked: tuple, name
     assert np.abs(got / expected - 1).max() < 1e-3 + HALF
     if name == "specular_coefficients":
         assert channels == ("c0", "c1", "c2")
+        assert np.array_equal(rounded(image, LOBE_BITS), image) and not np.array_equal(
+            rounded(image, LOBE_BITS - 1), image
+        )
 
 
 def test_f0_and_roughness_follow_their_formulas(folder: Path, checked: tuple) -> None:

@@ -93,6 +93,12 @@ def test_every_picture_decodes(made: tuple[dict, str]) -> None:
     assert sum(seen) > len(seen) / 2
 
 
+def test_the_page_has_a_film_in_two_lights(made: tuple[dict, str]) -> None:
+    films = re.findall(r'src="data:image/webp;base64,([^"]+)" alt="(one turn[^"]*)"', made[1])
+    assert [text for _, text in films] == ["one turn, captured light", "one turn, sunset"]
+    assert all(b"ANMF" in base64.b64decode(data) for data, _ in films)
+
+
 def test_metrics_have_the_keys_that_others_read(made: tuple[dict, str]) -> None:
     metrics = made[0]
     assert {"views", "psnr", "ssim", "flip", "per_view", "asset_psnr", "asset_ssim", "asset_flip"} <= metrics[

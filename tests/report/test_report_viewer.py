@@ -41,6 +41,9 @@ SHOWN = [
     "wireframe",
 ]
 
+CORES, LOADS = 2, 5.0  # seconds in which the view of a run's page is there
+SMALLER = 3.0  # seconds of processor time that this page takes less than that of a draft of 40 photos
+
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SyntheticResults:
@@ -183,6 +186,22 @@ def test_it_starts_and_turns(opened: Tab) -> None:
     assert changed(by_mouse, drawn(opened)) > 0.005
     opened.run("document.getElementById('viewer-home').click()")
     assert changed(first, drawn(opened)) < 0.001
+
+
+@pytest.mark.slow
+def test_it_loads_in_five_seconds_on_two_cores(page: Path, tmp_path: Path) -> None:
+    """By processor time, so that other work on the machine does not count; no GPU. The filter of the light is most."""
+    if installed() is None:
+        pytest.skip("no Chromium is installed")
+    with tab(tmp_path / "profile") as fresh:
+        fresh.size(1280, 720)
+        before = fresh.processor_seconds()
+        fresh.call("Page.navigate", url=page.as_uri())
+        fresh.until("document.documentElement && document.documentElement.dataset.viewer === 'ready'")
+        fresh.until("Number(document.getElementById('viewer-canvas').dataset.frames) > 0")
+        fresh.run("new Promise(r => requestAnimationFrame(() => requestAnimationFrame(r)))")
+        taken = fresh.processor_seconds() - before
+        assert 0.5 < taken < CORES * LOADS - SMALLER, taken
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,8 @@ class ScriptError(RuntimeError):
 class Tab:
     """One page. `troubles`: errors and warnings of its console, and uncaught exceptions."""
 
-    def __init__(self, send: int, receive: int) -> None:
-        self._send, self._receive = send, receive
+    def __init__(self, send: int, receive: int, process: int = 0) -> None:
+        self._send, self._receive, self._process = send, receive, process
         self._buffer, self._count, self._session = b"", 0, ""
         self.troubles: list[str] = []
         self.requests: list[str] = []
@@ -99,6 +99,17 @@ class Tab:
                 raise TimeoutError(f"{code} after {seconds} s; {self.troubles} {raised}")
             time.sleep(0.05)
 
+    def processor_seconds(self) -> float:
+        """Of all living processes of the browser since they began, its software renderer among them."""
+        found, ticks = {self._process}, 0
+        for stat in sorted(Path("/proc").glob("[0-9]*/stat"), key=lambda p: int(p.parent.name)):
+            with suppress(OSError):  # a process that ended meanwhile
+                fields = stat.read_text().rpartition(")")[2].split()
+                if int(fields[1]) in found or int(stat.parent.name) == self._process:
+                    found.add(int(stat.parent.name))
+                    ticks += int(fields[11]) + int(fields[12])
+        return ticks / os.sysconf("SC_CLK_TCK")
+
     def size(self, width: int, height: int, *, phone: bool = False) -> None:
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
 
@@ -125,7 +136,7 @@ def tab(profile: Path, *options: str) -> Iterator[Tab]:
     os.close(theirs_read)
     os.close(theirs_write)
     try:
-        found = Tab(ours_write, ours_read)
+        found = Tab(ours_write, ours_read, process.pid)
         found.attach()
         yield found
     finally:

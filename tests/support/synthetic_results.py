@@ -22,6 +22,7 @@ from pipeline.artifacts import (
     ViewMask,
 )
 from pipeline.capture_artifacts import Capture
+from pipeline.film import animated_webp
 from pipeline.images import write_exr, write_png
 from pipeline.reflectance_artifacts import ReflectanceField
 
@@ -115,10 +116,13 @@ def _usd(folder: Path, made: SyntheticInputs, indices: tuple[int, ...], scale: i
         views.append(HeldOutView(index=camera.index, exr=exr, png=png, scale=scale))
     for side in ("left", "front", "right", "shape_front"):
         write_png(folder / f"previews/{side}.png", np.full((32, 32, 4), 0.5))
+    for number, name in enumerate(("captured", "sunset")):
+        frames = [np.full((32, 32, 3), 80 * number + 20 * i, np.uint8) for i in range(3)]
+        (folder / f"previews/turn_{name}.webp").write_bytes(animated_webp(frames, 4.0, 80))
     write_exr(folder / "asset/environment.exr", np.linspace(0, 2, 64 * 128 * 3, dtype=np.float32).reshape(64, 128, 3))
     files = tuple(
         FileRef.of(folder, p)
-        for p in sorted(folder.rglob("*.png")) + [folder / "asset/environment.exr"]
+        for p in [*sorted(folder.rglob("*.png")), *sorted(folder.rglob("*.webp")), folder / "asset/environment.exr"]
         if "asset_views" not in p.parts
     )
     return Located(UsdAsset(name="head", root="asset/head.usd", files=files, views=tuple(views), checks=36), folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import pytest
 
 from workflows.cli.main import main
 from workflows.run import estimate, needs
-from workflows.run.plan import make_plan
+from workflows.run.plan import Step, make_plan
 from workflows.run.request import RunRequest
 
 pytestmark = pytest.mark.usefixtures("toys")
@@ -121,3 +122,33 @@ def test_the_plan_for_programs(photos: Path, capsys: pytest.CaptureFixture[str])
         (name, "made", "new") for name in ("first", "second", "third")]  # fmt: skip
     assert plan["settings"] == {"first.plus": {"value": 2, "preset": 0}}
     assert {"disk_bytes", "memory_mb"} <= plan.keys()
+
+
+def test_a_shared_file_counts_once_and_a_page_that_was_given_up_counts(tmp_path: Path) -> None:
+    (tmp_path / "bake").mkdir()
+    (tmp_path / "usd").mkdir()
+    (tmp_path / "bake/map.exr").write_bytes(b"x" * 100)
+    (tmp_path / "usd/map.exr").hardlink_to(tmp_path / "bake/map.exr")
+    (tmp_path / "usd/head.glb").write_bytes(b"x" * 7)
+    listed = [{"path": "page.html", "size": 1000}, {"path": "head.glb", "size": 7}, {"path": "x"}, 3]
+    (tmp_path / "usd/manifest.json").write_text(manifest := json.dumps({"files": listed}))
+    seen: set[int] = set()
+    assert needs._bytes_of(tmp_path / "bake", seen) == 100
+    assert needs._bytes_of(tmp_path / "usd", seen) == 7 + len(manifest) + 1000
+
+
+@pytest.mark.parametrize(
+    ("options", "added"), [((), 45 + 15), (("--keep-all",), 45 + 30), (("--store", "else"), 90 + 30)]
+)
+def test_the_results_count_twice_where_they_are_copied(
+    options: tuple[str, ...], added: int, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asset and page, of which OUT has copies unless its own store has the same files."""
+    changes: dict[str, Any] = {"keep_all": "--keep-all" in options}
+    changes |= {"store": str(photos.parent / "else")} if "--store" in options else {}
+    plan = make_plan(RunRequest(capture=str(photos), out=str(photos.parent / "out"), **changes))
+    monkeypatch.setattr(needs, "records", lambda *_: iter(()))
+    steps = [estimate.Expected(Step(n, None, "made"), None, "table") for n in ("usd", "report")]
+    monkeypatch.setattr(needs, "_kept", lambda _, name: 1e6 * needs.KEPT_MB[name])
+    plan = dataclasses.replace(plan, configs={"usd": plan.configs["first"], "report": plan.configs["first"]})
+    assert needs.needs(plan, steps).disk == added * 1e6

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.errors import NeufaceError
+from pipeline.film import animated_webp
 from pipeline.store import MANIFEST, read_object
 from workflows.run.owned import write_owned
 
@@ -28,7 +28,7 @@ def write_turn(out: Path) -> bool:
     """Write the picture of the run in the folder `out`. False if the run has no asset, or its store no mesh."""
     try:
         sources = _sources(out)
-        data = webp(list(frames(*sources))) if sources else b""
+        data = animated_webp(list(frames(*sources)), SECONDS, QUALITY) if sources else b""
     except (NeufaceError, OSError, ValueError, KeyError, TypeError, AttributeError):  # a damaged or older result
         return False
     if data:
@@ -71,14 +71,3 @@ def frames(mesh_file: Path, albedo_files: list[Path]) -> Iterator[npt.NDArray[np
 def _reduced(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     step = max(1, image.shape[0] // ALBEDO_SIDE)
     return image[::step, ::step]
-
-
-def webp(pictures: list[npt.NDArray[np.uint8]]) -> bytes:
-    """An animation of RGB pictures that goes on for ever."""
-    import cv2
-
-    film: Any = cv2.Animation()
-    film.frames = [np.ascontiguousarray(p[..., ::-1]) for p in pictures]
-    film.durations = np.full(len(pictures), round(1000 * SECONDS / len(pictures)), np.int32)
-    done, data = cv2.imencodeanimation(".webp", film, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])
-    return bytes(np.asarray(data, np.uint8)) if done else b""

@@ -24,6 +24,7 @@ from workflows.run.plan import Plan, make_plan
 from workflows.run.request import RunRequest
 from workflows.run.runner import Around, ExecuteStage, run_stages
 from workflows.run.session import Session
+from workflows.run.spare_page import put_page_back
 from workflows.run.steering import BUDGET, PRESET
 
 
@@ -36,6 +37,7 @@ def run_as_asked(
     """As `run_stages`, and with every change that the user makes meanwhile. Returns the plan that was carried out, and
     what was done. Raises as `run_stages`."""
     steering = watch.steering
+    put_page_back(plan)
     with steering.open_to_changes():
         while True:
             made: list[str] = []

@@ -20,8 +20,8 @@ from workflows.run.plan import Plan
 from workflows.run.published import is_record, note_published, published
 from workflows.run.replace import Replacement, drop, prepare, put, tidy
 from workflows.run.report_timing import TIMED, with_seconds
-from workflows.run.request import OWN_STORE
 from workflows.run.room import check_room_for_copies
+from workflows.run.spare_page import owns_its_store, page_in_one_place
 from workflows.run.verdict import verdict_of_done
 from workflows.store.roots import note_root
 
@@ -55,6 +55,7 @@ def publish(
         aside = write_owned(plan.out, "run.json", json.dumps(record, indent=1), is_record)
         for before, now in (moved | ({"run.json": aside} if aside else {})).items():
             notify(f"{plan.out / before} is yours: kept as {plan.out / now}")
+        page_in_one_place(plan, stages)
         note_root(plan.store, plan.out, {n: d.key for n, d in stages.items()})
     except OSError as e:
         raise stage_error_from_os_error(e, plan.out) or e from e
@@ -88,7 +89,7 @@ def _replace_folders(
         "report": report_files(stages, exr=not plan.request.no_exr_views),
         "reflectance": reflectance_files(stages),
     }
-    linked = frozenset(_linked(plan, assets))
+    linked = frozenset(_linked(plan, (*assets.values(), *wanted["report"].values())))
     zipped = [assets[p] for p in packed(assets)] if plan.request.pack else []
     for name in wanted:
         moved |= tidy(out, name, known)
@@ -119,11 +120,12 @@ def _stop_if(stopped: Callable[[], bool]) -> None:
         raise Cancelled("stopped by the user; finished stages are kept, nothing was published")
 
 
-def _linked(plan: Plan, assets: Copies) -> Iterable[Path]:
-    """Files of the store that get a second name in OUT instead of a copy: those of the asset, where the store is OUT's
-    own. An edit in place then damages a result that takes a minute to make again, which its hash tells; the views of
-    the fit are copied, and so is everything of a store that several folders share."""
-    return assets.values() if plan.store.root.resolve() == (plan.out / OWN_STORE).resolve() else ()
+def _linked(plan: Plan, sources: Iterable[Path]) -> Iterable[Path]:
+    """Files of the store that get a second name in OUT instead of a copy: those of the stage usd, where the store is
+    OUT's own. An edit in place then damages a result that takes a minute to make again, which its hash tells; the views
+    of the fit are copied, and so is everything of a store that several folders share."""
+    inside = plan.store.root / "usd"
+    return (p for p in sources if p.is_relative_to(inside)) if owns_its_store(plan) else ()
 
 
 def _fill(name: str, copies: Copies, timing: Mapping[str, float], linked: frozenset[Path], folder: Path) -> None:

@@ -62,6 +62,11 @@ class RunRequest(BaseModel):
     no_exr_views: bool = Field(
         default=False, description="no EXR pictures of the held-out views in OUT/report, only PNG; the store has them"
     )
+    keep_all: bool = Field(
+        default=False,
+        description="keep the report's page in OUT/.store as well: by default it is in OUT alone, and comes back from "
+        "there when it is needed",
+    )
     no_live: bool = Field(default=False, description="tell `neuface view` nothing while the run goes on")
     strict: bool = Field(default=False, description="a result that is only usable also counts as refused: exit code 3")
 

@@ -2,7 +2,11 @@
 // module becomes a blob, and its imports the addresses of the blobs before it.
 (async () => {
   const island = (id) => document.getElementById(id).textContent.trim();
-  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const bytes = (text) => {
+    const found = atob(text), out = new Uint8Array(found.length);
+    for (let i = 0; i < out.length; i++) out[i] = found.charCodeAt(i);
+    return out;
+  };
   try {
     const packed = new Blob([bytes(island("viewer-modules"))]).stream().pipeThrough(new DecompressionStream("gzip"));
     const modules = JSON.parse(await new Response(packed).text());

@@ -2,7 +2,9 @@
 import * as THREE from 'three';
 
 export function bytesOf(base64) {
-  return Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
+  const found = atob(base64), out = new Uint8Array(found.length);
+  for (let i = 0; i < out.length; i++) out[i] = found.charCodeAt(i);
+  return out;
 }
 
 // A map of the asset, in glTF's convention: row 0 is v = 0.

@@ -3,6 +3,15 @@ import * as THREE from 'three';
 import { bytesOf } from './data.js';
 
 const TURN = Math.PI / 180;
+// Pixels along a face of the filtered light. three.js takes 256 at least, whose filter needs most of the time in which a
+// page without a GPU loads; our lights have 32 pixels to a face.
+const FACE = 128;
+
+class Generator extends THREE.PMREMGenerator {
+  _setSize() {
+    this._cubeSize = FACE;
+  }
+}
 
 // One light of the page's data {width, height, rgb: base64 of half floats, row 0 at the bottom} as a texture.
 function textureOf(light) {
@@ -27,7 +36,7 @@ export class Lights {
     this.scene = scene;
     this.lights = lights;
     this.filtered = new Map();
-    this.generator = new THREE.PMREMGenerator(renderer);
+    this.generator = new Generator(renderer);
   }
 
   // Uses the light of this name, turned around the vertical axis.

@@ -64,7 +64,7 @@ class Viewer {
     this.view.up.set(0, 1, 0);
     this.view.scale.set(1, 1, 1);
     this.controls.target.copy(this.centre);
-    const away = this.radius / Math.sin(this.view.fov / 2 * Math.PI / 180) * (this.frusta.visible ? 4 : 0.68) / Math.min(1, this.view.aspect);
+    const away = this.radius / Math.sin(this.view.fov / 2 * Math.PI / 180) * (this.frusta.visible ? 4 : 0.8) / Math.min(1, this.view.aspect);
     this.view.position.copy(this.centre).add(new THREE.Vector3(0.35, 0.1, 1).normalize().multiplyScalar(away));
     this.view.updateProjectionMatrix();
     this.controls.update();
