@@ -130,9 +130,10 @@ OF_CAMERAS = (
     # ---------------------------------------------------------------- pictures and fields on disk
     Mutation("pipeline/images.py", "values.clip(-HALF_MAX, HALF_MAX).astype(np.float16)", "values.astype(np.float16)",
              f"{IMAGES}::test_half_floats_never_become_infinite"),
-    Mutation("pipeline/images.py", "astype(np.float16) if half else values)", "astype(np.float16) if True else values)",
+    Mutation("pipeline/images.py", "    if half:\n", "    if True:\n",
              f"{IMAGES}::test_exr_round_trip"),
-    Mutation("pipeline/images.py", "_plane(data[..., i], half=half)", "_plane(data[..., i], half=False)",
+    Mutation("pipeline/images.py", "_plane(data[..., i], half=half, fraction=fraction)",
+             "_plane(data[..., i], half=False, fraction=fraction)",
              f"{IMAGES}::test_half_exr_is_close"),
     Mutation("pipeline/fields/face.py", "np.savez_compressed(path, spec=", "np.savez(path, spec=",
              "tests/fields/test_face.py::test_same_model_same_bytes"),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.artifacts import Located
+from pipeline.artifacts import Located, sha256_of
 from pipeline.capture_artifacts import Capture
 from pipeline.demo.capture import write_demo_capture
 from tests.support.points import PATIENCE, kill
@@ -32,6 +32,7 @@ SMALL = {
     "bake.size": 256,
     "usd.preview_size": 128,
 }
+LARGE = 20_000  # bytes
 SHOWN = 40  # differences that a failure lists
 STAGES = [
     "capture",
@@ -127,6 +128,16 @@ def test_everything_promised_is_there(done: Path) -> None:
     assert [p for p in promised if not (done / p).is_file()] == []
     page = (done / "report/index.html").read_text()
     assert "http://" not in page.replace("http://www.w3.org", "") and "https://" not in page
+
+
+def test_nothing_large_is_kept_twice(done: Path) -> None:
+    """OUT and its store share what they have in common; the fit's views alone are copied (running.md, The store)."""
+    found: dict[str, set[int]] = {}
+    for path in done.rglob("*"):
+        if path.is_file() and path.stat().st_size > LARGE and path.parent != done / "report/views":
+            found.setdefault(sha256_of(path), set()).add(path.stat().st_ino)
+    assert len(found) > 10 and [h for h, inodes in found.items() if len(inodes) > 1] == []
+    assert [p.parent.parent.name for p in done.rglob("index.html")] == [done.name]
 
 
 def test_only_what_depends_on_a_setting_runs_again(
