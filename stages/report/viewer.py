@@ -48,7 +48,7 @@ MODULES = (  # in the order of their imports, by the name under which others imp
     ("./main.js", "viewer/main.js"),
 )
 # Colours that differ for every kind of colour vision [Okabe and Ito 2008], after a grey for "none".
-CODES = ("#9a9a9a", "#56b4e9", "#e69f00", "#f0e442", "#009e73", "#cc79a7", "#d55e00", "#0072b2")
+CODES = ("#c8c8c8", "#56b4e9", "#e69f00", "#f0e442", "#009e73", "#cc79a7", "#d55e00", "#0072b2")
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,12 +17,14 @@ from support.browser import Tab, installed, tab
 from support.synthetic_results import SyntheticResults, write_results
 
 from pipeline.artifacts import Located
+from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.contract import Context
 from pipeline.maths.latlong import latlong_directions
 from pipeline.transforms import project, rows
 from pipeline.verdict import Limits, judged
+from stages.report.pictures import scale_colours
 from stages.report.stage import STAGE, Config, Inputs
-from stages.report.viewer import MODULES, light_data
+from stages.report.viewer import CODES, MODULES, light_data
 from stages.report.viewer_cameras import chosen, straightened
 from tests.support.viewer_results import with_glb
 
@@ -330,6 +332,77 @@ def test_landmarks_and_the_turn(opened: Tab) -> None:
     choose(opened, "camera", "")
     still = drawn(opened)
     assert changed(still, drawn(opened)) < 0.001
+
+
+TAB, RIGHT = ("Tab", 9), ("ArrowRight", 39)
+
+
+@pytest.mark.slow
+def test_keys_reach_every_control_and_move_it(opened: Tab) -> None:
+    """Real keys: Tab from the top on, then an arrow on a slider and on the canvas."""
+    kinds = ", ".join(f"#viewer {kind}" for kind in ("canvas", "select", "input", "button"))
+    controls = set(opened.run(f"[...document.querySelectorAll('{kinds}')]"
+                              ".filter(e => e.checkVisibility() && e.id).map(e => e.id)"))  # fmt: skip
+    assert {"viewer-canvas", "viewer-channel", "viewer-mesh", "viewer-light", "viewer-turn", "viewer-exposure",
+            "viewer-camera", "viewer-frusta", "viewer-home"} <= controls  # fmt: skip
+    opened.run("document.activeElement.blur(); document.querySelector('.skip').focus()")
+    reached, before = [], drawn(opened)
+    for _ in range(80):
+        opened.press(*TAB)
+        reached.append(opened.run("document.activeElement.id"))
+        if reached[-1] == "viewer-canvas":
+            opened.press(*RIGHT)
+            assert changed(before, drawn(opened)) > 0.005
+            opened.run("document.getElementById('viewer-home').click()")
+        if reached[-1] == "viewer-exposure":
+            opened.press(*RIGHT)
+            assert float(opened.run("document.activeElement.value")) == pytest.approx(0.1)
+            choose(opened, "exposure", 0, "input")
+    assert controls <= set(reached)
+
+
+@pytest.mark.slow
+def test_a_click_on_a_camera_shows_its_view(opened: Tab) -> None:
+    """Where the picture has the colour of held-out cameras."""
+    tick(opened, "frusta", True)
+    opened.run("document.getElementById('viewer-home').click()")
+    picture = drawn(opened)
+    blue = np.abs(picture[..., ::-1] - [0x56, 0xB4, 0xE9]).max(-1) < 12
+    assert blue.sum() > 5
+    left, top = opened.run("(r => [r.x, r.y])(document.getElementById('viewer-canvas').getBoundingClientRect())")
+    y, x = (int(v[0]) for v in np.nonzero(blue))
+    for kind in ("mousePressed", "mouseReleased"):
+        opened.call("Input.dispatchMouseEvent", type=kind, x=left + x, y=top + y, button="left", clickCount=1)
+    select = "document.getElementById('viewer-camera')"
+    assert "held out" in opened.run(f"{select}.options[{select}.selectedIndex].text")
+    assert opened.run("document.getElementById('viewer-photo').hidden") is False
+    choose(opened, "camera", "")
+    tick(opened, "frusta", False)
+
+
+# Linear RGB as people without long, middle or short cones see it [Machado, Oliveira and Fernandes 2009], severity 1.
+VISION = {
+    "protanopia": ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)),
+    "deuteranopia": ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
+    "tritanopia": ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.303900)),
+}
+
+
+@pytest.mark.parametrize("kind", VISION)
+def test_codes_and_scales_differ_for_every_kind_of_colour_vision(kind: str) -> None:
+    """By CIE76 in Lab: codes are 15 apart at least, and each tenth of a scale is lighter than the one before."""
+    codes = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in CODES])
+    lab = seen_as(codes, kind)
+    apart = np.linalg.norm(lab[:, None] - lab[None], axis=-1)[np.triu_indices(len(lab), 1)]
+    assert apart.min() > 15
+    assert (np.diff(seen_as(scale_colours()[::25], kind)[:, 0]) > 2).all()
+
+
+def seen_as(rgb: np.ndarray, kind: str) -> np.ndarray:
+    """CIE Lab (N, 3) of 8-bit sRGB colours (N, 3)."""
+    linear = (linear_from_srgb(rgb / 255.0) @ np.array(VISION[kind]).T).clip(0, 1)
+    shown = srgb_from_linear(linear).astype(np.float32)[None]
+    return np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2Lab)[0])
 
 
 @pytest.mark.slow

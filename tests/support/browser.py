@@ -118,6 +118,11 @@ class Tab:
         for kind, (x, y) in kinds:
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
+    def press(self, key: str, code: int) -> None:
+        """A key of the keyboard, by its name and its number in Windows."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
     def picture(self, **clip: float) -> bytes:
         area = {"clip": {**clip, "scale": 1}} if clip else {}
         return base64.b64decode(self.call("Page.captureScreenshot", format="png", **area)["data"])

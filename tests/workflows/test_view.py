@@ -100,6 +100,16 @@ def test_other_hosts_paths_and_tokens_are_refused(served: str) -> None:
         assert ask(served, path)[0] == 404, path
 
 
+def test_a_record_or_picture_that_is_a_link_is_not_followed(run: Path, served: str, tmp_path: Path) -> None:
+    path, secret = urlsplit(served).path, tmp_path / "elsewhere.txt"
+    secret.write_text("secret")
+    (run / "live").mkdir(exist_ok=True)
+    for name in ("run.json", "live/fit.jpg"):
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to(secret)
+        assert ask(served, f"{path}{name}")[0] == 404, name
+
+
 def test_pages_may_load_nothing_of_others(served: str) -> None:
     path = urlsplit(served).path
     for name in ("page/live.html", "page/live.js", "page/live.css", "state"):
