@@ -116,10 +116,10 @@ def test_from_half_of_a_stage_on_its_own_pace_tells_its_end() -> None:
     """Twice as slow as expected; at a quarter both count the same."""
     forecast = Forecast({"first": 100.0}, 0.0)
     forecast.started("first", 0.0)
-    forecast.progress(25, 100, "working", 50.0)
+    forecast.progress(25, 90, "working", 50.0)
     pace = (30 + 50) / (30 + 25)
     assert forecast.remaining(50.0) == pytest.approx(0.75 * (0.5 * 100 * pace + 0.5 * 200))
-    forecast.progress(50, 100, "working", 100.0)
+    forecast.progress(50, 90, "working", 100.0)
     assert forecast.remaining(100.0) == pytest.approx(100.0)
 
 
