@@ -112,6 +112,17 @@ def test_the_time_that_passes_between_two_events_counts() -> None:
     assert late is not None and late > 50.0  # three times slower than expected: so will be the rest
 
 
+def test_from_half_of_a_stage_on_its_own_pace_tells_its_end() -> None:
+    """Twice as slow as expected; at a quarter both count the same."""
+    forecast = Forecast({"first": 100.0}, 0.0)
+    forecast.started("first", 0.0)
+    forecast.progress(25, 90, "working", 50.0)
+    pace = (30 + 50) / (30 + 25)
+    assert forecast.remaining(50.0) == pytest.approx(0.75 * (0.5 * 100 * pace + 0.5 * 200))
+    forecast.progress(50, 90, "working", 100.0)
+    assert forecast.remaining(100.0) == pytest.approx(100.0)
+
+
 def test_nothing_is_said_where_nothing_is_known() -> None:
     forecast = Forecast({"first": None, "second": 50.0}, 0.0)
     forecast.started("first", 0.0)
