@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline import meshes
-from pipeline.meshes import F64, Mask, Mesh
+from pipeline.meshes import F32, F64, Mask, Mesh
 
 AWAY = 0.003  # metres: nearer, the head's skin stands for it
 JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
@@ -40,7 +40,7 @@ def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
     return Mesh(parted.astype(np.float32), normals, own)
 
 
-def beside_head(dense: Mesh, skin: Mesh, ears: F64 | None = None, hair: Mask | None = None) -> Mask:
+def beside_head(dense: Mesh, skin: Mesh, ears: F32 | None = None, hair: Mask | None = None) -> Mask:
     """(V,) vertices of the dense mesh that the head's skin does not stand for. ears (n, 3): points of the skin; hair
     (V,): vertices that are hair."""
     from scipy.spatial import cKDTree

@@ -150,7 +150,12 @@ def _asset_paths(layer: Sdf.Layer) -> list[str]:
     """The paths of other files that a layer names, in its order."""
     copy, seen = Sdf.Layer.CreateAnonymous(), list[str]()
     copy.TransferContent(layer)
-    UsdUtils.ModifyAssetPaths(copy, lambda p: seen.append(p) or p)
+
+    def see(p: str) -> str:
+        seen.append(p)
+        return p
+
+    UsdUtils.ModifyAssetPaths(copy, see)
     return list(dict.fromkeys(seen))
 
 
