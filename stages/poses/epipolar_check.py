@@ -64,7 +64,7 @@ def check_cameras(
         uv_j = np.asarray(features[j].uv[pair.matches[:, 1]], np.float64)
         good = epipolar_pixels(cameras[i], cameras[j], uv_i, uv_j) < far * edge
         counts[i, j] = (int(good.sum()), len(good))
-    share = _shares({p: c for p, c in counts.items() if not held.intersection(p)}, len(cameras))
+    share = _shares({p: c for p, c in counts.items() if held.isdisjoint(p)}, len(cameras))
     right = {i for i in range(len(cameras)) if share[i] >= AGREE}
     for view in held:
         share[view] = _share(c for p, c in counts.items() if view in p and right.intersection(p))

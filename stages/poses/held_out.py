@@ -140,7 +140,7 @@ def _errors(uv: F64, xyz: F64, camera: Any, pose: Any) -> F64:
     m = np.asarray(pose.matrix(), np.float64)
     distortion = np.array([*camera.params[4:9]], np.float64)
     seen, _ = project(np.asarray(camera.calibration_matrix(), np.float64), rigid(m[:, :3], m[:, 3]), distortion, xyz)
-    return np.nan_to_num(np.linalg.norm(seen - uv, axis=1), nan=np.inf)
+    return np.asarray(np.nan_to_num(np.linalg.norm(seen - uv, axis=1), nan=np.inf), np.float64)
 
 
 def _colmap_camera(lens: Lens, size: tuple[int, int]) -> Any:

@@ -75,8 +75,8 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         ]
         errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
         yield JudgedView(
-            i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, *errors,
-            mask_from=masks[i].source,
+            i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, errors[0],
+            errors[1], masks[i].source,
         )  # fmt: skip
 
 
