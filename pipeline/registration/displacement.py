@@ -18,16 +18,16 @@ from pipeline.registration.scan import Scan
 REACH = 0.003  # metres of the template: largest displacement
 AGREE, CLOSE = 2.0, 2e-4  # the latter in metres of the template
 SPREAD = 2  # rings of quads over which it fades to its borders
-HALVED = 8  # rounds of halving what closes lips
+HALVED = 8  # rounds of halving what closes lips and lids
 TAKEN_BACK = 6  # rounds of taking it back
 
 
 def displacement(
-    points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float, lips: Mask | None = None
+    points: F64, normals: F64, quads: Indices, free: Mask, scan: Scan, unit: float, closed: Mask | None = None
 ) -> tuple[F64, F64]:
     """(n,) metres along normals (n, 3) from points (n, 3), and (n,) how well the place is seen. quads (Q, 4); free
-    (Q,): those that may be displaced. unit: world units per metre of the template. lips (Q,): quads of lips that are
-    closed, which then meet."""
+    (Q,): those that may be displaced. unit: world units per metre of the template. closed (Q,): quads of lips and
+    lids that are closed, which then meet."""
     signed, seen = scan.along(points, normals, REACH * unit)
     pairs = scan.pairs(points, normals, 2 * REACH * unit)
     agrees = np.isfinite(signed) & (np.abs(np.nan_to_num(signed)) <= AGREE * pairs.distance + CLOSE * unit)
@@ -46,16 +46,18 @@ def displacement(
         bad = np.zeros(len(points), np.bool_)
         bad[hit] = True
         moved = moved * _faded(~bad, quads)
-    if lips is not None:
-        moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, lips, unit)
+    if closed is not None and closed.any():
+        moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, closed, unit)
     return moved, np.where(use, seen, 0.0)
 
 
-def _met(points: F64, normals: F64, quads: Indices, free: Mask, lips: Mask, unit: float) -> F64:
-    """(n,) what closes lips (Q,) after everything else; less where they would pass through each other."""
+def _met(points: F64, normals: F64, quads: Indices, free: Mask, closed: Mask, unit: float) -> F64:
+    """(n,) what closes lips and lids (Q,) after everything else; less where they would pass through each other."""
     faces, inner = triangles_of(quads[free]), np.zeros(len(points), np.bool_)
     inner[quads[~free]] = True
-    more = np.where(inner, 0.0, _smooth(np.where(inner, 0.0, meeting(points, normals, quads[lips], unit)), quads[lips]))
+    more = np.where(
+        inner, 0.0, _smooth(np.where(inner, 0.0, meeting(points, normals, quads[closed], unit)), quads[closed])
+    )
     before = np.unique(piercing_edges(points, faces))
     for turn in range(HALVED):
         hit = np.setdiff1d(piercing_edges(points + more[:, None] * normals, faces), before)

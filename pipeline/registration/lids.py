@@ -18,6 +18,7 @@ from pipeline.registration.scan import Scan
 from pipeline.template.model import Template
 
 BLINK = ("eyeBlinkLeft", "eyeBlinkRight")
+LIDS = "lids"  # the region
 STRENGTHS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)  # more, and the lids of the mean head pass each other
 CLOSED = 0.25  # from this strength the eyes count as closed
 REST = 0.3  # strength of the rest of closed eyes: the lids have their length, and do not pass each other yet
@@ -102,7 +103,7 @@ def _margins(template: Template) -> list[tuple[Indices, Indices]]:
 
 def _rings(template: Template) -> list[Indices]:
     """Vertices of the lids by their distance in edges from the sockets."""
-    lids, sockets = (template.quads[template.regions[n]] for n in ("lids", "sockets"))
+    lids, sockets = (template.quads[template.regions[n]] for n in (LIDS, "sockets"))
     rings = [np.intersect1d(lids, sockets)]
     done = rings[0]
     while len(rings) < RINGS:
@@ -115,4 +116,4 @@ def _rings(template: Template) -> list[Indices]:
 
 def _closable(template: Template) -> bool:
     names = template.expressions.names if template.expressions else ()
-    return set(BLINK) <= set(names) and {"lids", "sockets"} <= set(template.regions)
+    return set(BLINK) <= set(names) and {LIDS, "sockets"} <= set(template.regions)

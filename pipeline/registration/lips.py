@@ -96,7 +96,8 @@ def meeting(points: F64, normals: F64, quads: Indices, unit: float) -> F64:
     other lip, where that is at most SLIT away and faces them. quads (Q, 4): those of the lips. unit: world units
     per metre of the template.
 
-    Closed lips touch along a line. Registered ones leave a slit behind it, which no light reaches: a black line.
+    Closed lips touch along a line, and so do closed lids. Registered ones leave a slit behind it, which no light
+    reaches: a black line.
     """
     out = np.zeros(len(points))
     rows, faces = np.unique(quads), triangles_of(quads)

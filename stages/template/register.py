@@ -16,7 +16,7 @@ from pipeline.registration.displacement import displacement
 from pipeline.registration.followers import followed
 from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.identity_fit import PlacedHead
-from pipeline.registration.lids import REST, closing, lids_closed, with_lids
+from pipeline.registration.lids import LIDS, REST, closing, lids_closed, with_lids
 from pipeline.registration.lips import LIPS, closing_lips, lips_closed
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
 from pipeline.registration.quality import outer_quads
@@ -104,10 +104,9 @@ def register(
     regions, parts = (index_of(x, len(template.quads)) for x in (template.regions, template.parts))
     free = np.repeat(outer_quads(regions, tuple(template.regions)), 4**levels)
     points, normals, quads = limit_surface(vertices, level)
-    closed_lips = None
-    if lips_closed(template, landmarks, placed.scale):
-        closed_lips = np.repeat(np.isin(np.arange(len(template.quads)), template.regions[LIPS]), 4**levels)
-    moved, seen = displacement(points, normals, quads, free, scan, placed.scale, closed_lips)
+    names = [LIDS] * closed + [LIPS] * lips_closed(template, landmarks, placed.scale)
+    meet = np.isin(np.arange(len(template.quads)), [q for n in names for q in template.regions.get(n, ())])
+    moved, seen = displacement(points, normals, quads, free, scan, placed.scale, np.repeat(meet, 4**levels))
     lids = points[np.unique(quads[free])]
     for part, eye in known_eyes.items():
         own = eye_rows(level, template.parts[part], levels)

@@ -109,3 +109,6 @@ def test_lips_that_face_away_do_not_meet() -> None:
     turned = np.concatenate([quads[:64], quads[64:, ::-1]])  # the upper sheet shows the lower one its back
     assert not meeting(points, normals, turned, 1.0)[:81].any()
     assert not meeting(points, normals, quads[:0], 1.0).any()
+    points, normals, quads = sheets(1e-4, tilt=2.0)  # 63 degrees: a corner, not a slit
+    assert not meeting(points, normals, quads, 10.0)[:81].any()
+    assert meeting(*sheets(1e-4, tilt=0.2), 10.0)[:81].any()
