@@ -364,6 +364,7 @@ def test_keys_reach_every_control_and_move_it(opened: Tab) -> None:
 @pytest.mark.slow
 def test_a_click_on_a_camera_shows_its_view(opened: Tab) -> None:
     """Where the picture has the colour of held-out cameras."""
+    opened.run("document.getElementById('viewer-canvas').scrollIntoView({block: 'start', behavior: 'instant'})")
     tick(opened, "frusta", True)
     opened.run("document.getElementById('viewer-home').click()")
     picture = drawn(opened)
