@@ -51,10 +51,11 @@ def fitted(f0: float, roughness: float, *, skin: bool, scale: float = 1.0) -> fi
     return fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, np.full(len(albedo), skin))
 
 
-@pytest.mark.parametrize(("f0", "roughness"), [(0.03, 0.45), (0.09, 0.45), (0.05, 0.6)])
-def test_an_objects_material_is_found(f0: float, roughness: float) -> None:
+@pytest.mark.parametrize(("f0", "roughness", "limit"), [(0.03, 0.45, 0.05), (0.09, 0.45, 0.05), (0.05, 0.6, 0.18)])
+def test_an_objects_material_is_found(f0: float, roughness: float, limit: float) -> None:
+    """A rough layer's wide lobe is nearly a part of the diffuse light: its F0 is less certain."""
     found = fitted(f0, roughness, skin=False, scale=1.1)
-    assert np.median(found.f0) == pytest.approx(f0, rel=0.15)
+    assert np.median(found.f0) == pytest.approx(f0, rel=limit)
     assert np.median(found.roughness) == pytest.approx(roughness, abs=0.06)
     assert np.median(found.correction) == pytest.approx(1.1, rel=0.03)
 

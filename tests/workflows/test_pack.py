@@ -115,10 +115,10 @@ def test_without_the_option_or_an_asset_there_is_none(plan: Plan, photos: Path) 
         main(["run", str(photos), "--out", str(photos.parent / "c"), "--pack", "rar"])
 
 
-def test_room_is_asked_for(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_room_is_asked_for(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     monkeypatch.setattr("workflows.run.publish.check_room_for_copies", lambda out, files: asked.append(len([*files])))
-    publish(plan, [usd(tmp_path / "art")])
+    publish(plan, [usd(plan.store.root / "usd/art")])
     assert asked == [len(KEPT)]  # the asset's own files are hard links into OUT/.store
 
 
