@@ -64,7 +64,7 @@ class MovingLamps:
         for at, p in zip(self._lamps, self._turned(x, n, eye), strict=True):
             if at is not None:
                 unused, own = (np.empty((len(x), 3), np.float32) for _ in range(2))
-                share = standard.shares((p.normal * p.wo).sum(1), alpha)
+                share = standard.shares((p.normal * p.wo).sum(1), alpha).astype(np.float32)
                 kernels.shade(
                     p.normal, p.wo, corner, weights, f0.astype(np.float32), alpha, at.flux, at.lamp, share, unused, own
                 )

@@ -87,19 +87,23 @@ def lobes(at: Arrivals, vertex: npt.NDArray[np.int64], normal: F64, wo: F64, alp
     """(M, K, 2, 3) specular radiance of M observations at vertices, for K widths: F0 [:, :, 0] + [:, :, 1]."""
     out = np.empty((len(vertex), len(alphas), 2, 3), np.float32)
     share = shares((normal * wo).sum(1)[:, None], np.asarray(alphas)[None])
-    kernels.lobes(vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), share, out)
+    kernels.lobes(vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), _f32(share), out)
     return out
 
 
-def shares(cosine: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating]) -> F32:
+def shares(cosine: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating]) -> F64:
     """(2, ...) a and b of the layer's reflected share F0 a + b, bilinear in a table."""
-    return _f32(np.stack([_looked_up(t, cosine, alpha) for t in _tables()]))
+    return np.stack([_looked_up(t, cosine, alpha) for t in _tables()])
 
 
 def layer(cosine: npt.NDArray[np.floating], f0: npt.NDArray[np.floating], alpha: npt.NDArray[np.floating]) -> F64:
     """R (M,) for n.v, F0 and alpha (M,), bilinear in a table; 0 where F0 is 0, because there is no layer."""
-    a, b = (_looked_up(t, cosine, alpha) for t in _tables())
-    return np.where(np.asarray(f0) > 0, f0 * a + b, 0.0)
+    return reflected(shares(cosine, alpha), f0)
+
+
+def reflected(share: F64, f0: npt.NDArray[np.floating]) -> F64:
+    """R (M,) of `layer` from `shares` (2, M)."""
+    return np.where(np.asarray(f0) > 0, f0 * share[0] + share[1], 0.0)
 
 
 def radiance(
@@ -109,12 +113,11 @@ def radiance(
     (M,); corner, weights (M, 3)."""
     alpha = np.maximum(roughness**2, LEAST_ALPHA).astype(np.float32)
     diffuse, specular = (np.empty((len(normal), 3), np.float32) for _ in range(2))
-    cosine = (normal * wo).sum(1)
+    share = shares((normal * wo).sum(1), alpha)
     kernels.shade(
-        _f32(normal), _f32(wo), corner, _f32(weights), _f32(f0), alpha, at.flux, at.lamp, shares(cosine, alpha),
-        diffuse, specular,
-    )  # fmt: skip
-    kept = 1 - layer(cosine, f0, alpha)
+        _f32(normal), _f32(wo), corner, _f32(weights), _f32(f0), alpha, at.flux, at.lamp, _f32(share), diffuse, specular
+    )
+    kept = 1 - reflected(share, f0)
     return kept[:, None] * base / np.pi * diffuse, np.where(f0[:, None] > 0, specular, 0).astype(np.float64)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, vertex_normals
+from pipeline.meshes import F64, Indices, Mask, vertex_normals
 from pipeline.registration.cage import HIDDEN, LOOSE
 from pipeline.registration.identity_fit import Data, PlacedHead, landmark_data, place
 from pipeline.registration.outgrown import GROWS, growing, outgrown
@@ -33,36 +33,40 @@ def refined(template: Template, landmarks: F64, head: PlacedHead, scan: Scan) ->
 
 def surface_data(template: Template, head: PlacedHead, scan: Scan, reach: float) -> Data:
     """Point-to-plane data of the skin's outer vertices within `reach` metres of the template."""
-    vertex = _outer(template)
-    normals = vertex_normals(head.vertices, template.triangles()).astype(np.float64)[vertex]
+    vertex, normals = _outer(template, head)
     pairs = scan.pairs(head.vertices[vertex], normals, reach * head.scale)
-    loose = sum((template.region_weights(n) for n in LOOSE if n in template.regions), np.zeros(len(template.vertices)))
-    limit = np.where(loose[vertex] > 0, min(LOOSE_REACH, reach), reach) * head.scale
+    limit = np.where(_inside(template, LOOSE)[vertex], min(LOOSE_REACH, reach), reach) * head.scale
     use = np.flatnonzero((pairs.weight > 0) & (pairs.distance <= limit))
     use = use[:: max(1, len(use) // MOST)]
-    corners = np.repeat(vertex[use, None], 3, axis=1)
-    weights = np.tile([1.0, 0.0, 0.0], (len(use), 1))
-    sigma = SIGMA / np.sqrt(pairs.weight[use])
-    return Data(corners, weights, pairs.where[use], sigma, pairs.normals[use])
+    return _data(vertex[use], pairs.where[use], pairs.weight[use], pairs.normals[use])
 
 
 def outgrown_data(template: Template, head: PlacedHead, scan: Scan) -> Data:
     """Data of the vertices that the surface outgrows."""
-    vertex = _outer(template)
-    normals = vertex_normals(head.vertices, template.triangles()).astype(np.float64)[vertex]
-    grows = sum((template.region_weights(n) for n in GROWS if n in template.regions), np.zeros(len(template.vertices)))
-    may = growing(template.vertices[vertex], grows[vertex] > 0)
+    vertex, normals = _outer(template, head)
+    may = growing(template.vertices[vertex], _inside(template, GROWS)[vertex])
     found = outgrown(head.vertices[vertex], normals, may, scan, head.scale)
     use = np.flatnonzero(found.weight > 0)
-    corners = np.repeat(vertex[found.rows[use], None], 3, axis=1)
-    weights = np.tile([1.0, 0.0, 0.0], (len(use), 1))
-    return Data(corners, weights, found.where[use], SIGMA / np.sqrt(found.weight[use]), found.directions[use])
+    return _data(vertex[found.rows[use]], found.where[use], found.weight[use], found.directions[use])
 
 
-def _outer(template: Template) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """(N,) vertices of the skin that photos can show."""
+def _data(vertex: Indices, where: F64, weight: F64, normals: F64) -> Data:
+    """Data at vertices (N,), of which the distance along normals (N, 3) counts."""
+    weights = np.tile([1.0, 0.0, 0.0], (len(vertex), 1))
+    return Data(np.repeat(vertex[:, None], 3, axis=1), weights, where, SIGMA / np.sqrt(weight), normals)
+
+
+def _outer(template: Template, head: PlacedHead) -> tuple[Indices, F64]:
+    """(N,) vertices of the skin that photos can show, and their normals (N, 3) on the head."""
     skin = template.part_vertices(SKIN)
-    inside = sum(
-        (template.region_weights(n) for n in HIDDEN if n in template.regions), np.zeros(len(template.vertices))
-    )
-    return np.asarray(skin[inside[skin] == 0], np.int64)
+    vertex = np.asarray(skin[~_inside(template, HIDDEN)[skin]], np.int64)
+    return vertex, vertex_normals(head.vertices, template.triangles()).astype(np.float64)[vertex]
+
+
+def _inside(template: Template, regions: tuple[str, ...]) -> Mask:
+    """(V,) vertices with a quad of one of the regions; those that the template lacks have none."""
+    out = np.zeros(len(template.vertices))
+    for name in regions:
+        if name in template.regions:
+            out += template.region_weights(name)
+    return out > 0
