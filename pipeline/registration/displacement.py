@@ -3,14 +3,15 @@
 Symbols: p, N limit points and normals; t the distance from p along N to the surface, e that to its nearest place. A
 point is displaced if the surface there faces as the head does, photos see it, and t <= AGREE e + CLOSE: else the normal
 meets another part (the other lip, the lid below). Under hair nothing is displaced outwards, but what would come through
-the hair is sunk. Where displaced places pass through each other, the displacement is taken back.
+the hair is sunk. Where displaced places pass through each other or turn over, the displacement is taken back.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Indices, Mask, triangles_of
+from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, triangles_of
+from pipeline.meshes import unit as unit_normals
 from pipeline.registration.folds import piercing_edges
 from pipeline.registration.lips import meeting
 from pipeline.registration.scan import Scan
@@ -20,6 +21,7 @@ AGREE, CLOSE = 2.0, 2e-4  # the latter in metres of the template
 SPREAD = 2  # rings of quads over which it fades to its borders
 HALVED = 8  # rounds of halving what closes lips and lids
 TAKEN_BACK = 6  # rounds of taking it back
+TURNED = 0.4  # cosine
 
 
 def displacement(
@@ -40,7 +42,8 @@ def displacement(
     faces = triangles_of(quads[free])
     before = np.unique(piercing_edges(points, faces))
     for _ in range(TAKEN_BACK):
-        hit = np.setdiff1d(piercing_edges(points + moved[:, None] * normals, faces), before)
+        now = points + moved[:, None] * normals
+        hit = np.union1d(np.setdiff1d(piercing_edges(now, faces), before), _turned(points, now, faces))
         if not len(hit):
             break
         bad = np.zeros(len(points), np.bool_)
@@ -49,6 +52,13 @@ def displacement(
     if closed is not None and closed.any():
         moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, closed, unit)
     return moved, np.where(use, seen, 0.0)
+
+
+def _turned(before: F64, now: F64, faces: Faces) -> Indices:
+    """Vertices of faces (F, 3) that the displacement turns by more than TURNED: normals beside a fold of an ear meet
+    its other side."""
+    was, is_ = (unit_normals(area_vectors(x, faces)) for x in (before, now))
+    return np.asarray(np.unique(faces[(was * is_).sum(1) < TURNED]), np.int64)
 
 
 def _met(points: F64, normals: F64, quads: Indices, free: Mask, closed: Mask, unit: float) -> F64:

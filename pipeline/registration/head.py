@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.meshes import F32, F64, Indices, Mask
-from pipeline.registration.subdivision import Level, limit, subdivided
+from pipeline.registration.subdivision import Level, edges_of, limit, subdivided
 
 LEFT_OUT = ("lashes",)  # regions that the asset leaves out: they need a material with opacity
 
@@ -50,6 +50,15 @@ class Head:
         """(n, 3) the limit points, moved along their normals by the displacement."""
         points, normals, _ = self._surface
         return np.asarray(points + self.displacement[:, None].astype(np.float64) * normals)
+
+    def finer(self) -> F64:
+        """(n + E + Q 4^levels, 3) displaced points after one more subdivision, E the edges of the fine quads: at their
+        vertices, the edges' middles, the quads' middles. The displacement is linear between the vertices."""
+        quads, moved = self.surface()[2], self.displacement.astype(np.float64)
+        points, normals, _ = limit_surface(self.vertices, subdivided(self.quads, len(self.vertices), self.levels + 1))
+        ends = edges_of(quads, len(moved)).ends
+        heights = np.concatenate([moved, moved[ends].mean(1), moved[quads].mean(1)])
+        return np.asarray(points + heights[:, None] * normals)
 
     def fine_uvs(self) -> tuple[F64, Indices]:
         """(U', 2) texture coordinates and quads (Q 4^levels, 4), linear along the borders of charts."""

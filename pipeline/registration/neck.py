@@ -5,6 +5,11 @@ template's neck along, and a gap would open there. Symbols: d distance along the
 open border at the neck; e that from the nearest place of the neck that clothes or hair cover.
 
     share = min(step(d; HELD, FREE), step(e; HELD_COVERED, FREE_COVERED))    step: 0 up to the first, 1 from the second
+
+The template's last ring lies beneath that mesh, which overlaps it (stages/uv/remainder.py): on the same surface, the
+two would show in turn, in stripes.
+
+    depth = SUNK (1 - step(d; OVERLAPPED, LEVEL))
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from pipeline.template.model import SKIN, Template
 NECK = "neck"  # the region whose open border counts: other templates may have holes for eyes and mouth
 HELD, FREE = 0.02, 0.055  # metres of the template; the face begins 51 mm from the border
 HELD_COVERED, FREE_COVERED = 0.006, 0.035  # the same from a covered place: a collar ends where it is seen to end
+SUNK, OVERLAPPED, LEVEL = 5e-4, 0.004, 0.008  # metres of the template
 COVER = (0.004, 0.03)  # metres of the template outside of the skin: a surface between them covers it
 
 
@@ -61,6 +67,12 @@ def _step(x: F64, low: float, high: float) -> F64:
 def from_border(template: Template) -> F64:
     """(V,) metres along edges of the skin from the neck's border; infinite without a border, and beside the skin."""
     return _away(template.vertices, template.quads[template.parts[SKIN]], _neck_quads(template))
+
+
+def sunk(template: Template) -> F64:
+    """(V,) metres of the template by which the skin lies beneath the surface near the neck's border; 0 elsewhere."""
+    away = from_border(template)
+    return np.asarray(SUNK * (1 - _step(np.minimum(away, LEVEL), OVERLAPPED, LEVEL)))
 
 
 def neck_border(template: Template) -> Indices:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array, vstack
@@ -16,8 +16,9 @@ from pipeline.registration.displacement import displacement
 from pipeline.registration.followers import followed
 from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.identity_fit import PlacedHead
-from pipeline.registration.lids import LIDS, REST, closing, lids_closed, with_lids
+from pipeline.registration.lids import LIDS, REST, UPPER_LIDS, between, closing, lids_closed, with_lids
 from pipeline.registration.lips import LIPS, closing_lips, lips_closed
+from pipeline.registration.neck import sunk
 from pipeline.registration.nonrigid import Fitted, Guides, fitted
 from pipeline.registration.quality import outer_quads
 from pipeline.registration.refine_identity import refined
@@ -31,7 +32,9 @@ AROUND = 0.25  # metres of the template: the surface further from the head's mid
 ASKED = 30_000  # vertices of the surface whose visibility is computed; the others take that of the nearest
 LANDMARK_REACH = 0.006  # metres of the template: a landmark further from the surface does not guide
 ADULT = 1.1  # metres per metre of the template of an average adult: the unit of a capture of unknown scale
-CLOSED_LIDS = 2.0  # weight of what pulls closed lids, or closed lips, together, in that of a point on the surface
+# weights of what pulls closed lids and closed lips together, in that of a point on the surface
+CLOSED_LIDS, CLOSED_LIPS = 20.0, 2.0
+HIDDEN = 0.6  # share of the lids' margins in a point from which no surface shows it while they are closed
 
 Step = Callable[[int, int, str], None]
 
@@ -91,6 +94,8 @@ def register(
     closed = lids_closed(template, placed, cage, scan)
     start = with_lids(template, placed, REST if closed else 0.0)
     step(1, 5, "deformation")
+    if closed:
+        cage = replace(cage, shown=cage.shown & (between(template, cage) < HIDDEN))
     rest, guides = start[cage.of_template], guides_for(template, placed, cage, scan, landmarks, closed)
     found = fitted(cage, rest, scan, guides, placed.scale, lambda: step(1, 5, "deformation"))
     vertices = followed(template, start, cage.of_template, found.vertices, found.rotations, placed.scale)
@@ -107,6 +112,7 @@ def register(
     names = [LIDS] * closed + [LIPS] * lips_closed(template, landmarks, placed.scale)
     meet = np.isin(np.arange(len(template.quads)), [q for n in names for q in template.regions.get(n, ())])
     moved, seen = displacement(points, normals, quads, free, scan, placed.scale, np.repeat(meet, 4**levels))
+    moved = moved - placed.scale * (level.stencil @ sunk(template))
     lids = points[np.unique(quads[free])]
     for part, eye in known_eyes.items():
         own = eye_rows(level, template.parts[part], levels)
@@ -153,7 +159,8 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
     where = landmarks[points.network]
     known = np.isfinite(where).all(1)
     on, away = scan.nearest(np.nan_to_num(where))
-    use = np.flatnonzero(known & (away < LANDMARK_REACH * placed.scale))
+    wrong = closed & np.isin(points.network, UPPER_LIDS)
+    use = np.flatnonzero(known & (away < LANDMARK_REACH * placed.scale) & ~wrong)
     row = np.full(len(template.vertices), -1, np.int64)
     row[cage.of_template] = np.arange(len(cage.of_template))
     flat = csr_array(
@@ -169,7 +176,7 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
     if lips_closed(template, landmarks, placed.scale):
         more, there = closing_lips(template, placed, cage, placed.vertices[cage.of_template])
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
-        least = np.concatenate([least, np.full(len(there), CLOSED_LIDS)])
+        least = np.concatenate([least, np.full(len(there), CLOSED_LIPS)])
     return Guides(stencil, place_at, least)
 
 

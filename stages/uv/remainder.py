@@ -2,7 +2,8 @@
 mesh of its own, with charts on a tile of its own.
 
 Symbols: p a vertex of the dense mesh, q the nearest of the head's skin with normal n. p is left over if it lies outside
-(n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end) and |p - q| > JOINT.
+(n . (p - q) >= OUT |p - q|) by more than AWAY, or if q is on the head's border (the neck's end). The parts overlap by
+OVERLAP there, where the head lies beneath (pipeline/registration/neck.py).
 Around an ear (AROUND_EARS from its skin) nothing is left over but hair: photos from the front leave a web of the visual
 hull behind it, and the template has the back of an ear.
 """
@@ -15,7 +16,7 @@ from pipeline import meshes
 from pipeline.meshes import F32, F64, Mask, Mesh
 
 AWAY = 0.003  # metres: nearer, the head's skin stands for it
-JOINT = 0.001  # metres: the parts overlap by about a triangle at the neck's end
+OVERLAP = 0.0035  # metres over which the parts overlap at the neck's end; neck.OVERLAPPED is more
 OUT = 0.5  # cosine: what is inside of the head, or beside a fold of it, is not left over
 AROUND_EARS = 0.02  # metres
 SMALL = 0.01  # of the dense mesh's area: a piece up to this size that touches hair is hair
@@ -48,8 +49,10 @@ def beside_head(dense: Mesh, skin: Mesh, ears: F32 | None = None, hair: Mask | N
     points: F64 = dense.vertices.astype(np.float64)
     away, nearest = cKDTree(skin.vertices.astype(np.float64)).query(points)
     out = ((points - skin.vertices[nearest]) * skin.normals[nearest]).sum(1)
-    at_border = _border(skin)[nearest]
-    beside = np.where(at_border, away > JOINT, (away > AWAY) & (out >= OUT * away))
+    border = _border(skin)
+    beside = border[nearest] | ((away > AWAY) & (out >= OUT * away))
+    if border.any():
+        beside |= cKDTree(skin.vertices[border].astype(np.float64)).query(points)[0] < OVERLAP
     if ears is not None and len(ears):
         close = np.isfinite(cKDTree(ears).query(points, distance_upper_bound=AROUND_EARS)[0])
         beside &= ~close if hair is None else ~close | hair

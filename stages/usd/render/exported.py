@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 F32 = npt.NDArray[np.float32]
 CAGE_HEIGHT = "cage_displacement"  # name of the map of displacement from the cage's limit surface
+FINER = 1  # further subdivision of the cage: facets of the given ones lie up to .1 mm inside of the outline
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +158,8 @@ def _normal(folder: Path, name: str, count: int) -> F32 | None:
 
 
 def read_usd_mesh(path: Path) -> UvSurface:
-    """The meshes that are rendered (purpose default or render) as one of triangles. A cage is subdivided as often as
-    the asset says, and displaced by the map in textures/."""
+    """The meshes that are rendered (purpose default or render) as one of triangles. A cage is subdivided FINER
+    steps more than the asset says, as renderers do, and displaced by the map in textures/."""
     from pxr import Usd, UsdGeom
 
     from stages.usd.write.cage import is_cage, joined
@@ -205,7 +206,7 @@ def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
 def _displaced(mesh: UsdGeom.Mesh, path: Path) -> UvSurface:
     from stages.usd.write.cage import evaluated
 
-    smooth = evaluated(mesh)
+    smooth = evaluated(mesh, FINER)
     count = tile_count(smooth)
     if not _paths(path.parent, path.stem, CAGE_HEIGHT, "exr", count)[0].is_file():
         return smooth

@@ -18,6 +18,7 @@ from pipeline import meshes
 from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
+from pipeline.registration.facets import raised
 from pipeline.registration.head import Head, kept_quads, load_head
 from pipeline.registration.rig import load_rig
 from pipeline.registration.shapes import load_shapes, with_shapes
@@ -109,6 +110,9 @@ def _coarse(head: Head, kept: Mask) -> tuple[UvSurface, csr_array]:
     uv_quads = subdivided(head.uv_quads, len(head.uvs), steps, "sharp").quads[keep]
     points, fine = head.displaced(), head.surface()[2]
     normals = meshes.vertex_normals(points, triangles_of(fine))
+    count = level.stencil.shape[0]
+    own, finer = normals[:count].astype(np.float64), points if steps < head.levels else head.finer()
+    points = points[:count] + raised(points[:count], own, level.quads, finer)[:, None] * own
     rows, faces = np.unique(quads, return_inverse=True)
     used, uv_faces = np.unique(uv_quads, return_inverse=True)
     made = UvSurface(
@@ -172,13 +176,14 @@ def is_cage(mesh: UsdGeom.Mesh) -> bool:
     return mesh.GetPrim().GetCustomDataByKey(LEVELS_KEY) is not None
 
 
-def evaluated(mesh: UsdGeom.Mesh) -> UvSurface:
-    """Triangles of an authored cage after its subdivisions: limit points and limit normals, without displacement."""
+def evaluated(mesh: UsdGeom.Mesh, more: int = 0) -> UvSurface:
+    """Triangles of an authored cage after its subdivisions and `more`: limit points and limit normals, without
+    displacement."""
     points = np.array(mesh.GetPointsAttr().Get(), np.float64)
     quads = np.array(mesh.GetFaceVertexIndicesAttr().Get(), np.int64).reshape(-1, 4)
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     uvs, uv_quads = np.array(st.Get(), np.float64), np.array(st.GetIndices(), np.int64).reshape(-1, 4)
-    levels = int(mesh.GetPrim().GetCustomDataByKey(LEVELS_KEY))
+    levels = int(mesh.GetPrim().GetCustomDataByKey(LEVELS_KEY)) + more
     none = np.zeros(0, np.int64)
     head = Head(points, quads, uvs, uv_quads, none, none, none.astype(np.float32), none.astype(np.float32), levels)
     limit_points, normals, fine = head.surface()
