@@ -27,7 +27,7 @@ REACH = 0.004  # metres: a lid without a surface within it counts as this far aw
 WON = 0.97  # of the mean square distance of open lids: less is won by chance
 LEAST_LOOP = 6  # vertices of a ring around an eye: fewer are none
 RINGS = 4  # rings of vertices from the border with the socket that make a lid's margin, of the thickness of the lid
-# the face network's landmarks of the upper lids' margins; of closed eyes it places them 4 mm too high, the lower lids' 1
+# the face network's landmarks of the upper lids' margins: of closed eyes it places them 4 mm too high
 UPPER_LIDS = (157, 158, 159, 160, 161, 173, 246, 384, 385, 386, 387, 388, 398, 466)
 GAP = 4e-4  # metres between closed lids
 
