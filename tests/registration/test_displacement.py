@@ -52,6 +52,24 @@ def test_a_normal_that_meets_another_part_moves_nothing(unit: float, beyond: flo
     assert (seen == (1.0 if moves else 0.0)).all()
 
 
+def test_what_would_turn_a_facet_over_is_taken_back() -> None:
+    """One vertex whose normal meets the other side of a fold, far away: it and its surroundings stay."""
+    n, quads = ball_quads(12)
+    odd, one = 200, np.ones(len(n))
+    t = np.full(len(n), 1e-4)
+    t[odd] = 0.04
+    scan = SimpleNamespace(
+        along=lambda points, normals, reach: (t, one),
+        pairs=lambda points, normals, reach: SimpleNamespace(distance=t),
+        over=lambda points, normals, reach: 0 * one,
+    )
+    found, _ = displacement(RADIUS * n, n, quads, np.ones(len(quads), bool), scan, 1.0)  # type: ignore[arg-type]
+    assert found[odd] == 0 and found.max() <= 1e-4 + 1e-12
+    away = rings_from(np.arange(len(n)) == odd, quads)
+    np.testing.assert_allclose(found[away > SPREAD + 1], 1e-4)
+    assert (found[away == 1] == 0).all()
+
+
 def test_closed_lips_meet_and_do_not_pass_through_each_other() -> None:
     """Two sheets with normals that point anywhere within 40 degrees: half of the way at each would make them cross."""
     n = 13

@@ -9,7 +9,18 @@ from support.ball_head import ball_template
 
 from pipeline.meshes import Mesh, triangles_of, vertex_normals
 from pipeline.registration.expressions import transferred
-from pipeline.registration.neck import FREE, HELD, covered_neck, from_border, neck_border, neck_share
+from pipeline.registration.neck import (
+    FREE,
+    HELD,
+    LEVEL,
+    OVERLAPPED,
+    SUNK,
+    covered_neck,
+    from_border,
+    neck_border,
+    neck_share,
+    sunk,
+)  # fmt: skip
 from pipeline.registration.rig import jaw_axis, jaw_weights
 from pipeline.registration.scan import Scan
 from pipeline.template.load import load_template
@@ -50,6 +61,14 @@ def test_the_share_rises_with_the_distance_from_the_border() -> None:
     assert (share[AWAY >= FREE] == 1).all() and (share[~SKIN] == 1).all()
     straight = np.linalg.norm(TEMPLATE.vertices[SKIN][:, None] - TEMPLATE.vertices[border][None], axis=2).min(1)
     assert (AWAY[SKIN] >= straight - 1e-12).all() and (AWAY[SKIN] <= 1.6 * straight + 0.01).mean() > 0.9
+
+
+def test_the_last_ring_lies_beneath_the_scan() -> None:
+    depth = sunk(TEMPLATE)
+    assert (depth[AWAY <= OVERLAPPED] == SUNK).all() and (depth[AWAY >= LEVEL] == 0).all()
+    order = np.argsort(AWAY)
+    assert (np.diff(depth[order]) <= 0).all() and (depth[~SKIN] == 0).all()
+    assert (sunk(ball_template(4)) == 0).all()
 
 
 def test_a_template_without_an_open_neck_moves_everywhere() -> None:

@@ -13,7 +13,7 @@ from pipeline.artifacts import FileRef, Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import Mesh
 from stages.uv.hair import hair_faces, hair_mesh, hair_vertices
-from stages.uv.remainder import beside_head, left_over
+from stages.uv.remainder import OVERLAP, beside_head, left_over
 
 
 def scan(thick: float = 0.015) -> tuple[Mesh, np.ndarray]:
@@ -74,3 +74,17 @@ def test_around_an_ear_only_hair_is_left_over() -> None:
     left = beside_head(dense, ball, ears, told)
     assert not left[web & ~told].any() and left[told].all() and left[knob].all()
     assert not beside_head(dense, ball, ears)[web].any()
+
+
+def test_the_scan_overlaps_the_necks_end() -> None:
+    """A head that ends at a circle: what lies beneath it is left over, with a rim on the head's own side."""
+    dense = ball_scan(RADIUS)
+    own = dense.faces[(dense.vertices[dense.faces][:, :, 1] > -0.06).all(1)]
+    vertices, faces, rows = meshes.compact(dense.vertices, own)
+    head = Mesh(np.asarray(vertices, np.float32), dense.normals[rows], faces)
+    beside = beside_head(dense, head)
+    high = dense.vertices[:, 1]
+    end = head.vertices[:, 1].min()
+    assert beside[high <= end].all()
+    rim = (high > end) & (high < end + 0.5 * OVERLAP)
+    assert rim.any() and beside[rim].all() and not beside[high > end + 2 * OVERLAP].any()

@@ -21,6 +21,7 @@ from pipeline.lighting.dome import read_light, read_moving
 from pipeline.lighting.moving import MovingLight
 from pipeline.map_lookup import bilinear
 from pipeline.meshes import fans, vertex_normals
+from pipeline.registration.facets import raised
 from pipeline.transforms import apply
 from stages.usd.layout import existing, light_file
 from stages.usd.write.mesh import UvSurface, tile_count
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 F32 = npt.NDArray[np.float32]
 CAGE_HEIGHT = "cage_displacement"  # name of the map of displacement from the cage's limit surface
-FINER = 1  # further subdivision of the cage: facets of the given ones lie up to .1 mm inside of the outline
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +158,9 @@ def _normal(folder: Path, name: str, count: int) -> F32 | None:
 
 
 def read_usd_mesh(path: Path) -> UvSurface:
-    """The meshes that are rendered (purpose default or render) as one of triangles. A cage is subdivided FINER
-    steps more than the asset says, as renderers do, and displaced by the map in textures/."""
+    """The meshes that are rendered (purpose default or render) as one of triangles. A cage is subdivided as often as
+    the asset says and displaced by the map in textures/; its facets follow the surface that renderers with finer
+    subdivision show."""
     from pxr import Usd, UsdGeom
 
     from stages.usd.write.cage import is_cage, joined
@@ -206,15 +207,23 @@ def _triangles(mesh: UsdGeom.Mesh) -> UvSurface:
 def _displaced(mesh: UsdGeom.Mesh, path: Path) -> UvSurface:
     from stages.usd.write.cage import evaluated
 
-    smooth = evaluated(mesh, FINER)
+    smooth = evaluated(mesh)
     count = tile_count(smooth)
     if not _paths(path.parent, path.stem, CAGE_HEIGHT, "exr", count)[0].is_file():
         return smooth
+    height = _map(path.parent, path.stem, CAGE_HEIGHT, count)[..., :1]
+    moved, finer = (_at_height(x, height, count) for x in (smooth, evaluated(mesh, 1)))
+    normals = vertex_normals(moved, smooth.faces)
+    quads = smooth.faces.reshape(-1, 6)[:, [0, 1, 2, 5]].astype(np.int64)
+    high = raised(moved.astype(np.float64), normals.astype(np.float64), quads, finer.astype(np.float64))
+    return replace(smooth, vertices=np.asarray(moved + high[:, None] * normals, np.float32), normals=normals)
+
+
+def _at_height(smooth: UvSurface, height: F32, count: int) -> F32:
+    """(n, 3) vertices, moved along their normals by a map of heights."""
     uv = np.zeros((len(smooth.vertices), 2), np.float32)
     uv[smooth.faces] = smooth.uvs[smooth.uv_faces]
-    height = bilinear(_map(path.parent, path.stem, CAGE_HEIGHT, count)[..., :1], uv, count)
-    moved = np.asarray(smooth.vertices + height * smooth.normals, np.float32)
-    return replace(smooth, vertices=moved, normals=vertex_normals(moved, smooth.faces))
+    return np.asarray(smooth.vertices + bilinear(height, uv, count) * smooth.normals, np.float32)
 
 
 def read_cameras(lookdev: Path) -> dict[int, tuple[PinholeCamera, bool]]:
