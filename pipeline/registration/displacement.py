@@ -22,6 +22,7 @@ SPREAD = 2  # rings of quads over which it fades to its borders
 HALVED = 8  # rounds of halving what closes lips and lids
 TAKEN_BACK = 6  # rounds of taking it back
 TURNED = 0.4  # cosine
+EASED = 5  # rings of quads around it, and rounds of smoothing there
 
 
 def displacement(
@@ -40,7 +41,7 @@ def displacement(
     sunk = np.where(blocked, 0.0, np.minimum(scan.over(points, normals, 2 * REACH * unit), REACH * unit))
     moved = np.where(sunk > 0, np.minimum(moved, -sunk), moved)
     faces = triangles_of(quads[free])
-    before = np.unique(piercing_edges(points, faces))
+    before, odd = np.unique(piercing_edges(points, faces)), np.zeros(len(points), np.bool_)
     for _ in range(TAKEN_BACK):
         now = points + moved[:, None] * normals
         hit = np.union1d(np.setdiff1d(piercing_edges(now, faces), before), _turned(points, now, faces))
@@ -48,7 +49,8 @@ def displacement(
             break
         bad = np.zeros(len(points), np.bool_)
         bad[hit] = True
-        moved = moved * _faded(~bad, quads)
+        odd |= bad
+        moved = _eased(moved * _faded(~bad, quads), odd, quads[free])
     if closed is not None and closed.any():
         moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, closed, unit)
     return moved, np.where(use, seen, 0.0)
@@ -75,6 +77,17 @@ def _met(points: F64, normals: F64, quads: Indices, free: Mask, closed: Mask, un
             return more
         more[hit] *= 0.5 if turn < HALVED - 2 else 0.0
     return np.zeros(len(points))
+
+
+def _eased(moved: F64, odd: Mask, quads: Indices) -> F64:
+    """The displacement (n,) with the mean of the surroundings within EASED rings of what was taken back, odd (n,): else
+    a step is seen around it."""
+    near = odd.copy()
+    for _ in range(EASED):
+        near[quads[near[quads].any(1)]] = True
+    for _ in range(EASED if near.any() else 0):
+        moved = np.where(near, _smooth(moved, quads), moved)
+    return moved
 
 
 def _smooth(values: F64, quads: Indices) -> F64:

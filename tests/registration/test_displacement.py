@@ -10,7 +10,7 @@ from support.ball_head import RADIUS, ball_quads
 
 from pipeline.meshes import triangles_of
 from pipeline.registration import displacement as module
-from pipeline.registration.displacement import AGREE, CLOSE, SPREAD, displacement
+from pipeline.registration.displacement import AGREE, CLOSE, EASED, SPREAD, displacement
 from pipeline.registration.folds import piercing_edges
 from pipeline.registration.lips import meeting
 
@@ -64,10 +64,10 @@ def test_what_would_turn_a_facet_over_is_taken_back() -> None:
         over=lambda points, normals, reach: 0 * one,
     )
     found, _ = displacement(RADIUS * n, n, quads, np.ones(len(quads), bool), scan, 1.0)  # type: ignore[arg-type]
-    assert found[odd] == 0 and found.max() <= 1e-4 + 1e-12
+    assert 0 <= found[odd] < 0.7e-4 and found.max() <= 1e-4 + 1e-12
     away = rings_from(np.arange(len(n)) == odd, quads)
-    np.testing.assert_allclose(found[away > SPREAD + 1], 1e-4)
-    assert (found[away == 1] == 0).all()
+    np.testing.assert_allclose(found[away > SPREAD + 1 + EASED], 1e-4)
+    assert found[away == 1].max() < 0.9e-4
 
 
 def test_closed_lips_meet_and_do_not_pass_through_each_other() -> None:
