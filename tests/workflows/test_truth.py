@@ -132,6 +132,15 @@ def test_distances_are_exact_on_a_plane() -> None:
     assert geometry.distances(plane, np.array([[2.0, 0, 0]]))[0] == pytest.approx(1)
 
 
+def test_a_mesh_of_more_triangles_than_samples_is_no_further_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geometry, "TREE_SAMPLES", 100)
+    ball = trimesh.creation.icosphere(5)  # 20,480 triangles
+    random = np.random.default_rng(1)
+    corners = ball.triangles[random.integers(0, len(ball.faces), 300)]
+    points = np.einsum("nij,ni->nj", corners, random.dirichlet(np.ones(3), 300))
+    assert geometry.distances(ball, points).max() < 1e-12
+
+
 def test_held_out_pictures_are_found_in_the_store(tmp_path: Path) -> None:
     from workflows.evaluation.held_out import held_out_exr
 

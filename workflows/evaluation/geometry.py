@@ -83,11 +83,13 @@ def seen(mesh: Any, cameras: Iterable[tuple[PinholeCamera, F32 | None]]) -> F64:
 
 
 def distances(mesh: Any, points: F64) -> F64:
-    """From each point to the mesh: exact over the triangles of the nearest of many samples."""
+    """From each point to the mesh: exact over the triangles of the nearest of many samples. Each triangle has one at
+    least: a mesh with more triangles than samples would seem further away, by as much as a triangle's size."""
     import trimesh
     from scipy.spatial import cKDTree
 
     samples, face = trimesh.sample.sample_surface(mesh, TREE_SAMPLES, seed=1)
+    samples, face = np.concatenate([samples, mesh.triangles_center]), np.r_[face, np.arange(len(mesh.faces))]
     _, nearest = cKDTree(samples).query(points, NEIGHBOURS)
     triangles = mesh.triangles[face[nearest.ravel()]]
     repeated = np.repeat(points, NEIGHBOURS, axis=0)
