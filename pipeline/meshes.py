@@ -177,7 +177,12 @@ def edges(faces: Faces) -> Indices:
 
 def unique_edges(faces: Faces) -> Indices:
     """(E, 2) the vertices of each edge once, the lower first, sorted."""
-    return np.asarray(np.unique(np.sort(edges(faces), axis=1), axis=0), np.int64)
+    e = edges(faces)
+    if not len(e):
+        return e
+    count = int(e.max()) + 1  # one number for each edge sorts ten times as fast as rows
+    low, high = np.divmod(np.unique(e.min(1) * count + e.max(1)), count)
+    return np.stack([low, high], 1)
 
 
 def paired_edges(faces: Faces, count: int) -> tuple[Indices, Indices, int]:

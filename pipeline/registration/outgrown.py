@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pipeline.meshes import F64, Indices, Mask, unit
+from pipeline.meshes import F32, F64, Indices, Mask, unit
 from pipeline.registration.scan import Scan
 
 GROWS = ("ears",)  # regions; elsewhere what reaches further is hair or clothes
@@ -67,10 +67,25 @@ def growing(points: F64, ears: Mask) -> Mask:
 
 
 def _around(points: F64, scan: Scan, reach: float) -> Indices:
-    """At most MOST vertices of the scan that are seen and lie within `reach` of the points' boxes of either side."""
-    seen = np.flatnonzero(scan.seen > SEEN)
+    """At most MOST vertices of the scan that are seen and lie within `reach` of the points."""
+    seen = np.flatnonzero((scan.seen > SEEN) & _in_boxes(scan.mesh.vertices, points, reach))
     if not len(points) or not len(seen):
         return np.zeros(0, np.int64)
     near = np.isfinite(cKDTree(points).query(scan.mesh.vertices[seen], distance_upper_bound=reach)[0])
     rows = seen[near]
     return np.asarray(rows[:: max(1, -(-len(rows) // MOST))], np.int64)
+
+
+def _in_boxes(vertices: F32, points: F64, reach: float) -> Mask:
+    """(V,) vertices within `reach` of the boxes around the points (M, 3) of either side of their middle: few are, and
+    only these are compared with points."""
+    inside = np.zeros(len(vertices), np.bool_)
+    if not len(points):
+        return inside
+    centred = points - points.mean(0)
+    across = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    side = centred @ across > 0
+    for own in (points[side], points[~side]):
+        if len(own):
+            inside |= ((vertices >= own.min(0) - reach) & (vertices <= own.max(0) + reach)).all(1)
+    return inside
