@@ -65,8 +65,8 @@ def test_the_package_has_the_eyes_as_a_face_set_of_the_head(asset: Path) -> None
     stage = Usd.Stage.Open(str(asset / "head.usdz"))
     head = UsdGeom.Mesh.Get(stage, "/head/geo/render")
     sets = {str(s.GetPrim().GetName()): s for s in UsdGeom.Subset.GetAllGeomSubsets(head)}
-    assert len(sets["eyes_1002"].GetIndicesAttr().Get()) == 2 * 4 * EYES
-    material = UsdShade.MaterialBindingAPI(sets["eyes_1002"]).ComputeBoundMaterial()[0]
+    assert len(sets["eyes"].GetIndicesAttr().Get()) == 2 * 4 * EYES
+    material = UsdShade.MaterialBindingAPI(sets["eyes"]).ComputeBoundMaterial()[0]
     assert inputs_of(material)["ior"].Get() == pytest.approx(IOR)
     texture = UsdShade.Shader(inputs_of(material)["diffuseColor"].GetConnectedSources()[0][0].source.GetPrim())
     assert texture.GetInput("file").Get().path.endswith("1002.png")

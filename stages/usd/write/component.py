@@ -12,16 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdSkel, Vt
 
-from pipeline import tiles
 from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
-from stages.usd.write.eyes import EYES, eye_material
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
-from stages.usd.write.pieces import Piece, bind_pieces, grouped, pieces, together
+from stages.usd.write.pieces import bind_pieces, grouped, pieces, together
 from stages.usd.write.rig import RIG, MeshRig, bind, with_head, write_skeleton
-from stages.usd.write.shading import MATERIAL, Look, Part, preview_networks
+from stages.usd.write.shading import Look
 from stages.usd.write.tile_materials import (
     Made,
     TileMaterial,
@@ -161,6 +159,7 @@ def package_layer(
     who: Identity,
     mesh: UvSurface,
     look: Look,
+    materials: Sequence[TileMaterial],
     rig: MeshRig | None = None,
     eyes: Mask | None = None,
     hair: Look | None = None,
@@ -176,30 +175,20 @@ def package_layer(
         _fill(stage, who.name, mesh, None, look)
     else:
         UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
+        written = write_materials(stage, f"/{who.name}/mtl", materials, look, hair, across=count)
+        own = {(m.tile, m.eyes): material for m, material in written.items()}
         skeleton = _geo(stage, who.name, rig)
         found, moving = list(pieces(mesh, count, eyes)), 0 if rig is None else len(rig.weights)
         for kind, some in grouped(found, moving, None if hair is None else count - 1).items():
             whole, faces = together(some, count)
             made = _mesh(stage, f"/{who.name}/geo/{kind}", whole)
-            own = hair if kind == HAIR and hair is not None else look
-            bind_pieces(made, faces, [_piece_material(stage, who.name, kind, piece, own, count) for piece in some])
+            bind_pieces(made, faces, [own[piece.tile, piece.eyes] for piece in some])
             used = np.unique(whole.faces).astype(np.int64)
             if kind == HAIR:
                 made.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
             if rig is not None and skeleton is not None and kind in (RENDER, HAIR):
                 bind(stage, made, with_head(rig, len(used)) if kind == HAIR else rig.of_vertices(used), skeleton)
     return detached(stage)
-
-
-def _piece_material(stage: Usd.Stage, name: str, kind: str, piece: Piece, look: Look, count: int) -> UsdShade.Material:
-    """The material of one tile's triangles, of hair's or of the eyes on it. count: of the tiles."""
-    called = EYES if piece.eyes else HAIR if kind == HAIR else MATERIAL
-    path, part = f"/{name}/mtl/{called}_{tiles.FIRST + piece.tile}", Part(piece.tile, count)
-    if piece.eyes:
-        return eye_material(stage, path, look, part)
-    material = UsdShade.Material.Define(stage, path)
-    preview_networks(stage, material, look, part)
-    return material
 
 
 def _fill(

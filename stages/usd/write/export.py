@@ -132,7 +132,7 @@ def export(
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
         plain = _plain(look)
         hair = None if maps.hair is None else _plain(maps.hair)
-        single = component.package_layer(who, light_mesh, plain, light_rig, light_eyes, hair)
+        single = component.package_layer(who, light_mesh, plain, materials, light_rig, light_eyes, hair)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")

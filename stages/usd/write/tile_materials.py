@@ -81,13 +81,19 @@ def names_on(mesh: UvSurface, materials: Sequence[TileMaterial]) -> tuple[str, .
 
 
 def write_materials(
-    stage: Usd.Stage, scope: str, materials: Sequence[TileMaterial], look: Look, hair: Look | None = None
+    stage: Usd.Stage,
+    scope: str,
+    materials: Sequence[TileMaterial],
+    look: Look,
+    hair: Look | None = None,
+    across: int = 1,
 ) -> Made:
-    """Author the materials below a scope. hair: the look of HAIR."""
+    """Author the materials below a scope. hair: the look of HAIR. across: tiles that the texture coordinates have in
+    the unit square."""
     made = {}
     for m in materials:
         own = hair if m.name == HAIR and hair is not None else look if m.displaced else replace(look, displacement=None)
-        path, part = f"{scope}/{m.name}", Part(m.tile)
+        path, part = f"{scope}/{m.name}", Part(m.tile, across)
         if m.eyes:
             made[m] = eye_material(stage, path, own, part)
             continue
