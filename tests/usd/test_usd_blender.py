@@ -230,7 +230,7 @@ def test_blender_shows_the_asset_as_its_photos(tmp_path: Path) -> None:
     said = [line for line in ran.stdout.splitlines() if line.startswith("PROBE ")]
     assert said, ran.stdout[-2000:] + ran.stderr[-2000:]
     found, methods, world, photos, camera, transform = json.loads(said[0].removeprefix("PROBE "))
-    assert found["render"] == [[2, 2]] and methods["captured"] == "BOTH" and transform == "Standard"
+    assert found["render"] == [[2, 2]] and methods["skin_1001"] == "BOTH" and transform == "Standard"
     assert world == ["environment.exr"] and photos[camera] == [f"{camera.removeprefix('view_')}.png"]
     picture = cv2.imread(str(tmp_path / "a.png"), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (HEIGHT, WIDTH, 4)

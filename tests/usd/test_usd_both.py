@@ -61,7 +61,7 @@ def test_each_has_its_own_maps(made: tuple[Path, Path]) -> None:
         files[variant] = UsdShade.Shader(surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source.GetPrim())
         assert bool(material.ComputeDisplacementSource()[0]) == (variant == "template")
     paths = {k: s.GetInput("file").Get() for k, s in files.items()}
-    assert paths["template"].path == "./textures/head_albedo.<UDIM>.png"
+    assert paths["template"].path == "./textures/head_albedo.1001.png"
     assert paths["scan"].path == "./textures/head_scan_albedo.png" and Path(paths["scan"].resolvedPath).is_file()
     sets.SetSelection("look", "specular_workflow")
     material = UsdShade.Material.Get(stage, "/head/mtl/captured_scan")

@@ -72,22 +72,25 @@ def test_the_map_holds_metres(made: tuple[SyntheticInputs, Path]) -> None:
     assert np.abs(read_exr(made[1] / "textures/head_cage_displacement.1003.exr")[0]).max() == 0  # beside the head
 
 
-@pytest.mark.parametrize("output", ["", "mtlx"])
-def test_the_material_displaces(made: tuple[SyntheticInputs, Path], output: str) -> None:
+@pytest.mark.parametrize("name", ["skin_1001", "skin_1002"])
+@pytest.mark.parametrize(("output", "number"), [("", None), ("mtlx", "<UDIM>")])
+def test_the_materials_displace(made: tuple[SyntheticInputs, Path], name: str, output: str, number: str | None) -> None:
     stage = Usd.Stage.Open(str(made[1] / "head.usd"))
-    material = UsdShade.Material.Get(stage, "/head/mtl/captured")
+    material = UsdShade.Material.Get(stage, f"/head/mtl/{name}")
     source = material.ComputeDisplacementSource(output)[0]
     height = source.GetInput("displacement").GetConnectedSources()[0][0].source
     file = UsdShade.Shader(height.GetPrim()).GetInput("file").Get().path
-    assert file == "./textures/head_cage_displacement.<UDIM>.exr"
+    assert file == f"./textures/head_cage_displacement.{number or name[-4:]}.exr"
     if output:
         assert source.GetShaderId() == "ND_displacement_float" and source.GetInput("scale").Get() == 1.0
     for variant in ("high", "proxy"):
         stage.GetDefaultPrim().GetVariantSet("lod").SetVariantSelection(variant)
         assert not material.ComputeDisplacementSource(output)[0]
-        preview = UsdShade.Shader.Get(stage, "/head/mtl/captured/preview")
+        preview = UsdShade.Shader.Get(stage, f"/head/mtl/{name}/preview")
         assert not preview.GetInput("displacement").HasConnectedSource()
         assert not stage.GetPrimAtPath("/head/geo/rest").IsActive()
+    beside = UsdShade.Material.Get(stage, "/head/mtl/clothes")
+    assert not beside.ComputeDisplacementSource(output)[0]  # its mesh is not subdivided
 
 
 @pytest.mark.parametrize("file", ["head.usd", "lookdev.usda", "head.usdz"])

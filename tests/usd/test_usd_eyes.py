@@ -39,19 +39,21 @@ def test_the_eyes_faces_have_the_cornea(asset: Path) -> None:
     subsets = {s.GetPrim().GetName(): s for s in UsdGeom.Subset.GetGeomSubsets(cage)}
     count = len(cage.GetFaceVertexCountsAttr().Get())
     rows = {n: set(s.GetIndicesAttr().Get()) for n, s in subsets.items()}
-    assert set(rows) == {"eyes", "skin"} and len(rows["eyes"]) == EYES
-    assert rows["eyes"] | rows["skin"] == set(range(count)) and not rows["eyes"] & rows["skin"]
+    assert set(rows) == {"eyes", "skin_1001", "skin_1002"} and len(rows["eyes"]) == EYES
+    assert sorted(i for r in rows.values() for i in r) == list(range(count))
     found = {n: UsdShade.MaterialBindingAPI(s).ComputeBoundMaterial()[0] for n, s in subsets.items()}
-    assert {n: str(m.GetPath()) for n, m in found.items()} == {"eyes": "/head/mtl/eyes", "skin": "/head/mtl/captured"}
+    assert {n: str(m.GetPath()) for n, m in found.items()} == {n: f"/head/mtl/{n}" for n in rows}
     preview = inputs_of(found["eyes"])
     assert preview["ior"].Get() == pytest.approx(IOR) and preview["roughness"].Get() == pytest.approx(ROUGHNESS)
-    assert preview["metallic"].Get() == 0 and preview["diffuseColor"].HasConnectedSource()
+    assert preview["metallic"].Get() == 0
+    texture = UsdShade.Shader(preview["diffuseColor"].GetConnectedSources()[0][0].source.GetPrim())
+    assert texture.GetInput("file").Get().path == "./textures/head_albedo.1002.png"
     openpbr = inputs_of(found["eyes"], "mtlx")
     assert openpbr["specular_ior"].Get() == pytest.approx(IOR)
     assert openpbr["specular_roughness"].Get() == pytest.approx(ROUGHNESS) and openpbr["specular_weight"].Get() == 1
     assert found["eyes"].ComputeDisplacementSource()[0] and found["eyes"].ComputeDisplacementSource("mtlx")[0]
     skin = UsdShade.MaterialBindingAPI(cage).ComputeBoundMaterial()[0]
-    assert str(skin.GetPath()) == "/head/mtl/captured"  # of programs that know no subsets
+    assert str(skin.GetPath()) == "/head/mtl/skin_1001"  # of programs that know no subsets
 
 
 @pytest.mark.parametrize("file", ["head.usd", "lookdev.usda", "head.usdz"])
@@ -63,8 +65,8 @@ def test_the_package_has_the_eyes_as_a_face_set_of_the_head(asset: Path) -> None
     stage = Usd.Stage.Open(str(asset / "head.usdz"))
     head = UsdGeom.Mesh.Get(stage, "/head/geo/render")
     sets = {str(s.GetPrim().GetName()): s for s in UsdGeom.Subset.GetAllGeomSubsets(head)}
-    assert len(sets["eyes_1002"].GetIndicesAttr().Get()) == 2 * 4 * EYES
-    material = UsdShade.MaterialBindingAPI(sets["eyes_1002"]).ComputeBoundMaterial()[0]
+    assert len(sets["eyes"].GetIndicesAttr().Get()) == 2 * 4 * EYES
+    material = UsdShade.MaterialBindingAPI(sets["eyes"]).ComputeBoundMaterial()[0]
     assert inputs_of(material)["ior"].Get() == pytest.approx(IOR)
     texture = UsdShade.Shader(inputs_of(material)["diffuseColor"].GetConnectedSources()[0][0].source.GetPrim())
     assert texture.GetInput("file").Get().path.endswith("1002.png")

@@ -60,11 +60,11 @@ def test_it_is_a_prim_with_its_own_tile_and_material(made: tuple[SyntheticInputs
     assert hair.GetPurposeAttr().Get() == "render" and hair.GetSubdivisionSchemeAttr().Get() == "none"
     assert hair.GetDoubleSidedAttr().Get() and not rest.GetDoubleSidedAttr().Get()
     material = bound(hair)
-    assert str(material.GetPath()) == "/head/mtl/hair" and str(bound(rest).GetPath()) == "/head/mtl/captured"
+    assert str(material.GetPath()) == "/head/mtl/hair" and str(bound(rest).GetPath()) == "/head/mtl/clothes"
     for output in ("", "mtlx"):
         assert material.ComputeSurfaceSource(output)[0] and not material.ComputeDisplacementSource(output)[0]
     texture = material.ComputeSurfaceSource()[0].GetInput("diffuseColor").GetConnectedSources()[0][0].source
-    assert UsdShade.Shader(texture.GetPrim()).GetInput("file").Get().path == "./textures/head_albedo.<UDIM>.png"
+    assert UsdShade.Shader(texture.GetPrim()).GetInput("file").Get().path == "./textures/head_albedo.1004.png"
 
 
 def test_the_variants_have_it_where_the_template_is(made: tuple[SyntheticInputs, Path]) -> None:
@@ -85,13 +85,13 @@ def test_the_variants_have_it_where_the_template_is(made: tuple[SyntheticInputs,
     looks = {}
     for look in ("standard", "specular_workflow", "neuface_basis"):
         sets.SetSelection("look", look)
-        for name in ("captured", "hair"):
+        for name in ("skin_1001", "skin_1002", "clothes", "hair"):
             material = UsdShade.Material.Get(stage, f"/head/mtl/{name}")
             found = tuple(
                 str(material.ComputeSurfaceSource(o)[0].GetPath().MakeRelativePath(material.GetPath()))
                 for o in ("", "mtlx")
             )
-            assert looks.setdefault(look, found) == found  # the same network of both materials
+            assert looks.setdefault(look, found) == found  # the same network of all materials
     assert len(set(looks.values())) == 3
 
 
@@ -120,7 +120,7 @@ def test_it_follows_the_head_and_no_expression(made: tuple[SyntheticInputs, Path
 def test_the_package_reads_its_tile(made: tuple[SyntheticInputs, Path]) -> None:
     stage = Usd.Stage.Open(str(made[1] / "head.usdz"))
     material = bound(of(stage, "hair"))
-    assert material.GetPath().name == "hair_1004"
+    assert material.GetPath().name == "hair"
     texture = material.ComputeSurfaceSource()[0].GetInput("diffuseColor").GetConnectedSources()[0][0].source
     assert UsdShade.Shader(texture.GetPrim()).GetInput("file").Get().path.endswith("1004.png")
 

@@ -57,10 +57,11 @@ def test_every_map_has_a_file_for_each_tile(tiled: tuple[Path, UsdAsset]) -> Non
         assert name.replace("1002", "1001") in names and name.replace("1001", "1002") in names
 
 
-def test_the_networks_read_rows_of_tiles_and_usd_finds_them_all(tiled: tuple[Path, UsdAsset]) -> None:
+def test_materialx_reads_rows_of_tiles_and_usd_finds_them_all(tiled: tuple[Path, UsdAsset]) -> None:
     stage = Usd.Stage.Open(str(tiled[0] / "head.usd"))
     shaders = [UsdShade.Shader(p) for p in stage.Traverse() if p.IsA(UsdShade.Shader)]
-    paths = {s.GetPath().name: s.GetInput("file").Get().path for s in shaders if s.GetInput("file")}
+    mtlx = [s for s in shaders if s.GetInput("file") and s.GetShaderId().startswith("ND_")]
+    paths = {s.GetPath().name: s.GetInput("file").Get().path for s in mtlx}
     assert paths["albedo"] == "./textures/head_albedo.<UDIM>.png"
     assert paths["coefficients_0"] == "./internal/head_coefficients_rgb0.<UDIM>.exr"
     assert paths["basis_0"] == "./internal/head_basis_rgb0.exr"
@@ -97,6 +98,44 @@ def test_tiles_do_not_mix_at_their_border() -> None:
     u = np.array([0.0, 0.99, 1 - 1e-6, 1.0, 1.01, 2.0, 3.0])
     uv = np.stack([u, np.full_like(u, 0.4)], -1)
     np.testing.assert_array_equal(bilinear(image, uv, 2)[:, 0], [1, 1, 1, 5, 5, 5, 5])
+
+
+@pytest.mark.parametrize("level", ["render", "high", "proxy"])
+def test_each_face_reads_its_own_tile(tiled: tuple[Path, UsdAsset], level: str) -> None:
+    """Face by face: the file of its tile, with coordinates inside the unit square; in each look, and in MaterialX the
+    row of tiles with the coordinates as they are."""
+    stage = Usd.Stage.Open(str(tiled[0] / "head.usd"))
+    sets = stage.GetDefaultPrim().GetVariantSets()
+    sets.SetSelection("lod", level)
+    mesh = UsdGeom.Mesh.Get(stage, f"/head/geo/{level}")
+    st = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()).reshape(-1, 3, 2)
+    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    assert [s.GetPrim().GetName() for s in subsets] == [f"captured_{n}" for n in NUMBERS]
+    rows = [np.array(s.GetIndicesAttr().Get()) for s in subsets]
+    assert np.array_equal(np.sort(np.concatenate(rows)), np.arange(len(st)))
+    for look in ("standard", "specular_workflow"):
+        sets.SetSelection("look", look)
+        for tile, (one, own) in enumerate(zip(subsets, rows, strict=True)):
+            material = UsdShade.MaterialBindingAPI(one).ComputeBoundMaterial()[0]
+            surface = material.ComputeSurfaceSource()[0]
+            assert surface.GetInput("useSpecularWorkflow").Get() == (look != "standard")
+            for name in ("diffuseColor", "roughness", "normal"):
+                texture = UsdShade.Shader(surface.GetInput(name).GetConnectedSources()[0][0].source.GetPrim())
+                file = texture.GetInput("file").Get()
+                assert file.path.split(".")[-2] == NUMBERS[tile] and Path(file.resolvedPath).is_file()
+                assert texture.GetInput("wrapS").Get() == texture.GetInput("wrapT").Get() == "clamp"
+                reader = UsdShade.Shader(texture.GetInput("st").GetConnectedSources()[0][0].source.GetPrim())
+                shift = reader.GetInput("translation").Get() if reader.GetShaderId() == "UsdTransform2d" else (0, 0)
+                at = st[own] + np.array(shift)
+                assert at.min() >= 0 and at.max() <= 1 and at[..., 0].max() > 0.9, (name, tile)
+            assert "<UDIM>" in picture_of(material, "mtlx", "base_color")
+
+
+def picture_of(material: UsdShade.Material, context: str, name: str) -> str:
+    surface = material.ComputeSurfaceSource(context)[0]
+    return str(
+        UsdShade.Shader(surface.GetInput(name).GetConnectedSources()[0][0].source.GetPrim()).GetInput("file").Get()
+    )
 
 
 def test_other_formats_have_a_material_for_each_tile(tiled: tuple[Path, UsdAsset]) -> None:
@@ -163,6 +202,31 @@ def smaller(asset: Path) -> None:
     write_png(path, read_encoded(path)[::2, ::2] / 255.0)
 
 
+def material(asset: Path, change: Callable[[UsdShade.Shader], object], shader: str) -> None:
+    stage = Usd.Stage.Open(str(asset / "payload.usdc"))
+    change(UsdShade.Shader.Get(stage, f"/head/mtl/captured_1002/{shader}"))
+    stage.Save()
+
+
+def shifted(asset: Path) -> None:
+    """The second tile's material moves the coordinates by too little."""
+    material(asset, lambda s: s.GetInput("translation").Set((-0.5, 0)), "st_of_part")
+
+
+def row_in_preview(asset: Path) -> None:
+    material(asset, lambda s: s.GetInput("file").Set("./textures/head_normal.<UDIM>.png"), "normal")
+
+
+def swapped(asset: Path) -> None:
+    """A face changes its face set."""
+    stage = Usd.Stage.Open(str(asset / "payload.usdc"))
+    one, two = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/head/geo/render")).GetMaterialBindSubsets()
+    first, second = (list(s.GetIndicesAttr().Get()) for s in (one, two))
+    one.GetIndicesAttr().Set(first[1:])
+    two.GetIndicesAttr().Set([*second, first[0]])
+    stage.Save()
+
+
 FAULTS: list[tuple[Callable[[Path], None], str, str]] = [
     (lambda a: (a / "textures/head_albedo.1002.png").unlink(), "missing_texture", "head_albedo.1002.png"),
     (lambda a: (a / "textures/head_f0.1001.exr").unlink(), "missing_texture", "head_f0.1001.exr"),
@@ -170,6 +234,9 @@ FAULTS: list[tuple[Callable[[Path], None], str, str]] = [
     (across, "st", "are in two UDIM tiles"),
     (beyond, "missing_texture", "head_albedo.1003.png"),
     (smaller, "tile_size", "64x64 and 128x128"),
+    (shifted, "st", "faces lie outside of the picture of /head/mtl/captured_1002/"),
+    (swapped, "st", "1 faces lie outside of the picture of /head/mtl/captured_1002/"),
+    (row_in_preview, "usdShadeValidators:NormalMapTextureValidator.InvalidFile", "<UDIM>"),
 ]
 
 

@@ -8,6 +8,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from stages.usd.check.chart_checks import chart_findings
 from stages.usd.check.findings import Finding
+from stages.usd.check.reader_checks import moves, reader_findings
 from stages.usd.check.tile_checks import coordinate_findings, tiled
 
 F64 = npt.NDArray[np.float64]
@@ -150,8 +151,9 @@ def _primvars(mesh: UsdGeom.Mesh, sizes: dict[str, int]) -> list[Finding]:
     values = np.array(st.Get(Usd.TimeCode.Default()), np.float64)
     if not out and np.isfinite(values).all() and st.GetInterpolation() == "faceVarying":
         corners = np.array(st.ComputeFlattened(), np.float64)
-        placed = coordinate_findings(mesh, corners) if tiled(mesh) else _in_square(mesh, values)
-        return placed or chart_findings(mesh, corners)
+        in_row = tiled(mesh) or moves(mesh)
+        placed = coordinate_findings(mesh, corners) if in_row else _in_square(mesh, values)
+        return placed or [*reader_findings(mesh, corners), *chart_findings(mesh, corners)]
     return [*out, *_in_square(mesh, values)]
 
 

@@ -27,7 +27,6 @@ from stages.usd.check.material_checks import colour_findings, material_findings,
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
 MISSING_ID = "MissingShaderIdInRegistry"
-UNRESOLVED = "NormalMapTextureValidator.InvalidFile"
 
 
 def validate(path: Path) -> list[Finding]:
@@ -78,13 +77,13 @@ def _validators() -> list[object]:
 
 
 def library(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Findings of UsdValidation. Two are lowered to info: MaterialX shader ids, which builds without its node
-    definitions do not know; and a normal map in tiles, which has no single file (`textures` checks the tiles)."""
+    """Findings of UsdValidation. One is lowered to info: MaterialX shader ids, which builds without its node
+    definitions do not know."""
     out = []
     for e in UsdValidation.ValidationContext(_validators()).Validate(stage):
         kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
         message, name = " ".join(e.GetMessage().split()), e.GetIdentifier()
-        known = (MISSING_ID in name and "'ND_" in message) or (UNRESOLVED in name and tile_checks.is_tiled(message))
+        known = MISSING_ID in name and "'ND_" in message
         level = "info" if known or kind == "info" else "warning" if kind.startswith("warn") else "error"
         where = ", ".join(str(s.GetPrim().GetPath()) for s in e.GetSites() if s.IsPrim())
         out.append(Finding(level, name, message, where))  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
+from pxr import Sdf, Usd, UsdGeom, Vt
 from scipy.sparse import csr_array
 
 from pipeline import meshes
@@ -20,12 +20,14 @@ from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
 from pipeline.registration.facets import raised
 from pipeline.registration.head import Head, kept_quads, load_head
+from pipeline.registration.quality import outer_quads
 from pipeline.registration.rig import load_rig
 from pipeline.registration.shapes import load_shapes, with_shapes
 from pipeline.registration.subdivision import limit, subdivided
 from stages.usd.write.eyes import eye_quads
 from stages.usd.write.mesh import UvSurface
 from stages.usd.write.rig import MeshRig, mesh_rig
+from stages.usd.write.variants import HAIR, REST
 
 COARSE = 1  # subdivisions of the mesh for programs that do not subdivide
 LEVELS_KEY = "neufaceSubdivisions"  # customData of the cage: steps after which its vertices carry the displacement
@@ -35,7 +37,7 @@ LEVELS_KEY = "neufaceSubdivisions"  # customData of the cage: steps after which 
 class CageSurface:
     """vertices (V, 3), quads (Q, 4), uvs (U, 2), uv_quads (Q, 4): the cage without what the asset leaves out. rows
     (V,): of its vertices in the template. levels: subdivisions after which its vertices carry the displacement. eyes
-    (Q,): fitted eyes, which have a material of their own."""
+    (Q,): fitted eyes, which have a material of their own. outer (Q,): the skin's outside."""
 
     vertices: F64
     quads: Indices
@@ -44,6 +46,7 @@ class CageSurface:
     rows: Indices
     levels: int
     eyes: Mask
+    outer: Mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +65,10 @@ class TemplateMesh:
     coarse_eyes: Mask | None = None
     hair: UvSurface | None = None
 
+    def beside(self) -> tuple[str, ...]:
+        """Names of the meshes beside the template."""
+        return tuple(name for name, part in ((REST, self.rest), (HAIR, self.hair)) if part is not None)
+
 
 def template_mesh(
     registered: Located[RegisteredHead], textured: UvSurface, *, rigged: bool, measured: str = "", hair_faces: int = 0
@@ -77,7 +84,8 @@ def template_mesh(
     heights = np.zeros(len(textured.vertices), np.float32)
     heights[: len(used)] = head.displacement[used]
     eyes = eye_quads(head, registered.artifact)[kept]
-    cage, (coarse, points) = _cage(head, kept, eyes), _coarse(head, kept)
+    outer = outer_quads(head.region, registered.artifact.regions)[kept]
+    cage, (coarse, points) = _cage(head, kept, eyes, outer), _coarse(head, kept)
     fine_eyes = np.repeat(eyes, len(coarse.faces) // len(eyes)) if eyes.any() else None
     first, hair = 2 * len(quads), len(textured.faces) - hair_faces
     rest, hairs = _part(textured, first, hair), _part(textured, hair, len(textured.faces))
@@ -91,12 +99,12 @@ def template_mesh(
     return replace(made, rig=mesh_rig(rig).of_vertices(cage.rows), coarse_rig=mesh_rig(rig, points))
 
 
-def _cage(head: Head, kept: Mask, eyes: Mask) -> CageSurface:
+def _cage(head: Head, kept: Mask, eyes: Mask, outer: Mask) -> CageSurface:
     rows, quads = np.unique(head.quads[kept], return_inverse=True)
     used, uv_quads = np.unique(head.uv_quads[kept], return_inverse=True)
     return CageSurface(
         head.vertices[rows], quads.reshape(-1, 4), head.uvs[used].astype(np.float32), uv_quads.reshape(-1, 4),
-        rows.astype(np.int64), head.levels, eyes,
+        rows.astype(np.int64), head.levels, eyes, outer,
     )  # fmt: skip
 
 
@@ -149,9 +157,9 @@ def joined(parts: list[UvSurface]) -> UvSurface:
 
 
 # ------------------------------------------------------------------ USD
-def write_cage(stage: Usd.Stage, path: str, cage: CageSurface, material: UsdShade.Material) -> UsdGeom.Mesh:
+def write_cage(stage: Usd.Stage, path: str, cage: CageSurface) -> UsdGeom.Mesh:
     """Author the cage: quads, Catmull-Clark, borders as pipeline.registration.subdivision has them. It has no normals:
-    those of a subdivision surface are its limit's."""
+    those of a subdivision surface are its limit's. Its materials are bound by the caller."""
     points = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(cage.vertices, np.float32))
     out = UsdGeom.Mesh.Define(stage, path)
     out.CreatePointsAttr(points)
@@ -167,7 +175,6 @@ def write_cage(stage: Usd.Stage, path: str, cage: CageSurface, material: UsdShad
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(cage.uvs, np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(cage.uv_quads.ravel(), np.int32)))
     out.GetPrim().SetCustomDataByKey(LEVELS_KEY, cage.levels)
-    UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
     return out
 
 

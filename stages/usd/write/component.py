@@ -8,20 +8,27 @@ among them and among the meshes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdShade, UsdSkel, Vt
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdSkel, Vt
 
-from pipeline import tiles
 from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
-from stages.usd.write.eyes import EYES, bind_eyes, eye_material
-from stages.usd.write.materialx import materialx_networks
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
-from stages.usd.write.pieces import Piece, bind_pieces, grouped, pieces, together
+from stages.usd.write.pieces import bind_pieces, grouped, pieces, together
 from stages.usd.write.rig import RIG, MeshRig, bind, with_head, write_skeleton
-from stages.usd.write.shading import MATERIAL, Look, preview_networks
+from stages.usd.write.shading import Look
+from stages.usd.write.tile_materials import (
+    Made,
+    TileMaterial,
+    bind_tiles,
+    skins,
+    split_by_tile,
+    tile_materials,
+    write_materials,
+)
 from stages.usd.write.variants import (
     HAIR,
     RENDER,
@@ -89,16 +96,16 @@ def root_layer(
     extents: list[Gf.Vec3f],
     look: Look,
     *,
-    high: bool,
+    materials: Sequence[TileMaterial],
+    high: Sequence[str],
     proxy: bool,
     thumbnail: str | None,
-    rest: bool = False,
-    scan: Look | None = None,
-    hair: Look | None = None,
+    beside: tuple[str, ...] = (),
+    scan: Sequence[TileMaterial] = (),
 ) -> Sdf.Layer:
-    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded. rest:
-    whether there is a mesh beside the template; scan, hair: the looks of the scan's mesh and of hair, if there are
-    such meshes beside it."""
+    """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded.
+    high: names of the dense mesh's materials, none without it. beside: names of the meshes beside the template. scan:
+    the materials of the scan's mesh, if there is one beside it."""
     stage = new_stage(
         "Captured head. Open or reference this file; lookdev.usda adds the captured light and cameras.", who.name
     )
@@ -109,12 +116,11 @@ def root_layer(
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    write_looks(stage, prim, look, scan, hair)
-    beside = (*([REST] if rest else []), *([HAIR] if hair is not None else []))
-    write_levels(stage, prim, beside=beside, scan=scan is not None, high=high, proxy=proxy)
+    write_looks(stage, prim, look, skins([*materials, *scan]))
+    write_levels(stage, prim, beside=beside, scan=bool(scan), high=high, proxy=proxy)
     if look.displacement:
-        without_displacement(stage, prim, look)
-    if scan is not None:
+        without_displacement(stage, prim, look, skins([m for m in materials if m.displaced]))
+    if scan:
         write_meshes(stage, prim, beside=beside)
     return detached(stage)
 
@@ -136,12 +142,13 @@ def payload_layer(
     return detached(stage)
 
 
-def high_layer(mesh: UvSurface, look: Look) -> Sdf.Layer:
-    """high.usdc: the dense mesh as /high. The material is bound where it is loaded."""
+def high_layer(mesh: UvSurface, look: Look, materials: Sequence[TileMaterial]) -> Sdf.Layer:
+    """high.usdc: the dense mesh as /high. Its materials are bound where it is loaded."""
     stage = Usd.Stage.CreateInMemory(Usd.Stage.LoadNone)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
-    made = _mesh(stage, "/high", mesh, None)
+    made = _mesh(stage, "/high", mesh)
+    split_by_tile(made, materials)
     made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     stage.SetDefaultPrim(made.GetPrim())
     stage.GetRootLayer().documentation = "The captured head's surface before decimation."
@@ -152,6 +159,7 @@ def package_layer(
     who: Identity,
     mesh: UvSurface,
     look: Look,
+    materials: Sequence[TileMaterial],
     rig: MeshRig | None = None,
     eyes: Mask | None = None,
     hair: Look | None = None,
@@ -167,30 +175,20 @@ def package_layer(
         _fill(stage, who.name, mesh, None, look)
     else:
         UsdGeom.Scope.Define(stage, f"/{who.name}/mtl")
+        written = write_materials(stage, f"/{who.name}/mtl", materials, look, hair, across=count)
+        own = {(m.tile, m.eyes): material for m, material in written.items()}
         skeleton = _geo(stage, who.name, rig)
         found, moving = list(pieces(mesh, count, eyes)), 0 if rig is None else len(rig.weights)
         for kind, some in grouped(found, moving, None if hair is None else count - 1).items():
             whole, faces = together(some, count)
-            made = _mesh(stage, f"/{who.name}/geo/{kind}", whole, None)
-            own = hair if kind == HAIR and hair is not None else look
-            bind_pieces(made, faces, [_piece_material(stage, who.name, kind, piece, own, count) for piece in some])
+            made = _mesh(stage, f"/{who.name}/geo/{kind}", whole)
+            bind_pieces(made, faces, [own[piece.tile, piece.eyes] for piece in some])
             used = np.unique(whole.faces).astype(np.int64)
             if kind == HAIR:
                 made.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
             if rig is not None and skeleton is not None and kind in (RENDER, HAIR):
                 bind(stage, made, with_head(rig, len(used)) if kind == HAIR else rig.of_vertices(used), skeleton)
     return detached(stage)
-
-
-def _piece_material(stage: Usd.Stage, name: str, kind: str, piece: Piece, look: Look, count: int) -> UsdShade.Material:
-    """The material of one tile's triangles, of hair's or of the eyes on it. count: of the tiles."""
-    called = EYES if piece.eyes else HAIR if kind == HAIR else MATERIAL
-    own, path = look.on_tile(piece.tile), f"/{name}/mtl/{called}_{tiles.FIRST + piece.tile}"
-    if piece.eyes:
-        return eye_material(stage, path, own, (piece.tile, count))
-    material = UsdShade.Material.Define(stage, path)
-    preview_networks(stage, material, own, (piece.tile, count))
-    return material
 
 
 def _fill(
@@ -201,22 +199,22 @@ def _fill(
     look: Look,
     hair: Look | None = None,
 ) -> None:
-    skeleton = _geo(stage, name, mesh.rig if isinstance(mesh, TemplateMesh) else None)
+    template = mesh if isinstance(mesh, TemplateMesh) else None
+    rig = None if template is None else template.rig
+    skeleton = _geo(stage, name, rig)
     UsdGeom.Scope.Define(stage, f"/{name}/mtl")
-    material = _material(stage, f"/{name}/mtl/{MATERIAL}", look)
-    shown = _shown(stage, f"/{name}/geo", mesh, material)
-    if isinstance(mesh, TemplateMesh) and mesh.cage.eyes.any():
-        bind_eyes(shown[0], mesh.cage.eyes, eye_material(stage, f"/{name}/mtl/{EYES}", look), material)
-    if isinstance(mesh, TemplateMesh) and mesh.rig is not None and skeleton is not None:
-        bind(stage, shown[0], mesh.rig, skeleton)
+    made = write_materials(stage, f"/{name}/mtl", tile_materials(mesh), look, hair)
+    shown = _shown(stage, f"/{name}/geo", mesh, made)
+    if rig is not None and skeleton is not None:
+        bind(stage, shown[0], rig, skeleton)
     hairs = None
-    if isinstance(mesh, TemplateMesh) and mesh.hair is not None and hair is not None:
-        hairs = _mesh(stage, f"/{name}/geo/{HAIR}", mesh.hair, _material(stage, f"/{name}/mtl/{HAIR}", hair))
+    if template is not None and template.hair is not None and hair is not None:
+        hairs = _mesh(stage, f"/{name}/geo/{HAIR}", template.hair, made)
         hairs.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
         hairs.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*hair.mean_albedo)]))
-        if mesh.rig is not None and skeleton is not None:
-            bind(stage, hairs, with_head(mesh.rig, len(mesh.hair.vertices)), skeleton)
-    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, material)
+        if rig is not None and skeleton is not None:
+            bind(stage, hairs, with_head(rig, len(template.hair.vertices)), skeleton)
+    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, made)
     for one in shown if stand_in is None else [*shown, stand_in]:
         one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     if stand_in is not None:
@@ -227,19 +225,12 @@ def _fill(
 
 
 def _scan(stage: Usd.Stage, name: str, mesh: UvSurface, look: Look, *, purposes: bool) -> None:
-    material = _material(stage, f"/{name}/mtl/{SCAN_MATERIAL}", look)
-    made = _mesh(stage, f"/{name}/geo/{SCAN}", mesh, material)
+    materials = write_materials(stage, f"/{name}/mtl", tile_materials(mesh, SCAN_MATERIAL), look)
+    made = _mesh(stage, f"/{name}/geo/{SCAN}", mesh, materials)
     made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     if purposes:
         made.CreatePurposeAttr(UsdGeom.Tokens.render)
         made.SetProxyPrim(UsdGeom.Mesh.Get(stage, f"/{name}/geo/proxy"))
-
-
-def _material(stage: Usd.Stage, path: str, look: Look) -> UsdShade.Material:
-    material = UsdShade.Material.Define(stage, path)
-    preview_networks(stage, material, look)
-    materialx_networks(stage, material, look)
-    return material
 
 
 def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton | None:
@@ -251,19 +242,18 @@ def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton |
     return write_skeleton(stage, f"/{name}/geo/{RIG}", rig)
 
 
-def _shown(
-    stage: Usd.Stage, geo: str, mesh: UvSurface | TemplateMesh, material: UsdShade.Material
-) -> list[UsdGeom.Mesh]:
+def _shown(stage: Usd.Stage, geo: str, mesh: UvSurface | TemplateMesh, materials: Made) -> list[UsdGeom.Mesh]:
     """The meshes of full detail: one of triangles, or the template's cage and what lies beside it."""
     if isinstance(mesh, UvSurface):
-        return [_mesh(stage, f"{geo}/{RENDER}", mesh, material)]
-    out = [write_cage(stage, f"{geo}/{RENDER}", mesh.cage, material)]
-    return out if mesh.rest is None else [*out, _mesh(stage, f"{geo}/{REST}", mesh.rest, material)]
+        return [_mesh(stage, f"{geo}/{RENDER}", mesh, materials)]
+    cage = write_cage(stage, f"{geo}/{RENDER}", mesh.cage)
+    bind_tiles(cage, materials, mesh.cage.eyes)
+    return [cage] if mesh.rest is None else [cage, _mesh(stage, f"{geo}/{REST}", mesh.rest, materials)]
 
 
-def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Material | None) -> UsdGeom.Mesh:
+def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, materials: Made | None = None) -> UsdGeom.Mesh:
     """Author a mesh of triangles, or of quads if it is paired. Vertices without a face are left out; normals are
-    normalised."""
+    normalised. materials: of the tiles, if it gets one here."""
     counts, corners, uv_corners = faces_of(mesh)
     used, faces = np.unique(corners, return_inverse=True)
     uv_used, uv_faces = np.unique(uv_corners, return_inverse=True)
@@ -285,6 +275,6 @@ def _mesh(stage: Usd.Stage, path: str, mesh: UvSurface, material: UsdShade.Mater
     kept = mesh.uvs[uv_used].clip(0, [tile_count(mesh), 1])
     st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(kept, np.float32)))
     st.SetIndices(Vt.IntArray.FromNumpy(np.ascontiguousarray(uv_faces.ravel(), np.int32)))
-    if material is not None:
-        UsdShade.MaterialBindingAPI.Apply(out.GetPrim()).Bind(material)
+    if materials is not None:
+        bind_tiles(out, materials)
     return out

@@ -31,7 +31,8 @@ from stages.usd.write.moving_light import write_domes
 from stages.usd.write.obj import write_obj
 from stages.usd.write.package import bounded_png, write_package
 from stages.usd.write.shading import Look
-from stages.usd.write.variants import HIGH_FILE, SCAN
+from stages.usd.write.tile_materials import names_on, tile_materials
+from stages.usd.write.variants import HIGH_FILE, SCAN, SCAN_MATERIAL
 
 NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
 BLENDER = "open_in_blender.py"  # a script for the user, copied as it lies beside this module
@@ -88,18 +89,19 @@ def export(
     hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
     holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
     cameras = tuple(sorted(cameras_of(poses.artifact, face.artifact).cameras, key=lambda c: c.index))
+    materials = tile_materials(head or mesh)
     layers = {
         f"{name}.usd": (
             component.root_layer(
                 who,
                 hints,
                 look,
-                high=high is not None,
+                materials=materials,
+                high=() if high is None else names_on(high, materials),
                 proxy=proxy is not None,
                 thumbnail=THUMBNAIL,
-                rest=head is not None and head.rest is not None,
-                scan=None if scan is None else scan[1].look,
-                hair=maps.hair,
+                beside=() if head is None else head.beside(),
+                scan=() if scan is None else tile_materials(scan[0], SCAN_MATERIAL),
             ),
             "usda",
         ),
@@ -112,7 +114,7 @@ def export(
         "lookdev.usda": (lookdev_layer(name, cameras, holdout, poses.artifact.roi_radius, moving), "usda"),
     }
     if high is not None:
-        layers[HIGH_FILE] = (component.high_layer(high, look), "usdc")
+        layers[HIGH_FILE] = (component.high_layer(high, look, materials), "usdc")
     for file, (layer, form) in layers.items():
         write_layer(layer, folder / file, form)
     dome = environment(light, config.environment_width)
@@ -130,7 +132,7 @@ def export(
         # viewers on phones do not read MaterialX, and some use any preview surface that they find
         plain = _plain(look)
         hair = None if maps.hair is None else _plain(maps.hair)
-        single = component.package_layer(who, light_mesh, plain, light_rig, light_eyes, hair)
+        single = component.package_layer(who, light_mesh, plain, materials, light_rig, light_eyes, hair)
         written.append(_package(single, folder, name, plain, tile_count(mesh)))
     if config.glb:
         written.append(folder / f"{name}.glb")

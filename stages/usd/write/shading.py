@@ -18,7 +18,7 @@ HEIGHT = "displacement"  # reader of the displacement map, and the output of bot
 @dataclass(frozen=True, slots=True)
 class Look:
     """Inputs of the material's networks. Paths are relative to the layer, with <UDIM> in place of the tile's number if
-    there are several tiles; None leaves a map out.
+    there are several tiles (MaterialX reads these, preview surfaces one tile each); None leaves a map out.
 
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     displacement: metres along the normal, of a mesh that is subdivided.
@@ -46,6 +46,18 @@ class Look:
         return replace(self, **named, coefficients=tuple(c.replace(tiles.TOKEN, number) for c in self.coefficients))
 
 
+@dataclass(frozen=True, slots=True)
+class Part:
+    """The tile whose files a preview surface reads, and how many tiles the texture coordinates have in the unit square:
+    1 where each tile has a unit of its own (UDIM), else they lie side by side in it."""
+
+    tile: int = 0
+    across: int = 1
+
+
+WHOLE = Part()  # of an asset with one tile
+
+
 def ior_from_f0(f0: float) -> float:
     """Index of refraction whose reflectance at normal incidence is f0: (1 + sqrt(f0)) / (1 - sqrt(f0)).
 
@@ -68,17 +80,17 @@ def connect(target: UsdShade.Input, source: UsdShade.Output) -> None:
 
 
 # ------------------------------------------------------------------ UsdPreviewSurface
-def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look, part: tuple[int, int] = (0, 1)) -> None:
+def preview_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look, part: Part = WHOLE) -> None:
     """Author `preview` as the material's surface, in the metallic workflow, which all importers read in the same way.
-    Author `preview_specular` with a map of F0; it is a variant, because many importers misread it. part: see
-    `_in_part`.
+    Author `preview_specular` with a map of F0; it is a variant, because many importers misread it. Both read the files
+    of one tile.
     """
-    path = str(material.GetPath())
+    path, look = str(material.GetPath()), look.on_tile(part.tile)
     name = material.CreateInput("st_name", T.String)
     name.Set("st")
     reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", T.String).ConnectToSource(name)
-    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), *part)
+    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), part)
     albedo = _texture(stage, st, f"{path}/albedo", look.albedo, "sRGB")
     roughness = _texture(stage, st, f"{path}/roughness", look.roughness, "raw", "r") if look.roughness else None
     normal = _normal_texture(stage, st, f"{path}/normal", look.normal) if look.normal else None
@@ -115,14 +127,13 @@ def eye_preview(
     look: Look,
     ior: float,
     roughness: float,
-    part: tuple[int, int] = (0, 1),
+    part: Part = WHOLE,
 ) -> None:
-    """Author `preview` of an eye: the head's colours and displacement under a clear surface of one roughness. part: see
-    `_in_part`."""
-    path = str(material.GetPath())
+    """Author `preview` of an eye: the colours and displacement of its tile under a clear surface of one roughness."""
+    path, look = str(material.GetPath()), look.on_tile(part.tile)
     reader = shader(stage, f"{path}/st_reader", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", T.String).Set("st")
-    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), *part)
+    st = _in_part(stage, path, reader.CreateOutput("result", T.Float2), part)
     surface = shader(stage, f"{path}/preview", "UsdPreviewSurface")
     surface.CreateInput("useSpecularWorkflow", T.Int).Set(0)
     for name, value in (("metallic", 0.0), ("ior", ior), ("roughness", roughness)):
@@ -137,23 +148,22 @@ def eye_preview(
         material.CreateDisplacementOutput().ConnectToSource(surface.ConnectableAPI(), "displacement")
 
 
-def _in_part(stage: Usd.Stage, path: str, st: UsdShade.Output, number: int, count: int) -> UsdShade.Output:
-    """Texture coordinates of a map of which the mesh has `count` side by side in the unit square, in this map's own
-    square: (count u - number, v)."""
-    if count == 1:
+def _in_part(stage: Usd.Stage, path: str, st: UsdShade.Output, part: Part) -> UsdShade.Output:
+    """Texture coordinates in the unit square of one tile: (across u - tile, v)."""
+    if part == WHOLE:
         return st
     out = shader(stage, f"{path}/st_of_part", "UsdTransform2d")
     connect(out.CreateInput("in", T.Float2), st)
-    out.CreateInput("scale", T.Float2).Set(Gf.Vec2f(count, 1))
-    out.CreateInput("translation", T.Float2).Set(Gf.Vec2f(-number, 0))
+    out.CreateInput("scale", T.Float2).Set(Gf.Vec2f(part.across, 1))
+    out.CreateInput("translation", T.Float2).Set(Gf.Vec2f(-part.tile, 0))
     return out.CreateOutput("result", T.Float2)
 
 
 def _texture(
     stage: Usd.Stage, st: UsdShade.Output, path: str, file: str, space: str, channel: str = "rgb"
 ) -> UsdShade.Output:
-    """Author a texture reader. It is clamped: charts never wrap, and wrapping would mix opposite borders. (Readers of
-    tiles ignore this.)"""
+    """Author a texture reader of one file. It is clamped: charts never wrap, and wrapping would mix opposite borders.
+    It never has <UDIM>: the USD library does not resolve that in normal maps, and many programs not at all."""
     out = shader(stage, path, "UsdUVTexture")
     out.CreateInput("file", T.Asset).Set(Sdf.AssetPath(file))
     out.CreateInput("sourceColorSpace", T.Token).Set(space)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 
 from pxr import Sdf, Usd, UsdGeom, UsdShade
@@ -19,12 +20,9 @@ SCAN_MATERIAL = f"{MATERIAL}_{SCAN}"
 HIGH_FILE = "high.usdc"
 
 
-def write_looks(
-    stage: Usd.Stage, prim: Usd.Prim, look: Look, scan: Look | None = None, hair: Look | None = None
-) -> None:
-    """Variant set `look`: which network of the material is its surface. Each variant contains only the differences; the
-    payload alone equals the first variant. scan, hair: of these meshes' own materials, which follow."""
-    names = [MATERIAL, *([HAIR] if hair is not None else []), *([SCAN_MATERIAL] if scan is not None else [])]
+def write_looks(stage: Usd.Stage, prim: Usd.Prim, look: Look, names: Sequence[str]) -> None:
+    """Variant set `look`: which network of the materials of these names is their surface. Each variant contains only
+    the differences; the payload alone equals the first variant."""
     materials = [prim.GetPath().AppendPath(f"mtl/{n}") for n in names]
     outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
     if not look.specular:
@@ -44,13 +42,13 @@ def write_looks(
 
 
 def write_levels(
-    stage: Usd.Stage, prim: Usd.Prim, *, beside: tuple[str, ...], scan: bool, high: bool, proxy: bool
+    stage: Usd.Stage, prim: Usd.Prim, *, beside: tuple[str, ...], scan: bool, high: Sequence[str], proxy: bool
 ) -> None:
     """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone. beside: names of
-    the meshes beside the template (REST, HAIR)."""
+    the meshes beside the template (REST, HAIR). high: names of the dense mesh's materials, none without it."""
     path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
-    for variant, made in ((HIGH, high), (RENDER, True), (PROXY, proxy)):
+    for variant, made in ((HIGH, bool(high)), (RENDER, True), (PROXY, proxy)):
         if not made:
             continue
         lods.AddVariant(variant)
@@ -65,8 +63,9 @@ def write_levels(
                     stage.OverridePrim(path.AppendPath("geo/proxy")).SetActive(False)
                 dense = stage.OverridePrim(path.AppendPath("geo/high"))
                 dense.GetPayloads().AddPayload(f"./{HIGH_FILE}")
-                bound = UsdShade.MaterialBindingAPI.Apply(dense).GetDirectBindingRel()
-                bound.SetTargets([path.AppendPath(f"mtl/{MATERIAL}")])
+                _bind(dense, high[0])
+                for name in high if len(high) > 1 else ():
+                    _bind(stage.OverridePrim(dense.GetPath().AppendChild(name)), name)
             else:
                 shown = stage.OverridePrim(path.AppendPath("geo/proxy"))
                 purpose = shown.CreateAttribute("purpose", Sdf.ValueTypeNames.Token, False, Sdf.VariabilityUniform)
@@ -74,9 +73,17 @@ def write_levels(
     lods.SetVariantSelection(RENDER)
 
 
-def without_displacement(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
-    """Take the displacement out of the material where the mesh is no cage: the dense mesh, the proxy."""
-    material = prim.GetPath().AppendPath(f"mtl/{MATERIAL}")
+def _bind(prim: Usd.Prim, name: str) -> None:
+    """Bind a material of the default prim."""
+    root = prim.GetPath().GetPrefixes()[0]
+    bound = UsdShade.MaterialBindingAPI.Apply(prim).GetDirectBindingRel()
+    bound.SetTargets([root.AppendPath(f"mtl/{name}")])
+
+
+def without_displacement(stage: Usd.Stage, prim: Usd.Prim, look: Look, names: Sequence[str]) -> None:
+    """Take the displacement out of the materials of these names where the mesh is no cage: the dense mesh, the
+    proxy."""
+    materials = [prim.GetPath().AppendPath(f"mtl/{name}") for name in names]
     outputs = [f"outputs:{HEIGHT}", *([f"outputs:mtlx:{HEIGHT}"] if look.f0 and look.roughness else [])]
     surfaces = ["preview", *(["preview_specular"] if look.specular else [])]
     lods = prim.GetVariantSets().GetVariantSet("lod")
@@ -85,10 +92,10 @@ def without_displacement(stage: Usd.Stage, prim: Usd.Prim, look: Look) -> None:
             continue
         lods.SetVariantSelection(variant)
         with lods.GetVariantEditContext():
-            for output in outputs:
+            for material, output in product(materials, outputs):
                 over = stage.OverridePrim(material)
                 over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False).SetConnections([])
-            for surface in surfaces:
+            for material, surface in product(materials, surfaces):
                 over = stage.OverridePrim(material.AppendPath(surface))
                 over.CreateAttribute(f"inputs:{HEIGHT}", Sdf.ValueTypeNames.Float, custom=False).SetConnections([])
     lods.SetVariantSelection(RENDER)
