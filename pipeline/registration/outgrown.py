@@ -68,7 +68,8 @@ def growing(points: F64, ears: Mask) -> Mask:
 
 def _around(points: F64, scan: Scan, reach: float) -> Indices:
     """At most MOST vertices of the scan that are seen and lie within `reach` of the points."""
-    seen = np.flatnonzero((scan.seen > SEEN) & _in_boxes(scan.mesh.vertices, points, reach))
+    seen = np.flatnonzero(scan.seen > SEEN)
+    seen = seen[_in_boxes(scan.mesh.vertices[seen], points, reach)]
     if not len(points) or not len(seen):
         return np.zeros(0, np.int64)
     near = np.isfinite(cKDTree(points).query(scan.mesh.vertices[seen], distance_upper_bound=reach)[0])
