@@ -14,7 +14,7 @@ from pipeline.registration import refine_identity
 from pipeline.registration.cage import cage_of
 from pipeline.registration.identity_fit import Data, PlacedHead
 from pipeline.registration.nonrigid import Guides, fitted
-from pipeline.registration.outgrown import COVERED, OUTSIDE, REACH, ROOT, growing, outgrown
+from pipeline.registration.outgrown import COVERED, OUTSIDE, REACH, ROOT, _in_boxes, growing, outgrown
 from pipeline.registration.scan import Scan
 from pipeline.template.model import Template
 
@@ -105,3 +105,15 @@ def test_the_identity_is_asked_too(monkeypatch: pytest.MonkeyPatch) -> None:
     more = given[0][2]
     assert len(more.where) and more.normals is not None and (more.normals[:, 0] > 0.5).all()
     assert (template.vertices[more.corners[:, 0], 0] > 0.06).all() and (more.sigma > 0).all()
+
+
+def test_boxes_leave_out_no_vertex_within_reach() -> None:
+    """Against all distances, for points on two sides and on one."""
+    random = np.random.default_rng(4)
+    vertices = random.uniform(-0.1, 0.1, (3000, 3)).astype(np.float32)
+    sides = np.concatenate([random.normal([x, 0, 0], 0.005, (40, 3)) for x in (-0.08, 0.08)])
+    for points in (sides, sides[:1], sides[:40]):
+        inside = _in_boxes(vertices, points, 0.01)
+        near = np.linalg.norm(vertices[:, None] - points[None], axis=2).min(1) <= 0.01
+        assert near.any() and inside[near].all() and inside.mean() < 0.2
+    assert not _in_boxes(vertices, sides[:0], 0.01).any()
