@@ -32,8 +32,7 @@ AROUND = 0.25  # metres of the template: the surface further from the head's mid
 ASKED = 30_000  # vertices of the surface whose visibility is computed; the others take that of the nearest
 LANDMARK_REACH = 0.006  # metres of the template: a landmark further from the surface does not guide
 ADULT = 1.1  # metres per metre of the template of an average adult: the unit of a capture of unknown scale
-# weights of what pulls closed lids and closed lips together, in that of a point on the surface
-CLOSED_LIDS, CLOSED_LIPS = 20.0, 2.0
+CLOSED = 20.0  # weight of what holds closed lids and closed lips together, in that of a point on the surface
 HIDDEN = 0.6  # share of the lids' margins in a point from which no surface shows it while they are closed
 
 Step = Callable[[int, int, str], None]
@@ -172,11 +171,11 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
     if closed:
         more, there = closing(template, placed, cage)
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
-        least = np.concatenate([least, np.full(len(there), CLOSED_LIDS)])
+        least = np.concatenate([least, np.full(len(there), CLOSED)])
     if lips_closed(template, landmarks, placed.scale):
-        more, there = closing_lips(template, placed, cage, placed.vertices[cage.of_template])
+        more, there = closing_lips(template, cage, placed.vertices[cage.of_template])
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
-        least = np.concatenate([least, np.full(len(there), CLOSED_LIPS)])
+        least = np.concatenate([least, np.full(len(there), CLOSED)])
     return Guides(stencil, place_at, least)
 
 
