@@ -3,12 +3,12 @@
 Photos show closed lips as one surface, which says nothing about where they touch; what pulls both lips outwards then
 parts them, and rays pass into the mouth. Symbols: u a vertex of the upper lip where the lips of the template touch, l1
 and l2 the vertices of the lower lip beside it, a its place between them from left to right; B the stencil of limit
-points; p the rest.
+points; p the rest; y up.
 
-    B (x_u - (a x_l1 + (1 - a) x_l2)) = the same of p
+    B (x_u - (a x_l1 + (1 - a) x_l2)) = the same of p, but for its part along y, which is GAP at most
 
-Held firmly, the lips stay beside each other as they are at rest, so that data that press them together do not take one
-through the other. `meeting` closes what is left between them.
+Held firmly, the lips stay beside each other, so that data that press them together do not take one through the other.
+`meeting` closes what is left between them.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pipeline.meshes import F64, Indices, triangles_of
 from pipeline.meshes import unit as unit_normals
 from pipeline.ray_casting import RayCaster
 from pipeline.registration.cage import Cage
+from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.subdivision import limit
 from pipeline.template.model import Template
 
@@ -31,6 +32,7 @@ LOWER = 0.25  # of the largest drop in `jawOpen`: what drops by more belongs to 
 SLIT = 0.0015  # metres of the template: wider is no slit of closed lips
 SHARE, MEETINGS = 0.4, 3  # of the way that each lip goes in a round, and rounds: they don't pass through each other
 FACING = 0.5  # cosine
+GAP = 1e-4  # metres of the template
 
 
 def lips_closed(template: Template, landmarks: F64, unit: float) -> bool:
@@ -41,7 +43,7 @@ def lips_closed(template: Template, landmarks: F64, unit: float) -> bool:
     return bool(_has_mouth(template) and np.isfinite(apart) and apart < CLOSED * unit)
 
 
-def closing_lips(template: Template, cage: Cage, rest: F64) -> tuple[csr_array, F64]:
+def closing_lips(template: Template, placed: PlacedHead, cage: Cage, rest: F64) -> tuple[csr_array, F64]:
     """Stencil (n, V) over the cage and the places (n, 3) of what joins its lips. rest (V, 3): of the cage."""
     row = np.full(len(template.vertices), -1, np.int64)
     row[cage.of_template] = np.arange(len(cage.of_template))
@@ -53,7 +55,10 @@ def closing_lips(template: Template, cage: Cage, rest: F64) -> tuple[csr_array, 
     value = np.array([[1.0, -a, a - 1.0] for _, _, a in ends]).ravel()
     difference = csr_array((value, (at, column)), shape=(len(ends), len(rest)))
     stencil = csr_array(difference @ limit(cage.quads, len(rest)).point)
-    return stencil, np.asarray(stencil @ rest)
+    up = placed.world_from_template[:3, 1]
+    apart = np.asarray(stencil @ rest)
+    high = apart @ up / (up @ up)  # in metres of the template
+    return stencil, apart + (np.minimum(GAP, high) - high)[:, None] * up
 
 
 def _facing(template: Template) -> list[tuple[int, Indices, float]]:

@@ -173,7 +173,7 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
         least = np.concatenate([least, np.full(len(there), CLOSED)])
     if lips_closed(template, landmarks, placed.scale):
-        more, there = closing_lips(template, cage, placed.vertices[cage.of_template])
+        more, there = closing_lips(template, placed, cage, placed.vertices[cage.of_template])
         stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
         least = np.concatenate([least, np.full(len(there), CLOSED)])
     return Guides(stencil, place_at, least)

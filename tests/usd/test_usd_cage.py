@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdShade
+from scipy.spatial import cKDTree
 from support.synthetic_asset import RADIUS, SyntheticInputs, run_stage
 from support.synthetic_head import HEIGHT, SIDE, height_at, template_inputs
 
@@ -106,10 +107,10 @@ def test_other_formats_have_triangles_of_the_first_subdivision(made: tuple[Synth
     count = sum(len(p.GetFaceVertexCountsAttr().Get()) for p in parts)
     quads = len(cage.GetFaceVertexCountsAttr().Get())
     assert count == 2 * 4 * quads + len(rest.GetFaceVertexCountsAttr().Get())
-    fine = np.round(read_usd_mesh(made[1] / "head.usd").vertices, 4)
-    exact = {tuple(p) for p in fine}
-    points = np.round(np.array(parts[0].GetPointsAttr().Get()), 4)
-    assert np.mean([tuple(p) in exact for p in points]) > 0.6  # its vertices are vertices of the finest
+    points = np.array(parts[0].GetPointsAttr().Get())
+    away = cKDTree(read_usd_mesh(made[1] / "head.usd").vertices).query(points)[0]
+    edge = float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))
+    assert np.mean(away < 0.1 * edge) > 0.9  # vertices of the finest, but that larger facets are raised by more
 
 
 def test_a_cage_that_is_none_is_found(made: tuple[SyntheticInputs, Path]) -> None:
