@@ -135,6 +135,11 @@ def triangles_of(quads: Indices) -> Faces:
     return np.asarray(quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), np.int32)
 
 
+def quads_of(faces: Faces) -> Indices:
+    """(F / 2, 4) the quads that `triangles_of` cut into triangles (F, 3)."""
+    return np.asarray(faces.reshape(-1, 6)[:, [0, 1, 2, 5]], np.int64)
+
+
 def whole_quads(faces: Faces, uv_faces: Faces) -> Mask:
     """(F / 2,) pairs of triangles 2 q and 2 q + 1 (F, 3) that are one quad in space and in the texture: both halves
     have the diagonal from the first to the third corner. A pair that a seam of the charts cuts is no quad."""
@@ -146,7 +151,7 @@ def polygons(faces: Faces, quads: Mask) -> tuple[Indices, Indices]:
     """Corner counts (P,) and all corners (n,) of paired triangles (F, 3) as quads where `quads` (F / 2,), else as two
     triangles each; in the order of the triangles."""
     pair = np.asarray(faces, np.int64).reshape(-1, 6)
-    both = np.where(quads[:, None], np.concatenate([pair[:, [0, 1, 2, 5]], pair[:, :2]], 1), pair)
+    both = np.where(quads[:, None], np.concatenate([quads_of(faces), pair[:, :2]], 1), pair)
     kept = np.arange(6) < np.where(quads, 4, 6)[:, None]
     sizes = np.stack([np.where(quads, 4, 3), np.where(quads, 0, 3)], 1).ravel()
     return sizes[sizes > 0], both[kept]

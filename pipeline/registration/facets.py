@@ -44,6 +44,11 @@ def raised(points: F64, normals: F64, quads: Indices, finer: F64) -> F64:
     return np.asarray(found)
 
 
+def lifted(points: F64, normals: F64, quads: Indices, finer: F64) -> F64:
+    """(n, 3) points, at their heights along the normals; as `raised` has them."""
+    return np.asarray(points + raised(points, normals, quads, finer)[:, None] * normals)
+
+
 def _system(ends: Indices, length: F64, count: int) -> csr_array:
     """(n, n) half of the second derivatives of the sum; 1 for vertices without an edge."""
     a, b = ends.T

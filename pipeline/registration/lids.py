@@ -104,18 +104,17 @@ def _along(points: F64) -> F64:
 def _margins(template: Template) -> list[tuple[Indices, Indices]]:
     """Of each eye and each ring of the margin: vertices of the upper and of the lower lid, from the right corner to the
     left one of the person, with both corners."""
-    out = []
-    for ring in _rings(template) if _closable(template) else ():
-        across = template.vertices[ring, 0]
-        for own in (ring[across > 0], ring[across < 0]):
+    if not _closable(template):
+        return []
+    out, x, down = [], template.vertices[:, 0], -blink(template)[:, 1]
+    for ring in _rings(template):
+        for own in (ring[x[ring] > 0], ring[x[ring] < 0]):
             loop = _loop(template.quads[template.regions[LIDS]], own)
             if len(loop) < LEAST_LOOP:
                 continue
-            x = template.vertices[loop, 0]
-            loop = np.roll(loop, -int(np.argmin(x)))
-            end = int(np.argmax(template.vertices[loop, 0]))
+            loop = np.roll(loop, -int(np.argmin(x[loop])))
+            end = int(np.argmax(x[loop]))
             one, other = loop[: end + 1], np.r_[loop[:1], loop[end:][::-1]]
-            down = -blink(template)[:, 1]
             out.append((one, other) if down[one].mean() > down[other].mean() else (other, one))
     return out
 

@@ -167,16 +167,13 @@ def guides_for(template: Template, placed: PlacedHead, cage: Cage, scan: Scan, l
         shape=(len(use), len(cage.of_template)),
     )
     stencil, place_at = csr_array(flat @ limit(cage.quads, len(cage.of_template)).point), on[use]
-    least = np.zeros(len(use))
-    if closed:
-        more, there = closing(template, placed, cage)
-        stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
-        least = np.concatenate([least, np.full(len(there), CLOSED)])
+    held = [closing(template, placed, cage)] if closed else []
     if lips_closed(template, landmarks, placed.scale):
-        more, there = closing_lips(template, placed, cage, placed.vertices[cage.of_template])
-        stencil, place_at = csr_array(vstack([stencil, more])), np.concatenate([place_at, there])
-        least = np.concatenate([least, np.full(len(there), CLOSED)])
-    return Guides(stencil, place_at, least)
+        held.append(closing_lips(template, placed, cage, placed.vertices[cage.of_template]))
+    places = np.concatenate([place_at, *(there for _, there in held)])
+    least = np.zeros(len(places))
+    least[len(use) :] = CLOSED
+    return Guides(csr_array(vstack([stencil, *(more for more, _ in held)])), places, least)
 
 
 def index_of(named: Mapping[str, Indices], count: int) -> Indices:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline import meshes, tiles
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh, joined, triangles_of
-from pipeline.registration.facets import raised
+from pipeline.registration.facets import lifted
 from pipeline.registration.head import Head, kept_quads, limit_surface
 from pipeline.registration.quality import face_quads, outer_quads
 from pipeline.registration.subdivision import subdivided
@@ -89,7 +89,7 @@ def _displaced(head: Head) -> tuple[F64, F64]:
     """(n, 3) points whose facets follow the fitted surface where it was seen, and their normals."""
     moved, quads = head.displaced(), head.surface()[2]
     normals = meshes.vertex_normals(moved, triangles_of(quads)).astype(np.float64)
-    return moved + raised(moved, normals, quads, head.finer())[:, None] * normals, normals
+    return lifted(moved, normals, quads, head.finer()), normals
 
 
 def compacted(points: F64, normals: F64, quads: Indices) -> tuple[Mesh, Indices]:

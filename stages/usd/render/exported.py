@@ -20,8 +20,8 @@ from pipeline.images import read_encoded, read_exr
 from pipeline.lighting.dome import read_light, read_moving
 from pipeline.lighting.moving import MovingLight
 from pipeline.map_lookup import bilinear
-from pipeline.meshes import fans, vertex_normals
-from pipeline.registration.facets import raised
+from pipeline.meshes import fans, quads_of, vertex_normals
+from pipeline.registration.facets import lifted
 from pipeline.transforms import apply
 from stages.usd.layout import existing, light_file
 from stages.usd.write.mesh import UvSurface, tile_count
@@ -214,9 +214,9 @@ def _displaced(mesh: UsdGeom.Mesh, path: Path) -> UvSurface:
     height = _map(path.parent, path.stem, CAGE_HEIGHT, count)[..., :1]
     moved, finer = (_at_height(x, height, count) for x in (smooth, evaluated(mesh, 1)))
     normals = vertex_normals(moved, smooth.faces)
-    quads = smooth.faces.reshape(-1, 6)[:, [0, 1, 2, 5]].astype(np.int64)
-    high = raised(moved.astype(np.float64), normals.astype(np.float64), quads, finer.astype(np.float64))
-    return replace(smooth, vertices=np.asarray(moved + high[:, None] * normals, np.float32), normals=normals)
+    exact, up, middles = (x.astype(np.float64) for x in (moved, normals, finer))
+    vertices = lifted(exact, up, quads_of(smooth.faces), middles)
+    return replace(smooth, vertices=vertices.astype(np.float32), normals=normals)
 
 
 def _at_height(smooth: UvSurface, height: F32, count: int) -> F32:

@@ -18,7 +18,7 @@ from pipeline import meshes
 from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, triangles_of
-from pipeline.registration.facets import raised
+from pipeline.registration.facets import lifted
 from pipeline.registration.head import Head, kept_quads, load_head
 from pipeline.registration.quality import outer_quads
 from pipeline.registration.rig import load_rig
@@ -120,7 +120,7 @@ def _coarse(head: Head, kept: Mask) -> tuple[UvSurface, csr_array]:
     normals = meshes.vertex_normals(points, triangles_of(fine))
     count = level.stencil.shape[0]
     own, finer = normals[:count].astype(np.float64), points if steps < head.levels else head.finer()
-    points = points[:count] + raised(points[:count], own, level.quads, finer)[:, None] * own
+    points = lifted(points[:count], own, level.quads, finer)
     rows, faces = np.unique(quads, return_inverse=True)
     used, uv_faces = np.unique(uv_quads, return_inverse=True)
     made = UvSurface(
