@@ -78,7 +78,7 @@ def test_around_an_ear_only_hair_is_left_over() -> None:
 
 def test_the_scan_overlaps_the_necks_end() -> None:
     """A head that ends at a circle: what lies beneath it is left over, with a rim on the head's own side."""
-    dense = ball_scan(RADIUS)
+    dense = ball_scan(RADIUS, 160)  # edges of 1 mm: the border's own neighbourhood is much narrower than OVERLAP
     own = dense.faces[(dense.vertices[dense.faces][:, :, 1] > -0.06).all(1)]
     vertices, faces, rows = meshes.compact(dense.vertices, own)
     head = Mesh(np.asarray(vertices, np.float32), dense.normals[rows], faces)
@@ -86,5 +86,5 @@ def test_the_scan_overlaps_the_necks_end() -> None:
     high = dense.vertices[:, 1]
     end = head.vertices[:, 1].min()
     assert beside[high <= end].all()
-    rim = (high > end) & (high < end + 0.5 * OVERLAP)
+    rim = (high > end) & (high < end + 0.7 * OVERLAP)
     assert rim.any() and beside[rim].all() and not beside[high > end + 2 * OVERLAP].any()
