@@ -117,7 +117,7 @@ OF_FIT = (
     Mutation("stages/bake/standard_fit.py", "kept = 1 - standard.layer(cosine, f0[v], alpha[v])",
              "kept = 1 + standard.layer(cosine, f0[v], alpha[v])",
              "tests/bake/test_standard_fit.py::test_an_objects_material_is_found"),
-    Mutation("stages/bake/standard_fit.py", "seen.colour - lit.lobes[:, k, 1]))", "seen.colour))",
+    Mutation("stages/bake/standard_fit.py", "colour - lobes[:, k, 1]))", "colour))",
              "tests/bake/test_standard_fit.py::test_an_objects_material_is_found"),
     Mutation("stages/bake/standard_fit.py", "q - 2 * mean * g + mean**2 * h", "q - mean * g + mean**2 * h",
              "tests/bake/test_standard_fit.py::test_an_objects_material_is_found"),

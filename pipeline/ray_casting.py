@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from pipeline import threads
+
 F64 = npt.NDArray[np.float64]
 EMBREE_SIZE = 100.0  # Embree has absolute tolerances: the mesh is scaled to about this size
+SHARE = 8192  # rays that are worth a thread
 
 
 class RayCaster:
@@ -22,6 +26,7 @@ class RayCaster:
         self._scale = EMBREE_SIZE / self.span
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, (vertices * self._scale).astype(np.float32), faces)
+        self._cast(np.zeros((1, 3)), np.eye(3)[:1], False)  # builds the tree, which two threads must not do at once
 
     def first_faces(
         self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating]
@@ -43,5 +48,17 @@ class RayCaster:
     def _run(
         self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating], output: bool = False
     ) -> Any:
+        """In as many threads as compiled loops have. A ray's result does not depend on the rays beside it."""
+        parts = min(int(threads.in_use()[1]), len(origins) // SHARE)
+        if parts < 2:
+            return self._cast(origins, directions, output)
+        with ThreadPoolExecutor(parts) as pool:
+            pairs = (np.array_split(x, parts) for x in (origins, directions))
+            found = list(pool.map(lambda o, d: self._cast(o, d, output), *pairs))
+        if not output:
+            return np.concatenate(found)
+        return {key: np.concatenate([f[key] for f in found]) for key in ("primID", "tfar")}
+
+    def _cast(self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating], output: bool) -> Any:
         starts = np.ascontiguousarray(origins * self._scale, np.float32)
         return self._scene.run(starts, np.ascontiguousarray(directions, np.float32), output=output)

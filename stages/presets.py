@@ -136,9 +136,9 @@ def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
 
 
 def _template(merged: dict[str, dict[str, Any]]) -> None:
-    """The head template is registered only where the asset is made from it, or where that is asked for."""
+    """The head template is registered only where the asset may be made from it, or where that is asked for."""
     uv, template = merged.get("uv", {}), merged.get("template", {})
-    if uv.get("mesh") in ("template", "both") and "template" in merged:
+    if uv.get("mesh") != "scan" and "template" in merged:
         template.setdefault("enabled", True)
 
 

@@ -19,6 +19,7 @@ from pipeline.registration.scan import Scan
 REACH = 0.003  # metres of the template: largest displacement
 AGREE, CLOSE = 2.0, 2e-4  # the latter in metres of the template
 SPREAD = 2  # rings of quads over which it fades to its borders
+DRAW, DRAWN = 5e-5, 16  # metres of the template that closed lips are drawn apart in a round, and rounds
 HALVED = 8  # rounds of halving what closes lips and lids
 TAKEN_BACK = 6  # rounds of taking it back
 TURNED = 0.4  # cosine
@@ -52,6 +53,7 @@ def displacement(
         odd |= bad
         moved = _eased(moved * _faded(~bad, quads), odd, quads[free])
     if closed is not None and closed.any():
+        moved = _apart(points, moved, normals, quads[free], quads[closed], unit)
         moved = moved + _met(points + moved[:, None] * normals, normals, quads, free, closed, unit)
     return moved, np.where(use, seen, 0.0)
 
@@ -61,6 +63,23 @@ def _turned(before: F64, now: F64, faces: Faces) -> Indices:
     its other side."""
     was, is_ = (unit_normals(area_vectors(x, faces)) for x in (before, now))
     return np.asarray(np.unique(faces[(was * is_).sum(1) < TURNED]), np.int64)
+
+
+def _apart(points: F64, moved: F64, normals: F64, quads: Indices, closed: Indices, unit: float) -> F64:
+    """The displacement (n,) with what passes through itself in closed lips and lids (C, 4) drawn inwards, until it does
+    not: data on either side press them into each other. quads (Q, 4): those that may be displaced."""
+    own = np.zeros(len(points), np.bool_)
+    own[closed] = True
+    quads = quads[own[quads].any(1)]
+    for _ in range(DRAWN):
+        hit = np.unique(piercing_edges(points + moved[:, None] * normals, triangles_of(quads)))
+        if not len(hit):
+            return moved
+        bad = np.zeros(len(points), np.bool_)
+        bad[hit] = True
+        bad[quads[bad[quads].any(1)]] = True
+        moved = np.where(bad & own, moved - DRAW * unit, moved)
+    return moved
 
 
 def _met(points: F64, normals: F64, quads: Indices, free: Mask, closed: Mask, unit: float) -> F64:

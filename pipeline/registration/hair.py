@@ -18,6 +18,9 @@ rise from the nearest skin to what lies RISE_AT inwards of the border must be en
 
     rise / RISE + change / CHANGE >= LEAST_SCORE
 
+Hair that is not told is worse than stubble that is: skin follows neither a fringe nor hair that stands off, while what
+is told keeps the surface that the photos show. So the limits are low.
+
 Source: Boykov and Jolly, Interactive graph cuts (2001), for the two terms; Rother, Kolmogorov and Blake, GrabCut
 (2004), for the repeated seeds.
 """
@@ -54,8 +57,8 @@ LEAST_SEEDS = 60  # patches: 5 square centimetres
 LEAST_SHARE = 0.12  # of the seen scalp that must stand off for there to be hair
 RISE_AT = (0.010, 0.015)  # inwards of the border, where rise and change are measured
 RISE, CHANGE = 0.0025, 20.0  # of height, and of colour in units of CIELAB: each counts as one
-LEAST_RISE, LEAST_CHANGE = 0.0015, 6.0
-LEAST_SCORE = 1.6  # of their sum; phone photos of two men have 4.3 and 1.8, a shaved scanned head .3
+LEAST_RISE, LEAST_CHANGE = 0.0008, 2.5
+LEAST_SCORE = 0.8  # of their sum; persons with hair have .97 (white on pale skin) to 4.3, a shaved scanned head .3
 SMALL = 4e-4  # square metres: smaller islands and holes of hair are taken away
 BENEATH, INWARD = (
     0.002,

@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline import tiles
 from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import F64, Mask, Mesh
+from pipeline.meshes import F64, Charts, Mask, Mesh
 from pipeline.registration.head import load_head, of_triangles
+from pipeline.registration.quality import outer_quads
 
 COLOURS = {  # linear reflectance; the inside is the throat's as a camera sees it, so that it is dark without shadows
     "mouth_inside": (0.10, 0.03, 0.03),
@@ -51,3 +53,14 @@ def inside_of(registered: Located[RegisteredHead], mesh: Mesh) -> Inside | None:
             share += mine
             colour += mine[:, None] * np.array(own)
     return Inside(share, colour / np.maximum(share, 1e-9)[:, None])
+
+
+def hidden_tiles(registered: Located[RegisteredHead], charts: Charts) -> frozenset[int]:
+    """Tiles with parts of the head, but none of the skin's outside: mouth, sockets, eyes. Photos show little of them,
+    whatever is photographed."""
+    if registered.artifact.head is None:
+        return frozenset()
+    head, names = load_head(registered.path(registered.artifact.head)), registered.artifact.regions
+    outside = of_triangles(head, outer_quads(head.region, names).astype(np.int64), names) > 0
+    tile = tiles.of_face(charts)[: len(outside)]
+    return frozenset(np.setdiff1d(tile, tile[outside]).tolist())

@@ -79,7 +79,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.eyes import painted_eyes
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
-    from stages.bake.mouth import inside_of
+    from stages.bake.mouth import hidden_tiles, inside_of
     from stages.bake.statistics import together
     from stages.bake.unseen import with_hair
     from stages.bake.write import joined, write_maps
@@ -120,6 +120,9 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     pixel = footprint.pixel(mesh, (v.camera for v in views))
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
     figures = all_tiles.figures(detail=baker.detailed) | baker.material_figures
+    hidden = hidden_tiles(inputs.template, charts) if uv.artifact.of_template else frozenset[int]()
+    outside = together([s for number, s in enumerate(counted) if number not in hidden])
+    figures["unseen"] = outside.figures(detail=False)["unseen"]
     figures |= {k: round(1000 * v, 5) for k, v in sizes.items() if v}
     head = inputs.template.artifact
     if uv.artifact.of_template:
@@ -189,4 +192,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=23, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=24, inputs=Inputs, config=Config, output=TextureSet, run=run)

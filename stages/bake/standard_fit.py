@@ -89,10 +89,10 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Lit:
-    """What arrives at M observations: lobes (M, K, 2, 3) for F0 = 1 and the rim, for each of ALPHAS; shade (M, 3): S.
-    received (V, 3): S at the vertices, of the still light or its stand-in."""
+    """What arrives at M observations. lobes(rows, alphas): (m, K, 2, 3) of m of them, for F0 = 1 and the rim, for K
+    widths; shade (M, 3): S. received (V, 3): S at the vertices, of the still light or its stand-in."""
 
-    lobes: F32
+    lobes: Callable[[npt.NDArray[np.int64], F32], F32]
     shade: F64
     received: F64
 
@@ -123,17 +123,19 @@ class _Sums:
 
 def fit(
     mesh: Mesh, normals: F64, at: standard.Arrivals | Lit, albedo: F64, seen: Seen, skin: Mask,
-    check: Callable[[], None] = lambda: None, hair: Mask | None = None,
+    check: Callable[[], None] = lambda: None, hair: Mask | None = None, asked: Mask | None = None,
 ) -> Fitted:  # fmt: skip
     """Fit everything. normals, albedo (V, 3) of the field at the vertices; at: a still light as it arrives at them, or
-    what arrives at the observations; skin, hair (V,): where these priors hold."""
+    what arrives at the observations; skin, hair (V,): where these priors hold. asked (V,):
+    vertices that tell F0 and roughness, which vary slowly; by default all do. All tell the albedo's correction."""
     hair = np.zeros_like(skin) if hair is None else hair
     skin = skin & ~hair
     w = _weights(normals, seen)
     lit = at if isinstance(at, Lit) else under_dome(at, normals, seen)
     check()
-    sums = _sums(normals, seen, w, lit, len(normals))
-    often = np.bincount(seen.vertex[w > 0], minlength=len(normals)) >= MIN_VIEWS
+    rows = np.arange(len(w)) if asked is None else np.flatnonzero(asked[seen.vertex])
+    sums = _sums(normals, seen, w, lit, rows)
+    often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
     near = Smoother(mesh, max(WIDTH, LEAST_WIDTH * edge))
     h, g = (near(x * often[:, None]) for x in (sums.h, sums.g))
@@ -164,7 +166,11 @@ def fit(
 def under_dome(at: standard.Arrivals, normals: F64, seen: Seen) -> Lit:
     """What arrives at the observations under a still light."""
     received = np.asarray(at.irradiance / np.pi, np.float64)
-    lobes = standard.lobes(at, seen.vertex, normals[seen.vertex], seen.wo, ALPHAS)
+
+    def lobes(rows: npt.NDArray[np.int64], alphas: F32) -> F32:
+        vertex = seen.vertex[rows]
+        return standard.lobes(at, vertex, normals[vertex], seen.wo[rows], alphas)
+
     return Lit(lobes, received[seen.vertex], received)
 
 
@@ -177,26 +183,29 @@ def _weights(normals: F64, seen: Seen) -> F64:
     return np.asarray(robust * ((cosine - GRAZING) / (FACING - GRAZING)).clip(0, 1))
 
 
-def _sums(normals: F64, seen: Seen, w: F64, lit: Lit, count: int) -> _Sums:
-    cosine, v = (normals[seen.vertex] * seen.wo).sum(1), seen.vertex
+def _sums(normals: F64, seen: Seen, weights: F64, lit: Lit, rows: npt.NDArray[np.int64]) -> _Sums:
+    """Of the observations `rows` (m,)."""
+    v, w, colour, count = seen.vertex[rows], weights[rows], seen.colour[rows], len(normals)
+    cosine = (normals[v] * seen.wo[rows]).sum(1)
     h, g, q = (np.zeros((count, len(ALPHAS))) for _ in range(3))
 
     def total(values: F64) -> F64:
         return np.stack([np.bincount(v, values[:, i], count) for i in range(values.shape[1])], 1)
 
     def without_base(z: F64, t: F64) -> F64:
-        """z (M, 3) less its best multiple of t (M, 3) at each vertex."""
+        """z (m, 3) less its best multiple of t (m, 3) at each vertex."""
         norm = np.maximum(total(w[:, None] * t * t), 1e-12)
         return np.asarray(z - (total(w[:, None] * z * t) / norm)[v] * t)
 
-    shade = np.maximum(lit.shade / max(float(lit.shade.mean()), 1e-12), 1e-6) if len(v) else lit.shade
+    lobes, shade = lit.lobes(rows, ALPHAS), lit.shade[rows]
+    shade = np.maximum(shade / max(float(shade.mean()), 1e-12), 1e-6) if len(v) else shade
     for k, alpha in enumerate(ALPHAS):
         kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), alpha))
         t = kept[:, None] * shade
-        x, y = (without_base(z, t) for z in (lit.lobes[:, k, 0].astype(np.float64), seen.colour - lit.lobes[:, k, 1]))
+        x, y = (without_base(z, t) for z in (lobes[:, k, 0].astype(np.float64), colour - lobes[:, k, 1]))
         for out, product in ((h, x * x), (g, x * y), (q, y * y)):
             out[:, k] = np.bincount(v, w * product.sum(1), count)
-    y = without_base(seen.colour, shade)
+    y = without_base(colour, shade)
     bare, weight = (np.asarray(np.bincount(v, z, count), np.float64) for z in (w * (y * y).sum(1), w))
     return _Sums(h, g, q, bare, weight)
 
@@ -251,9 +260,11 @@ def _correction(
     alpha = roughness**2
     cosine = (normals[v] * seen.wo).sum(1)
     k = np.abs(ALPHAS[None] - alpha[:, None]).argmin(1)[v]
-    layered = (f0[v] > 0)[:, None]
-    rows = np.arange(len(v))
-    specular = np.where(layered, f0[v, None] * lit.lobes[rows, k, 0] + lit.lobes[rows, k, 1], 0.0)
+    specular = np.zeros((len(v), 3))
+    for one in np.unique(k):
+        rows = np.flatnonzero((k == one) & (f0[v] > 0))
+        lobes = lit.lobes(rows, ALPHAS[one : one + 1])[:, 0]
+        specular[rows] = f0[v[rows], None] * lobes[:, 0] + lobes[:, 1]
     kept = 1 - standard.layer(cosine, f0[v], alpha[v])
     m = albedo[v] * lit.shade * kept[:, None]
     above, below = (

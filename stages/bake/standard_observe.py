@@ -14,6 +14,7 @@ from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.lighting.standard import COUNT, Arrivals, arrivals
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh, unit
+from pipeline.thinning import thinned
 from pipeline.transforms import inverse_rigid, matrix, project
 from pipeline.visibility import FittedPhoto
 from stages.bake import detail_kernels as kernels
@@ -35,6 +36,7 @@ def standard_material(
     look (V, 3): the albedo with what photos do not show filled, region (V,): of the head (skin.skin_of)."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
+    thin = thinned(len(mesh.vertices), mesh.faces)
     observations, view, face = _observed(field, mesh, normals, albedo, views, skin_code, found)
     skin = skin_of(face, albedo if look is None else look.astype(np.float64), region)
     moving = field.moving_light
@@ -45,7 +47,9 @@ def standard_material(
     else:
         poses = [matrix(v.camera.world_from_cam) for v in views]
         at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
-    out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check, hair)
+    out = standard_fit.fit(
+        mesh, normals, at, albedo, observations, skin, check, hair, None if thin is None else thin.chosen
+    )
     correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
     return replace(out, correction=correction)
 
@@ -57,15 +61,22 @@ def carried(
     """What arrives under a light that moves with the camera. stand_in: the still one; view (M,): number of each
     observation's photo; poses (4, 4) of the photos."""
     moving = MovingLamps(light)
-    lobes = np.empty((len(view), len(standard_fit.ALPHAS), 2, 3), np.float32)
+    x, n = mesh.vertices[seen.vertex], normals[seen.vertex].astype(np.float32)
+    eyes = [Standpoint.of(pose) for pose in poses]
     lit = np.empty((len(view), 3))
-    for number, pose in enumerate(poses):
+    for number, eye in enumerate(eyes):
         check()
-        rows = np.flatnonzero(view == number)
-        x, n = mesh.vertices[seen.vertex[rows]], normals[seen.vertex[rows]].astype(np.float32)
-        eye = Standpoint.of(pose)
-        lobes[rows] = moving.lobes(x, n, eye, standard_fit.ALPHAS)
-        lit[rows] = moving.irradiance(x, n, eye) / np.pi
+        own = np.flatnonzero(view == number)
+        lit[own] = moving.irradiance(x[own], n[own], eye) / np.pi
+
+    def lobes(rows: Indices, alphas: F32) -> F32:
+        out = np.empty((len(rows), len(alphas), 2, 3), np.float32)
+        for number, eye in enumerate(eyes):
+            check()
+            own = np.flatnonzero(view[rows] == number)
+            out[own] = moving.lobes(x[rows[own]], n[rows[own]], eye, alphas)
+        return out
+
     still = shade(stand_in, normals, np.ones((len(normals), 3), np.float32)).astype(np.float64)
     return standard_fit.Lit(lobes, lit, still)
 

@@ -15,7 +15,7 @@ from pipeline.units import ContentHash
 class Config(StageConfig):
     """Settings of the template stage."""
 
-    enabled: bool = Field(False, description="register the head template; default: only with uv.mesh=template")
+    enabled: bool = Field(False, description="register the head template; default: unless uv.mesh=scan")
     levels: int = Field(2, ge=1, le=3, description="subdivisions of the registered head's quads")
     require: bool = Field(False, description="fail if the template does not fit the head, or the capture shows no face")
     hair: bool = Field(True, description="tell hair apart and keep it as a mesh of its own; off: the skin follows it")

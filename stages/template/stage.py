@@ -152,4 +152,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=13, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=15, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

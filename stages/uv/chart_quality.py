@@ -48,9 +48,10 @@ class Quality:
     face_share: float | None = None
 
 
-def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Quality:
+def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None, given: meshes.Mask | None = None) -> Quality:
     """Every figure of a finished unwrap. face: (F,) mask of the triangles of the face; charts then have different
-    scales, which do not count as stretch."""
+    scales, which do not count as stretch. given: (F,) triangles whose layout is the template's: they do not count as
+    stretched, because nobody can change it."""
     uv_area = signed_areas(charts.uvs.astype(np.float64), charts.faces)
     area = meshes.areas(mesh.vertices, mesh.faces)
     share = area / area.sum()
@@ -63,7 +64,9 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Qual
     if face is not None:
         alike = Charts(evened(charts.uvs.astype(np.float64), charts.faces, area).astype(np.float32), charts.faces)
     mean, most = stretch(mesh, alike, ~flat)
-    linf = _stretches(mesh, alike, ~flat)[1]
+    own = np.ones(len(area), np.bool_) if given is None else ~given
+    far = own.copy()
+    far[~flat] &= _stretches(mesh, alike, ~flat)[1] > STRETCHED
     return Quality(
         charts=int(label.max()) + 1,
         fragments=int((np.bincount(label, share) < FRAGMENT).sum()),
@@ -75,7 +78,7 @@ def measure(mesh: Mesh, charts: Charts, face: meshes.Mask | None = None) -> Qual
         empty=float(share[flat].sum()),
         seam_front=seam_length(mesh, charts),
         tile_utilisation=tuple(c / RASTER**2 for c in covered),
-        stretched=float(share[~flat][linf > STRETCHED].sum() + share[flat].sum()),
+        stretched=float(share[far].sum()),
         face_share=None if face is None else face_share(charts, face),
     )
 

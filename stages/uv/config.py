@@ -13,11 +13,11 @@ from pipeline.units import Texels, Triangles
 class Config(StageConfig):
     """Settings of the uv stage."""
 
-    mesh: Literal["scan", "template", "both"] = Field(
-        "scan",
+    mesh: Literal["auto", "scan", "template", "both"] = Field(
+        "auto",
         description="what the asset is made of: the decimated scan, or the registered template (its topology and "
-        "texture layout; the scan where the template does not hold); both: the template, and the scan as a variant "
-        "with maps of its own",
+        "texture layout; the scan where the template does not hold); auto: the template on people whose registration "
+        "has no fault, else the scan; both: the template, and the scan as a variant with maps of its own",
     )
     rest: bool = Field(
         True,

@@ -58,7 +58,8 @@ def build_registered(
     with ThreadPoolExecutor(1) as beside:
         away = beside.submit(_away, dense, mesh, proxy, shown & (head.seen[rows][mesh.faces] > 0).all(1))
         step(1, 3, "measuring charts")
-        quality = _skin_share(measure(whole, laid, face), laid, face)
+        given = np.arange(len(face)) < len(mesh.faces)
+        quality = _skin_share(measure(whole, laid, face, given), laid, face)
         step(2, 3, "measuring distances")
         deviation, rough, against = away.result()
     step(3, 3, "done")

@@ -42,7 +42,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.progress(done, total, message)
 
     head, notes, quality = inputs.template, list[str](), tuple[Finding, ...]()
-    ref = head.artifact.head if config.mesh != "scan" else None
+    why = _against_template(head.artifact, config)
+    ref = None if why else head.artifact.head
     if ref is not None:
         from pipeline.registration.head import load_head
         from stages.uv.hair import hair_vertices
@@ -53,8 +54,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         quality = head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
-        if config.mesh != "scan":
-            notes.append(f"the mesh is the scan's: {head.artifact.reason}")
+        if config.mesh != "scan" and (head.artifact.registered or config.mesh != "auto"):
+            notes.append(f"the mesh is the scan's: {why}")
     made = _saved(built, "", context).model_copy(
         update={
             "of_template": ref is not None,
@@ -65,6 +66,18 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     if ref is None or config.mesh != "both":
         return made
     return made.model_copy(update={"scan": _saved(_of_scan(dense, inputs, config, step), "scan_", context)})
+
+
+def _against_template(head: RegisteredHead, config: Config) -> str:
+    """Why the mesh is the scan's; "" if it is the template's."""
+    if config.mesh == "scan" or not head.registered:
+        return head.reason or "uv.mesh=scan"
+    if config.mesh != "auto":
+        return ""
+    faults = [f.said for f in head.quality if f.level != "good"]
+    if head.eyes_reason and not head.figures.get("eyes_closed"):
+        faults.append(f"its eyes could not be fitted ({head.eyes_reason})")
+    return f"{faults[0]}; uv.mesh=template takes the template nevertheless" if faults else ""
 
 
 def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:
@@ -113,4 +126,4 @@ def _saved(built: Built, prefix: str, context: Context) -> UvMesh:
     )
 
 
-STAGE = Stage(name="uv", version=13, inputs=Inputs, config=Config, output=UvMesh, run=run)
+STAGE = Stage(name="uv", version=14, inputs=Inputs, config=Config, output=UvMesh, run=run)

@@ -9,11 +9,11 @@ import pytest
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import Mesh, areas, triangles_of
+from pipeline.meshes import Charts, Mesh, areas, triangles_of
 from pipeline.registration.head import Head
 from pipeline.visibility import Occluder
 from stages.bake.build import _known
-from stages.bake.mouth import COLOURS, inside_of
+from stages.bake.mouth import COLOURS, hidden_tiles, inside_of
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.ball_head import ball_quads, no_head
 
@@ -63,3 +63,16 @@ def test_the_bake_takes_them(tmp_path: Path) -> None:
 def test_a_template_without_a_mouth_has_no_inside(tmp_path: Path) -> None:
     registered, mesh = head_and_mesh(tmp_path, ("face", "ears", "neck"))
     assert inside_of(registered, mesh) is None and inside_of(no_head(tmp_path), mesh) is None
+
+
+def test_tiles_without_skin_s_outside_are_hidden(tmp_path: Path) -> None:
+    """Face on tile 1001, the mouth's inside and teeth on 1002, hair of the scan on 1003; and all on one tile."""
+    registered, mesh = head_and_mesh(tmp_path)
+    tile = np.repeat([0, 0, 0, 0, 1, 1], 32)
+    more = np.concatenate([tile, np.full(8, 2)])
+    corners = np.array([[0.2, 0.2], [0.4, 0.2], [0.2, 0.4]], np.float32)
+    for place, wanted in ((more, {1}), (0 * more, set())):
+        uvs = (corners[None] + np.stack([place, 0 * place], -1)[:, None]).reshape(-1, 2).astype(np.float32)
+        charts = Charts(uvs, np.arange(len(uvs), dtype=np.int32).reshape(-1, 3))
+        assert hidden_tiles(registered, charts) == wanted
+    assert hidden_tiles(no_head(tmp_path), charts) == set()

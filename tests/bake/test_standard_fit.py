@@ -60,6 +60,19 @@ def test_an_objects_material_is_found(f0: float, roughness: float, limit: float)
     assert np.median(found.correction) == pytest.approx(1.1, rel=0.03)
 
 
+def test_a_third_of_the_vertices_tells_f0_and_all_tell_the_albedo() -> None:
+    """Base colours that differ from the field's by a wave that only all vertices together show."""
+    mesh, at, albedo, seen = scene(0.04, 0.45)
+    wave = 1 + 0.2 * np.sin(120 * mesh.vertices[:, 0])[:, None]
+    n, asked = mesh.normals.astype(np.float64), np.arange(len(albedo)) % 3 == 0
+    skin = np.zeros(len(albedo), bool)
+    whole, some = (fits.fit(mesh, n, at, albedo / wave, seen, skin, asked=a) for a in (None, asked))
+    assert np.median(some.f0) == pytest.approx(0.04, rel=0.06)
+    assert np.median(some.roughness) == pytest.approx(np.median(whole.roughness), abs=0.02)
+    np.testing.assert_allclose(some.correction, whole.correction, rtol=0.01)
+    assert np.corrcoef(some.correction[:, 0], wave[:, 0])[0, 1] > 0.95
+
+
 def test_black_is_corrected_as_much_as_white() -> None:
     """Without a pull that follows the albedo, black hair beside skin kept the error of the field."""
     mesh, at, albedo, seen = scene(0.0, 0.45, scale=1.5)

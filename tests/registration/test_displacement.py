@@ -101,3 +101,26 @@ def test_closed_lips_meet_and_do_not_pass_through_each_other() -> None:
     faces = triangles_of(quads)
     assert not len(piercing_edges(points + moved[:, None] * normals, faces))
     assert len(piercing_edges(points + meeting(points, normals, quads, 1.0)[:, None] * normals, faces))
+
+
+def test_lips_that_pass_through_each_other_are_drawn_apart() -> None:
+    """Two bent sheets face to face, that overlap by up to 0.3 mm in their middle."""
+    at = np.linspace(-0.01, 0.01, 21)
+    x, z = (v.ravel() for v in np.meshgrid(at, at, indexing="ij"))
+    cells = np.arange(20 * 21).reshape(20, 21)[:, :20].ravel()
+    up = np.stack([cells, cells + 1, cells + 22, cells + 21], 1)
+    bulge = 3e-4 * np.exp(-(x * x + z * z) / 2 / 0.004**2) - 5e-5
+    tilt = 1e-5 * np.sin(900 * x) * np.cos(700 * z)
+    low = np.stack([x, 0.5 * bulge, z], 1)
+    high = np.stack([x, -0.5 * bulge + tilt, z], 1)
+    points = np.concatenate([low, high])
+    quads = np.concatenate([up, up[:, ::-1] + len(x)])
+    normals = np.repeat([[0.0, 1, 0], [0.0, -1, 0]], len(x), 0)
+    assert len(piercing_edges(points, triangles_of(quads))) > 20
+    moved = module._apart(points, np.zeros(len(points)), normals, quads, quads, 1.0)
+    now = points + moved[:, None] * normals
+    assert len(piercing_edges(now, triangles_of(quads))) == 0
+    assert (moved <= 0).all() and moved.min() > -4e-4
+    assert (moved[np.hypot(*points[:, [0, 2]].T) > 0.012] == 0).all()
+    far = module._apart(points, np.zeros(len(points)), normals, quads, quads[:20], 1.0)
+    assert (far[up[40:]] == 0).all()  # only what is closed moves

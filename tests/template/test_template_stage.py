@@ -173,8 +173,9 @@ def test_the_scan_is_used_where_the_template_does_not_hold(tmp_path: Path) -> No
     assert any("no face" in w for w in uv.warnings) and uv.tiles == 1
 
 
-def test_it_is_registered_only_where_the_asset_is_made_from_it() -> None:
-    assert not configs_for("draft", {})["template"].enabled
+def test_it_is_registered_only_where_the_asset_may_be_made_from_it() -> None:
+    assert configs_for("draft", {})["template"].enabled
+    assert not configs_for("draft", {"uv": {"mesh": "scan"}})["template"].enabled
     assert configs_for("draft", {"uv": {"mesh": "template"}})["template"].enabled
     assert not configs_for("draft", {"uv": {"mesh": "template"}, "template": {"enabled": False}})["template"].enabled
 

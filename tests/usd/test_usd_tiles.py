@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, UsdShade, UsdUtils
+from pxr import Tf, Usd, UsdGeom, UsdShade, UsdUtils
 from support.synthetic_asset import RADIUS, ball, cut_in_two, run_stage, write_inputs
 
 from pipeline.artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
 from pipeline.map_lookup import bilinear
-from stages.usd.check.validate import validate
+from stages.usd.check.validate import _without_noise, validate
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
 from stages.usd.render.relight import vertex_values
@@ -38,6 +38,21 @@ def tiled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, UsdAsset]:
 @pytest.fixture
 def asset(tiled: tuple[Path, UsdAsset], tmp_path: Path) -> Path:
     return Path(shutil.copytree(tiled[0], tmp_path / "asset"))
+
+
+def test_the_library_s_complaints_about_tiles_are_not_printed(
+    tiled: tuple[Path, UsdAsset], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It looks for files with <UDIM> in their names. Other warnings are still printed."""
+    validate(tiled[0] / "head.usd")
+    assert "UDIM" not in "".join(capfd.readouterr())
+    with _without_noise():
+        Tf.Warn("./head.<UDIM>.png is not there")
+        Tf.Warn("something else is wrong")
+    said = "".join(capfd.readouterr())
+    assert "UDIM" not in said and "something else is wrong" in said
+    Tf.Warn("and as before")
+    assert "and as before" in "".join(capfd.readouterr())
 
 
 def cut_ball() -> UvSurface:

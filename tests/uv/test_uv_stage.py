@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from pipeline import meshes
 from pipeline.artifacts import FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
+from pipeline.head_artifacts import RegisteredHead
+from pipeline.verdict import Finding
 from stages.surface.build import build
 from stages.uv import unwrap
-from stages.uv.stage import Config, Inputs, run
+from stages.uv.stage import Config, Inputs, _against_template, run
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.ball_head import no_head
 
@@ -78,3 +81,43 @@ def test_failing_unwrap_is_a_stage_error(inputs: Inputs, tmp_path: Path, monkeyp
     with pytest.raises(StageError, match="unwrapped"):
         run(inputs, Config(target_faces=2000), Context(tmp_path, tmp_path))
     assert "out of range" in str(unwrap._failed("a face index is out of range"))
+
+
+def finding(level: str) -> Finding:
+    return Finding(check="pierced", level=level, value=3, limit="at most 0", said="3 edges pass")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("mesh", "head", "why"),
+    [
+        ("auto", {}, ""),
+        ("auto", {"quality": (finding("usable"),)}, "3 edges pass; uv.mesh=template"),
+        ("auto", {"eyes_reason": "eye_left: no edge"}, "its eyes could not be fitted (eye_left: no edge)"),
+        ("auto", {"eyes_reason": "eye_left: the eyes are closed", "figures": {"eyes_closed": 1.0}}, ""),
+        ("auto", {"registered": False, "reason": "no face"}, "no face"),
+        ("template", {"quality": (finding("unusable"),), "eyes_reason": "no edge"}, ""),
+        ("both", {"quality": (finding("usable"),)}, ""),
+        ("template", {"registered": False, "reason": "no face"}, "no face"),
+        ("scan", {}, "uv.mesh=scan"),
+    ],
+)
+def test_what_the_mesh_is_made_of(mesh: str, head: dict[str, object], why: str) -> None:
+    found = _against_template(RegisteredHead.model_validate({"registered": True} | head), Config(mesh=mesh))
+    assert found.startswith(why) if why else found == ""
+
+
+@pytest.mark.parametrize(
+    ("mesh", "registered", "said"),
+    [("auto", False, ()), ("template", False, ("the mesh is the scan's: no face",)), ("auto", True, ("the mesh is",))],
+)
+def test_it_is_told_where_a_head_is_not_taken(
+    inputs: Inputs, tmp_path: Path, mesh: str, registered: bool, said: tuple[str, ...]
+) -> None:
+    """Not of things, from which nobody expects a head."""
+    head = RegisteredHead(registered=registered, reason="no face", quality=(finding("usable"),))
+    small = {"target_faces": 500, "proxy_faces": 200, "texture_size": 256}
+    made = run(
+        replace(inputs, template=Located(head, tmp_path)), Config(mesh=mesh, **small), Context(tmp_path, tmp_path)
+    )
+    assert len(made.warnings) == len(said) and not made.of_template
+    assert all(w.startswith(s) for w, s in zip(made.warnings, said, strict=True))

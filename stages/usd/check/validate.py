@@ -12,7 +12,8 @@ import re
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from stages.usd.check.material_checks import colour_findings, material_findings,
 
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
 IMAGES = (".png", ".jpg", ".jpeg", ".exr", ".hdr", ".tif", ".tiff")
+TILE_NAME = "<UDIM>"
 MISSING_ID = "MissingShaderIdInRegistry"
 
 
@@ -80,7 +82,9 @@ def library(stage: Usd.Stage, path: Path) -> list[Finding]:
     """Findings of UsdValidation. One is lowered to info: MaterialX shader ids, which builds without its node
     definitions do not know."""
     out = []
-    for e in UsdValidation.ValidationContext(_validators()).Validate(stage):
+    with _without_noise():
+        errors = UsdValidation.ValidationContext(_validators()).Validate(stage)
+    for e in errors:
         kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
         message, name = " ".join(e.GetMessage().split()), e.GetIdentifier()
         known = MISSING_ID in name and "'ND_" in message
@@ -88,6 +92,23 @@ def library(stage: Usd.Stage, path: Path) -> list[Finding]:
         where = ", ".join(str(s.GetPrim().GetPath()) for s in e.GetSites() if s.IsPrim())
         out.append(Finding(level, name, message, where))  # type: ignore[arg-type]
     return out
+
+
+@contextmanager
+def _without_noise() -> Iterator[None]:
+    """Keep the library from printing that it can't find "NAME.<UDIM>.png": it resolves tiles in UsdUVTexture alone, not
+    in MaterialX. That each tile is there is checked by `textures`. What else it has to say is printed afterwards."""
+    from pxr import Tf
+
+    held = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        said = [d.commentary for d in held.TakeUncoalescedDiagnostics()]
+        del held
+        for text in said:
+            if TILE_NAME not in text:
+                Tf.Warn(text)
 
 
 # ------------------------------------------------------------------ layers
