@@ -21,8 +21,8 @@ class Config(StageConfig):
     )
     rest: bool = Field(
         True,
-        description="with mesh=template: add hair, and what the scan shows beside the template (clothes, shoulders), "
-        "as meshes on tiles of their own",
+        description="made from the template: add hair, and what the scan shows beside it (clothes, shoulders), as "
+        "meshes on tiles of their own",
     )
     target_faces: Triangles = Field(50_000, ge=200, le=2_000_000, description="triangles of the textured mesh")
     remesh: Literal["adaptive", "uniform", "quads"] = Field(

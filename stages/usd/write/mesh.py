@@ -141,7 +141,8 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
     near = cKDTree(corners.mean(1)).query(ends.mean(1), candidates, workers=-1)[1]
     hit, weights_at_centre = _nearest(ends.mean(1), corners, near)
     scale = float(np.sqrt(_areas(corners).sum() / max(_areas(t).sum(), 1e-12)))  # metres per unit of texture
-    expected = _continued(ends, corners[hit], t[hit], weights_at_centre)
+    affine = _affine(corners, t)
+    expected = _continued(ends, corners[hit], t[hit], weights_at_centre, affine[hit])
     places = np.concatenate([corners.mean(1), scale * t.mean(1)], 1)
     wanted = np.concatenate([ends, scale * expected], -1)
     uvs = np.zeros((len(ends), 3, 2))
@@ -152,7 +153,8 @@ def with_uvs_from(proxy: UvSurface, full: UvSurface, candidates: int = CANDIDATE
         face, weights = _nearest(query[:, :3], corners[inside], near)
         found = (t[inside[face]] * weights[..., None]).sum(1)
         if beyond > 0:
-            plane = _continued(query[:, None, :3], corners[inside[face]], t[inside[face]], weights)[:, 0]
+            own = inside[face]
+            plane = _continued(query[:, None, :3], corners[own], t[own], weights, affine[own])[:, 0]
             step = plane - found
             length = np.linalg.norm(step, axis=1, keepdims=True)
             found = found + step * np.minimum(1, beyond / np.maximum(length, 1e-30))
@@ -181,7 +183,8 @@ def _lay_flat(uvs: F64, ends: F64, corners: F64, t: F64, weights: F64, most: flo
     turned = _turned(ends[lost] - ends[lost].mean(1, keepdims=True), own[lost], base[lost])
     on = (corners[lost] * weights[lost][..., None]).sum(1)
     middle = (t[lost] * weights[lost][..., None]).sum(1)
-    step = _continued(on[:, None] + turned, corners[lost], t[lost], weights[lost]) - middle[:, None]
+    affine = _affine(corners[lost], t[lost])
+    step = _continued(on[:, None] + turned, corners[lost], t[lost], weights[lost], affine) - middle[:, None]
     reach = np.linalg.norm(step, axis=2).max(1)
     uvs[lost] = middle[:, None] + step * np.minimum(1, most / np.maximum(reach, 1e-30))[:, None, None]
 
@@ -254,12 +257,17 @@ def without_overlap(proxy: UvSurface, size: int = 1024) -> UvSurface:
     return UvSurface(proxy.vertices, proxy.normals, proxy.faces, *_shared(t))
 
 
-def _continued(points: F64, corners: F64, t: F64, weights: F64) -> F64:
-    """(N, K, 2) texture coordinates of points (N, K, 3) by each triangle's affine map from space to texture."""
-    edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
+def _continued(points: F64, corners: F64, t: F64, weights: F64, affine: F64) -> F64:
+    """(N, K, 2) texture coordinates of points (N, K, 3) by each triangle's map `affine` (N, 3, 2)."""
     on = (corners * weights[..., None]).sum(1)
     start = (t * weights[..., None]).sum(1)
-    return np.asarray(start[:, None] + (points - on[:, None]) @ (_pseudoinverse(edges) @ along))
+    return np.asarray(start[:, None] + (points - on[:, None]) @ affine)
+
+
+def _affine(corners: F64, t: F64) -> F64:
+    """(F, 3, 2) texture coordinates over space in the planes of triangles (F, 3, 3) with coordinates t (F, 3, 2)."""
+    edges, along = corners[:, 1:] - corners[:, :1], t[:, 1:] - t[:, :1]
+    return np.asarray(_pseudoinverse(edges) @ along)
 
 
 def _pseudoinverse(edges: F64) -> F64:
