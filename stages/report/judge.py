@@ -19,8 +19,8 @@ PSNR = Limits(28.0, 18.0)
 MASK = Limits(0.95, 0.8)
 # dB of the worst view below the median: at most 3 on the heads above; 7 if its mask is wrong.
 WORST = Limits(6.0, 15.0, lower=False)
-# dB lost from the fitted field to the asset: 0 to .4 on good scans, .3 to .9 on heads made from the template, whose facets
-# of 1.3 mm smooth the outline; 1.9 with hundreds of charts.
+# dB lost from the fitted field to the asset: 0 to .4 on good scans, .3 to .9 on heads made from the template, whose
+# facets of 1.3 mm smooth the outline; 1.9 with hundreds of charts.
 LOST = Limits(1.0, 3.0, lower=False)
 
 

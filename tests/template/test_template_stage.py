@@ -119,7 +119,7 @@ def ball_files(tmp_path: Path, eyes: bool = True) -> tuple[Located[Surface], Loc
 def test_the_uv_stage_takes_the_registered_head(tmp_path: Path) -> None:
     surface, registered, head = ball_files(tmp_path)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, registered, None)  # type: ignore[arg-type]
     (tmp_path / "out").mkdir()
     uv = uv_stage.run(files, UvConfig(mesh="template", rest=False), Context(tmp_path / "out", tmp_path))
     path = tmp_path / "out" / uv.mesh.path
@@ -150,7 +150,7 @@ def test_what_lies_beside_the_head_is_on_the_next_tile(tmp_path: Path) -> None:
     )  # fmt: skip
     meshes.save(tmp_path / "surface.npz", both)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, registered, None)  # type: ignore[arg-type]
     made = {}
     for rest in (False, True):
         (tmp_path / str(rest)).mkdir()
@@ -167,7 +167,7 @@ def test_what_lies_beside_the_head_is_on_the_next_tile(tmp_path: Path) -> None:
 def test_the_scan_is_used_where_the_template_does_not_hold(tmp_path: Path) -> None:
     surface, _, _ = ball_files(tmp_path)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
     config = UvConfig(mesh="template", target_faces=2000, proxy_faces=300)
     uv = uv_stage.run(files, config, Context(tmp_path, tmp_path))
     assert any("no face" in w for w in uv.warnings) and uv.tiles == 1

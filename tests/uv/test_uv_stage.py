@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from pipeline import meshes
 from pipeline.artifacts import FileRef, Located, MaskSet, Surface
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
 from pipeline.head_artifacts import RegisteredHead
@@ -39,7 +40,7 @@ def inputs(tmp_path: Path) -> Inputs:
     )
     # fitted photos and cameras are only asked for with tiles=auto (test_uv_tiles)
     masks = Located(MaskSet(masks=()), tmp_path)
-    return Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
+    return Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -102,8 +103,15 @@ def finding(level: str) -> Finding:
     ],
 )
 def test_what_the_mesh_is_made_of(mesh: str, head: dict[str, object], why: str) -> None:
-    found = _against_template(RegisteredHead.model_validate({"registered": True} | head), Config(mesh=mesh))
+    artifact, config = RegisteredHead.model_validate({"registered": True} | head), Config.model_validate({"mesh": mesh})
+    found = _against_template(artifact, config, lambda: False)
     assert found.startswith(why) if why else found == ""
+
+
+@pytest.mark.parametrize(("mesh", "scan"), [("auto", True), ("template", False), ("both", False)])
+def test_a_light_stage_keeps_the_scan_unless_asked(mesh: str, scan: bool) -> None:
+    head = RegisteredHead(registered=True)
+    assert bool(_against_template(head, Config.model_validate({"mesh": mesh}), lambda: True)) == scan
 
 
 @pytest.mark.parametrize(
@@ -116,8 +124,8 @@ def test_it_is_told_where_a_head_is_not_taken(
     """Not of things, from which nobody expects a head."""
     head = RegisteredHead(registered=registered, reason="no face", quality=(finding("usable"),))
     small = {"target_faces": 500, "proxy_faces": 200, "texture_size": 256}
-    made = run(
-        replace(inputs, template=Located(head, tmp_path)), Config(mesh=mesh, **small), Context(tmp_path, tmp_path)
-    )
+    still = Located(Capture(kind="photos", views=()), tmp_path)
+    given = replace(inputs, template=Located(head, tmp_path), capture=still)
+    made = run(given, Config.model_validate({"mesh": mesh} | small), Context(tmp_path, tmp_path))
     assert len(made.warnings) == len(said) and not made.of_template
     assert all(w.startswith(s) for w, s in zip(made.warnings, said, strict=True))
