@@ -17,7 +17,7 @@ from pipeline.camera import PinholeCamera
 from pipeline.capture_artifacts import CaptureView, GivenCamera
 from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.transforms import apply, centre_K_from_corner_K, inverse_rigid, rigid, rows, similarity
-from workflows.bench.captures_figures import Run, figures_of, texture_of
+from workflows.bench.captures_figures import Run, _of_own_tile, figures_of, texture_of
 from workflows.evaluation import geometry, rendered_person, stored_truth
 
 RADIUS, SIZE = 0.1, 96
@@ -284,6 +284,15 @@ def test_psnr_by_label(tmp_path: Path, person: Path) -> None:
 
 
 # ------------------------------------------------------------------ a run's own figures
+def test_the_face_has_its_share_of_its_own_tile() -> None:
+    """Half of the first tile, a speck on the second, nothing on the third."""
+    tile = np.repeat([0, 1, 2], [40, 100, 60])
+    face = np.zeros(200, np.bool_)
+    face[:20] = face[45:50] = True
+    assert _of_own_tile(face, tile) == 0.5
+    assert _of_own_tile(np.zeros(200, np.bool_), tile) == 0
+
+
 def test_texture_figures_of_two_charts(tmp_path: Path) -> None:
     """A square of 1 m with the left half of the texture, and a speck with the right; the speck is a fragment."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)

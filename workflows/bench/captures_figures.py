@@ -110,7 +110,7 @@ def _masks(run: Run) -> Figures:
 
 # ------------------------------------------------------------------ texture
 def texture_of(run: Run) -> tuple[Figures, Ranges]:
-    """Fragments and the face's share of the covered texels; ranges of F0 and roughness by label."""
+    """Fragments, the face's share of the covered texels of its tile, and ranges of F0 and roughness by label."""
     if "mesh" not in run.manifest("uv") or "maps" not in run.manifest("bake"):
         return {}, {}
     from pipeline import meshes
@@ -128,8 +128,15 @@ def texture_of(run: Run) -> tuple[Figures, Ranges]:
     inside = _labels(code[covered], names) if code is not None else {}
     if inside:
         faces = [mask for name, mask in inside.items() if name in FACE]
-        found["face_share"] = round(float(np.mean(np.any(faces, axis=0))), 4) if faces else 0.0
+        tile = np.nonzero(covered)[1] // covered.shape[0]
+        found["face_share"] = round(_of_own_tile(np.any(faces, axis=0), tile), 4) if faces else 0.0
     return found, _ranges(run, covered, inside)
+
+
+def _of_own_tile(face: npt.NDArray[np.bool_], tile: npt.NDArray[np.int64]) -> float:
+    """Share of the face (N,) in the covered texels of the tile that shows most of it. tile (N,): of each texel."""
+    own = tile == np.bincount(tile, face).argmax()
+    return float(face[own].mean())
 
 
 def _covered(mesh: Any, charts: Any, size: int) -> npt.NDArray[np.bool_]:

@@ -68,7 +68,7 @@ TABLES = (
             Figure(
                 "face_share",
                 "face (%)",
-                "share of the covered texels with the label face or eyes",
+                "share of the covered texels of its tile with the label face or eyes",
                 1,
                 SHARE,
                 0.02,
