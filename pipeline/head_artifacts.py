@@ -33,7 +33,8 @@ class RegisteredHead(Artifact):
     95 % of the subdivided head's distance from the fitted surface, then both with displacement), over skin that the
     photos show. eyes: those that were fitted; eyes_reason: why others stay the template's own. hair: npz of `hair`
     (V,), the vertices of the fitted surface that are hair; hair_reason: why there is none. quality: the checks; they
-    count for the stage uv where the asset is made from this head, and for no verdict else.
+    count for the stage uv where the asset is made from this head, and for no verdict else. faulty: it was registered,
+    but with a fault that the settings do not allow.
     """
 
     registered: bool
@@ -55,6 +56,7 @@ class RegisteredHead(Artifact):
     hair: FileRef | None = None
     hair_reason: str = ""
     quality: tuple[Finding, ...] = ()
+    faulty: bool = False
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -140,6 +140,7 @@ def _template(merged: dict[str, dict[str, Any]]) -> None:
     uv, template = merged.get("uv", {}), merged.get("template", {})
     if uv.get("mesh") != "scan" and "template" in merged:
         template.setdefault("enabled", True)
+        template.setdefault("faultless", uv.get("mesh", "auto") == "auto")
 
 
 def _of_template(folder: str | None) -> Settings:

@@ -5,8 +5,9 @@ Source of the limits: a scanned bald head in a studio and rendered persons (docs
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from pipeline.eyes.iris import LEAST_PIXELS
 from pipeline.registration.identity_fit import MAX_RESIDUAL
 from pipeline.verdict import Finding, Limits, judged
 
@@ -38,6 +39,15 @@ def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
     )  # fmt: skip
 
 
+def faults(quality: Sequence[Finding], eyes: str) -> str:
+    """The first fault of a registered template, for assets that are made from it only without one; "" for none. eyes:
+    why they are not fitted."""
+    wrong = [f.said for f in quality if f.level != "good"]
+    if eyes:
+        wrong.append(f"its eyes could not be fitted ({eyes})")
+    return f"{wrong[0]}; uv.mesh=template takes the template nevertheless" if wrong else ""
+
+
 MIN_FACES = 0.1  # of the photos: persons have 0.25 or more also if photographed all around, a statue had 0.06
 SCALES = (0.75, 1.75)  # metres per metre of the template: a child's head to the largest of adults
 MAX_WEIGHT = 3.0  # root mean square of the identity weights: persons have 1
@@ -58,6 +68,13 @@ def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:
         return f"the template's landmarks are {residual_mm:.2g} mm off (median), more than {1000 * MAX_RESIDUAL:g}"
     if metric and not SCALES[0] <= scale <= SCALES[1]:
         return f"the head would be {scale:.2g} times the template's size, outside of {SCALES[0]:g} to {SCALES[1]:g}"
+    return ""
+
+
+def refused_irises(pixels: float) -> str:
+    """Why photos are too coarse for the template's eyes; "" if they are not. pixels: across an iris."""
+    if pixels < LEAST_PIXELS:
+        return f"an iris is {pixels:.2g} pixels across, fewer than {LEAST_PIXELS:g}"
     return ""
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
+from pipeline.artifacts import Camera
+from pipeline.eyes.ball import IRIS
 from pipeline.eyes.fit import FittedBall, fitted_eyes, unseen_eye
 from pipeline.eyes.place import eye_displacement, eye_rows, with_eyes
 from pipeline.meshes import F64, Indices, Mesh, triangles_of
@@ -26,6 +28,7 @@ from pipeline.registration.rig import EYES
 from pipeline.registration.scan import Scan
 from pipeline.registration.subdivision import Level, limit, subdivided
 from pipeline.template.model import SKIN, Template
+from pipeline.transforms import apply, matrix
 from pipeline.visibility import FittedPhoto, Occluder, seen_weight
 
 AROUND = 0.25  # metres of the template: the surface further from the head's middle is not looked at
@@ -62,6 +65,15 @@ def scan_of(mesh: Mesh, head: PlacedHead, views: Sequence[FittedPhoto]) -> tuple
     used, flat = np.unique(faces, return_inverse=True)
     part = Mesh(mesh.vertices[used], mesh.normals[used], flat.reshape(-1, 3).astype(np.int32))
     return Scan(part, _seen(part, views, Occluder(mesh))), np.asarray(used, np.int64)
+
+
+def iris_pixels(cameras: Sequence[Camera], head: PlacedHead) -> float:
+    """Pixels across an iris of the placed head, seen from its front: of the median photo; 0 without any."""
+    middle = apply(head.world_from_template, np.zeros(3))
+    size = IRIS * 2 * head.scale / ADULT
+    poses = [(matrix(c.K)[0, 0], matrix(c.world_from_cam)[:3, 3]) for c in cameras]
+    across = [focal * size / max(float(np.linalg.norm(centre - middle)), 1e-12) for focal, centre in poses]
+    return float(np.median(across)) if across else 0.0
 
 
 def _seen(part: Mesh, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:

@@ -47,8 +47,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     from pipeline.template.load import load_template
     from pipeline.visibility import seen_by
     from stages.template.hair import told_hair, under_hair
-    from stages.template.judge import refused_faces, refused_placing
-    from stages.template.register import register, scan_of
+    from stages.template.judge import refused_faces, refused_irises, refused_placing
+    from stages.template.register import iris_pixels, register, scan_of
 
     def step(done: int, total: int, message: str) -> None:
         context.check()
@@ -57,6 +57,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     ref = inputs.masks.artifact.landmarks
     if ref is None:
         return _refused(config, "no face was found in three photos or more")
+    if config.faultless and inputs.capture.artifact.stage is not None:
+        return _refused(config, "a light stage: the scan predicts its lights better")
     why = refused_faces(photos_that_agree(inputs.masks.path(ref)), len(inputs.masks.artifact.masks))
     if why:
         return _refused(config, why)
@@ -70,6 +72,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         return _refused(config, why)
     step(0, 5, "visibility")
     views = seen_by(inputs.inverse_rendering.artifact, inputs.poses.artifact, inputs.masks, inputs.capture)
+    why = refused_irises(iris_pixels([v.camera for v in views], placed)) if config.faultless else ""
+    if why:
+        return _refused(config, why)
     dense = meshes.load(inputs.surface.path(inputs.surface.artifact.mesh))
     scan, rows = scan_of(dense, placed, views)
     hair = None
@@ -104,7 +109,7 @@ def _registered(
     from pipeline.registration.neck import covered_neck
     from pipeline.registration.rig import rig_of
     from stages.template.figures import figures_of, fitted_eye, region_figures
-    from stages.template.judge import judge, refused_fit
+    from stages.template.judge import faults, judge, refused_fit
 
     regions = tuple(template.regions)
     by_region = region_figures(found, regions, scan)
@@ -114,6 +119,11 @@ def _registered(
     why = refused_fit(figures)
     if why:
         return _refused(config, why)
+    quality = judge(figures)
+    unfitted = "; ".join(f"{part}: {ball.reason}" for part, ball in found.eyes.items() if ball.reason)
+    why = faults(quality, "" if found.closed else unfitted) if config.faultless else ""
+    if why:
+        return _refused(config, why).model_copy(update={"faulty": True})
     found.head.save(context.workdir / HEAD)
     covered = covered_neck(template, found.head.vertices, scan, found.placed.scale)
     rig = rig_of(template, found.head.vertices, found.placed.world_from_template, covered)
@@ -134,9 +144,9 @@ def _registered(
         identity=tuple(round(float(w), 6) for w in found.placed.weights),
         figures=figures,
         eyes=tuple(fitted_eye(part, ball) for part, ball in found.eyes.items() if not ball.reason),
-        eyes_reason="; ".join(f"{part}: {ball.reason}" for part, ball in found.eyes.items() if ball.reason),
+        eyes_reason=unfitted,
         distances_mm={n: (d.median, d.most, d.displaced_median, d.displaced_most) for n, d in by_region.items()},
-        quality=judge(figures),
+        quality=quality,
     )
 
 
@@ -152,4 +162,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=15, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=16, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, UvMesh
-from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.verdict import Finding
@@ -23,14 +21,13 @@ MESH, PROXY = "uv_mesh.npz", "proxy.npz"
 @dataclass(frozen=True, slots=True)
 class Inputs:
     """The dense mesh; the fitted photos and their cameras, for the pixel size on the mesh; the face's landmarks; the
-    registered template; whether the capture is a light stage's."""
+    registered template."""
 
     surface: Located[Surface]
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     masks: Located[MaskSet]
     template: Located[RegisteredHead]
-    capture: Located[Capture]
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
@@ -45,8 +42,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         context.progress(done, total, message)
 
     head, notes, quality = inputs.template, list[str](), tuple[Finding, ...]()
-    why = _against_template(head.artifact, config, lambda: inputs.capture.artifact.stage is not None)
-    ref = None if why else head.artifact.head
+    ref = head.artifact.head if config.mesh != "scan" else None
     if ref is not None:
         from pipeline.registration.head import load_head
         from stages.uv.hair import hair_vertices
@@ -57,8 +53,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
         quality = head.artifact.quality
     else:
         built = _of_scan(dense, inputs, config, step)
-        if config.mesh != "scan" and (head.artifact.registered or config.mesh != "auto"):
-            notes.append(f"the mesh is the scan's: {why}")
+        if config.mesh in ("template", "both") or (config.mesh == "auto" and head.artifact.faulty):
+            notes.append(f"the mesh is the scan's: {head.artifact.reason}")
     made = _saved(built, "", context).model_copy(
         update={
             "of_template": ref is not None,
@@ -69,20 +65,6 @@ def run(inputs: Inputs, config: Config, context: Context) -> UvMesh:
     if ref is None or config.mesh != "both":
         return made
     return made.model_copy(update={"scan": _saved(_of_scan(dense, inputs, config, step), "scan_", context)})
-
-
-def _against_template(head: RegisteredHead, config: Config, light_stage: Callable[[], bool]) -> str:
-    """Why the mesh is the scan's; "" if it is the template's. light_stage: whether the capture is one's."""
-    if config.mesh == "scan" or not head.registered:
-        return head.reason or "uv.mesh=scan"
-    if config.mesh != "auto":
-        return ""
-    if light_stage():
-        return "the lights of a light stage are predicted better on the scan; uv.mesh=template takes the template"
-    faults = [f.said for f in head.quality if f.level != "good"]
-    if head.eyes_reason and not head.figures.get("eyes_closed"):
-        faults.append(f"its eyes could not be fitted ({head.eyes_reason})")
-    return f"{faults[0]}; uv.mesh=template takes the template nevertheless" if faults else ""
 
 
 def _of_scan(dense: Mesh, inputs: Inputs, config: Config, step: Step) -> Built:

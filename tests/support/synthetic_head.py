@@ -118,7 +118,7 @@ def template_inputs(
         folder,
     )  # fmt: skip
     (folder / "uv").mkdir()
-    files = uv_stage.Inputs(surface, None, None, Located(MaskSet(masks=()), folder), template, None)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, Located(MaskSet(masks=()), folder), template)  # type: ignore[arg-type]
     uv = uv_stage.run(
         files,
         uv_stage.Config(mesh=mesh, target_faces=3000, proxy_faces=300),

@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from pipeline import meshes, tiles
-from pipeline.artifacts import CameraSet, FileRef, Located, MaskSet, Surface
+from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet, Surface
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.registration.facets import raised
 from pipeline.registration.head import Head
+from pipeline.registration.identity_fit import PlacedHead
 from pipeline.registration.subdivision import subdivided
 from pipeline.template.load import OWN, load_template
 from stages.presets import configs_for
 from stages.template.config import folder_digest
-from stages.template.judge import judge, refused_faces, refused_fit, refused_placing
+from stages.template.judge import faults, judge, refused_faces, refused_fit, refused_irises, refused_placing
+from stages.template.register import ADULT, iris_pixels
 from stages.template.stage import Config, Inputs, run
 from stages.uv import stage as uv_stage
 from stages.uv.config import Config as UvConfig
 from tests.support.ball_head import ball_scan, ball_template, no_head
+from tests.support.textured_ball import camera_on_orbit
 
 GOOD = {"distance_mm": 0.1, "distance_95_mm": 0.5, "landmarks_mm": 2.0, "folded": 0.0, "pierced": 0.0}
 
@@ -94,6 +99,37 @@ def test_checks_and_reasons() -> None:
         assert refused_fit(fit | {name: bad})
 
 
+def test_without_a_fault_is_with_every_check_good_and_eyes() -> None:
+    assert faults(judge(GOOD), "") == ""
+    for name, bad in (("distance_95_mm", 2.0), ("pierced", 1.0)):
+        why = faults(judge(GOOD | {name: bad}), "")
+        assert "uv.mesh=template" in why and f"{bad:g}" in why
+    assert "(eye_left: no edge)" in faults(judge(GOOD), "eye_left: no edge")
+
+
+def test_irises_of_less_than_six_pixels_are_refused() -> None:
+    """Cameras at 0.5 and 1 m from a head of usual size: an iris of 11.7 mm, by similar triangles."""
+    head = PlacedHead(np.diag([ADULT, ADULT, ADULT, 1.0]), np.zeros(0), np.zeros((0, 3)), np.zeros(0), 0.0)
+    near, far = (camera_on_orbit(20.0, 0.0, away, np.zeros(3)) for away in (0.5, 1.0))
+    K = np.array([[900.0, 0, 200.0], [0, 900.0, 200.0], [0, 0, 1]])
+    made = [
+        Camera(index=i, name=str(i), K=tuple(map(tuple, K.tolist())), width=400, height=400,
+               world_from_cam=tuple(map(tuple, np.asarray(pose).tolist())), distortion=(0.0,) * 5)
+        for i, pose in enumerate((near, far, far))
+    ]  # fmt: skip
+    assert iris_pixels(made[:1], head) == pytest.approx(900 * 0.0117 / 0.5, rel=1e-6)
+    assert iris_pixels(made, head) == pytest.approx(900 * 0.0117, rel=1e-6) and iris_pixels([], head) == 0
+    assert not refused_irises(6.1) and "6" in refused_irises(5.9)
+
+
+@pytest.mark.parametrize(("faultless", "why"), [(True, "a light stage"), (False, "too few landmarks")])
+def test_a_light_stage_is_not_registered_by_default(faultless: bool, why: str, tmp_path: Path) -> None:
+    stage = SimpleNamespace(artifact=SimpleNamespace(stage=object()))
+    given = replace(inputs(tmp_path, np.full((468, 3), np.nan)), capture=stage)  # type: ignore[arg-type]
+    found = run(given, Config(enabled=True, faultless=faultless), Context(tmp_path, tmp_path))
+    assert not found.registered and found.reason.startswith(why)
+
+
 def ball_files(tmp_path: Path, eyes: bool = True) -> tuple[Located[Surface], Located[RegisteredHead], Head]:
     """A ball as scan and as registered head on two tiles; with eyes, half of it is theirs and a part is left out."""
     ball = ball_template(6)
@@ -119,7 +155,7 @@ def ball_files(tmp_path: Path, eyes: bool = True) -> tuple[Located[Surface], Loc
 def test_the_uv_stage_takes_the_registered_head(tmp_path: Path) -> None:
     surface, registered, head = ball_files(tmp_path)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, registered, None)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
     (tmp_path / "out").mkdir()
     uv = uv_stage.run(files, UvConfig(mesh="template", rest=False), Context(tmp_path / "out", tmp_path))
     path = tmp_path / "out" / uv.mesh.path
@@ -150,7 +186,7 @@ def test_what_lies_beside_the_head_is_on_the_next_tile(tmp_path: Path) -> None:
     )  # fmt: skip
     meshes.save(tmp_path / "surface.npz", both)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, registered, None)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, registered)  # type: ignore[arg-type]
     made = {}
     for rest in (False, True):
         (tmp_path / str(rest)).mkdir()
@@ -167,14 +203,15 @@ def test_what_lies_beside_the_head_is_on_the_next_tile(tmp_path: Path) -> None:
 def test_the_scan_is_used_where_the_template_does_not_hold(tmp_path: Path) -> None:
     surface, _, _ = ball_files(tmp_path)
     masks = Located(MaskSet(masks=()), tmp_path)
-    files = uv_stage.Inputs(surface, None, None, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
+    files = uv_stage.Inputs(surface, None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
     config = UvConfig(mesh="template", target_faces=2000, proxy_faces=300)
     uv = uv_stage.run(files, config, Context(tmp_path, tmp_path))
     assert any("no face" in w for w in uv.warnings) and uv.tiles == 1
 
 
 def test_it_is_registered_only_where_the_asset_may_be_made_from_it() -> None:
-    assert configs_for("draft", {})["template"].enabled
+    assert configs_for("draft", {})["template"].enabled and configs_for("draft", {})["template"].faultless
+    assert not configs_for("draft", {"uv": {"mesh": "both"}})["template"].faultless
     assert not configs_for("draft", {"uv": {"mesh": "scan"}})["template"].enabled
     assert configs_for("draft", {"uv": {"mesh": "template"}})["template"].enabled
     assert not configs_for("draft", {"uv": {"mesh": "template"}, "template": {"enabled": False}})["template"].enabled

@@ -147,7 +147,7 @@ def test_the_stage_hands_its_findings_on(tmp_path: Path) -> None:
         components=1, removed_components=0, cell=0.006,
     )  # fmt: skip
     masks = Located(MaskSet(masks=()), tmp_path)
-    inputs = Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
+    inputs = Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
     uv = run(inputs, Config(target_faces=3000, proxy_faces=300, texture_size=512), Context(tmp_path, tmp_path))
     assert len(uv.findings) == 10 and {f.level for f in uv.findings} == {"good"}, [str(f) for f in uv.findings]
 

@@ -13,14 +13,12 @@ from pydantic import ValidationError
 
 from pipeline import meshes
 from pipeline.artifacts import FileRef, Located, MaskSet, Surface
-from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import Cancelled, StageError
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.verdict import Finding
 from stages.surface.build import build
 from stages.uv import unwrap
-from stages.uv.stage import Config, Inputs, _against_template, run
+from stages.uv.stage import Config, Inputs, run
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.ball_head import no_head
 
@@ -40,7 +38,7 @@ def inputs(tmp_path: Path) -> Inputs:
     )
     # fitted photos and cameras are only asked for with tiles=auto (test_uv_tiles)
     masks = Located(MaskSet(masks=()), tmp_path)
-    return Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
+    return Inputs(Located(artifact, tmp_path), None, None, masks, no_head(tmp_path))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -84,48 +82,22 @@ def test_failing_unwrap_is_a_stage_error(inputs: Inputs, tmp_path: Path, monkeyp
     assert "out of range" in str(unwrap._failed("a face index is out of range"))
 
 
-def finding(level: str) -> Finding:
-    return Finding(check="pierced", level=level, value=3, limit="at most 0", said="3 edges pass")  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
-    ("mesh", "head", "why"),
+    ("mesh", "faulty", "said"),
     [
-        ("auto", {}, ""),
-        ("auto", {"quality": (finding("usable"),)}, "3 edges pass; uv.mesh=template"),
-        ("auto", {"eyes_reason": "eye_left: no edge"}, "its eyes could not be fitted (eye_left: no edge)"),
-        ("auto", {"eyes_reason": "eye_left: the eyes are closed", "figures": {"eyes_closed": 1.0}}, ""),
-        ("auto", {"registered": False, "reason": "no face"}, "no face"),
-        ("template", {"quality": (finding("unusable"),), "eyes_reason": "no edge"}, ""),
-        ("both", {"quality": (finding("usable"),)}, ""),
-        ("template", {"registered": False, "reason": "no face"}, "no face"),
-        ("scan", {}, "uv.mesh=scan"),
+        ("auto", False, ()),
+        ("auto", True, ("the mesh is the scan's: no face",)),
+        ("scan", True, ()),
+        ("template", False, ("the mesh is the scan's: no face",)),
     ],
 )
-def test_what_the_mesh_is_made_of(mesh: str, head: dict[str, object], why: str) -> None:
-    artifact, config = RegisteredHead.model_validate({"registered": True} | head), Config.model_validate({"mesh": mesh})
-    found = _against_template(artifact, config, lambda: False)
-    assert found.startswith(why) if why else found == ""
-
-
-@pytest.mark.parametrize(("mesh", "scan"), [("auto", True), ("template", False), ("both", False)])
-def test_a_light_stage_keeps_the_scan_unless_asked(mesh: str, scan: bool) -> None:
-    head = RegisteredHead(registered=True)
-    assert bool(_against_template(head, Config.model_validate({"mesh": mesh}), lambda: True)) == scan
-
-
-@pytest.mark.parametrize(
-    ("mesh", "registered", "said"),
-    [("auto", False, ()), ("template", False, ("the mesh is the scan's: no face",)), ("auto", True, ("the mesh is",))],
-)
 def test_it_is_told_where_a_head_is_not_taken(
-    inputs: Inputs, tmp_path: Path, mesh: str, registered: bool, said: tuple[str, ...]
+    inputs: Inputs, tmp_path: Path, mesh: str, faulty: bool, said: tuple[str, ...]
 ) -> None:
     """Not of things, from which nobody expects a head."""
-    head = RegisteredHead(registered=registered, reason="no face", quality=(finding("usable"),))
+    head = RegisteredHead(registered=False, reason="no face", faulty=faulty)
     small = {"target_faces": 500, "proxy_faces": 200, "texture_size": 256}
-    still = Located(Capture(kind="photos", views=()), tmp_path)
-    given = replace(inputs, template=Located(head, tmp_path), capture=still)
+    given = replace(inputs, template=Located(head, tmp_path))
     made = run(given, Config.model_validate({"mesh": mesh} | small), Context(tmp_path, tmp_path))
     assert len(made.warnings) == len(said) and not made.of_template
     assert all(w.startswith(s) for w, s in zip(made.warnings, said, strict=True))

@@ -165,7 +165,7 @@ def test_the_stage_counts_tiles_from_the_fitted_photos(ball: Mesh, tmp_path: Pat
     )  # fmt: skip
     masks = Located(MaskSet(masks=()), tmp_path)
     rig = Located(face, tmp_path), Located(poses, tmp_path)
-    inputs = Inputs(Located(surface, tmp_path), *rig, masks, no_head(tmp_path), None)  # type: ignore[arg-type]
+    inputs = Inputs(Located(surface, tmp_path), *rig, masks, no_head(tmp_path))
     out = run(inputs, Config(target_faces=1200, tile_size=256, tiles="auto"), Context(tmp_path, tmp_path))
     mesh, charts = meshes.load(tmp_path / out.mesh.path), meshes.load_charts(tmp_path / out.mesh.path)
     assert 1 < out.tiles == int(tiles.of_face(charts).max()) + 1 == len(out.tile_utilisation) <= 4

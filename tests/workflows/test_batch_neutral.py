@@ -126,7 +126,7 @@ def test_settings_that_leave_no_head_are_refused_before_anything_runs(
 @pytest.mark.parametrize(
     ("changes", "mesh"),
     [({}, "template"), ({"sets": ("uv.mesh=both",)}, "both"), ({"config": {"uv": {"mesh": "both"}}}, "both"),
-     ({"neutral": None}, "scan"),
+     ({"neutral": None}, "auto"),
      ({"neutral": None, "average": True}, "template"), ({"config": {"uv": {"rest": False}}}, "template")],
 )  # fmt: skip
 def test_the_asset_is_made_from_the_template_if_nothing_was_said(
