@@ -13,24 +13,24 @@ from pipeline.contract import Done, StageConfig
 from pipeline.store import RUN
 from workflows.run.plan import Plan, Step, preview
 
-# Seconds on two cores of an Intel Xeon at 2.5 GHz without a GPU, other work beside it. draft: medians of four captures
-# of 36 to 100 photos; studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
+# Seconds on two cores without a GPU, other work beside it. draft: until the surface, medians of four captures of 36 to
+# 100 photos; behind it, a person made from the head template. studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
 # workflows/run/budget.py. For orders of magnitude: earlier runs on the same machine replace it stage by stage.
 SECONDS: dict[str, dict[str, float]] = {
     "draft": {
         "inverse_rendering": 100,
         "surface": 10,
-        "template": 15,
-        "uv": 12,
+        "template": 50,
+        "uv": 16,
         "reflectance": 300,
-        "bake": 20,
-        "usd": 18,
-        "report": 5,
+        "bake": 60,
+        "usd": 80,
+        "report": 20,
     },
     "studio": {
         "inverse_rendering": 780,
         "surface": 15,
-        "template": 20,
+        "template": 55,
         "uv": 25,
         "reflectance": 300,
         "bake": 60,
@@ -40,7 +40,7 @@ SECONDS: dict[str, dict[str, float]] = {
     "film": {
         "inverse_rendering": 1500,
         "surface": 60,
-        "template": 25,
+        "template": 60,
         "uv": 60,
         "reflectance": 300,
         "bake": 300,
