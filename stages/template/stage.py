@@ -162,4 +162,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=16, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=17, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
