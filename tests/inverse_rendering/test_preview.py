@@ -68,7 +68,7 @@ def test_nothing_of_the_fit_changes(monkeypatch: Any) -> None:
 def test_a_limit_counts_the_pictures() -> None:
     t = trainer(SMALL)
     t.allowance = 3.0
-    run_fit(t, Hooks(lambda *a, **k: None, lambda: False, None, lambda model: 1.0))
+    run_fit(t, Hooks(lambda *a, **k: None, lambda: False, None, lambda model: 2.5))
     alone = trainer(SMALL)
     alone.allowance = 3.0
     run_fit(alone, hooks())
