@@ -14,8 +14,9 @@ from pipeline.store import RUN
 from workflows.run.plan import Plan, Step, preview
 
 # Seconds on two cores without a GPU, other work beside it. draft: until the surface, medians of four captures of 36 to
-# 100 photos; behind it, a person made from the head template. studio and film: the scanned head of docs/benchmarks.md, divided among the stages as in
-# workflows/run/budget.py. For orders of magnitude: earlier runs on the same machine replace it stage by stage.
+# 100 photos; behind it, a person made from the head template. studio and film: the scanned head of docs/benchmarks.md,
+# divided among the stages as in workflows/run/budget.py. For orders of magnitude: earlier runs on the same machine
+# replace it stage by stage.
 SECONDS: dict[str, dict[str, float]] = {
     "draft": {
         "inverse_rendering": 100,
