@@ -49,7 +49,7 @@ class RayCaster:
         self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating], output: bool = False
     ) -> Any:
         """In as many threads as compiled loops have. A ray's result does not depend on the rays beside it."""
-        parts = min(int(threads.in_use()[1]), len(origins) // SHARE)
+        parts = min(threads.of_compiled_loops(), len(origins) // SHARE)
         if parts < 2:
             return self._cast(origins, directions, output)
         with ThreadPoolExecutor(parts) as pool:

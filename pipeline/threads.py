@@ -22,6 +22,11 @@ os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.environ.get("TMPDIR") or "/t
 NAMES = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+def of_compiled_loops() -> int:
+    """The number of threads that compiled loops use."""
+    return int(in_use()[NAMES.index("NUMBA_NUM_THREADS")])
+
+
 def in_use() -> list[str]:
     """The number of threads that each of NAMES asks for: its text, or this process's number of cores where it is unset.
 

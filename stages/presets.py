@@ -103,7 +103,7 @@ def configs_for(
                 known(key, names, what=f"unknown setting of {stage}", where=f"{origin} {stage}.{key}")
             merged[stage].update(current)
     _tile_size(merged)
-    _template(merged)
+    _template(merged, classes)
     return {name: _checked(name, classes[name], values) for name, values in merged.items()}
 
 
@@ -135,12 +135,15 @@ def _tile_size(merged: dict[str, dict[str, Any]]) -> None:
         uv["tile_size"] = bake["size"]
 
 
-def _template(merged: dict[str, dict[str, Any]]) -> None:
+def _template(merged: dict[str, dict[str, Any]], classes: Mapping[str, type[StageConfig]]) -> None:
     """The head template is registered only where the asset may be made from it, or where that is asked for."""
-    uv, template = merged.get("uv", {}), merged.get("template", {})
-    if uv.get("mesh") != "scan" and "template" in merged:
+    field = classes["uv"].model_fields.get("mesh") if "uv" in classes else None
+    if field is None or "template" not in merged:
+        return
+    mesh, template = merged["uv"].get("mesh", field.default), merged["template"]
+    if mesh != "scan":
         template.setdefault("enabled", True)
-        template.setdefault("faultless", uv.get("mesh", "auto") == "auto")
+        template.setdefault("faultless", mesh == "auto")
 
 
 def _of_template(folder: str | None) -> Settings:

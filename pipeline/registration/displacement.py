@@ -3,7 +3,8 @@
 Symbols: p, N limit points and normals; t the distance from p along N to the surface, e that to its nearest place. A
 point is displaced if the surface there faces as the head does, photos see it, and t <= AGREE e + CLOSE: else the normal
 meets another part (the other lip, the lid below). Under hair nothing is displaced outwards, but what would come through
-the hair is sunk. Where displaced places pass through each other or turn over, the displacement is taken back.
+the hair is sunk. Where displaced places pass through each other or turn over, the displacement is taken back. Closed
+lips and lids that the data press into each other are moved inwards until they do not, and then meet.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ def fit(
     check: Callable[[], None] = lambda: None, hair: Mask | None = None, asked: Mask | None = None,
 ) -> Fitted:  # fmt: skip
     """Fit everything. normals, albedo (V, 3) of the field at the vertices; at: a still light as it arrives at them, or
-    what arrives at the observations; skin, hair (V,): where these priors hold. asked (V,):
-    vertices that tell F0 and roughness, which vary slowly; by default all do. All tell the albedo's correction."""
+    what arrives at the observations; skin, hair (V,): where these priors hold. asked (V,): vertices whose
+    observations decide F0 and roughness, which vary slowly; by default all. The albedo's correction is of all."""
     hair = np.zeros_like(skin) if hair is None else hair
     skin = skin & ~hair
     w = _weights(normals, seen)

@@ -18,7 +18,7 @@ from pipeline.artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
 from pipeline.map_lookup import bilinear
-from stages.usd.check.validate import _without_noise, validate
+from stages.usd.check.validate import _without_tile_warnings, validate
 from stages.usd.render.camera import orbit_camera
 from stages.usd.render.exported import load_exported
 from stages.usd.render.relight import vertex_values
@@ -46,7 +46,7 @@ def test_the_library_s_complaints_about_tiles_are_not_printed(
     """It looks for files with <UDIM> in their names. Other warnings are still printed."""
     validate(tiled[0] / "head.usd")
     assert "UDIM" not in "".join(capfd.readouterr())
-    with _without_noise():
+    with _without_tile_warnings():
         Tf.Warn("./head.<UDIM>.png is not there")
         Tf.Warn("something else is wrong")
     said = "".join(capfd.readouterr())

@@ -82,7 +82,7 @@ def library(stage: Usd.Stage, path: Path) -> list[Finding]:
     """Findings of UsdValidation. One is lowered to info: MaterialX shader ids, which builds without its node
     definitions do not know."""
     out = []
-    with _without_noise():
+    with _without_tile_warnings():
         errors = UsdValidation.ValidationContext(_validators()).Validate(stage)
     for e in errors:
         kind = str(e.GetType()).rsplit(".", 1)[-1].lower()
@@ -95,7 +95,7 @@ def library(stage: Usd.Stage, path: Path) -> list[Finding]:
 
 
 @contextmanager
-def _without_noise() -> Iterator[None]:
+def _without_tile_warnings() -> Iterator[None]:
     """Keep the library from printing that it can't find "NAME.<UDIM>.png": it resolves tiles in UsdUVTexture alone, not
     in MaterialX. That each tile is there is checked by `textures`. What else it has to say is printed afterwards."""
     from pxr import Tf
