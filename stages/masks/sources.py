@@ -12,6 +12,7 @@ from pipeline.artifacts import Camera
 from pipeline.errors import StageError, UsageError
 from stages.masks.config import Method
 from stages.masks.grabcut import INNER, OUTER, cut_by_region
+from stages.masks.hull_consistency import opinions
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized
@@ -22,6 +23,8 @@ from stages.masks.user_model import UserModel, mask_by_model
 LOOKED_AT = 12  # views that are used for the choice
 PERSON_SHARE = 0.5  # of the centre of the region of interest that the network must classify as person
 PERSON_VIEWS = 0.9  # smallest share of such views: the network takes a statue for a person from some sides, but not all
+BETTER = 0.05  # of IoU with the hull: an object's masks must agree by so much better than the network's
+CHOICE_SIZE, CHOICE_CELLS = 320, 64  # pixels and voxels for the choice
 MIN_AROUND, WRONG_SIDE = 0.02, 0.3  # smallest share of the photo around the region; mean alpha of a nearly empty area
 SOFT = 2  # pixels of the working size: accuracy of a segmented contour
 
@@ -93,10 +96,14 @@ def plan(
         return Plan(method)
     if method == "object":
         return _by_points(solid())
-    shares = [_person_share(i, v.disc, threshold, min(working_size, 320), seed)
-              for i, v in zip(images, some, strict=True)]  # fmt: skip
+    longest = min(working_size, CHOICE_SIZE)
+    persons = [person_mask(i, v.disc, threshold, longest, seed) for i, v in zip(images, some, strict=True)]
+    shares = [_share_of_centre(p, v) for p, v in zip(persons, some, strict=True)]
     if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
-        return Plan("person")
+        found = solid()
+        if found is None or found.support is None or not _agrees_better(found, some, images, persons, seed):
+            return Plan("person")
+        return _by_points(found)
     found = solid()
     if found is not None:
         return _by_points(found)
@@ -112,10 +119,30 @@ def _by_points(solid: SupportedObject | None) -> Plan:
     return Plan("object", solid=solid)
 
 
-def _person_share(image: U8, disc: Disc, threshold: float, longest: int, seed: int) -> float:
-    inside = person_mask(image, disc, threshold, longest, seed)
-    centre = disc.scaled(inside.shape[1] / image.shape[1]).covers(inside.shape[0], inside.shape[1], 0.5)
+def _share_of_centre(inside: Bool, view: PhotoToMask) -> float:
+    """Share of the centre of the region of interest that a mask (h, w) covers."""
+    centre = view.disc.scaled(inside.shape[1] / view.camera.width).covers(inside.shape[0], inside.shape[1], 0.5)
     return float(inside[centre].mean()) if centre.any() else 0.0
+
+
+def _agrees_better(
+    solid: SupportedObject, views: Sequence[PhotoToMask], images: Sequence[U8], persons: Sequence[Bool], seed: int
+) -> bool:
+    """Whether the masks of an object on a support agree clearly better with each other than the network's (h, w).
+
+    A network that takes carved hair for a person's, but not the stone face below it, is sure of itself in nearly every
+    photo; its masks still contradict each other.
+    """
+    cuts = [cut_by_points(i, v.camera, solid, CHOICE_SIZE, seed) for i, v in zip(images, views, strict=True)]
+    of_object, of_person = (_agreement(views, m, solid.roi_radius) for m in (cuts, persons))
+    return of_object > of_person + BETTER
+
+
+def _agreement(views: Sequence[PhotoToMask], masks: Sequence[Bool], roi_radius: float) -> float:
+    """Median over the views of the IoU of a mask (h, w) with the visual hull of all."""
+    alphas = [m.astype(np.float32) for m in masks]
+    found = opinions([v.camera for v in views], alphas, [True] * len(views), roi_radius, CHOICE_CELLS)
+    return float(np.median([o.iou or 0.0 for o in found]))
 
 
 def mask(view: PhotoToMask, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:

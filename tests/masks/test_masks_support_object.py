@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -143,10 +145,43 @@ def test_a_statue_is_no_person(
     sides: list[float], points_at_hand: bool, wanted: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     said = iter(sides)
-    monkeypatch.setattr(sources, "_person_share", lambda *_: next(said))
+    monkeypatch.setattr(sources, "_share_of_centre", lambda *_: next(said))
+    monkeypatch.setattr(sources, "_agrees_better", lambda *_: False)
     noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)  # no background of one colour
     camera = cameras(1)[0]
     views = [PhotoToMask(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
     solid = find_supported_object(points(), cameras(), ROI, 0) if points_at_hand else None
     assert solid is not None or not points_at_hand
     assert sources.plan(views, "auto", 0.5, 64, 0, lambda: solid).method == wanted
+
+
+@pytest.mark.parametrize(
+    ("of_network", "supported", "wanted"),
+    [
+        ("whole", True, "person"),
+        ("upper half", True, "object"),  # the carved hair of a statue, another part in each photo
+        ("upper half", False, "person"),  # a cluster of points without a support can be a part of a room
+    ],
+)
+def test_masks_that_contradict_each_other_are_no_person(
+    of_network: str, supported: bool, wanted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The network is sure of a person in all photos; what it marks decides."""
+    pictures = [np.round(view(c, False)[0] * 255).astype(np.uint8) for c in cameras()]
+    truth = {p.tobytes(): view(c, False)[1] for c, p in zip(cameras(), pictures, strict=True)}
+
+    def network(image: np.ndarray, *_: object) -> np.ndarray:
+        inside = truth[image.tobytes()].copy()
+        rows = np.flatnonzero(inside.any(1))
+        if of_network != "whole":
+            inside[rows[0] + int(len(rows) * (0.35 + 0.3 * (image[0, 0, 0] % 2))) :] = False
+        return inside
+
+    monkeypatch.setattr(sources, "person_mask", network)
+    monkeypatch.setattr(sources, "_share_of_centre", lambda *_: 1.0)
+    solid = find_supported_object(points(), cameras(), ROI, 0)
+    assert solid is not None and solid.support is not None
+    found = solid if supported else replace(solid, support=None)
+    views = [PhotoToMask(c.index, c.name, c, Disc(80, 60, 60, 0.0), False, partial(np.copy, p), None)
+             for c, p in zip(cameras(), pictures, strict=True)]  # fmt: skip
+    assert sources.plan(views, "auto", 0.5, 160, 0, lambda: found).method == wanted
