@@ -95,7 +95,7 @@ def segment(
     found = _opinions(masked, voting, poses, config, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     first = _seen(masked, [])
-    if config.resegment:
+    if config.resegment and _agreement(masked) >= MIN_AGREEMENT:  # else the hull knows no better than the masks
         bad = _outliers(masked)
         corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
                           list(zip(masked, found, bad, strict=True)), context, "checking masks")  # fmt: skip
@@ -311,9 +311,14 @@ def _at_size(o: Opinion, width: int, height: int) -> Opinion:
     return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), max(1, round(o.margin * factor)), o.iou)
 
 
-def _dropped(masked: list[Masked], warnings: list[str]) -> list[int]:
+def _agreement(masked: list[Masked]) -> float:
+    """Median over the fitted views of the IoU with the hull; 0 if none is known."""
     known = [m.iou for m in masked if m.iou is not None and not m.view.holdout]
-    median = float(np.median(known)) if known else 0.0
+    return float(np.median(known)) if known else 0.0
+
+
+def _dropped(masked: list[Masked], warnings: list[str]) -> list[int]:
+    median = _agreement(masked)
     if median < MIN_AGREEMENT:
         warnings.append(f"masks and cameras agree poorly: median IoU with the visual hull {median:.2f}, expected at "
                         f"least {MIN_AGREEMENT:.2f}; check the masks and the cameras")  # fmt: skip

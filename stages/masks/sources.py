@@ -20,7 +20,7 @@ from stages.masks.segment_person import person_mask
 from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
-LOOKED_AT = 12  # views that are used for the choice
+LOOKED_AT = 24  # views that are used for the choice: fewer leave a wrong hull without contradiction
 PERSON_SHARE = 0.5  # of the centre of the region of interest that the network must classify as person
 PERSON_VIEWS = 0.9  # smallest share of such views: the network takes a statue for a person from some sides, but not all
 BETTER = 0.05  # of IoU with the hull: an object's masks must agree by so much better than the network's
@@ -101,7 +101,7 @@ def plan(
     shares = [_share_of_centre(p, v) for p, v in zip(persons, some, strict=True)]
     if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
         found = solid()
-        if found is None or found.support is None or not _agrees_better(found, some, images, persons, seed):
+        if found is None or not _agrees_better(found, some, images, persons, seed):
             return Plan("person")
         return _by_points(found)
     found = solid()
@@ -128,10 +128,10 @@ def _share_of_centre(inside: Bool, view: PhotoToMask) -> float:
 def _agrees_better(
     solid: SupportedObject, views: Sequence[PhotoToMask], images: Sequence[U8], persons: Sequence[Bool], seed: int
 ) -> bool:
-    """Whether the masks of an object on a support agree clearly better with each other than the network's (h, w).
+    """Whether the masks of an object agree clearly better with each other than the network's (h, w).
 
-    A network that takes carved hair for a person's, but not the stone face below it, is sure of itself in nearly every
-    photo; its masks still contradict each other.
+    A network that takes a skull, or the carved hair of a statue, for a person is sure of itself in nearly every photo;
+    its masks still contradict each other.
     """
     cuts = [cut_by_points(i, v.camera, solid, CHOICE_SIZE, seed) for i, v in zip(images, views, strict=True)]
     of_object, of_person = (_agreement(views, m, solid.roi_radius) for m in (cuts, persons))
@@ -139,10 +139,10 @@ def _agrees_better(
 
 
 def _agreement(views: Sequence[PhotoToMask], masks: Sequence[Bool], roi_radius: float) -> float:
-    """Median over the views of the IoU of a mask (h, w) with the visual hull of all."""
+    """Mean over the views of the IoU of a mask (h, w) with the visual hull of all."""
     alphas = [m.astype(np.float32) for m in masks]
     found = opinions([v.camera for v in views], alphas, [True] * len(views), roi_radius, CHOICE_CELLS)
-    return float(np.median([o.iou or 0.0 for o in found]))
+    return float(np.mean([o.iou or 0.0 for o in found]))
 
 
 def mask(view: PhotoToMask, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:

@@ -209,6 +209,24 @@ def test_computed_outlier_is_mended(scene: Scene, tmp_path: Path) -> None:
     assert iou(alphas[6], ball_alpha(c)) > 0.85
 
 
+@pytest.mark.parametrize(("wrong", "mended"), [(2, True), (9, False)])
+def test_nothing_is_mended_by_a_hull_that_most_masks_contradict(
+    wrong: int, mended: bool, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Masks of another half of the ball in each wrong view leave a hull that is no ball."""
+
+    def half(view: PhotoToMask, *_: object) -> tuple[F32, str]:
+        alpha = ball_alpha(view.camera)
+        if view.index >= 12 - wrong:
+            alpha[(slice(None), slice(64, None)) if view.index % 2 else (slice(64, None),)] = 0
+        return alpha, "person"
+
+    monkeypatch.setattr(segment, "mask", half)
+    found, _ = run(scene, tmp_path / "s", faces=False)
+    assert any(m.source == "person+hull" for m in found.masks) == mended
+    assert mended or {f.level for f in found.findings if f.check == "mask_agreement"} == {"unusable"}
+
+
 def test_view_that_shows_nothing_is_dropped(scene: Scene, tmp_path: Path) -> None:
     scene.repaint(8, np.zeros((SIZE, SIZE, 3), np.float32))
     found, _ = run(scene, tmp_path / "s")
