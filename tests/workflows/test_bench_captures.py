@@ -322,6 +322,14 @@ def test_against_is_printed_at_the_end(root: Path, capsys: pytest.CaptureFixture
         run(root, "--against", str(root.parent / "nothing.json"))
 
 
+def test_a_row_is_compared_with_the_one_that_it_replaces(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(root, "--only", "good_2")
+    assert "captures compared" not in capsys.readouterr().out  # no row yet
+    (root / "good_2" / "better").write_text("")
+    run(root, "--only", "good_2")
+    assert "good_2: asset_psnr [asset (dB)] 20.00 -> 21.00 (+1.00), better" in capsys.readouterr().out
+
+
 def test_the_folders_beside_the_project_are_where_the_project_is() -> None:
     """They are counted from the modules' own places, which move."""
     root = Path(__file__).resolve().parents[2]

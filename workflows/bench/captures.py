@@ -50,7 +50,11 @@ def options(sub: argparse.ArgumentParser) -> None:
         help="the table as JSON, with Markdown beside it (docs/benchmarks/"
         "captures.json for the usual captures, preset and splits, else OUT/captures.json)",
     )
-    sub.add_argument("--against", metavar="FILE", help="a table as JSON: print what got better and worse since")
+    sub.add_argument(
+        "--against",
+        metavar="FILE",
+        help="a table as JSON: print what got better and worse since (the rows that are replaced)",
+    )
     sub.add_argument(
         "--limit", type=a_time, default=60 * LIMIT, metavar="TIME", help="for each capture: 90s, 40m (40m)"
     )
@@ -60,9 +64,9 @@ def run(given: argparse.Namespace, console: Console, command: Sequence[str] = CH
     """neuface bench captures"""
     root, out = captures.root_of(given.root), Path(given.out)
     found = captures.find(root, given.only, given.holdout)
-    old = read_table(Path(given.against)) if given.against else None
     path = table_path(given)
     rows = read_table(path) if path.is_file() else {}
+    old = read_table(Path(given.against)) if given.against else dict(rows)
     made = about(root)
     for number, capture in enumerate(found, 1):
         console.note(f"[{number}/{len(found)}] {capture.name}: {capture.skipped or 'held out ' + capture.holdout}")
@@ -75,16 +79,10 @@ def run(given: argparse.Namespace, console: Console, command: Sequence[str] = CH
         write_table(path, rows)
     console.close()
     print(f"table  {path.with_suffix('.md')}")
-    if old is not None:
-        mine = {c.name for c in found}
-        print(
-            "\n".join(
-                compare(
-                    old if not given.only else {n: r for n, r in old.items() if n in mine},
-                    {n: r for n, r in rows.items() if n in mine},
-                )
-            )
-        )
+    mine = {c.name for c in found}
+    asked = old if not given.only else {n: r for n, r in old.items() if n in mine}
+    if old:
+        print("\n".join(compare(asked, {n: r for n, r in rows.items() if n in mine})))
     return 0
 
 
