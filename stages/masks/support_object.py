@@ -2,7 +2,8 @@
 
 Symbols: points (N, 3) asset coordinates; R radius of the region of interest; plane n . x = o, n towards the cameras.
 The object is the largest connected group of points above the support plane (pipeline.support) within REACH of the
-region of interest. Its projected points give the silhouette.
+region of interest. Its projected points give the silhouette. A smooth base has few points, or none: where the lowest
+points would fall onto the support the object may go on, and the photo decides.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from stages.masks.region import U8, Bool, dilated, eroded, resized, working_size
 AROUND, REACH = 2.5, 1.6  # R: where the support is searched; how far the object may extend
 LINK, COMPANY = 0.1, 4  # R: distance of connected points; fewest neighbours within it
 MIN_POINTS = 200
+STRAYS = 0.05  # share of the points that may lie below the lowest ones that count
+BASE, DROPS = 0.3, (0.0, 0.25, 0.5, 0.75)  # share of the points' height that is lowest; heights that these fall to
 SPACING = 0.07  # R: gaps between projected points that are closed
 GREY = 6  # levels: a photo whose channels differ less is grey
 TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
@@ -30,11 +33,13 @@ TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
 
 @dataclass(frozen=True, slots=True)
 class SupportedObject:
-    """An object. points: (N, 3) on it. support: its support plane, None if not found."""
+    """An object. points: (N, 3) on it. support: its support plane, None if not found. base: (M, 3) between its lowest
+    points and the support, where it may go on."""
 
     points: F64
     support: Support | None
     roi_radius: float
+    base: F64
 
 
 def find_supported_object(
@@ -48,7 +53,19 @@ def find_supported_object(
     if support is not None:
         own &= points @ support.normal - support.offset > CLEAR * roi_radius
     found = _largest_cluster(points[own], LINK * roi_radius)
-    return SupportedObject(found, support, roi_radius) if len(found) >= MIN_POINTS else None
+    if len(found) < MIN_POINTS:
+        return None
+    return SupportedObject(found, support, roi_radius, base_of(found, support))
+
+
+def base_of(points: F64, support: Support | None) -> F64:
+    """(M, 3) the lowest of an object's points (N, 3) and what is between them and its support; none without one."""
+    if support is None:
+        return np.zeros((0, 3))
+    height = points @ support.normal - support.offset
+    bottom = float(np.quantile(height, STRAYS))
+    low = height < bottom + BASE * (height.max() - bottom)
+    return np.concatenate([points[low] - (1 - t) * height[low, None] * support.normal for t in (*DROPS, 1.0)])
 
 
 def _largest_cluster(points: F64, link: float) -> F64:
@@ -72,23 +89,23 @@ def cut_by_points(image: U8, camera: Camera, solid: SupportedObject, longest: in
     8-bit sRGB."""
     w, h = working_size(image.shape[1], image.shape[0], longest)
     small = np.asarray(resized(image, w, h), np.uint8)
-    inside, gap = silhouette_of_points(camera, solid, h, w)
-    trimap = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    inside, gap = silhouette_of_points(camera, solid.points, solid.roi_radius, h, w)
+    may_be = inside | silhouette_of_points(camera, solid.base, solid.roi_radius, h, w)[0]
+    trimap = np.where(may_be, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[eroded(inside, max(1, gap // 2))] = cv2.GC_FGD
-    trimap[~dilated(inside, 2 * gap)] = cv2.GC_BGD
+    trimap[~dilated(may_be, 2 * gap)] = cv2.GC_BGD
     return cut(distinct(small), trimap, seed)
 
 
-def silhouette_of_points(camera: Camera, solid: SupportedObject, height: int, width: int) -> tuple[Bool, int]:
-    """(height, width) silhouette of the object's projected points, gaps closed and holes filled; and the gap in
-    pixels."""
+def silhouette_of_points(camera: Camera, points: F64, roi_radius: float, height: int, width: int) -> tuple[Bool, int]:
+    """(height, width) silhouette of projected points (N, 3), gaps closed and holes filled; and the gap in pixels."""
     K, d = matrix(camera.K), np.array(camera.distortion, np.float64)
-    uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, solid.points)
+    uv, z = project(K, inverse_rigid(matrix(camera.world_from_cam)), d, points)
     scale = width / camera.width
     front = np.isfinite(uv).all(1)
     if not front.any():
         return np.zeros((height, width), bool), 1
-    gap = max(1, int(np.ceil(SPACING * solid.roi_radius * K[0, 0] * scale / float(np.median(z[front])))))
+    gap = max(1, int(np.ceil(SPACING * roi_radius * K[0, 0] * scale / float(np.median(z[front])))))
     gap = min(gap, max(height, width) // 4)
     pad = 2 * gap + 2  # so that areas are also closed and filled across the frame's border
     canvas = np.zeros((height + 2 * pad, width + 2 * pad), np.uint8)

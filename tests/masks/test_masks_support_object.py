@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from stages.masks import sources
 from stages.masks.region import Disc
 from stages.masks.sources import PhotoToMask
 from stages.masks.stage import STAGE, Config, Inputs
-from stages.masks.support_object import distinct, find_supported_object, silhouette_of_points
+from stages.masks.support_object import base_of, cut_by_points, distinct, find_supported_object, silhouette_of_points
 from tests.support.textured_ball import camera_on_orbit
 
 WIDTH, HEIGHT, RADIUS, ROI = 160, 120, 0.1, 0.16
@@ -97,8 +98,27 @@ def test_projected_points_fill_the_silhouette() -> None:
     found = find_supported_object(points(), cameras(), ROI, 0)
     assert found is not None
     for c in cameras():
-        inside, gap = silhouette_of_points(c, found, HEIGHT, WIDTH)
+        inside, gap = silhouette_of_points(c, found.points, ROI, HEIGHT, WIDTH)
         assert gap >= 1 and iou(inside, view(c, True)[1]) > 0.9
+
+
+def test_a_smooth_base_without_points_is_of_the_object() -> None:
+    """No points on the lowest 8 cm: what is below the lowest ones is asked of the photo, down to the table."""
+    everything = points()
+    bare = everything[(everything[:, 1] < TABLE + 0.01) | (everything[:, 1] > TABLE + 0.08)]
+    found = find_supported_object(bare, cameras(), ROI, 0)
+    assert found is not None and found.support is not None
+    height = found.base @ found.support.normal - found.support.offset
+    assert abs(height.min()) < 1e-9 and np.quantile(found.points[:, 1], 0.05) > TABLE + 0.06  # strays
+    assert len(base_of(found.points, None)) == 0
+    cut_off = replace(found, base=found.base[:0])
+    cut = []
+    for c in cameras()[::3]:
+        picture, truth = view(c, True)
+        image = np.round(picture * 255).astype(np.uint8)
+        cut.append([iou(cut_by_points(image, c, x, WIDTH, 0), truth) for x in (found, cut_off)])
+    whole, lower = np.array(cut).T
+    assert whole.min() > 0.97 and (whole > lower).all() and lower.min() < 0.9
 
 
 def test_grey_photos_get_their_texture_as_colours() -> None:
