@@ -44,6 +44,7 @@ from benchmarks.kill_matrix import (
     struck,
     survivors,
     table,
+    too_early,
 )
 from tests.support.facescape_tree import write_tree
 from tests.support.points import Point, hold
@@ -137,7 +138,7 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         threading.Timer(LET_GO, point.release).start()
     cell = struck(process, name)
     cell.faults += _faults(folder, out, name, mark, before)
-    return cell
+    return too_early(cell, (folder / "said.txt").read_text(errors="replace"))
 
 
 def _faults(folder: Path, out: Path, name: str, mark: str, before: set[Path]) -> Iterator[str]:

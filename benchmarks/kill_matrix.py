@@ -56,8 +56,10 @@ MARK = "NEUFACE_KILL_MATRIX"
 PUBLISHING = "publishing"
 RETRIES = 3
 LAST, SAME, NOT_COMPARED = "then undisturbed", "the same bytes", "not compared"
+TOO_EARLY = "1, Python was starting"
 PATIENCE = 1800.0  # seconds until a run counts as hanging
 LIMIT = 60.0  # seconds from the first signal to the end
+TRACED = "says Traceback"
 TRACES = re.compile(r"Traceback|\*\*\* |Exception ignored|Segmentation fault|Aborted")
 
 
@@ -96,7 +98,7 @@ class Cell:
 
     def is_fault(self) -> bool:
         """Whether something is wrong with it."""
-        return any(f not in (SAME, NOT_COMPARED) for f in self.faults)
+        return any(f not in (SAME, NOT_COMPARED, TOO_EARLY) for f in self.faults)
 
     def __str__(self) -> str:
         if self.faults:
@@ -184,6 +186,15 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         return Cell(None)
     cell = struck(process, name)
     cell.faults += _faults(folder, out, name, mark, before)
+    return too_early(cell, (folder / "said.txt").read_text(errors="replace"))
+
+
+def too_early(cell: Cell, said: str) -> Cell:
+    """The cell; where Python itself was still starting, which answers SIGINT with exit code 1 and a traceback before it
+    comes to the program's first line, with that as its only word."""
+    ours = any(f"{ROOT}/{part}/" in said for part in ("workflows", "stages", "pipeline", "tests"))
+    if cell.code == 1 and "KeyboardInterrupt" in said and not ours and set(cell.faults) <= {"exit code 1", TRACED}:
+        cell.faults = [TOO_EARLY]
     return cell
 
 

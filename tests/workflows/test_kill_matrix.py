@@ -83,6 +83,20 @@ def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None
         assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == ignored
 
 
+def test_python_s_own_start_is_told_from_a_fault() -> None:
+    """Its traceback has no line of ours. One that has is a fault, and so is another exit code, or a process left."""
+    own = 'File "<frozen site>", line 599, in main\nKeyboardInterrupt'
+    ours = f'File "{kill_matrix.ROOT}/workflows/cli/entry.py", line 9\n{own}'
+    traced = ["exit code 1", "says Traceback"]
+    for code, said, faults, fault in (
+        (1, own, traced, False), (1, ours, traced, True), (-6, own, ["exit code 134"], True), (130, "", [], False),
+        (1, own, [*traced, "1 processes live on"], True), (1, "Traceback", traced, True),
+    ):  # fmt: skip
+        cell = kill_matrix.too_early(Cell(code, 0.1, list(faults)), said)
+        assert cell.is_fault() is fault, (code, said, faults)
+        assert (str(cell) == kill_matrix.TOO_EARLY) == (said == own and code == 1 and not fault)
+
+
 def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of what a batch may leave, put there by hand."""
     from benchmarks import kill_batch, kill_matrix
