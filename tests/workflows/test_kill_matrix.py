@@ -97,6 +97,20 @@ def test_python_s_own_start_is_told_from_a_fault() -> None:
         assert (str(cell) == kill_matrix.TOO_EARLY) == (said == own and code == 1 and not fault)
 
 
+def test_a_batch_comes_to_each_point_again(tmp_path: Path) -> None:
+    """Of a batch that has finished, what a capture must make again stays no longer, and what comes before stays."""
+    from benchmarks.kill_batch import CAPTURES, MOMENTS, STAGES, forget
+
+    for moment in [m for m in MOMENTS if m.point]:
+        for folder in (*(f".store/{s}/key" for s in STAGES), *(f"{c}/asset" for c in CAPTURES)):
+            (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        forget(tmp_path, moment)
+        of = moment.point.partition(".")[0]
+        kept = {"capture": 0, "work": 1}.get(of, 1 if moment.finished else 2)
+        assert [s for s in STAGES if (tmp_path / ".store" / s).is_dir()] == list(STAGES[:kept]), moment.name
+        assert not any((tmp_path / c).exists() for c in CAPTURES)
+
+
 def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of what a batch may leave, put there by hand."""
     from benchmarks import kill_batch, kill_matrix
