@@ -10,7 +10,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks import kill_matrix
-from benchmarks.kill_matrix import PUBLISHING, RETRIES, Cell, Moment, left_in, moments, strike_in_time, under_way
+from benchmarks.kill_matrix import (
+    PUBLISHING,
+    RETRIES,
+    Cell,
+    Column,
+    Moment,
+    left_in,
+    moments,
+    strike_in_time,
+    under_way,
+)
 from stages.registry import REGISTRY
 from workflows.run.run_lock import exclusive_run
 
@@ -81,6 +91,18 @@ def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None
     for call, ignored in (("kill_matrix.not_ignored()", "False"), ("pass", "True")):
         command = [sys.executable, "-c", parent.format(call)]
         assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == ignored
+
+
+def test_cells_that_were_measured_later_join_their_column() -> None:
+    """The last row stays that of all moments, unless a fault came; the column's commit is that of most of its cells."""
+    last, same = kill_matrix.LAST, Cell(0, 0.0, [kill_matrix.SAME])
+    old = Column("here, 2026-01-02; commit abc1234", {"uv, 10%": Cell(143), last: Cell(0, 0.0, ["not compared"])})
+    new = Column("there, 2026-02-03; commit def5678; 16 photos of", {"usd, 10%": Cell(143, 2.0), last: same})
+    found = kill_matrix.added(old, new, ["usd"])
+    assert found.cells == {**old.cells, "usd, 10%": Cell(143, 2.0)}
+    assert found.made == f"{old.made}; usd later: there, 2026-02-03; def5678, then the same bytes"
+    other = Column(new.made, {last: Cell(0, 0.0, ["OTHER BYTES"])})
+    assert kill_matrix.added(old, other, ["usd"]).cells[last].is_fault()
 
 
 def test_python_s_own_start_is_told_from_a_fault() -> None:
