@@ -1,13 +1,14 @@
 """What a run does that is told to stop: every signal at every moment, as a table for docs/benchmarks/signals.md.
 
-    python -m benchmarks.kill_matrix FOLDER [--signals INT TERM HUP KILL TWICE] [--write]
+    python -m benchmarks.kill_matrix FOLDER [--signals INT TERM HUP KILL TWICE] [--stages STAGE ...] [--write]
 
 FOLDER gets a small demo capture, one run that nothing disturbs, and a run for each signal. That run is started again
 and again into the same folder, and the signal comes each time at the next moment: during the imports, a share of the
 way through each stage, and while results are published. At the end it goes through undisturbed, and must have the bytes
 of the first run. Columns of earlier calls with the same FOLDER are kept; `--signals` alone makes their table.
-`--write` puts them into docs/benchmarks/signals.json, and makes the page's table of it. TWICE is SIGTERM and, half a
-second later, SIGTERM again.
+`--write` puts them into docs/benchmarks/signals.json, and makes the page's table of it. `--stages` measures the moments
+of these stages alone, in a copy of the first run without their results, for the columns of that file. TWICE is SIGTERM
+and, half a second later, SIGTERM again.
 
 A cell has the exit code and the seconds until the process was gone; "done": the moment did not come, the stage
 was faster, also when it was made again with the signal sooner. A fault is in words, and makes the exit code 1.
@@ -56,8 +57,10 @@ MARK = "NEUFACE_KILL_MATRIX"
 PUBLISHING = "publishing"
 RETRIES = 3
 LAST, SAME, NOT_COMPARED = "then undisturbed", "the same bytes", "not compared"
+TOO_EARLY = "1, Python was starting"
 PATIENCE = 1800.0  # seconds until a run counts as hanging
 LIMIT = 60.0  # seconds from the first signal to the end
+TRACED = "says Traceback"
 TRACES = re.compile(r"Traceback|\*\*\* |Exception ignored|Segmentation fault|Aborted")
 
 
@@ -96,7 +99,7 @@ class Cell:
 
     def is_fault(self) -> bool:
         """Whether something is wrong with it."""
-        return any(f not in (SAME, NOT_COMPARED) for f in self.faults)
+        return any(f not in (SAME, NOT_COMPARED, TOO_EARLY) for f in self.faults)
 
     def __str__(self) -> str:
         if self.faults:
@@ -184,6 +187,15 @@ def strike(folder: Path, out: Path, moment: Moment, name: str) -> Cell:
         return Cell(None)
     cell = struck(process, name)
     cell.faults += _faults(folder, out, name, mark, before)
+    return too_early(cell, (folder / "said.txt").read_text(errors="replace"))
+
+
+def too_early(cell: Cell, said: str) -> Cell:
+    """The cell; where Python itself was still starting, which answers SIGINT with exit code 1 and a traceback before it
+    comes to the program's first line, with that as its only word."""
+    ours = any(f"{ROOT}/{part}/" in said for part in ("workflows", "stages", "pipeline", "tests"))
+    if cell.code == 1 and "KeyboardInterrupt" in said and not ours and set(cell.faults) <= {"exit code 1", TRACED}:
+        cell.faults = [TOO_EARLY]
     return cell
 
 
@@ -261,12 +273,17 @@ def run_through(folder: Path, out: Path) -> dict[str, object]:
     return record
 
 
-def column(folder: Path, name: str, whole: dict[str, object]) -> dict[str, Cell]:
-    """One signal at all moments, and whether the run that is left alone afterwards has the same bytes."""
+def column(folder: Path, name: str, whole: dict[str, object], stages: Sequence[str] = ()) -> None:
+    """One signal at all moments, or at those of some stages, and whether the run that is left alone afterwards has the
+    same bytes."""
     out = folder / f"{name}-{uuid.uuid4().hex[:8]}"
     timing = {n: float(s) for n, s in whole["timing"].items()}  # type: ignore[attr-defined]
     cells: dict[str, Cell] = {}
-    for moment in moments(timing):
+    chosen = [m for m in moments(timing) if not stages or m.stage in stages]
+    if stages:
+        shutil.copytree(folder / "whole", out)
+        forget(out, (chosen[0].stage, *chosen[0].later))
+    for moment in chosen:
         cells[moment.name] = strike_in_time(folder, out, moment, name)
         print(f"{name:5} {moment.name:28} {cells[moment.name]}", flush=True)
     same = run_through(folder, out)["asset_hash"] == whole["asset_hash"]
@@ -278,6 +295,14 @@ def made() -> str:
     """On what machine, of which commit, with which capture and settings."""
     machine = host_info.describe(host_info.machine())
     return f"{machine}; commit {commit()}; {VIEWS} photos of {SIZE} px, one thread, `{' '.join(SMALL)}`"
+
+
+def added(old: Column, new: Column, stages: Sequence[str]) -> Column:
+    """A column with the cells of some stages that were measured later. Its last row stays that of all moments."""
+    last = new.cells[LAST]
+    cells = {k: c for k, c in new.cells.items() if k != LAST or c.is_fault()}
+    note = new.made.partition(f"; {VIEWS} photos")[0].replace("commit ", "")
+    return Column(f"{old.made}; {', '.join(stages)} later: {note}, then {last}", {**old.cells, **cells})
 
 
 def column_in(content: dict[str, Any]) -> Column:
@@ -319,6 +344,7 @@ def main(arguments: Sequence[str]) -> int:
     p = argparse.ArgumentParser()
     p.add_argument("folder", type=Path)
     p.add_argument("--signals", nargs="*", choices=SIGNALS, default=list(SIGNALS))
+    p.add_argument("--stages", nargs="*", choices=[s.name for s in REGISTRY], default=[])
     p.add_argument("--write", action="store_true")
     given = p.parse_args(arguments)
     folder = given.folder.absolute()
@@ -327,9 +353,11 @@ def main(arguments: Sequence[str]) -> int:
     if given.signals:
         whole = run_through(folder, folder / "whole")
         for name in given.signals:
-            column(folder, name, whole)
+            column(folder, name, whole, given.stages)
     files = {n: folder / f"{n}.json" for n in SIGNALS}
     found = {n: column_in(json.loads(f.read_text())) for n, f in files.items() if f.is_file()}
+    if given.stages:
+        found = {n: added(recorded()[n], found[n], given.stages) for n in given.signals}
     if given.write:
         found = store(RECORD, {**recorded(), **found}, SIGNALS)
     return shown(found, table(found), write=given.write)

@@ -132,7 +132,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
         if out.calibrated:
             gain = cross_validation.solve_response(found, out.light_order, gain=True).gain
         if s.refine_geometry == AUTO and fit.prior is not None:
-            out = _judge_refinement(out, fit, found, shots)
+            out = _judge_refinement(out, fit, found, shots, rays)
     elif fit.validation:
         out = replace(given, facts=facts_of(given, s, "too few points are visible in enough views"))
     estimate = None
@@ -243,10 +243,11 @@ def _best_order(t: ValidationSamples, full: int) -> int:
     return int(np.argmin(errors))
 
 
-def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[Any]) -> Choices:
-    """Whether the fitted surface explains the validation views better than the prior."""
+def _judge_refinement(out: Choices, fit: Fit, t: ValidationSamples, shots: list[Any], rays: Rays) -> Choices:
+    """Whether the fitted surface explains the validation views better than the prior. rays: those of t: the
+    same places are compared, so that surfaces that are the same have the same error."""
     prior = prior_surface(fit)
-    seen = observe(prior, shots, *surface_points(prior, _exact_rays(fit, SEED + 1)))
+    seen = observe(prior, shots, *surface_points(prior, rays))
     before = cross_validation.validation_samples(seen, fit.validation, fit.model)
     own, theirs = (silhouette_error(fit, g) for g in (fit.model.geometry, prior))
     moved = theirs > own + SILHOUETTE

@@ -144,7 +144,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=27,
+    version=28,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -162,9 +162,9 @@ def _counting(view: PhotoView) -> Bool:
 
 def _looked_up(pixels: Bool, view: PhotoView, x: F64) -> Bool:
     """(N,) the values of a picture (H, W) at points x (N, 3); False outside of it."""
-    uv, depth = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, x)
+    uv, _ = transforms.project(view.K, transforms.inverse_rigid(view.world_from_cam), view.distortion, x)  # NaN: behind
     at = np.floor(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64)
-    framed = (depth > 0) & (at >= 0).all(1) & (at < view.size).all(1)
+    framed = np.asarray((at >= 0).all(1) & (at < view.size).all(1))
     column, row = np.where(framed[:, None], at, 0).T
     return np.asarray(framed & pixels[row, column], np.bool_)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,8 @@ def test_same_model_same_bytes(tmp_path: Path) -> None:
     for name in ("a.npz", "b.npz"):
         ball_model().save(tmp_path / name)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as file:
+        assert {i.compress_type for i in file.infolist()} == {zipfile.ZIP_DEFLATED}
 
 
 def test_foreign_format_is_refused(tmp_path: Path) -> None:

@@ -136,6 +136,12 @@ def test_gains_are_found() -> None:
     assert np.allclose(found[1::2] / found[::2], 1.1 / 0.9, rtol=0.02)
 
 
+def test_the_same_surface_is_no_relief_whatever_its_lobe_does(glossy: Choices) -> None:
+    """Both surfaces are looked up at the same places: what the lobe does to a point's mean is in both errors."""
+    fact = glossy.facts["relief"]
+    assert fact["error_without"] == fact["error_with"] and not glossy.refine_geometry
+
+
 @pytest.mark.slow
 def test_relief_is_there_where_the_prior_is_wrong(dull: Choices) -> None:
     assert not dull.refine_geometry

@@ -76,12 +76,11 @@ def test_a_silhouette_that_the_prior_misses_asks_for_relief(
     monkeypatch.setattr(model_selection, "prior_surface", lambda fit: theirs)
     monkeypatch.setattr(model_selection, "surface_points", lambda *a: (None, None))
     monkeypatch.setattr(model_selection, "observe", lambda *a: None)
-    monkeypatch.setattr(model_selection, "_exact_rays", lambda *a: None)
     monkeypatch.setattr(cross_validation, "validation_samples", lambda *a: None)
     monkeypatch.setattr(model_selection, "silhouette_error", lambda fit, g: prior if g is theirs else own)
     fit: Any = SimpleNamespace(validation=(1,), model=SimpleNamespace(geometry=ours))
     given = given_model(Config(), calibrated=False)
-    found = model_selection._judge_refinement(given, fit, None, [])  # type: ignore[arg-type]
+    found = model_selection._judge_refinement(given, fit, None, [], None)  # type: ignore[arg-type]
     assert found.refine_geometry is moved and found.facts["relief"]["silhouette_error"] == own
 
 

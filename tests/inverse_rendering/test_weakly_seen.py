@@ -104,36 +104,36 @@ def test_lengths_follow_the_noise_and_the_worse_neighbours() -> None:
 
 def test_outlines_are_where_the_masks_end() -> None:
     """Of a ball that is seen along x: its points on the circle around the view, not its middle, not a point behind it
-    at the same angle; none where the mask goes on, or does not count."""
+    at the same angle, no patch on the circle that faces the camera; none where the mask goes on or does not count."""
     view = camera(np.array([1.0, 0, 0]), 50.0)
     v, u = np.mgrid[:SIDE, :SIDE] + 0.5
     disc = (np.hypot(u - SIDE / 2, v - SIDE / 2) < 80).astype(np.float32)
     reach = 80 / 1.5 / SIDE * 50  # radius of a ball with this silhouette, seen from far away
     y = np.linspace(0, 2 * np.pi, 9)
     rim = reach * np.stack([np.zeros(9), np.cos(y), np.sin(y)], 1)
-    x = np.concatenate([rim, [[reach, 0, 0]], 0.7 * rim[:1]])
-    n = np.concatenate([rim / reach, [[1, 0, 0]], rim[:1] / reach])
+    x = np.concatenate([rim, [[reach, 0, 0]], 0.7 * rim[:1], rim[:1]])
+    n = np.concatenate([rim / reach, [[1, 0, 0]], rim[:1] / reach, [[1, 0, 0]]])
 
     def counted(**changed: object) -> F64:
         return outlines([replace(view, **{"alpha": disc, **changed})] * 3, x, n, SIDE)
 
-    assert counted() == pytest.approx([3] * 9 + [0, 0])
+    assert counted() == pytest.approx([3] * 9 + [0, 0, 0])
     assert not counted(alpha=np.ones_like(disc)).any()
     assert not counted(asked=np.zeros_like(disc)).any()
     assert not counted(doubtful=disc >= 0).any()
 
 
 def test_points_outside_of_the_masks_are_counted() -> None:
-    """A disc of 80 pixels in three views: at its middle, beside it, and beyond the photo."""
+    """A disc of 80 pixels in three views: at its middle, beside it, beyond both sides of the photo, behind them."""
     view = camera(np.array([1.0, 0, 0]), 50.0)
     v, u = np.mgrid[:SIDE, :SIDE] + 0.5
     disc = (np.hypot(u - SIDE / 2, v - SIDE / 2) < 80).astype(np.float32)
     a_pixel = 50 / 1.5 / SIDE
-    x = np.array([[0, 0, 0], [0, 81, 0], [0, 84, 0], [0, 0, -90], [0, 900, 0]]) * a_pixel
+    x = np.array([[0, 0, 0], [0, 81, 0], [0, 84, 0], [0, 0, -90], [0, 200, 0], [0, -200, 0], [900, 0, 0]]) * a_pixel
     views = [replace(view, alpha=disc)] * 3
-    assert outside(views, x, SIDE).tolist() == [0, 0, 3, 3, 0]
+    assert outside(views, x, SIDE).tolist() == [0, 0, 3, 3, 0, 0, 0]
     assert not outside([replace(v, asked=np.zeros_like(disc)) for v in views], x, SIDE).any()
-    assert outside([], x, SIDE).tolist() == [0] * 5
+    assert outside([], x, SIDE).tolist() == [0] * 7
 
 
 def test_the_rim_of_a_thin_disc_stays_where_masks_show_it() -> None:

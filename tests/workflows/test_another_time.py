@@ -17,6 +17,7 @@ from workflows.cli.keys import TIMES, Keys
 from workflows.live.look import look_at
 from workflows.live.publisher import told_live
 from workflows.live.wishes import ask
+from workflows.run import changes
 from workflows.run.changes import run_as_asked
 from workflows.run.plan import Plan, make_plan
 from workflows.run.publish import publish
@@ -129,14 +130,25 @@ def test_a_run_that_takes_no_change_goes_on(photos: Path, toys: None) -> None:
     assert watch.steering.change is None and len(run_stages(plan_of(photos), watch)) == 3
 
 
-def test_a_stop_is_a_stop_though_a_change_was_asked_for(photos: Path, toys: None) -> None:
-    plan, watch = plan_of(photos, sets=SLOW), Session(Recorded())
-    with watch.steering.open_to_changes():
+def test_a_stop_is_a_stop_though_a_change_was_asked_for(
+    photos: Path, toys: None, studio_adds: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both while the stages run: the run ends, and nothing is made or said of the change."""
+    plan, recorded = plan_of(photos, sets=SLOW), Recorded()
+    watch, calls = Session(recorded), list[Plan]()
+
+    def interrupted(plan: Plan, *_: object) -> None:
+        assert not calls, "the run goes on"
+        calls.append(plan)
         watch.steering.wish("preset studio")
         watch.stop.set()
-        assert watch.stopped()
+        assert watch.stopped() and watch.steering.change
+        raise Cancelled
+
+    monkeypatch.setattr(changes, "run_stages", interrupted)
     with pytest.raises(Cancelled):
         run_as_asked(plan, watch)
+    assert not recorded.told
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks import kill_matrix
-from benchmarks.kill_matrix import PUBLISHING, RETRIES, Cell, Moment, left_in, moments, strike_in_time, under_way
+from benchmarks.kill_matrix import (
+    PUBLISHING,
+    RETRIES,
+    Cell,
+    Column,
+    Moment,
+    left_in,
+    moments,
+    strike_in_time,
+    under_way,
+)
 from stages.registry import REGISTRY
 from workflows.run.run_lock import exclusive_run
 
@@ -81,6 +91,46 @@ def test_children_of_a_harness_that_ignores_hangups_do_not_ignore_them() -> None
     for call, ignored in (("kill_matrix.not_ignored()", "False"), ("pass", "True")):
         command = [sys.executable, "-c", parent.format(call)]
         assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == ignored
+
+
+def test_cells_that_were_measured_later_join_their_column() -> None:
+    """The last row stays that of all moments, unless a fault came; the column's commit is that of most of its cells."""
+    last, same = kill_matrix.LAST, Cell(0, 0.0, [kill_matrix.SAME])
+    old = Column("here, 2026-01-02; commit abc1234", {"uv, 10%": Cell(143), last: Cell(0, 0.0, ["not compared"])})
+    new = Column("there, 2026-02-03; commit def5678; 16 photos of", {"usd, 10%": Cell(143, 2.0), last: same})
+    found = kill_matrix.added(old, new, ["usd"])
+    assert found.cells == {**old.cells, "usd, 10%": Cell(143, 2.0)}
+    assert found.made == f"{old.made}; usd later: there, 2026-02-03; def5678, then the same bytes"
+    other = Column(new.made, {last: Cell(0, 0.0, ["OTHER BYTES"])})
+    assert kill_matrix.added(old, other, ["usd"]).cells[last].is_fault()
+
+
+def test_python_s_own_start_is_told_from_a_fault() -> None:
+    """Its traceback has no line of ours. One that has is a fault, and so is another exit code, or a process left."""
+    own = 'File "<frozen site>", line 599, in main\nKeyboardInterrupt'
+    ours = f'File "{kill_matrix.ROOT}/workflows/cli/entry.py", line 9\n{own}'
+    traced = ["exit code 1", "says Traceback"]
+    for code, said, faults, fault in (
+        (1, own, traced, False), (1, ours, traced, True), (-6, own, ["exit code 134"], True), (130, "", [], False),
+        (1, own, [*traced, "1 processes live on"], True), (1, "Traceback", traced, True),
+    ):  # fmt: skip
+        cell = kill_matrix.too_early(Cell(code, 0.1, list(faults)), said)
+        assert cell.is_fault() is fault, (code, said, faults)
+        assert (str(cell) == kill_matrix.TOO_EARLY) == (said == own and code == 1 and not fault)
+
+
+def test_a_batch_comes_to_each_point_again(tmp_path: Path) -> None:
+    """Of a batch that has finished, what a capture must make again stays no longer, and what comes before stays."""
+    from benchmarks.kill_batch import CAPTURES, MOMENTS, STAGES, forget
+
+    for moment in [m for m in MOMENTS if m.point]:
+        for folder in (*(f".store/{s}/key" for s in STAGES), *(f"{c}/asset" for c in CAPTURES)):
+            (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+        forget(tmp_path, moment)
+        of = moment.point.partition(".")[0]
+        kept = {"capture": 0, "work": 1}.get(of, 1 if moment.finished else 2)
+        assert [s for s in STAGES if (tmp_path / ".store" / s).is_dir()] == list(STAGES[:kept]), moment.name
+        assert not any((tmp_path / c).exists() for c in CAPTURES)
 
 
 def test_a_batch_s_faults_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,10 +22,10 @@ from tests.support.points import wait_for
 from tests.support.steered import Recorded, in_thread, plan_of
 from workflows.cli.console import Console
 from workflows.cli.keys import HELP, Keys, keys_of
-from workflows.live.folder import FOLDER, PICTURES, LiveFolder
+from workflows.live.folder import ASK, FOLDER, PICTURES, LiveFolder, put_whole
 from workflows.live.look import look_at
 from workflows.live.publisher import Live, told_live
-from workflows.live.wishes import ask
+from workflows.live.wishes import Wishes, ask
 from workflows.run.plan import Plan, make_plan
 from workflows.run.publish import publish
 from workflows.run.request import RunRequest
@@ -164,6 +164,29 @@ def test_a_run_tells_its_folder_and_takes_wishes_from_it(photos: Path, toys: Non
     assert not left.alive and left.state["status"] == "stopped" and "stopped by the user" in left.state["message"]
     told_run(plan_of(photos, sets=("second.steps=2",)), Session())
     assert not (plan.out / FOLDER).exists() and look_at(plan.out).record["stages"].keys() >= {"third"}
+
+
+def test_a_wish_is_for_one_run_and_taken_once(tmp_path: Path) -> None:
+    """A file that is put there again, with another time but the same number, is no second wish."""
+    folder = tmp_path / FOLDER
+    folder.mkdir()
+
+    def put(number: str, **content: str) -> None:
+        put_whole(folder / ASK, json.dumps({"run": "one", "wish": "pause", "number": number} | content).encode())
+
+    wishes = Wishes(tmp_path, "one")
+    assert wishes() is None
+    put("1")
+    assert wishes() == "pause"
+    assert wishes() is None
+    put("1", wish="stop")
+    assert wishes() is None
+    put("2", run="another")
+    assert wishes() is None
+    put("3", wish="nonsense")
+    assert wishes() is None
+    put("4", wish="stop")
+    assert wishes() == "stop"
 
 
 def test_what_failed_says_why_and_nothing_is_left_of_a_run_that_made_nothing(photos: Path, toys: None) -> None:
