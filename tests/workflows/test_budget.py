@@ -121,12 +121,14 @@ def test_the_run_plans_before_the_fit_alone(
     asked: list[Any] = []
 
     def found(store: Store, purpose: dict[str, Any], left: float, device: str, **of: Any) -> Any:
+        assert of == {"from_template": True}
         asked.append((purpose["after"], left))
         return BudgetPlan("coarse", 30.0, 1.0, True)
 
     monkeypatch.setattr(runner, "FIT", "second")
     monkeypatch.setattr(planning, "FIT", "second")
     monkeypatch.setattr(runner, "planned", found)
+    monkeypatch.setattr(runner, "probably_from_template", lambda plan, done: True)
     monkeypatch.setattr(BudgetPlan, "settings", lambda self: {})
     monkeypatch.setattr(BudgetPlan, "describe", lambda self, budget: "planned")
     plan = make_plan(RunRequest(capture=str(photos), out=str(tmp_path / "out"), budget=60.0))
