@@ -26,7 +26,7 @@ from pipeline.nearest import filled
 from pipeline.store import link_or_copy
 from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
-from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
+from stages.usd.write.ggx_conversion import GROUP, LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
 
@@ -38,6 +38,7 @@ NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
 RAYS = 4_000_000  # about the number of rays for the lamps' visibility
 LAMPS = (96, 384)
 LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
+HEIGHT_STEP = 2.0**-23  # metres, of a height above the cage: a tenth of a micrometre
 OCCLUSION_SIZE = 1024  # texels: it is computed at the vertices
 
 
@@ -109,7 +110,10 @@ def _derived(
     coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]))
     for i, picture in enumerate(in_groups(coefficients)):
         written.append(map_file(asset, name, f"coefficients_rgb{i}", exr))
-        write_exr(written[-1], picture, primaries=None)
+        if coefficients.shape[2] == GROUP:  # the bake's file has them as red, green and blue already
+            link_or_copy(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]), written[-1])
+        else:
+            write_exr(written[-1], picture, primaries=None)
     if "f0" not in bake.artifact.maps:
         return written, None
     f0 = _map(bake, "f0", tile)[..., 0]
@@ -215,8 +219,8 @@ def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name
     count, written = bake.artifact.tiles, []
     for tile in range(count):
         written.append(map_file(asset, name, CAGE_HEIGHT, tiles.form("exr", tile, count)))
-        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.size)
-        write_exr(written[-1], image, primaries=None, units="m")
+        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.side(tile))
+        write_exr(written[-1], image, step=HEIGHT_STEP, primaries=None, units="m")
     return written
 
 
@@ -276,7 +280,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequenc
 
 def covered_texels(bake: Located[TextureSet], tile: int = 0) -> Mask:
     """(H, W) mask of the texels that a chart touches; all texels if `coverage` was not baked."""
-    size, count = bake.artifact.size, bake.artifact.tiles
+    size, count = bake.artifact.side(tile), bake.artifact.tiles
     files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
     exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
     found: Mask | None = None
