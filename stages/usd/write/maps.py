@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,8 +132,7 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
 
 
 def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
-    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room; a copy of
-    the albedo, which `divided_albedo` may write anew."""
+    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room."""
     count = bake.artifact.tiles
     wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
     wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
@@ -152,7 +150,7 @@ def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
             continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = map_file(asset, name, which, form)
-            (shutil.copyfile if which == "albedo" else link_or_copy)(bake.path(ref), target)
+            link_or_copy(bake.path(ref), target)
             written.append(target)
     return written
 
@@ -179,6 +177,8 @@ def divided_albedo(
         albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
         image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
         exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
+        for form in (exr, png):  # names of the bake's files, which stay as they are
+            map_file(asset, name, "albedo", form).unlink()
         write_exr(map_file(asset, name, "albedo", exr), albedo, half=True)
         write_png_from_linear(map_file(asset, name, "albedo", png), albedo)
         written.append(map_file(asset, name, "occlusion", exr))
