@@ -201,7 +201,7 @@ MUTATIONS = (
              "tests/workflows/test_store_care.py::test_what_a_published_folder_names_stays_and_the_rest_goes"),
     Mutation("workflows/batch/schedule.py", "if resource.free == 0:", "if resource.free < -1000:",
              "tests/workflows/test_schedule.py"),
-    Mutation("workflows/run/budget.py", "stage = left - slower * rung.after", "stage = left",
+    Mutation("workflows/run/budget.py", "stage = left - slower * (rung.after + more)", "stage = left - slower * more",
              "tests/workflows/test_budget.py"),
     *OF_FIT,
     *OF_ASSET,

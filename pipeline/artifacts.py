@@ -320,17 +320,19 @@ class TextureMap(Artifact):
 
 
 class TextureSet(Artifact):
-    """Maps on the UV mesh, `size` texels square, row 0 = top (v = 1). With several UDIM tiles each map has `tiles`
-    files of that size (except lookup tables). zero_set_rms_mm: root mean square distance of the mesh from the SDF's
-    zero set, over texels near it; lod_rms_mm: that of each level of detail, over its area. coverage: share of all
-    texels under charts. figures: shares of the covered texels that no photo shows (`unseen`), whose albedo was clamped
-    (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a texel and median edge of the photos'
-    finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of the surface's area by region name;
-    empty without labelled photos. standard_fitted: base colour, F0 and roughness were fitted to the photos; else they
-    are converted from NeuFace's lobe. scan: those of the scan's mesh, if the asset has both meshes."""
+    """Maps on the UV mesh, square, row 0 = top (v = 1). With several UDIM tiles each map has `tiles` files (lookup
+    tables have one), tile t with `sides[t]` texels along a side; no sides: all have `size`. zero_set_rms_mm: root mean
+    square distance of the mesh from the SDF's zero set, over texels near it; lod_rms_mm: that of each level of detail,
+    over its area. coverage: share of all texels under charts. figures: shares of the covered texels that no photo shows
+    (`unseen`), whose albedo was clamped (`albedo_clamped`), that have photo detail (`detail_support`); mean edge of a
+    texel and median edge of the photos' finest pixel on the surface (`texel_mm`, `photo_pixel_mm`). regions: share of
+    the surface's area by region name; empty without labelled photos. standard_fitted: base colour, F0 and roughness
+    were fitted to the photos; else they are converted from NeuFace's lobe. scan: those of the scan's mesh, if the asset
+    has both meshes."""
 
     size: int
     tiles: int = 1
+    sides: tuple[int, ...] = ()
     padding: int
     maps: dict[str, TextureMap]
     coverage: float
@@ -342,6 +344,10 @@ class TextureSet(Artifact):
     scan: TextureSet | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+    def side(self, tile: int) -> int:
+        """Width and height of a tile's maps in texels."""
+        return self.sides[tile] if self.sides else self.size
 
 
 # ------------------------------------------------------------------ asset and report

@@ -145,12 +145,15 @@ class Store:
                     shutil.rmtree(folder)
 
     def finish(self, stage: str, key: str, partial: Path, artifact: A, run: dict[str, object]) -> Located[A]:
-        """Complete a partial folder: check that all files exist, flush them to disk, rename the folder."""
+        """Complete a partial folder: check that all files exist, flush them to disk, rename the folder. Files with the
+        same bytes share their room."""
+        first: dict[str, Path] = {}
         for ref in file_refs(artifact):
             fault = _fault(partial, ref)
             if fault:
                 raise RuntimeError(f"stage {stage} returned a manifest that does not match its files: {fault}")
             sync(partial / ref.path)
+            _share(first.setdefault(ref.sha256, partial / ref.path), partial / ref.path)
         write_synced(partial / MANIFEST, artifact.model_dump_json(indent=1))
         write_synced(partial / RUN, json.dumps(run, indent=1))
         sync(partial)
@@ -169,6 +172,15 @@ def link_or_copy(source: Path, target: Path) -> None:
         if e.errno in (errno.ENOSPC, errno.EDQUOT):
             raise
         shutil.copyfile(source, target)
+
+
+def _share(first: Path, path: Path) -> None:
+    """Make a file a second name of another one with the same bytes."""
+    if first.samefile(path):
+        return
+    second = path.with_name(f"{path.name}.partial")
+    link_or_copy(first, second)
+    second.replace(path)
 
 
 def lineage(path: Path) -> dict[str, list[str]]:

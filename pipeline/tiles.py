@@ -2,12 +2,16 @@
 
 Tile t has the coordinates t <= u <= t + 1, 0 <= v <= 1 and the number 1001 + t. All tiles are in one row, so there are
 at most ten: 1011 is above 1001. No chart crosses a border. A map with several tiles is NAME.1001.exr, NAME.1002.exr,
-..., and NAME.<UDIM>.exr refers to all of them; a map with a single tile is NAME.exr.
+..., and NAME.<UDIM>.exr refers to all of them; a map with a single tile is NAME.exr. Tiles may have different sizes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from pipeline.meshes import Charts, Indices, Mesh
 
@@ -18,6 +22,19 @@ TOKEN = "<UDIM>"
 def form(kind: str, tile: int, tiles: int) -> str:
     """End of the name of a tile's file, after "NAME.": "exr" if there is only one tile, else "1001.exr"."""
     return kind if tiles == 1 else f"{FIRST + tile}.{kind}"
+
+
+def side_by_side(images: Sequence[npt.NDArray[Any]], *, whole: bool = False) -> npt.NDArray[Any]:
+    """(H, tiles H, C) the square pictures (h, h, C) of all tiles in their order, smaller ones enlarged to the largest:
+    linear between texels. whole: values are codes, each stays as it is."""
+    import cv2
+
+    side = max(len(image) for image in images)
+    if all(len(image) == side for image in images):
+        return images[0] if len(images) == 1 else np.concatenate(images, 1)
+    how = cv2.INTER_NEAREST if whole else cv2.INTER_LINEAR
+    same = [cv2.resize(image, (side, side), interpolation=how) if len(image) < side else image for image in images]
+    return np.concatenate([image.reshape(side, side, -1) for image in same], 1)
 
 
 def of_face(charts: Charts) -> Indices:

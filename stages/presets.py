@@ -29,7 +29,8 @@ PRESETS: dict[str, dict[str, dict[str, Any]]] = {
         "inverse_rendering": {"preset": "draft"},
         "surface": {"resolution": 512},
         "uv": {"target_faces": 50_000},
-        "bake": {"size": 1024},
+        "bake": {"size": 1024, "beside": 2},
+        "usd": {"high_faces": 200_000},
     },
     "studio": {
         "inverse_rendering": {"preset": "studio"},

@@ -156,7 +156,7 @@ class Baker:
         seen = sighted(
             mesh, charts, self._views, side, lambda done, total: ahead(done, total, "visibility"), self._occluder
         )
-        nearest = _nearest(texel, size, self._scratch)
+        nearest = nearest_covered(texel, size, self._scratch)
         found = statistics_of(samples, size)
         log.info(
             "bake: tile %d, %.1f %% covered, basis residual %.3f",
@@ -259,7 +259,7 @@ def _covered(texel: Indices, size: int) -> Mask:
     return out.reshape(size, size)
 
 
-def _nearest(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.int32]:
+def nearest_covered(texel: Indices, size: int, scratch: Path | None) -> npt.NDArray[np.int32]:
     """(H, W) row in `texel` of the nearest covered texel, computed band by band."""
     covered = _covered(texel, size)
     row = blank(scratch, (size * size,), np.int32)

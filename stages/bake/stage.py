@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +41,11 @@ class Config(StageConfig):
     """Settings of the bake stage."""
 
     size: Texels = Field(1024, ge=256, le=16384, description="width and height of the maps in texels")
+    beside: Literal[1, 2, 4] = Field(
+        1,
+        description="made from the head template: tiles without the face (mouth, clothes, hair) have size / beside "
+        "texels along a side",
+    )
     detail: bool = Field(True, description="add the fine detail of the fitted photos to the albedo")
     fit_standard: bool = Field(
         True,
@@ -80,6 +86,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
     from stages.bake.mouth import hidden_tiles, inside_of
+    from stages.bake.smaller import smaller
     from stages.bake.statistics import together
     from stages.bake.unseen import with_hair
     from stages.bake.write import joined, write_maps
@@ -108,14 +115,17 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
         region, hair, labels.index("hair") if "hair" in labels else -1,
     )  # fmt: skip
-    parts, counted, judged, areas = [], [], [], Counter[int]()
+    parts, sides, counted, judged, areas = [], [], [], [], Counter[int]()
     for number in range(baker.tiles):
         baked = baker.tile(number)
-        parts.append(write_maps(baked, context, number, baker.tiles))
+        factor = config.beside if uv.artifact.of_template and number > 0 else 1
+        written = smaller(baked, factor, context.scratch)
+        parts.append(write_maps(written, context, number, baker.tiles))
+        sides.append(written.size)
         counted.append(baked.statistics)
         judged.append(chosen(baked.samples, baked.texel, baked.size, baked.votes, labels))
         areas.update(baked.regions)
-        del baked
+        del baked, written
     maps, all_tiles = joined(parts, [s.texels for s in counted], context), together(counted)
     pixel = footprint.pixel(mesh, (v.camera for v in views))
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
@@ -134,6 +144,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     return TextureSet(
         size=config.size,
         tiles=baker.tiles,
+        sides=tuple(sides),
         padding=config.size,
         maps=maps,
         coverage=all_tiles.coverage,
@@ -192,4 +203,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=24, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=25, inputs=Inputs, config=Config, output=TextureSet, run=run)

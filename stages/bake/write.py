@@ -18,7 +18,7 @@ from pipeline import tiles
 from pipeline.artifacts import FileRef, TextureMap
 from pipeline.colour import REC709
 from pipeline.contract import Context
-from pipeline.images import FRACTION, write_exr, write_png, write_png_from_linear
+from pipeline.images import write_exr, write_png, write_png_from_linear
 from pipeline.meshes import F32
 from stages.bake.build import Baked, bands
 from stages.bake.memmap_buffer import blank
@@ -30,7 +30,8 @@ MM = 1000.0
 MIN_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value in the map `coverage` of a covered texel that no photo shows
 OPTIONAL = ("clamped", "region")  # maps that are removed if they are empty
-LOBE_BITS = 14  # of the fraction: within 1 part in 32,768, where 16-bit floats are within 1 in 2,048
+HEIGHT_STEP = 2.0**-13  # of a displacement in mm: a tenth of a micrometre
+NORMAL_STEP = 2.0**-11  # of a normal: 0.03 degrees
 IN_MEMORY = 1 << 27  # values of a picture; a larger one is assembled in a file
 
 Function = Callable[..., npt.NDArray[Any]]
@@ -40,7 +41,7 @@ Function = Callable[..., npt.NDArray[Any]]
 class MapKind:
     """How a map is computed from arrays (N, ...) of the samples, and how it is stored. png: bits, 0 for none; encoded:
     the png contains v/2 + 1/2; codes: values are integers, also in the png; colour: the three channels are a colour;
-    units: of the values, for the EXR's header. fraction: bits of a 32-bit float's fraction that are kept."""
+    units: of the values, for the EXR's header. step: the EXR has multiples of it; wide: in 32 bits, not 16."""
 
     sources: tuple[str, ...]
     function: Function = lambda values: values
@@ -51,12 +52,8 @@ class MapKind:
     space: Literal["srgb_png", "raw"] = "raw"
     colour: bool = False
     units: str = ""
-    fraction: int = FRACTION
-
-    @property
-    def half(self) -> bool:
-        """Whether 16-bit floats hold it: lengths and numbered channels are stored in 32 bits."""
-        return not (self.units or self.numbered)
+    step: float = 0.0
+    wide: bool = False
 
     def values(self, samples: Samples, rows: Any = slice(None)) -> F32:
         """(N, channels) values of all samples, or of some rows."""
@@ -68,18 +65,17 @@ KINDS: dict[str, MapKind] = {
     "albedo": MapKind(("base_color",), png=8, space="srgb_png", colour=True),
     "neuface_albedo": MapKind(("albedo",), png=8, space="srgb_png", colour=True),
     "specular_coefficients": MapKind(
-        ("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True, fraction=LOBE_BITS
+        ("rho", "coefficients"), lambda rho, c: rho[..., None] * c, numbered=True
     ),  # fmt: skip
-    "lobe_coefficients": MapKind(("coefficients",), numbered=True, fraction=LOBE_BITS),
     "specular_intensity": MapKind(("rho",), png=8),
     "shininess": MapKind(("inv_kappa",), lambda s: 1 / np.maximum(s, MIN_INV_KAPPA)),
     "inv_kappa": MapKind(("inv_kappa",)),
     "roughness": MapKind(("roughness",), png=8),
     "f0": MapKind(("f0",), png=16),  # about 0.03: 8 bits would leave 8 steps
-    "normal": MapKind(("normal",), png=8, encoded=True),
+    "normal": MapKind(("normal",), png=8, encoded=True, step=NORMAL_STEP),
     "irradiance_ratio": MapKind(("irradiance_ratio",), png=8, colour=True),
     "ambient_occlusion": MapKind(("ambient",), png=8),
-    "displacement": MapKind(("displacement",), lambda d: d * np.float32(MM), units="mm"),
+    "displacement": MapKind(("displacement",), lambda d: d * np.float32(MM), units="mm", step=HEIGHT_STEP, wide=True),
     "clamped": MapKind(("clamped",), lambda c: (c > 0).astype(np.float32), png=8),
 }
 
@@ -111,7 +107,7 @@ def write_maps(baked: Baked, context: Context, tile: int = 0, count: int = 1) ->
     if baked.votes is not None or count > 1:
         maps["region"] = _region(baked, baked.votes, place)
     if tile == 0:
-        lut = MapKind((), numbered=True)
+        lut = MapKind((), numbered=True, wide=True)
         maps["basis_lut"] = _store("basis_lut", baked.lut, _range(baked.lut), lut, _Place(context, 0, 1))
     return maps
 
@@ -147,6 +143,12 @@ def resized(image: F32, size: int) -> F32:
     if len(image) == size:
         return image
     return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_LINEAR), np.float32)
+
+
+def numbered_channels(count: int) -> tuple[str, ...]:
+    """Names of the channels of a map of numbers. Three are red, green and blue, as the usd stage has them: its picture
+    of them is then the same file."""
+    return ("R", "G", "B") if count == 3 else tuple(f"c{i}" for i in range(count))
 
 
 def _from_samples(name: str, kind: MapKind, baked: Baked, place: _Place) -> TextureMap:
@@ -191,9 +193,9 @@ def _range(values: npt.NDArray[Any]) -> tuple[float, float, float]:
 def _store(name: str, image: F32, figures: tuple[float, float, float], kind: MapKind, place: _Place) -> TextureMap:
     folder = place.context.workdir / FOLDER
     exr, png = (tiles.form(k, place.tile, place.count) for k in ("exr", "png"))
-    channels = tuple(f"c{i}" for i in range(image.shape[2])) if kind.numbered else None
-    primaries = REC709 if kind.colour else None
-    write_exr(folder / f"{name}.{exr}", image, channels, half=kind.half, fraction=kind.fraction, primaries=primaries,
+    channels = numbered_channels(image.shape[2]) if kind.numbered else None
+    primaries = REC709 if kind.colour else None  # none for numbers
+    write_exr(folder / f"{name}.{exr}", image, channels, half=not kind.wide, step=kind.step, primaries=primaries,
               units=kind.units)  # fmt: skip
     files: dict[str, FileRef] = {exr: place.context.file(f"{FOLDER}/{name}.{exr}")}
     if kind.png:

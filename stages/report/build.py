@@ -193,7 +193,8 @@ def _maps(r: Results, side: int) -> list[Picture]:
     kinds = [tiles.form("exr", t, count) for t in range(count)]
     for name, texture in sorted(r.bake.artifact.maps.items()):
         if name not in SKIPPED_MAPS and set(kinds) <= texture.files.keys():
-            values = np.concatenate([_thinned(read_exr(r.bake.path(texture.files[k]))[0], side) for k in kinds], 1)
+            pictures = [_thinned(read_exr(r.bake.path(texture.files[k]))[0], side) for k in kinds]
+            values = tiles.side_by_side(pictures, whole=True)
             limits = FIXED_RANGES.get(name)
             picture = scaled_picture(values, *limits) if limits else map_picture(values, texture.space)
             scale = f"; scale {limits[0]:g} to {limits[1]:g}" if limits else ""
@@ -206,7 +207,7 @@ def _lobe_fit(r: Results, side: int) -> list[Picture]:
     files = [f for f in r.usd.artifact.files if LOBE_FIT in f.path]
     if not files:
         return []
-    picture = np.concatenate([_thinned(read_encoded(r.usd.path(f))[..., :3], side) for f in files], 1)
+    picture = tiles.side_by_side([_thinned(read_encoded(r.usd.path(f))[..., :3], side) for f in files], whole=True)
     off = r.usd.artifact.figures.get("ggx_residual", 0.0)
     caption = f"GGX against the fitted lobe. Red: residual ({off:.1%} in total); green: kappa not resolved"
     return [Picture(data_uri(picture, side), caption)]

@@ -1,10 +1,12 @@
 """The layout of the texture: charts in colours of their texel density, with their seams.
 
 A seam is an edge of a chart: an edge of a triangle in texture space that no other triangle shares. The density is the
-edge of a texel on the surface, sqrt(area / texture area) / size, on the scale of the 3D view's channel.
+edge of a texel on the surface, sqrt(area / texture area) / side of its tile, on the scale of the 3D view's channel.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -25,7 +27,8 @@ def uv_layout(r: Results, side: int) -> Picture:
     """The picture, tiles side by side, `side` pixels high."""
     path = r.uv.path(r.uv.artifact.mesh)
     mesh, charts = meshes.load(path), meshes.load_charts(path)
-    mm = texel_mm(mesh, charts, r.bake.artifact.size)
+    bake = r.bake.artifact
+    mm = texel_mm(mesh, charts, [bake.side(t) for t in range(tiles.count(charts))])
     picture = drawn(charts, mm, DRAWN * side)
     cut = seams(charts)
     caption = (
@@ -34,13 +37,15 @@ def uv_layout(r: Results, side: int) -> Picture:
     return Picture(data_uri(picture, side * tiles.count(charts)), caption + f"; {len(cut)} edges of charts")
 
 
-def texel_mm(mesh: meshes.Mesh, charts: meshes.Charts, size: int) -> F64:
-    """(F,) edge of a texel on the surface in each triangle, mm; infinite where a triangle has no texture area."""
+def texel_mm(mesh: meshes.Mesh, charts: meshes.Charts, sides: Sequence[int]) -> F64:
+    """(F,) edge of a texel on the surface in each triangle, mm; infinite where a triangle has no texture area. sides:
+    texels along a side of each tile."""
     corners = charts.uvs.astype(np.float64)[charts.faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(1000 * np.sqrt(meshes.areas(mesh.vertices, mesh.faces) / flat) / size, np.float64)
+        edge = 1000 * np.sqrt(meshes.areas(mesh.vertices, mesh.faces) / flat)
+        return np.asarray(edge / np.asarray(sides)[tiles.of_face(charts)], np.float64)
 
 
 def seams(charts: meshes.Charts) -> npt.NDArray[np.int64]:

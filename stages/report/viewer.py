@@ -1,7 +1,7 @@
 """The 3D view of the page: the asset's glb, maps, light, cameras and photos as text, and the code that shows them.
 
-The page is one file that is opened from a disk: nothing can be loaded beside it. Binary data are base64; the modules
-(three.js, unchanged, and ours) are one gzip file, which the page's only script unpacks and links.
+The page is one file that is opened from a disk: nothing can be loaded beside it. Binary data are base64 of gzip; the
+modules (three.js, unchanged, and ours) are one such file, which the page's only script unpacks and links.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from pipeline import tiles
 from pipeline.images import HALF_MAX, read_exr, shrink
 from pipeline.maths import studio_lights
 from stages.report.collect import Results
-from stages.report.pictures import png_uri, scale_colours
+from stages.report.pictures import exact_uri, scale_colours
 from stages.report.viewer_cameras import cameras_shown
+from stages.report.viewer_glb import packed_glb
 from stages.report.viewer_maps import maps_shown, scan_look
 from stages.report.viewer_marks import landmarks
 from stages.report.viewer_meshes import ShownMesh, shown_meshes
@@ -75,8 +76,9 @@ def viewer(r: Results) -> Viewer | None:
     digest = base64.b64encode(hashlib.sha256(boot.encode()).digest()).decode()
     meshes = tuple(shown_meshes(r))
     return Viewer(
-        _data(r, meshes), _base64(r.usd.path(glb).read_bytes()), _modules(), Markup(boot), f"sha256-{digest}",
-        Markup(_text("templates/viewer.css")), png_uri(np.repeat(scale_colours()[None], 10, 0)),
+        _data(r, meshes), _base64(packed_glb(r.usd.path(glb).read_bytes())), _modules(), Markup(boot),
+        f"sha256-{digest}",
+        Markup(_text("templates/viewer.css")), exact_uri(np.repeat(scale_colours()[None], 10, 0)),
         meshes,
     )  # fmt: skip
 
@@ -86,7 +88,7 @@ def _data(r: Results, meshes: tuple[ShownMesh, ...]) -> dict[str, Any]:
     bake, name = r.bake.artifact, r.usd.artifact.name
     maps = maps_shown(r.bake)
     return {
-        "texels": bake.size,
+        "texels": [bake.side(t) for t in range(bake.tiles)],
         "materials": [name if bake.tiles == 1 else f"{name}_{tiles.FIRST + t}" for t in range(bake.tiles)],
         "channels": list(_channels(r, maps)),
         "maps": maps,

@@ -11,7 +11,7 @@ from pipeline import tiles
 from pipeline.artifacts import Located, TextureSet
 from pipeline.colour import srgb_from_linear
 from pipeline.images import read_encoded, read_exr
-from stages.report.pictures import U8, png_uri
+from stages.report.pictures import U8, exact_uri
 
 MAP_SIDE = 1024  # texels of a map that only the view shows
 MAPS = ("ambient_occlusion", "irradiance_ratio", "confidence", "coverage", "region")
@@ -35,7 +35,7 @@ def map_uris(bake: Located[TextureSet], name: str) -> list[str]:
     """A map as PNG, one address a tile; every second, third, ... texel of a larger one, which keeps codes whole."""
     texture, count = bake.artifact.maps[name], bake.artifact.tiles
     pictures = [read_encoded(bake.path(texture.files[tiles.form("png", t, count)])) for t in range(count)]
-    return [png_uri(_bytes(thinned(p))) for p in pictures]
+    return [exact_uri(_bytes(thinned(p))) for p in pictures]
 
 
 def scan_look(bake: Located[TextureSet]) -> dict[str, Any] | None:
@@ -55,7 +55,7 @@ def _specular(scan: Located[TextureSet]) -> dict[str, Any]:
     found = [thinned(read_exr(scan.path(files[tiles.form("exr", t, count)]))[0][..., 0]) for t in range(count)]
     top = max(LEAST_F0, *(float(np.percentile(f, PERCENT)) for f in found))
     stored = [np.repeat(srgb_from_linear((f / top).clip(0, 1))[..., None], 3, -1) for f in found]
-    return {"specular": [png_uri(np.round(255 * s).astype(np.uint8)) for s in stored], "f0": top}
+    return {"specular": [exact_uri(np.round(255 * s).astype(np.uint8)) for s in stored], "f0": top}
 
 
 def thinned(image: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -63,7 +63,7 @@ def _known(r: Results) -> Iterator[tuple[str, str, tuple[Mesh, Charts], bool, bo
         yield "displaced", "displaced by its map", displaced(r), True, False
     high = usd_mesh(r, "high.usdc", "high")
     if high is not None:
-        yield "high", "level of detail: high, before decimation", high, True, False
+        yield "high", "level of detail: high", high, True, False
 
 
 # ------------------------------------------------------------------ levels

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
 from pipeline.errors import UsageError
-from pipeline.units import ContentHash, Pixels
+from pipeline.units import ContentHash, Pixels, Triangles
 from stages.usd.naming import check_name
 
 
@@ -43,6 +43,9 @@ class Config(StageConfig):
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     high: bool = Field(True, description="write the dense mesh as high.usdc, for the variant lod=high")
+    high_faces: Triangles = Field(
+        2_000_000, ge=50_000, description="most triangles of the dense mesh there; a finer one is decimated"
+    )
     environment_width: Pixels = Field(1024, ge=64, le=8192, multiple_of=2, description="width of environment.exr")
     render_views: bool = Field(True, description="render the held-out views from the exported files")
     samples: int = Field(

@@ -40,7 +40,7 @@ PNG = {
     "coverage",
     "ambient_occlusion",
 }
-ALL = PNG | {"specular_coefficients", "lobe_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
+ALL = PNG | {"specular_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
 
 
 @cache

@@ -19,6 +19,7 @@ from pipeline.visibility import Occluder
 from stages.bake import detail, regions, statistics
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
+from stages.bake.smaller import smaller
 from stages.bake.stage import Config, Inputs, region_shares, run
 from stages.bake.write import KINDS, joined, write_maps
 from stages.uv import pack, unwrap
@@ -195,3 +196,30 @@ def test_the_stage_bakes_every_tile_with_the_photos_detail(
     assert {p.name for p in (tmp_path / "out/textures").glob("albedo*")} == {
         f"albedo.{n}.{k}" for n in (1001, 1002) for k in ("exr", "png")
     }
+
+
+# ------------------------------------------------------------------ tiles of different sizes
+def test_a_smaller_tile_has_the_means_of_its_texels(written: tuple) -> None:
+    baked = written[1][1]
+    half = smaller(baked, 2)
+    assert half.size == SIZE // 2 and half.statistics is baked.statistics and smaller(baked, 1) is baked
+    row, column = np.divmod(baked.texel, SIZE)
+    assert set(half.texel.tolist()) == set((row // 2 * half.size + column // 2).tolist())
+    for i in (0, len(half.texel) // 2, len(half.texel) - 1):
+        own = (row // 2 == half.texel[i] // half.size) & (column // 2 == half.texel[i] % half.size)
+        assert half.samples.albedo[i] == pytest.approx(baked.samples.albedo[own].mean(0), rel=1e-5)
+        assert half.samples.rho[i] == pytest.approx(baked.samples.rho[own].mean(), rel=1e-5)
+    assert np.linalg.norm(half.samples.normal, axis=1) == pytest.approx(1, abs=1e-5)
+    assert half.samples.landed.dtype == np.bool_
+    assert half.nearest.shape == (half.size, half.size)
+    assert np.array_equal(half.nearest.ravel()[half.texel], np.arange(len(half.texel)))
+
+
+def test_tiles_of_different_sizes_stand_side_by_side() -> None:
+    large, small = np.zeros((8, 8, 3), np.float32), np.arange(16, dtype=np.float32).reshape(4, 4, 1).repeat(3, 2)
+    both = tiles.side_by_side([large, small])
+    assert both.shape == (8, 16, 3) and not both[:, :8].any()
+    assert both[1:3, 9:11, 0].mean() == pytest.approx(small[:2, :2, 0].mean()) and both[0, 8, 0] == 0
+    codes = tiles.side_by_side([large[..., :1], small[..., :1]], whole=True)
+    assert np.array_equal(codes[:, 8:, 0], small[..., 0].repeat(2, 0).repeat(2, 1))
+    assert tiles.side_by_side([small]) is small

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from pipeline import threads
-from pipeline.artifacts import Located
+from pipeline.artifacts import FileRef, Located, Report
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, DiskError, StageError
 from pipeline.store import Store, link_or_copy
@@ -348,3 +348,15 @@ def test_a_second_name_takes_no_room_and_is_a_copy_elsewhere(tmp_path: Path, mon
     number = errno.ENOSPC
     with pytest.raises(OSError, match="No space"):
         link_or_copy(source, tmp_path / "none.exr")
+
+
+def test_files_with_the_same_bytes_share_their_room(store: Store) -> None:
+    partial = store.begin("twins", "k")
+    for name, text in (("a.txt", "same"), ("b.txt", "same"), ("c.txt", "other")):
+        (partial / name).write_text(text)
+    refs = tuple(FileRef.of(partial, n) for n in ("a.txt", "b.txt", "c.txt", "a.txt"))
+    folder = store.finish("twins", "k", partial, Report(files=refs), {}).folder
+    assert {p.name for p in folder.iterdir()} >= {"a.txt", "b.txt", "c.txt"}
+    assert (folder / "a.txt").samefile(folder / "b.txt") and not (folder / "a.txt").samefile(folder / "c.txt")
+    assert [(folder / n).read_text() for n in ("a.txt", "b.txt", "c.txt")] == ["same", "same", "other"]
+    assert not list(folder.glob("*.partial"))

@@ -90,26 +90,14 @@ def test_half_exr_is_close(tmp_path: Path) -> None:
     assert 0 < np.abs(back - data).max() < 4 * 2**-11
 
 
-@pytest.mark.parametrize("fraction", [1, 14, 23])
-def test_a_shorter_fraction_is_the_nearest_one(fraction: int) -> None:
-    """Against rounding by exponents in 64 bits; what is not finite, zero and the largest float stay what they are."""
-    scale = 10.0 ** np.arange(-20, 20).repeat(25)
-    data = (scale * np.random.default_rng(4).normal(0, 1, 1000)).astype(np.float32)
-    found = images.rounded(data, fraction).astype(np.float64)
-    step = 2.0 ** (np.floor(np.log2(np.abs(data.astype(np.float64)))) - fraction)
-    assert (np.abs(found - data) <= step / 2).all() and np.array_equal(found / step, np.round(found / step))
-    ends = np.array([np.inf, -np.inf, 0, -0.0, np.finfo(np.float32).max], np.float32)
-    assert images.rounded(ends, fraction).tolist() == ends.tolist()
-    assert np.isnan(images.rounded(np.array([np.nan], np.float32), fraction)).all()
-
-
-def test_a_shorter_fraction_takes_less_room(tmp_path: Path) -> None:
+def test_steps_are_the_nearest_ones_and_take_less_room(tmp_path: Path) -> None:
     data = np.random.default_rng(5).normal(0, 1, (64, 64, 3)).astype(np.float32)
-    for name, fraction in (("whole", 23), ("short", 7)):
-        images.write_exr(tmp_path / f"{name}.exr", data, fraction=fraction)
-    assert np.array_equal(images.read_exr(tmp_path / "short.exr")[0], images.rounded(data, 7))
-    size = {n: (tmp_path / f"{n}.exr").stat().st_size for n in ("whole", "short")}
-    assert size["short"] < 0.7 * size["whole"]
+    images.write_exr(tmp_path / "whole.exr", data)
+    for half in (False, True):
+        images.write_exr(tmp_path / "steps.exr", data, step=2**-7, half=half)
+        found = images.read_exr(tmp_path / "steps.exr")[0]
+        assert np.array_equal(found * 128, np.round(found * 128)) and 0 < np.abs(found - data).max() <= 2**-8
+        assert (tmp_path / "steps.exr").stat().st_size < 0.7 * (tmp_path / "whole.exr").stat().st_size
 
 
 def test_half_floats_never_become_infinite(tmp_path: Path) -> None:

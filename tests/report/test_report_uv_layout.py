@@ -27,11 +27,11 @@ def test_seams_are_the_edges_of_charts() -> None:
 def test_the_edge_of_a_texel() -> None:
     """1 m over 1,000 texels is 1 mm; a surface twice as large in one direction has sqrt(2) mm; no area has no edge."""
     mesh, charts = square()
-    assert texel_mm(mesh, charts, 1000) == pytest.approx(1, rel=1e-5)
+    assert texel_mm(mesh, charts, [1000]) == pytest.approx(1, rel=1e-5)
     wide = Mesh(POINTS * np.float32([2, 1, 1]), mesh.normals, mesh.faces)
-    assert texel_mm(wide, charts, 1000) == pytest.approx(2**0.5, rel=1e-5)
+    assert texel_mm(wide, charts, [1000]) == pytest.approx(2**0.5, rel=1e-5)
     flat = Charts(np.where(np.arange(7)[:, None] < 4, UVS, 0).astype(np.float32), FACES)
-    assert texel_mm(mesh, flat, 1000)[2] == np.inf
+    assert texel_mm(mesh, flat, [1000])[2] == np.inf
 
 
 def test_the_drawing_has_charts_seams_and_paper() -> None:

@@ -5,6 +5,7 @@ The second needs Blender: `NEUFACE_BLENDER` names a `blender`, or a Python that 
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import runpy
@@ -24,6 +25,7 @@ from support.synthetic_head import template_inputs
 
 from pipeline.artifacts import Camera
 from stages.usd.render.exported import read_usd_mesh
+from stages.usd.write import export
 from stages.usd.write.export import BLENDER
 
 VIEWS, WIDTH, HEIGHT = (0, 3, 6, 9, 12), 96, 120  # of the synthetic asset; their photos are 0.png, 3.png, ...
@@ -108,22 +110,20 @@ def test_it_asks_blender_for_the_scene_of_the_photos(asset: Path, monkeypatch: p
     assert (made.cage.modifiers[0].levels, made.cage.modifiers[0].render_levels) == (2, 2)
     assert made.material.displacement_method == "BOTH"
     assert made.space.region_3d.view_perspective == "CAMERA" and made.space.shading.use_scene_world
-    assert "5 cameras, 0 with their photo" in capsys.readouterr().out
+    assert "--photos FOLDER names them" in capsys.readouterr().out
     assert not shown(made) and not made.bpy.ops.render.render.called
 
 
 def test_it_renders_what_it_is_asked_to(asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = opened(asset, monkeypatch, "--render", str(tmp_path / "a.png"), "--size", "60", "--samples", "4",
-                  "--camera", "view_6")  # fmt: skip
-    assert made.scene.camera.name == "view_6.001" and made.scene.cycles.samples == 4
-    assert made.scene.render.resolution_percentage == 50 and made.scene.render.filepath == str(tmp_path / "a.png")
+    made = opened(asset, monkeypatch, "--render", str(tmp_path / "a.png"), "--samples", "4")
+    assert made.scene.cycles.samples == 4 and made.scene.render.filepath == str(tmp_path / "a.png")
     made.bpy.ops.render.render.assert_called_once_with(write_still=True, scene="scene")
 
 
-def test_an_unknown_camera_is_refused(asset: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    with pytest.raises(SystemExit):
-        opened(asset, monkeypatch, "--camera", "view_99")
-    assert "there is no camera 'view_99'; there are: view_0, view_3" in capsys.readouterr().err
+def test_it_stays_short() -> None:
+    """A user reads it before running it."""
+    lines = Path(inspect.getfile(export)).with_name(BLENDER).read_text().partition("import argparse")[2].splitlines()
+    assert sum(bool(line.strip()) for line in lines) <= 68
 
 
 def test_photos_of_the_users_folder_are_behind_the_cameras(
@@ -138,24 +138,18 @@ def test_photos_of_the_users_folder_are_behind_the_cameras(
     assert (behind.display_depth, behind.frame_method, behind.alpha) == ("BACK", "STRETCH", 1.0)
 
 
-def test_the_runs_upright_copies_come_before_the_capture(
-    asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_the_runs_upright_copies_are_behind_the_cameras(
+    asset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    store, capture = tmp_path / "store", tmp_path / "capture"
+    store = tmp_path / "store"
     write_photo(store / "capture/KEY/photos/0_0.png")
     views = [{"index": 0, "image": {"path": "photos/0_0.png"}}, {"index": 3, "image": {"path": "photos/gone.png"}}]
     (store / "capture/KEY/manifest.json").write_text(json.dumps({"views": views}))
-    for name in ("0.png", "3.png", "images/6.png"):
-        write_photo(capture / name)
-    run = {"store": str(store), "request": {"capture": str(capture)}, "stages": {"capture": {"key": "KEY"}}}
+    run = {"store": str(store), "stages": {"capture": {"key": "KEY"}}}
     (asset.parent / "run.json").write_text(json.dumps(run))
-    assert shown(opened(asset, monkeypatch)) == {
-        "view_0": store / "capture/KEY/photos/0_0.png",
-        "view_3": capture / "3.png",
-        "view_6": capture / "images/6.png",
-    }
+    assert shown(opened(asset, monkeypatch)) == {"view_0": store / "capture/KEY/photos/0_0.png"}
     shutil.rmtree(store)  # as after `store gc`
-    assert set(shown(opened(asset, monkeypatch))) == {"view_0", "view_3", "view_6"}
+    assert not shown(opened(asset, monkeypatch)) and "--photos FOLDER names them" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("record", ["", "[]", '{"store": 3}'])

@@ -196,9 +196,10 @@ def test_an_albedo_that_was_fitted_with_shadows_is_left_as_it_is(tmp_path: Path)
     arrays = texture_arrays()
     ratio = np.full_like(arrays["albedo"], 0.8)
     ratio[:64] = 0.6
-    run_stage(
-        write_inputs(tmp_path / "in", arrays={**arrays, "irradiance_ratio": ratio}), tmp_path / "work", usdz=False
-    )
+    inputs = write_inputs(tmp_path / "in", arrays={**arrays, "irradiance_ratio": ratio})
+    run_stage(inputs, tmp_path / "work", usdz=False)
+    baked = inputs.bake.path(inputs.bake.artifact.maps["albedo"].files["exr"])
+    assert (tmp_path / "work/asset/textures/head_albedo.exr").samefile(baked)
     read = load_exported(tmp_path / "work/asset/head.usd")
     np.testing.assert_allclose(read.albedo, arrays["albedo"], atol=1e-6)
     np.testing.assert_allclose(read.occlusion, ratio, atol=1e-6)

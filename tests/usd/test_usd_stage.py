@@ -20,6 +20,7 @@ from support.synthetic_asset import (
     write_textures,
 )
 
+from pipeline.artifacts import sha256_of
 from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
 from pipeline.images import read_encoded, read_exr
@@ -59,6 +60,17 @@ def test_files_are_those_of_the_interface(exported) -> None:
     assert on_disk == listed | views
     assert asset.root == "asset/head.usd"
     assert asset.warnings == ()
+
+
+def test_the_bakes_maps_take_no_room_again_and_stay_as_they_are(exported, inputs) -> None:
+    """Maps are second names of the bake's files; an albedo without shadows is a file of its own."""
+    maps = inputs.bake.artifact.maps
+    for ref in (r for m in maps.values() for r in m.files.values()):
+        assert sha256_of(inputs.bake.path(ref)) == ref.sha256
+    asset = exported[0] / "asset"
+    assert (asset / "textures/head_normal.png").samefile(inputs.bake.path(maps["normal"].files["png"]))
+    for form, ref in maps["albedo"].files.items():
+        assert not (asset / f"textures/head_albedo.{form}").samefile(inputs.bake.path(ref))
 
 
 def test_component_structure(exported) -> None:
@@ -214,6 +226,7 @@ def test_another_process_writes_the_same_bytes(exported, inputs: SyntheticInputs
 import pickle, sys
 from pathlib import Path
 sys.path[:0] = [sys.argv[1], str(Path(sys.argv[1]).parent)]
+from pipeline.artifacts import sha256_of
 from pipeline.contract import Context
 from stages.usd.write.maps import look_of
 from stages.usd.write.mesh import read_mesh

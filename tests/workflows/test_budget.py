@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from pipeline.artifacts import MaskSet, ViewMask
 from pipeline.errors import UsageError
 from pipeline.store import Store
 from stages.presets import configs_for
@@ -17,7 +19,7 @@ from workflows.run import budget
 from workflows.run.budget import DRAFT_RATE, MIN_FIT, RUNGS, BudgetPlan, choose
 from workflows.run.plan import check_settings, make_plan, preview
 from workflows.run.request import RunRequest
-from workflows.run.runner import run_stages
+from workflows.run.runner import probably_from_template, run_stages
 
 NAMES = [r.name for r in RUNGS]
 
@@ -39,6 +41,27 @@ def test_a_rung_is_filled_with_rays_and_all_stages_fit() -> None:
             if plan.fits:
                 assert plan.seconds + slower * rung.after == pytest.approx(left, abs=0.1)
                 assert (plan.seconds - slower * rung.before) * pace * rung.rate >= min(rung.rays, 1.0)
+
+
+def test_the_head_templates_time_is_not_the_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rung is the same, or a smaller one; on a slow machine the template takes longer too."""
+    monkeypatch.setattr(budget, "calibrate", lambda device: DRAFT_RATE / 2)
+    scan, template = (
+        budget.planned(Store(tmp_path), {"of": made}, 700.0, "cpu", from_template=made) for made in (False, True)
+    )
+    assert scan.rung == template.rung == "draft"
+    assert scan.seconds - template.seconds == pytest.approx(2 * budget.TEMPLATE, abs=0.2)
+
+
+def test_a_person_is_planned_with_the_template(tmp_path: Path) -> None:
+    face = ViewMask.model_construct(index=0, labelled=("face",))
+    people = MaskSet.model_construct(masks=(face,) * 9)
+    things = MaskSet.model_construct(masks=(ViewMask.model_construct(index=0, labelled=()),) * 9)
+    for sets, masks, expected in (((), people, True), ((), things, False), (("uv.mesh=scan",), people, False)):
+        configs = check_settings(RunRequest(capture="c", out=str(tmp_path), budget=600.0, sets=sets), None)
+        done: Any = [SimpleNamespace(located=SimpleNamespace(artifact=masks))]
+        plan: Any = SimpleNamespace(configs=configs)
+        assert probably_from_template(plan, done) is expected
 
 
 def test_too_little_time_still_leaves_an_asset_and_is_told() -> None:
@@ -97,13 +120,15 @@ def test_the_run_plans_before_the_fit_alone(
 
     asked: list[Any] = []
 
-    def found(store: Store, purpose: dict[str, Any], left: float, device: str) -> Any:
+    def found(store: Store, purpose: dict[str, Any], left: float, device: str, **of: Any) -> Any:
+        assert of == {"from_template": True}
         asked.append((purpose["after"], left))
         return BudgetPlan("coarse", 30.0, 1.0, True)
 
     monkeypatch.setattr(runner, "FIT", "second")
     monkeypatch.setattr(planning, "FIT", "second")
     monkeypatch.setattr(runner, "planned", found)
+    monkeypatch.setattr(runner, "probably_from_template", lambda plan, done: True)
     monkeypatch.setattr(BudgetPlan, "settings", lambda self: {})
     monkeypatch.setattr(BudgetPlan, "describe", lambda self, budget: "planned")
     plan = make_plan(RunRequest(capture=str(photos), out=str(tmp_path / "out"), budget=60.0))

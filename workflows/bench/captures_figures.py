@@ -157,7 +157,7 @@ def _map(run: Run, name: str) -> F32 | None:
     if verdict is None:
         return None
     files = [verdict["files"][tiles.form("exr", t, count)] for t in range(count)]
-    return np.concatenate([read_exr(run.path("bake", f))[0][..., 0] for f in files], 1)
+    return tiles.side_by_side([read_exr(run.path("bake", f))[0][..., :1] for f in files], whole=True)[..., 0]
 
 
 def _labels(code: F32, names: list[str]) -> dict[str, npt.NDArray[np.bool_]]:

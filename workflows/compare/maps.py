@@ -152,10 +152,11 @@ def _picture(image: npt.NDArray[np.uint8], caption: str) -> Picture:
 
 def _read(side: Side, name: str) -> F32 | None:
     """(H, tiles H, C) a map from the store, else from the asset's folder; None if it is in neither."""
+    from pipeline import tiles
     from pipeline.images import read_exr
 
     files = _in_store(side, name) or _published(side, name)
-    return np.concatenate([read_exr(f)[0] for f in files], 1) if files else None
+    return tiles.side_by_side([read_exr(f)[0] for f in files]) if files else None
 
 
 def _in_store(side: Side, name: str) -> list[Path]:

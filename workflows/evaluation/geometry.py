@@ -111,10 +111,11 @@ def as_seen(linear: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 def albedo_map(textures: Path) -> F32:
     """The asset's albedo; of several tiles, side by side."""
+    from pipeline import tiles
     from pipeline.images import read_exr
 
     files = list(textures.glob("*_albedo.exr")) or sorted(textures.glob("*_albedo.[0-9]*.exr"))
-    return np.concatenate([read_exr(f)[0][..., :3] for f in files], 1)
+    return tiles.side_by_side([read_exr(f)[0][..., :3] for f in files])
 
 
 def mapped(mesh: Any, st: F64, texture: F32, camera: PinholeCamera, pixel: npt.NDArray[np.int64], factor: int) -> F64:

@@ -27,6 +27,7 @@ PLANS = ".budgets"  # in the store
 DRAFT_RATE = 45_000.0  # rays/s of the ball at the draft's settings on the machine on which `after` was measured
 START_UP = 4.0  # seconds of loading before the session's clock starts, on that machine
 MIN_FIT = 20.0  # seconds that a fit gets on that machine whatever the budget: less leaves nothing to use
+TEMPLATE = 75.0  # seconds more for the stages after the fit, on that machine, of a person made from the head template
 CALIBRATION = 6.0  # seconds of timed steps; about ten with what is built for them
 
 
@@ -35,7 +36,8 @@ class Rung:
     """A size of fit and of all that follows it.
 
     rays: below so many the rung under this one is more accurate. rate: of the draft's rays/s. before: seconds of the
-    fit's stage that are not training; after: seconds of the stages behind it; both on the machine of DRAFT_RATE.
+    fit's stage that are not training; after: seconds of the stages behind it without the head template; both on the
+    machine of DRAFT_RATE.
     """
 
     name: str
@@ -96,11 +98,12 @@ class BudgetPlan:
         return text if self.fits else text + "; the least that leaves an asset takes longer than the budget"
 
 
-def choose(left: float, pace: float) -> BudgetPlan:
-    """Rung and seconds of the fit's stage where the run has `left` seconds, on a machine of `pace` rays/s."""
+def choose(left: float, pace: float, more: float = 0.0) -> BudgetPlan:
+    """Rung and seconds of the fit's stage where the run has `left` seconds, on a machine of `pace` rays/s. more:
+    seconds that the stages behind the fit take beside a rung's own, on the machine of DRAFT_RATE."""
     slower = DRAFT_RATE / pace
     for rung in reversed(RUNGS):
-        stage = left - slower * rung.after
+        stage = left - slower * (rung.after + more)
         if (stage - slower * rung.before) * pace * rung.rate >= rung.rays:
             break
     least = slower * (MIN_FIT + rung.before)
@@ -121,15 +124,18 @@ def calibrate(device: str) -> float:
     return settings.batch * steps / (time.perf_counter() - begun)
 
 
-def planned(store: Store, purpose: Mapping[str, Any], left: float, device: str) -> BudgetPlan:
-    """The stored plan of the same request and the same earlier stages, else a new one."""
+def planned(
+    store: Store, purpose: Mapping[str, Any], left: float, device: str, *, from_template: bool = False
+) -> BudgetPlan:
+    """The stored plan of the same request and the same earlier stages, else a new one. from_template: the asset is
+    probably made from the head template."""
     path = _path(store, purpose)
     try:
         return BudgetPlan(**json.loads(path.read_text()))
     except (OSError, ValueError, TypeError):
         begun = time.monotonic()
         pace = calibrate(device)
-        found = choose(left - (time.monotonic() - begun), pace)
+        found = choose(left - (time.monotonic() - begun), pace, TEMPLATE if from_template else 0.0)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     write_synced(partial, json.dumps(asdict(found)))

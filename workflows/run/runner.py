@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from pipeline.artifacts import Artifact, Located
+from pipeline.artifacts import Artifact, Located, MaskSet
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
+from pipeline.people import shows_person
 from stages import registry
 from stages.registry import FIT
 from workflows.run.budget import START_UP, planned
@@ -88,12 +89,20 @@ def _stop_if_wished(watch: Session, stage: str) -> None:
         raise Cancelled(f"stopped by the user after {stage}; finished stages are kept, nothing was published")
 
 
+def probably_from_template(plan: Plan, done: Sequence[Done[Any]]) -> bool:
+    """Whether the head template is registered where it fits, and the photos show a person."""
+    masks = [d.located.artifact for d in done if isinstance(d.located.artifact, MaskSet)]
+    settings = plan.configs["template"].model_dump() if "template" in plan.configs else {}
+    return bool(settings.get("enabled")) and any(shows_person(m) for m in masks)
+
+
 def within_budget(plan: Plan, done: list[Done[Any]], watch: Session) -> Plan:
     """The plan with settings, from the fit on, that fit into the rest of its budget."""
     assert plan.request.budget is not None
     taken = sum(float(d.run.get("seconds", 0.0)) for d in done if not d.reused)
     left = plan.request.budget - max(watch.elapsed(), taken) - START_UP
     request = plan.request.model_dump(mode="json", include={"budget", "sets", "config", "holdout", "seed", "device"})
-    found = planned(plan.store, {**request, "after": [d.key for d in done]}, left, plan.device)
+    purpose = {**request, "after": [d.key for d in done]}
+    found = planned(plan.store, purpose, left, plan.device, from_template=probably_from_template(plan, done))
     watch.observer.note(found.describe(plan.request.budget))
     return replace(plan, configs=check_settings(plan.request, found.settings()))

@@ -7,9 +7,10 @@
     for (let i = 0; i < out.length; i++) out[i] = found.charCodeAt(i);
     return out;
   };
+  const unpacked = (id) =>
+    new Response(new Blob([bytes(island(id))]).stream().pipeThrough(new DecompressionStream("gzip")));
   try {
-    const packed = new Blob([bytes(island("viewer-modules"))]).stream().pipeThrough(new DecompressionStream("gzip"));
-    const modules = JSON.parse(await new Response(packed).text());
+    const modules = JSON.parse(await unpacked("viewer-modules").text());
     const urls = {};
     for (const [name, source] of modules) {
       let linked = source;
@@ -17,7 +18,7 @@
       urls[name] = URL.createObjectURL(new Blob([linked], { type: "text/javascript" }));
     }
     const { start } = await import(urls["./main.js"]);
-    await start(JSON.parse(island("viewer-data")), bytes(island("viewer-glb")).buffer);
+    await start(JSON.parse(island("viewer-data")), await unpacked("viewer-glb").arrayBuffer());
     document.documentElement.dataset.viewer = "ready";
   } catch (error) {
     document.documentElement.dataset.viewer = "failed";

@@ -150,7 +150,7 @@ export class Channels {
       case "checker": return look.map ? unlit(look.map, "checker") : this.none();
       case "density":
         if (!look.map) return this.none();
-        addDensity(mesh.geometry, this.data.texels);
+        addDensity(mesh.geometry, maps === this.data.maps ? this.data.texels[tile] : Math.max(...this.data.texels));
         return unlit(look.map, "density", { ...range, scale: this.scale(channel) });
       case "code": return texture ? unlit(texture, "code",
         { ...range, scale: this.scale(channel), count: channel.colours.length }) : this.none();

@@ -1,4 +1,5 @@
-"""Checks of textures in UDIM tiles: every tile that a mesh needs must exist, and all must have the same size.
+"""Checks of textures in UDIM tiles: every tile that a mesh needs must exist, and the maps of a tile must have the same
+size. (Tiles may differ; a map of another size than its tile's others is from another export.)
 
 The USD library does not report a missing tile; renderers show it black.
 """
@@ -77,15 +78,19 @@ def named(path: str, number: str) -> str:
     return str(UsdShade.UdimUtils.ReplaceUdimPattern(path, number))
 
 
-def tile_findings(
-    path: str, files: dict[str, str], wanted: set[str], sizes: set[tuple[int, ...]], where: str
-) -> list[Finding]:
-    """Findings on missing tiles and on tiles of different sizes."""
-    out = [
+def missing(path: str, files: dict[str, str], wanted: set[str], where: str) -> list[Finding]:
+    """A finding for each tile that there is no file of."""
+    return [
         Finding("error", "missing_texture", f"{named(path, number)} is missing", where)
         for number in sorted(wanted - files.keys())
     ]
-    if len(sizes) > 1:
-        text = " and ".join("x".join(map(str, s)) for s in sorted(sizes))
-        out.append(Finding("error", "tile_size", f"the tiles of {path} have different sizes: {text}", where))
+
+
+def of_other_size(sizes: dict[str, set[tuple[int, ...]]], where: str) -> list[Finding]:
+    """A finding for each tile whose maps have different sizes. sizes: by the tile's number."""
+    out = []
+    for number, found in sorted(sizes.items()):
+        if len(found) > 1:
+            text = " and ".join("x".join(map(str, s)) for s in sorted(found))
+            out.append(Finding("error", "tile_size", f"the maps of tile {number} have different sizes: {text}", where))
     return out

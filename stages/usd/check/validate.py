@@ -226,6 +226,7 @@ def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
     out: list[Finding] = []
     done: set[str] = set()
     wanted = tile_checks.needed(stage)
+    sizes: dict[str, set[tuple[int, ...]]] = {}
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         for attribute in prim.GetAttributes():
             value = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
@@ -235,7 +236,9 @@ def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
             if tile_checks.is_tiled(value.path):
                 if value.path not in done:
                     done.add(value.path)
-                    out += _tiles(value.path, tile_checks.tile_files(value.path, stage, attribute), wanted, where)
+                    files = tile_checks.tile_files(value.path, stage, attribute)
+                    out += _tiles(value.path, files, sizes, where)
+                    out += tile_checks.missing(value.path, files, wanted, where)
             elif not value.resolvedPath:
                 out.append(Finding("error", "missing_texture", f"{value.path} does not resolve", where))
             elif value.resolvedPath not in done:
@@ -243,20 +246,20 @@ def textures(stage: Usd.Stage, path: Path) -> list[Finding]:
                 fault = _image_fault(value.resolvedPath)
                 if fault:
                     out.append(Finding("error", "unreadable_texture", f"{value.path}: {fault}", where))
-    return out
+    return out + tile_checks.of_other_size(sizes, path.name)
 
 
-def _tiles(path: str, files: dict[str, str], wanted: set[str], where: str) -> list[Finding]:
-    """Findings on a texture in tiles: each must decode, none may be missing, all must have the same size."""
-    out, sizes = [], set()
+def _tiles(path: str, files: dict[str, str], sizes: dict[str, set[tuple[int, ...]]], where: str) -> list[Finding]:
+    """Findings on files of tiles that do not decode. Changes sizes: those found, by the tile's number."""
+    out = []
     for number, file in sorted(files.items()):
         seen: list[tuple[int, ...]] = []
         fault = _image_fault(file, seen)
-        sizes |= set(seen)
+        sizes.setdefault(number, set()).update(seen)
         if fault:
             named = tile_checks.named(path, number)
             out.append(Finding("error", "unreadable_texture", f"{named}: {fault}", where))
-    return out + tile_checks.tile_findings(path, files, wanted, sizes, where)
+    return out
 
 
 def _image_fault(resolved: str, sizes: list[tuple[int, ...]] | None = None) -> str:

@@ -35,7 +35,7 @@ CAGE_HEIGHT = "cage_displacement"  # name of the map of displacement from the ca
 
 @dataclass(frozen=True, slots=True)
 class ExportedAsset:
-    """The data of the model's equations. Maps of several tiles are side by side: W = tiles H.
+    """The data of the model's equations. Maps of several tiles are side by side, as large as the largest: W = tiles H.
 
     albedo (H, W, 3) linear reflectance; occlusion (H, W, 3) share of the captured light that arrives, with
     albedo * occlusion = fitted albedo, None for 1; coefficients (H, W, k) = rho c_j; inv_kappa (H, W, 1);
@@ -72,7 +72,7 @@ def load_exported(root: Path) -> ExportedAsset:
     mesh = read_usd_mesh(root)
     count = tile_count(mesh)
     albedo, inv_kappa = (_map(folder, name, m, count) for m in ("albedo", "inv_kappa"))
-    coefficients = np.concatenate([numbered(f) for f in _files(folder, name, "specular_coefficients", count)], 1)
+    coefficients = tiles.side_by_side([numbered(f) for f in _files(folder, name, "specular_coefficients", count)])
     basis = numbered(_files(folder, name, "basis_lut")[0]).mean(0)
     if coefficients.shape[2] != basis.shape[1]:
         raise StageError(
@@ -108,8 +108,7 @@ def _fitted(folder: Path, name: str, count: int) -> tuple[F32 | None, F32 | None
 
 
 def _map(folder: Path, name: str, which: str, count: int) -> F32:
-    read = [read_exr(f)[0] for f in _files(folder, name, which, count)]
-    return read[0] if count == 1 else np.concatenate(read, 1)
+    return tiles.side_by_side([read_exr(f)[0] for f in _files(folder, name, which, count)])
 
 
 def _files(folder: Path, name: str, which: str, count: int = 1) -> list[Path]:
@@ -152,7 +151,7 @@ def _normal(folder: Path, name: str, count: int) -> F32 | None:
     paths = _paths(folder, name, "normal", "png", count)
     if not paths[0].is_file():
         return None
-    stored = np.concatenate([read_encoded(p)[..., :3] for p in paths], 1)
+    stored = tiles.side_by_side([read_encoded(p)[..., :3] for p in paths])
     n = stored.astype(np.float32) / (255 if stored.dtype == np.uint8 else 65535) * 2 - 1
     return np.asarray(n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-6), np.float32)
 

@@ -23,6 +23,7 @@ from stages.usd.config import Config
 from stages.usd.layout import LIGHT
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
+from stages.usd.write.dense import coarser
 from stages.usd.write.gltf import write_glb
 from stages.usd.write.lookdev import lookdev_layer
 from stages.usd.write.maps import Maps, write_maps
@@ -71,7 +72,7 @@ def export(
         )
     proxy, left_out = _proxy(uv, mesh) if config.proxy else (None, [])
     notes += left_out
-    high, left_out = _high(surface, mesh) if config.high else (None, [])
+    high, left_out = _high(surface, mesh, config.high_faces) if config.high else (None, [])
     notes += left_out
     check()
     fitted_light = face.path(face.artifact.light)
@@ -210,9 +211,10 @@ def _proxy(uv: Located[UvMesh], mesh: UvSurface) -> tuple[UvSurface | None, list
     return (None, [f"the proxy mesh was left out: {fault}"]) if fault else (proxy, [])
 
 
-def _high(surface: Located[Surface], mesh: UvSurface) -> tuple[UvSurface | None, list[str]]:
-    """The dense mesh with texture coordinates from the textured mesh. At seams its corners reach into the padding."""
-    dense = read_mesh(surface.path(surface.artifact.mesh), with_uvs=False)
+def _high(surface: Located[Surface], mesh: UvSurface, most: int) -> tuple[UvSurface | None, list[str]]:
+    """The dense mesh, of about `most` triangles at most, with texture coordinates from the textured mesh. At seams its
+    corners reach into the padding."""
+    dense = coarser(read_mesh(surface.path(surface.artifact.mesh), with_uvs=False), most)
     high = with_uvs_from(dense, mesh, NEAR_HIGH, half_gap(mesh))
     fault = uv_fault(high, mesh)
     return (None, [f"the dense mesh was left out: {fault}"]) if fault else (high, [])

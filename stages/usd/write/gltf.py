@@ -40,7 +40,11 @@ from stages.usd.write.variants import HAIR
 
 FLOAT, UINT, USHORT, ARRAY_BUFFER, ELEMENT_BUFFER = 5126, 5125, 5123, 34962, 34963
 LINEAR, LINEAR_MIPMAPS, CLAMP = 9729, 9987, 33071
+COMPONENTS = {np.float32: FLOAT, np.uint32: UINT, np.uint16: USHORT}
 DIELECTRIC_F0 = 0.04
+# Steps of a morph target's offsets (m) and of its changes of normals: without noise they take a third of the room in a
+# page.
+OFFSET_STEP, TURN_STEP = 2.0**-18, 2.0**-8
 MIN_TOP, LARGEST_TOP = 0.02, 0.16  # range of F0's largest value: outliers of a fit must not use up the eight bits
 
 
@@ -64,7 +68,7 @@ class _Binary:
     def accessor(self, values: npt.NDArray[Any], kind: str, target: int, *, bounds: bool = False) -> int:
         found: dict[str, Any] = {
             "bufferView": self.view(np.ascontiguousarray(values).tobytes(), target),
-            "componentType": UINT if values.dtype == np.uint32 else FLOAT,
+            "componentType": COMPONENTS[values.dtype.type],
             "count": len(values),
             "type": kind,
         }
@@ -80,11 +84,10 @@ class _Binary:
         found: dict[str, Any] = {"componentType": FLOAT, "count": count, "type": "VEC3"}
         found |= {"min": full.min(0).tolist(), "max": full.max(0).tolist()}
         if len(rows):
-            short = count <= np.iinfo(np.uint16).max
-            index = np.ascontiguousarray(rows, np.uint16 if short else np.uint32)
+            index = np.ascontiguousarray(rows, _index(count))
             found["sparse"] = {
                 "count": len(rows),
-                "indices": {"bufferView": self._rows(index.tobytes()), "componentType": USHORT if short else UINT},
+                "indices": {"bufferView": self._rows(index.tobytes()), "componentType": COMPONENTS[index.dtype.type]},
                 "values": {"bufferView": self.view(np.ascontiguousarray(values, np.float32).tobytes())},
             }
         self.accessors.append(found)
@@ -186,7 +189,7 @@ def _primitive(mesh: UvSurface, material: int, binary: _Binary) -> dict[str, Any
             "NORMAL": binary.accessor(normals.astype(np.float32), "VEC3", ARRAY_BUFFER),
             "TEXCOORD_0": binary.accessor(np.stack([st[:, 0], 1 - st[:, 1]], -1), "VEC2", ARRAY_BUFFER),
         },
-        "indices": binary.accessor(faces.ravel().astype(np.uint32), "SCALAR", ELEMENT_BUFFER),
+        "indices": binary.accessor(faces.ravel().astype(_index(len(vertex))), "SCALAR", ELEMENT_BUFFER),
         "material": material,
     }
 
@@ -213,11 +216,20 @@ def _targets(vertex: Indices, rig: MeshRig, bent: list[F32], binary: _Binary) ->
         at = row[vertex[corner]]
         out.append(
             {
-                "POSITION": binary.sparse(corner, shape.offsets[at].astype(np.float32), len(vertex)),
-                "NORMAL": binary.sparse(corner, turned[at].astype(np.float32), len(vertex)),
+                "POSITION": binary.sparse(corner, _stepped(shape.offsets[at], OFFSET_STEP), len(vertex)),
+                "NORMAL": binary.sparse(corner, _stepped(turned[at], TURN_STEP), len(vertex)),
             }
         )
     return out
+
+
+def _stepped(values: npt.NDArray[np.floating], step: float) -> F32:
+    return np.asarray(np.round(values / step) * step, np.float32)
+
+
+def _index(count: int) -> type[np.uint16] | type[np.uint32]:
+    """The type of indices of `count` vertices; the largest value of a type means a restart."""
+    return np.uint16 if count <= np.iinfo(np.uint16).max else np.uint32
 
 
 def _eye_material(name: str, skin: dict[str, Any]) -> dict[str, Any]:

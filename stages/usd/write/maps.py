@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from pipeline.nearest import filled
 from pipeline.store import link_or_copy
 from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
-from stages.usd.write.ggx_conversion import LobeFit, basis_table, fit_figures, in_groups, lobe_fit
+from stages.usd.write.ggx_conversion import GROUP, LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
 
@@ -38,6 +37,7 @@ NEEDED = ("albedo", "specular_coefficients", "inv_kappa", "basis_lut")
 RAYS = 4_000_000  # about the number of rays for the lamps' visibility
 LAMPS = (96, 384)
 LIGHT_WIDTH = 128  # columns: an order of 10 has no finer detail
+HEIGHT_STEP = 2.0**-23  # metres, of a height above the cage: a tenth of a micrometre
 OCCLUSION_SIZE = 1024  # texels: it is computed at the vertices
 
 
@@ -109,7 +109,10 @@ def _derived(
     coefficients = numbered(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]))
     for i, picture in enumerate(in_groups(coefficients)):
         written.append(map_file(asset, name, f"coefficients_rgb{i}", exr))
-        write_exr(written[-1], picture, primaries=None)
+        if coefficients.shape[2] == GROUP:  # the bake's file has them as red, green and blue already
+            link_or_copy(bake.path(bake.artifact.maps["specular_coefficients"].files[exr]), written[-1])
+        else:
+            write_exr(written[-1], picture, primaries=None)
     if "f0" not in bake.artifact.maps:
         return written, None
     f0 = _map(bake, "f0", tile)[..., 0]
@@ -129,8 +132,7 @@ def shadows_fitted(bake: Located[TextureSet]) -> bool:
 
 
 def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
-    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room; a copy of
-    the albedo, which `divided_albedo` may write anew."""
+    """Every file of every map as NAME_map.format: under a second name in the same store, which takes no room."""
     count = bake.artifact.tiles
     wanted = {(m, tiles.form("exr", t, count)) for m in NEEDED[:-1] for t in range(count)} | {(NEEDED[-1], "exr")}
     wanted |= {("albedo", tiles.form("png", t, count)) for t in range(count)}
@@ -148,7 +150,7 @@ def copy_maps(bake: Located[TextureSet], name: str, asset: Path) -> list[Path]:
             continue  # the same as `albedo`
         for form, ref in sorted(texture.files.items()):
             target = map_file(asset, name, which, form)
-            (shutil.copyfile if which == "albedo" else link_or_copy)(bake.path(ref), target)
+            link_or_copy(bake.path(ref), target)
             written.append(target)
     return written
 
@@ -175,6 +177,8 @@ def divided_albedo(
         albedo = np.minimum(fitted / image, np.maximum(fitted, BRIGHTEST_ALBEDO)).astype(np.float32)
         image = np.where(albedo > 0, fitted / np.maximum(albedo, 1e-9), image).astype(np.float32)
         exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
+        for form in (exr, png):  # names of the bake's files, which stay as they are
+            map_file(asset, name, "albedo", form).unlink()
         write_exr(map_file(asset, name, "albedo", exr), albedo, half=True)
         write_png_from_linear(map_file(asset, name, "albedo", png), albedo)
         written.append(map_file(asset, name, "occlusion", exr))
@@ -215,8 +219,8 @@ def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name
     count, written = bake.artifact.tiles, []
     for tile in range(count):
         written.append(map_file(asset, name, CAGE_HEIGHT, tiles.form("exr", tile, count)))
-        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.size)
-        write_exr(written[-1], image, primaries=None, units="m")
+        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.side(tile))
+        write_exr(written[-1], image, step=HEIGHT_STEP, primaries=None, units="m")
     return written
 
 
@@ -276,7 +280,7 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequenc
 
 def covered_texels(bake: Located[TextureSet], tile: int = 0) -> Mask:
     """(H, W) mask of the texels that a chart touches; all texels if `coverage` was not baked."""
-    size, count = bake.artifact.size, bake.artifact.tiles
+    size, count = bake.artifact.side(tile), bake.artifact.tiles
     files = bake.artifact.maps["coverage"].files if "coverage" in bake.artifact.maps else {}
     exr, png = (tiles.form(k, tile, count) for k in ("exr", "png"))
     found: Mask | None = None

@@ -19,21 +19,18 @@ from stages.usd.write.variants import HAIR
 def write_obj(folder: Path, name: str, mesh: UvSurface, look: Look, hair: Look | None = None) -> list[Path]:
     """Write the files: metres, +Y up, as the asset. Indices start at 1; v, vt and vn are indexed separately. hair: the
     look of the last tile, if that is hair, which becomes an object of its own."""
-    normals = mesh.normals.astype(np.float64)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     count = tile_count(mesh)
     sizes, corners, uv_corners = faces_of(mesh)
     tile = tiles.of_face(Charts(mesh.uvs, mesh.uv_faces))
     home = np.zeros((len(mesh.uvs), 2), np.float32)
     home[mesh.uv_faces.ravel(), 0] = np.repeat(tile, 3)
     of_face = home[uv_corners[np.cumsum(sizes) - sizes], 0].astype(int).tolist()
-    texts = [f"{a}/{p}/{a}" for a, p in zip((corners + 1).tolist(), (uv_corners + 1).tolist(), strict=True)]
+    texts = [f"{a}/{p}" for a, p in zip((corners + 1).tolist(), (uv_corners + 1).tolist(), strict=True)]
     ends = np.cumsum(sizes).tolist()
     faces = ["f " + " ".join(texts[end - n : end]) for n, end in zip(sizes.tolist(), ends, strict=True)]
     lines = ["# Captured head, metres, +Y up. Made by NeuFace Asset.", f"mtllib {name}.mtl", f"o {name}"]
-    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.7g} {v:.7g}" for u, v in (mesh.uvs - home).clip(0, 1).tolist()]
-    lines += [f"vn {x:.5g} {y:.5g} {z:.5g}" for x, y, z in normals.tolist()]
+    lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices.tolist()]  # a micrometre
+    lines += [f"vt {u:.5f} {v:.5f}" for u, v in (mesh.uvs - home).clip(0, 1).tolist()]
     materials = []
     for t in range(count):
         called, own = MATERIAL if count == 1 else f"{MATERIAL}_{tiles.FIRST + t}", look
