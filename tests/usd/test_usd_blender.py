@@ -234,4 +234,5 @@ def test_blender_shows_the_asset_as_its_photos(tmp_path: Path) -> None:
     wanted = outline(tmp_path / "work/asset/head.usd", of)
     rows, columns = inside.any(1).nonzero()[0], inside.any(0).nonzero()[0]
     found_at = (columns[0], columns[-1] + 1, rows[0], rows[-1] + 1)
-    np.testing.assert_allclose(found_at, wanted, atol=1.2)  # at its place in the photo, to a pixel
+    # At its place in the photo, to a pixel; our facets are raised to keep the outline, Blender's lie inside of it.
+    np.testing.assert_allclose(found_at, wanted, atol=1.3)
