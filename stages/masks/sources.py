@@ -15,7 +15,7 @@ from stages.masks.grabcut import INNER, OUTER, cut_by_region
 from stages.masks.hull_consistency import opinions
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate
 from stages.masks.matting import soft_edge
-from stages.masks.region import F32, U8, Bool, Disc, resized
+from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import person_mask
 from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
@@ -61,7 +61,7 @@ class Plan:
 
 
 def plan(
-    views: Sequence[PhotoToMask], method: Method, threshold: float, working_size: int, seed: int,
+    views: Sequence[PhotoToMask], method: Method, threshold: float, longest: int, seed: int,
     solid: Callable[[], SupportedObject | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
     """Choose the method from a few of the fitted views. solid: finds the object among the sparse points. model: the
@@ -83,9 +83,9 @@ def plan(
         return Plan("model", model=model)
     fitted = [v for v in bare if not v.holdout] or bare
     some = fitted[:: -(-len(fitted) // LOOKED_AT)]
-    images = [v.read() for v in some]
+    colours, small = _looked_at(some, min(longest, CHOICE_SIZE))
     if method in ("auto", "key"):
-        background = find_background([border_colours(i) for i in images])
+        background = find_background(colours)
         if background is not None:
             return Plan("key", background)
         if method == "key":
@@ -96,15 +96,37 @@ def plan(
         return Plan(method)
     if method == "object":
         return _by_points(solid())
-    longest = min(working_size, CHOICE_SIZE)
-    persons = [person_mask(i, v.disc, threshold, longest, seed) for i, v in zip(images, some, strict=True)]
-    shares = [_share_of_centre(p, v) for p, v in zip(persons, some, strict=True)]
-    if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
-        found = solid()
-        if found is None or not _agrees_better(found, some, images, persons, seed):
-            return Plan("person")
-        return _by_points(found)
+    return _person_or_object(some, small, threshold, seed, solid)
+
+
+def _looked_at(views: Sequence[PhotoToMask], longest: int) -> tuple[list[U8], list[U8]]:
+    """Colours of each photo's border, and the photo reduced to `longest` pixels: one photo after the other, because
+    large ones do not fit in memory."""
+    colours, small = [], []
+    for view in views:
+        image = view.read()
+        colours.append(border_colours(image))
+        small.append(np.asarray(resized(image, *working_size(image.shape[1], image.shape[0], longest)), np.uint8))
+    return colours, small
+
+
+def _person_or_object(
+    views: Sequence[PhotoToMask],
+    images: Sequence[U8],
+    threshold: float,
+    seed: int,
+    solid: Callable[[], SupportedObject | None],
+) -> Plan:
+    """By what the network says of reduced photos (h, w, 3), and by whose masks agree."""
+    persons = [
+        person_mask(i, v.disc.scaled(i.shape[1] / v.camera.width), threshold, max(i.shape), seed)
+        for i, v in zip(images, views, strict=True)
+    ]
+    shares = [_share_of_centre(p, v) for p, v in zip(persons, views, strict=True)]
     found = solid()
+    if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
+        person = found is None or not _agrees_better(found, views, images, persons, seed)
+        return Plan("person") if person else _by_points(found)
     if found is not None:
         return _by_points(found)
     return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
@@ -133,7 +155,7 @@ def _agrees_better(
     A network that takes a skull, or the carved hair of a statue, for a person is sure of itself in nearly every photo;
     its masks still contradict each other.
     """
-    cuts = [cut_by_points(i, v.camera, solid, CHOICE_SIZE, seed) for i, v in zip(images, views, strict=True)]
+    cuts = [cut_by_points(i, v.camera, solid, max(i.shape), seed) for i, v in zip(images, views, strict=True)]
     of_object, of_person = (_agreement(views, m, solid.roi_radius) for m in (cuts, persons))
     return of_object > of_person + BETTER
 
@@ -145,7 +167,7 @@ def _agreement(views: Sequence[PhotoToMask], masks: Sequence[Bool], roi_radius: 
     return float(np.mean([o.iou or 0.0 for o in found]))
 
 
-def mask(view: PhotoToMask, how: Plan, threshold: float, working_size: int, seed: int) -> tuple[F32, str]:
+def mask(view: PhotoToMask, how: Plan, threshold: float, longest: int, seed: int) -> tuple[F32, str]:
     """Alpha (H, W) at the photo's size, and the method. A given mask is returned unchanged.
 
     Raises:
@@ -159,13 +181,13 @@ def mask(view: PhotoToMask, how: Plan, threshold: float, working_size: int, seed
     if how.method == "key" and how.background is not None:
         return key_out(image, how.background), "key"
     if how.method == "model" and how.model is not None:
-        inside = mask_by_model(image, view.disc, how.model, threshold, working_size, seed)
+        inside = mask_by_model(image, view.disc, how.model, threshold, longest, seed)
         return to_full_size(image, inside), "model"
     if how.method == "object" and how.solid is not None:
-        return to_full_size(image, cut_by_points(image, view.camera, how.solid, working_size, seed)), "object"
+        return to_full_size(image, cut_by_points(image, view.camera, how.solid, longest, seed)), "object"
     if how.method == "person":
-        return to_full_size(image, person_mask(image, view.disc, threshold, working_size, seed)), "person"
-    return to_full_size(image, cut_by_region(image, view.disc, working_size, seed)), "grabcut"
+        return to_full_size(image, person_mask(image, view.disc, threshold, longest, seed)), "person"
+    return to_full_size(image, cut_by_region(image, view.disc, longest, seed)), "grabcut"
 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
