@@ -20,10 +20,8 @@ from support.synthetic_results import SyntheticResults, write_results
 
 from pipeline.artifacts import Located
 from pipeline.contract import Context
-from pipeline.transforms import project, rows
 from pipeline.verdict import Limits, judged
 from stages.report.stage import STAGE, Config, Inputs
-from stages.report.viewer_cameras import chosen, straightened
 from tests.support.viewer_results import with_glb
 
 SHOWN = [
@@ -111,28 +109,6 @@ def test_without_the_setting_or_a_glb_nothing_runs(results: SyntheticResults, tm
     for made in (page_of(results, tmp_path / "off", viewer=False), page_of(plain, tmp_path / "none")):
         text = made.read_text()
         assert "<script>" not in text and "script-src" not in text
-
-
-def test_photos_are_straightened_as_the_cameras_project(results: SyntheticResults) -> None:
-    """A dot drawn where the distorted camera sees a point comes to where the plain camera sees it."""
-    camera = results.poses.artifact.cameras[0].model_copy(update={"distortion": (-0.2, 0.05, 0.002, -0.001, 0.0)})
-    w, h = camera.width, camera.height
-    K, pose = np.array(camera.K), np.eye(4)
-    point = np.array([[0.25 * w / K[0, 0], 0.3 * h / K[1, 1], 1.0]])
-    seen, _ = project(K, pose, np.array(camera.distortion), point)
-    plain, _ = project(K, pose, np.zeros(5), point)
-    y, x = np.indices((h, w)) + 0.5
-    dot = np.exp(-((x - seen[0, 0]) ** 2 + (y - seen[0, 1]) ** 2) / 18)
-    found = straightened(np.repeat((255 * dot).astype(np.uint8)[..., None], 3, 2), camera)[..., 0].astype(float)
-    centre = np.array([(found * x).sum(), (found * y).sum()]) / found.sum()
-    assert np.abs(centre - plain[0]).max() < 0.3 < np.abs(seen - plain).max()
-    untouched = camera.model_copy(update={"distortion": (0.0,) * 5, "K": rows(K)})
-    assert (straightened(np.full((h, w, 3), 7, np.uint8), untouched) == 7).all()
-
-
-def test_held_out_photos_come_first_and_few_others(results: SyntheticResults) -> None:
-    picked = chosen(results)
-    assert picked[:2] == [3, 9] and len(picked) == len(set(picked)) <= 12
 
 
 # ------------------------------------------------------------------ in a browser

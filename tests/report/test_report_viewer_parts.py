@@ -1,4 +1,4 @@
-"""Parts of the 3D view that need no browser: its modules, the direction of its lights, its colours."""
+"""Parts of the 3D view that need no browser: its modules, the direction of its lights, its colours, its photos."""
 
 from __future__ import annotations
 
@@ -10,11 +10,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from support.synthetic_results import SyntheticResults, write_results
 
 from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.maths.latlong import latlong_directions
+from pipeline.transforms import project, rows
 from stages.report.pictures import scale_colours
 from stages.report.viewer import CODES, MODULES, light_data
+from stages.report.viewer_cameras import chosen, straightened
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> SyntheticResults:
+    return write_results(tmp_path_factory.mktemp("results"))
 
 
 def test_every_module_imports_only_modules_before_it() -> None:
@@ -69,3 +77,25 @@ def seen_as(rgb: np.ndarray, kind: str) -> np.ndarray:
     linear = (linear_from_srgb(rgb / 255.0) @ np.array(VISION[kind]).T).clip(0, 1)
     shown = srgb_from_linear(linear).astype(np.float32)[None]
     return np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2Lab)[0])
+
+
+def test_photos_are_straightened_as_the_cameras_project(results: SyntheticResults) -> None:
+    """A dot drawn where the distorted camera sees a point comes to where the plain camera sees it."""
+    camera = results.poses.artifact.cameras[0].model_copy(update={"distortion": (-0.2, 0.05, 0.002, -0.001, 0.0)})
+    w, h = camera.width, camera.height
+    K, pose = np.array(camera.K), np.eye(4)
+    point = np.array([[0.25 * w / K[0, 0], 0.3 * h / K[1, 1], 1.0]])
+    seen, _ = project(K, pose, np.array(camera.distortion), point)
+    plain, _ = project(K, pose, np.zeros(5), point)
+    y, x = np.indices((h, w)) + 0.5
+    dot = np.exp(-((x - seen[0, 0]) ** 2 + (y - seen[0, 1]) ** 2) / 18)
+    found = straightened(np.repeat((255 * dot).astype(np.uint8)[..., None], 3, 2), camera)[..., 0].astype(float)
+    centre = np.array([(found * x).sum(), (found * y).sum()]) / found.sum()
+    assert np.abs(centre - plain[0]).max() < 0.3 < np.abs(seen - plain).max()
+    untouched = camera.model_copy(update={"distortion": (0.0,) * 5, "K": rows(K)})
+    assert (straightened(np.full((h, w, 3), 7, np.uint8), untouched) == 7).all()
+
+
+def test_held_out_photos_come_first_and_few_others(results: SyntheticResults) -> None:
+    picked = chosen(results)
+    assert picked[:2] == [3, 9] and len(picked) == len(set(picked)) <= 12
