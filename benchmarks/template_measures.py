@@ -187,7 +187,7 @@ def places_on_head(person: Person) -> dict[str, tuple[int, F64]]:
     points = apply(person.truth_from_asset, made.mesh.vertices.astype(np.float64))
     outside = _outside(made)
     skin = trimesh.Trimesh(points, made.mesh.faces[outside], process=False)
-    where, _, face = trimesh.proximity.closest_point(skin, np.stack([person.marks[n] for n in names]))
+    where, _, face = trimesh.proximity.closest_point_naive(skin, np.stack([person.marks[n] for n in names]))
     weights = trimesh.triangles.points_to_barycentric(skin.triangles[face], where)
     return {n: (int(outside[f]), np.asarray(w)) for n, f, w in zip(names, face, weights, strict=True)}
 
