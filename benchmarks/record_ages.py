@@ -28,6 +28,7 @@ CONCERNED: dict[str, tuple[str, ...]] = {
     "captures": ("stages", "pipeline"),
     "fuzz": ("stages/capture", "pipeline/images.py", "pipeline/picture_size.py", "pipeline/store.py",
              "pipeline/template", "workflows/batch/captures.py", "stages/presets.py"),
+    "history": (),  # each of its tables names its own
     "signals": RUNS,
     "signals_batch": RUNS,
     "signals_pool": RUNS,
@@ -41,32 +42,37 @@ COMMIT, DAY = re.compile(r"commit ([0-9a-f]{7,40})\b"), re.compile(r"\b(20\d\d-\
 
 @dataclass(frozen=True)
 class Made:
-    """A record, or a row of one. date: YYYY-MM-DD; commit: "" if it is not known."""
+    """A record, or a row of one. date: YYYY-MM-DD; commit: "" if it is not known; code: what a row is about, where that
+    is not the same for the whole record."""
 
     record: str
     row: str
     date: str
     commit: str = ""
+    code: tuple[str, ...] = ()
 
 
 def made(record: str, content: dict[str, Any]) -> Iterator[Made]:
-    """Each part of a record that was made on its own."""
+    """Each part of a record that was made on its own. Those of what is not in the code any more have no age."""
+    if content.get("kind") == "kept":
+        return
     if "made" in content:  # text
         commit, day = COMMIT.search(content["made"]), DAY.search(content["made"])
         yield Made(record, "", day[1] if day else "", commit[1] if commit else "")
     elif "date" in content:
-        yield Made(record, "", content["date"], content.get("commit", "").rstrip("+"))
+        code = tuple(content.get("code", ()))
+        yield Made(record, "", content["date"], content.get("commit", "").rstrip("+"), code)
     elif "machine" in content:
         yield Made(record, "", content["machine"]["date"], content.get("commit", "").rstrip("+"))
     else:
         for row, inner in content.get("rows", content).items():
             for one in made(record, inner) if isinstance(inner, dict) else ():
-                yield Made(record, row, one.date, one.commit)
+                yield Made(record, row, one.date, one.commit, one.code)
 
 
 def changes(since: Made) -> int | None:
     """Commits on the code concerned since then; None outside of a repository with its history."""
-    paths = ["--", *CONCERNED[since.record]]
+    paths = ["--", *(since.code or CONCERNED[since.record])]
     found = _git("rev-list", "--count", f"{since.commit}..HEAD", *paths) if since.commit else None
     if found is None:
         found = _git("rev-list", "--count", f"--since={since.date} 00:00:00", "HEAD", *paths)

@@ -16,6 +16,7 @@ def test_every_record_has_its_code_and_its_day() -> None:
     assert {p.stem for p in FOLDER.glob("*.json")} - {"mutations"} == set(CONCERNED)
     assert all((ROOT / path).exists() for paths in CONCERNED.values() for path in paths)
     found = all_made()
+    assert all(CONCERNED[m.record] or m.code for m in found)
     assert {m.record for m in found} == set(CONCERNED) and all(len(m.date) == 10 for m in found)
 
 
@@ -35,6 +36,9 @@ def test_records_of_each_form_are_read() -> None:
     assert list(made("signals", {"INT": {"made": "on 2026-01-02; before", "cells": {}}})) == [
         Made("signals", "INT", "2026-01-02")
     ]
+    table = {"date": "2026-01-02", "commit": "abc1234", "code": ["stages"], "rows": [["1"]]}
+    tables = {"a": {"kind": "current", **table}, "b": {"kind": "kept", **table}}  # what is kept has no age
+    assert list(made("history", tables)) == [Made("history", "a", "2026-01-02", "abc1234", ("stages",))]
 
 
 def test_changes_are_those_of_the_code_concerned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -59,5 +63,6 @@ def test_changes_are_those_of_the_code_concerned(tmp_path: Path, monkeypatch: py
     assert changes(Made("speed", "", today, names[0])) == 2 and changes(Made("speed", "", today, names[3])) == 0
     assert changes(Made("speed", "", today, "0123456789")) == 3  # no such commit: all of its day
     assert changes(Made("speed", "", "2099-01-01")) == 0
+    assert changes(Made("history", "a", today, names[0], ("other",))) == 1  # of its own code
     monkeypatch.setattr(record_ages, "ROOT", tmp_path / "code")
     assert changes(Made("speed", "", today)) is None and not has_history()
