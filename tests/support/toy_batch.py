@@ -56,6 +56,7 @@ class WorkConfig(StageConfig):
 
 class UsdConfig(StageConfig):
     name: str = "head"
+    high_faces: int = 0  # the draft preset sets it
 
 
 def run_work(inputs: WorkInputs, config: WorkConfig, context: Context) -> Worked:
