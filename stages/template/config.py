@@ -18,8 +18,8 @@ class Config(StageConfig):
     enabled: bool = Field(False, description="register the head template; default: unless uv.mesh=scan")
     faultless: bool = Field(
         False,
-        description="register only where nothing is wrong with the result: every check good, eyes fitted or closed, no "
-        "light stage, photos that show the irises; default: with uv.mesh=auto",
+        description="register only where nothing is wrong with the result: every check good, eyes fitted or closed, "
+        "no object, no light stage, photos that show the irises; default: with uv.mesh=auto",
     )
     levels: int = Field(2, ge=1, le=3, description="subdivisions of the registered head's quads")
     require: bool = Field(False, description="fail if the template does not fit the head, or the capture shows no face")

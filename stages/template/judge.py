@@ -62,6 +62,13 @@ def refused_faces(agree: int, photos: int) -> str:
     return ""
 
 
+def refused_object(sources: Sequence[str]) -> str:
+    """Why a subject is no person by how it was segmented; "" if it may be one. sources: of its masks."""
+    if any(s.startswith("object") for s in sources):
+        return "segmented as an object, not as a person (masks.method)"
+    return ""
+
+
 def refused_placing(residual_mm: float, scale: float, *, metric: bool) -> str:
     """Why the landmarks do not place the template; "" if they do. scale: metres per metre of the template."""
     if residual_mm > 1000 * MAX_RESIDUAL:

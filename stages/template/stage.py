@@ -47,7 +47,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     from pipeline.template.load import load_template
     from pipeline.visibility import seen_by
     from stages.template.hair import told_hair, under_hair
-    from stages.template.judge import refused_faces, refused_irises, refused_placing
+    from stages.template.judge import refused_faces, refused_irises, refused_object, refused_placing
     from stages.template.register import iris_pixels, register, scan_of
 
     def step(done: int, total: int, message: str) -> None:
@@ -59,6 +59,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
         return _refused(config, "no face was found in three photos or more")
     if config.faultless and inputs.capture.artifact.stage is not None:
         return _refused(config, "a light stage: the scan predicts its lights better")
+    why = refused_object([m.source for m in inputs.masks.artifact.masks]) if config.faultless else ""
+    if why:
+        return _refused(config, why)
     why = refused_faces(photos_that_agree(inputs.masks.path(ref)), len(inputs.masks.artifact.masks))
     if why:
         return _refused(config, why)
@@ -162,4 +165,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=17, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=18, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from pipeline import meshes, tiles
-from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet, Surface
+from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet, Surface, ViewMask
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.head_artifacts import RegisteredHead
@@ -120,6 +120,24 @@ def test_irises_of_less_than_six_pixels_are_refused() -> None:
     assert iris_pixels(made[:1], head) == pytest.approx(900 * 0.0117 / 0.5, rel=1e-6)
     assert iris_pixels(made, head) == pytest.approx(900 * 0.0117, rel=1e-6) and iris_pixels([], head) == 0
     assert not refused_irises(6.1) and "6" in refused_irises(5.9)
+
+
+@pytest.mark.parametrize(
+    ("faultless", "source", "why"),
+    [(True, "object", "as an object"), (True, "object+hull", "as an object"), (True, "person", "light stage"),
+     (False, "object", "too few landmarks")],
+)  # fmt: skip
+def test_what_was_segmented_as_an_object_is_not_registered_by_default(
+    faultless: bool, source: str, why: str, tmp_path: Path
+) -> None:
+    """A statue may have a face that many photos agree on."""
+    given = inputs(tmp_path, np.full((468, 3), np.nan))
+    mask = ViewMask(index=0, mask=given.masks.artifact.landmarks, source=source, coverage=0.3)
+    masks = given.masks.artifact.model_copy(update={"masks": (mask,)})
+    stage = SimpleNamespace(artifact=SimpleNamespace(stage=object() if source == "person" else None))
+    given = replace(given, masks=Located(masks, tmp_path), capture=stage)
+    found = run(given, Config(enabled=True, faultless=faultless), Context(tmp_path, tmp_path))
+    assert not found.registered and why in found.reason
 
 
 @pytest.mark.parametrize(("faultless", "why"), [(True, "a light stage"), (False, "too few landmarks")])
