@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from benchmarks.mutation import Mutation
 
+SUPPORTED = "tests/masks/test_masks_support_object.py"
+
 OF_ASSET = (
     # ---------------------------------------------------------------- registration of the head template
     Mutation("pipeline/registration/outgrown.py", ">= OUTSIDE * away", "<= OUTSIDE * away",
@@ -151,6 +153,20 @@ OF_ASSET = (
              "tests/masks/test_masks_refine_contour.py::test_an_affine_background_goes_on_behind_the_subject"),
     Mutation("stages/masks/refine_contour.py", "centre = mean - sx * x[..., None]",
              "centre = mean + sx * x[..., None]", "tests/masks/test_masks_refine_contour.py"),
+    Mutation("stages/masks/sources.py", "return of_object > of_person + BETTER", "return of_object > of_person - 1",
+             f"{SUPPORTED}::test_masks_that_contradict_each_other_are_no_person"),
+    Mutation("stages/masks/sources.py", "return of_object > of_person + BETTER", "return False",
+             f"{SUPPORTED}::test_masks_that_contradict_each_other_are_no_person"),
+    Mutation("stages/masks/support_object.py", "may_be = inside | silhouette_of_points(",
+             "may_be = inside & silhouette_of_points(",
+             f"{SUPPORTED}::test_a_smooth_base_without_points_is_of_the_object"),
+    Mutation("stages/masks/support_object.py", "low = height < bottom + BASE", "low = height > bottom + BASE",
+             f"{SUPPORTED}::test_a_smooth_base_without_points_is_of_the_object"),
+    Mutation("stages/masks/segment.py", "if config.resegment and _agreement(masked) >= MIN_AGREEMENT:",
+             "if config.resegment:",
+             "tests/masks/test_masks_stage.py::test_nothing_is_mended_by_a_hull_that_most_masks_contradict"),
+    Mutation("stages/template/judge.py", "s.startswith(\"object\")", "s == \"object\"",
+             "tests/template/test_template_stage.py::test_what_was_segmented_as_an_object_is_not_registered_by_default"),
     Mutation("stages/capture/colour_correction.py", "patches.colours / exposure", "patches.colours * exposure",
              "tests/capture/test_capture_colour_checker.py::test_of_a_cameras_charts_the_best_counts_at_its_photos_exposure"),
     Mutation("stages/capture/colour_correction.py", "@ m.T.astype(np.float32)", "@ m.astype(np.float32)",
