@@ -213,10 +213,15 @@ def write_exr(
 def _plane(values: F32, *, half: bool, step: float) -> npt.NDArray[Any]:
     """One channel as the writer needs it, in 16 or 32 bits a value."""
     if step:
-        values = (np.round(values / np.float32(step)) * np.float32(step)).astype(np.float32)
+        values = stepped(values, step)
     if half:
         return np.ascontiguousarray(values.clip(-HALF_MAX, HALF_MAX).astype(np.float16))
     return np.ascontiguousarray(values)
+
+
+def stepped(values: npt.NDArray[np.floating], step: float) -> F32:
+    """The nearest multiples of a step, a power of two: noise below it takes no room in a compressed file."""
+    return np.asarray(np.round(values / step) * step, np.float32)
 
 
 def read_exr(path: Path) -> tuple[F32, tuple[str, ...]]:

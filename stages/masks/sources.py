@@ -20,7 +20,7 @@ from stages.masks.segment_person import person_mask
 from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
-LOOKED_AT = 24  # views that are used for the choice: fewer leave a wrong hull without contradiction
+LOOKED_AT = 24  # views that are used for the choice: wrong masks of twelve can agree with each other
 PERSON_SHARE = 0.5  # of the centre of the region of interest that the network must classify as person
 PERSON_VIEWS = 0.9  # smallest share of such views: the network takes a statue for a person from some sides, but not all
 BETTER = 0.05  # of IoU with the hull: an object's masks must agree by so much better than the network's
@@ -81,21 +81,20 @@ def plan(
         return Plan("plate" if method == "plate" else "given")
     if model is not None and method == "auto":
         return Plan("model", model=model)
-    fitted = [v for v in bare if not v.holdout] or bare
-    some = fitted[:: -(-len(fitted) // LOOKED_AT)]
-    colours, small = _looked_at(some, min(longest, CHOICE_SIZE))
-    if method in ("auto", "key"):
-        background = find_background(colours)
-        if background is not None:
-            return Plan("key", background)
-        if method == "key":
-            raise StageError("the background is not of one colour", where="masks.method=key",
-                             value="the photos' borders differ in colour", limit="one colour around the subject, the "
-                             "same in all photos", remedy="use masks.method=auto, or give masks")  # fmt: skip
     if method in ("person", "grabcut"):
         return Plan(method)
     if method == "object":
         return _by_points(solid())
+    fitted = [v for v in bare if not v.holdout] or bare
+    some = fitted[:: -(-len(fitted) // LOOKED_AT)]
+    colours, small = _looked_at(some, min(longest, CHOICE_SIZE))
+    background = find_background(colours)
+    if background is not None:
+        return Plan("key", background)
+    if method == "key":
+        raise StageError("the background is not of one colour", where="masks.method=key",
+                         value="the photos' borders differ in colour", limit="one colour around the subject, the "
+                         "same in all photos", remedy="use masks.method=auto, or give masks")  # fmt: skip
     return _person_or_object(some, small, threshold, seed, solid)
 
 
@@ -119,7 +118,7 @@ def _person_or_object(
 ) -> Plan:
     """By what the network says of reduced photos (h, w, 3), and by whose masks agree."""
     persons = [
-        person_mask(i, v.disc.scaled(i.shape[1] / v.camera.width), threshold, max(i.shape), seed)
+        person_mask(i, v.disc.scaled(i.shape[1] / v.camera.width), threshold, max(i.shape[:2]), seed)
         for i, v in zip(images, views, strict=True)
     ]
     shares = [_share_of_centre(p, v) for p, v in zip(persons, views, strict=True)]
@@ -155,12 +154,12 @@ def _agrees_better(
     A network that takes a skull, or the carved hair of a statue, for a person is sure of itself in nearly every photo;
     its masks still contradict each other.
     """
-    cuts = [cut_by_points(i, v.camera, solid, max(i.shape), seed) for i, v in zip(images, views, strict=True)]
-    of_object, of_person = (_agreement(views, m, solid.roi_radius) for m in (cuts, persons))
+    cuts = [cut_by_points(i, v.camera, solid, max(i.shape[:2]), seed) for i, v in zip(images, views, strict=True)]
+    of_object, of_person = (_mean_iou(views, m, solid.roi_radius) for m in (cuts, persons))
     return of_object > of_person + BETTER
 
 
-def _agreement(views: Sequence[PhotoToMask], masks: Sequence[Bool], roi_radius: float) -> float:
+def _mean_iou(views: Sequence[PhotoToMask], masks: Sequence[Bool], roi_radius: float) -> float:
     """Mean over the views of the IoU of a mask (h, w) with the visual hull of all."""
     alphas = [m.astype(np.float32) for m in masks]
     found = opinions([v.camera for v in views], alphas, [True] * len(views), roi_radius, CHOICE_CELLS)

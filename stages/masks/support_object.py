@@ -2,8 +2,8 @@
 
 Symbols: points (N, 3) asset coordinates; R radius of the region of interest; plane n . x = o, n towards the cameras.
 The object is the largest connected group of points above the support plane (pipeline.support) within REACH of the
-region of interest. Its projected points give the silhouette. A smooth base has few points, or none: where the lowest
-points would fall onto the support the object may go on, and the photo decides.
+region of interest. Its projected points give the silhouette. A smooth base has few points, or none. So the object may
+go on between its lowest points and the support, and the photo decides.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ AROUND, REACH = 2.5, 1.6  # R: where the support is searched; how far the object
 LINK, COMPANY = 0.1, 4  # R: distance of connected points; fewest neighbours within it
 MIN_POINTS = 200
 STRAYS = 0.05  # share of the points that may lie below the lowest ones that count
-BASE, DROPS = 0.3, (0.0, 0.25, 0.5, 0.75)  # share of the points' height that is lowest; heights that these fall to
+BASE = 0.3  # share of the height of the points that is their lowest part
+LOWERED = (0.0, 0.25, 0.5, 0.75, 1.0)  # shares of a lowest point's height at which the base is looked for
 SPACING = 0.07  # R: gaps between projected points that are closed
 GREY = 6  # levels: a photo whose channels differ less is grey
 TEXTURE_PIXELS, TEXTURE_GAIN = 2.0, 6.0
@@ -65,7 +66,7 @@ def base_of(points: F64, support: Support | None) -> F64:
     height = points @ support.normal - support.offset
     bottom = float(np.quantile(height, STRAYS))
     low = height < bottom + BASE * (height.max() - bottom)
-    return np.concatenate([points[low] - (1 - t) * height[low, None] * support.normal for t in (*DROPS, 1.0)])
+    return np.concatenate([points[low] - (1 - t) * height[low, None] * support.normal for t in LOWERED])
 
 
 def _largest_cluster(points: F64, link: float) -> F64:

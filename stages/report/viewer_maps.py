@@ -32,7 +32,8 @@ def has_png(bake: Located[TextureSet], name: str) -> bool:
 
 
 def map_uris(bake: Located[TextureSet], name: str) -> list[str]:
-    """A map as PNG, one address a tile; every second, third, ... texel of a larger one, which keeps codes whole."""
+    """A map, one address a tile, no texel changed; every second, third, ... texel of a larger one, which keeps codes
+    whole."""
     texture, count = bake.artifact.maps[name], bake.artifact.tiles
     pictures = [read_encoded(bake.path(texture.files[tiles.form("png", t, count)])) for t in range(count)]
     return [exact_uri(_bytes(thinned(p))) for p in pictures]

@@ -1,7 +1,6 @@
-"""Quadric decimation (fast-simplification, MIT), and repair of the faults that it leaves.
+"""Quadric decimation (pipeline.decimation), and repair of the faults that it leaves.
 
-Symbols: a crowded edge has more than two faces. An edge collapse can pinch off a bubble, a small closed part that is
-joined at a ring of crowded edges. It is removed by cutting the mesh along those edges and keeping the largest part.
+A bubble is removed by cutting the mesh along crowded edges and keeping the largest part.
 """
 
 from __future__ import annotations
@@ -12,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
+from pipeline.decimation import is_crowded, largest_part, simplified, unit_box
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Indices, Mesh, split_apart
 
 AGGRESSIVENESS = (5.0, 3.0, 7.0, 2.0)  # tried in turn until the result is a manifold of the target size
 LOOP = 8  # edges of the largest hole that is closed
 ROUNDS = 4  # of removing bubbles
-UNIT = 1000.0  # the longest side of the box during decimation: its thresholds are absolute
 SAMPLE_SEED = 0
 NEAR = 12  # nearest points, and nearest centroids, of the other mesh: the distance to their triangles is computed
 SPREAD = 10  # points on the other mesh for each sample
@@ -38,12 +37,11 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     if len(dense.faces) <= target:
         return dense
     closed = meshes.topology(dense.faces, len(dense.vertices)).watertight
-    scale, origin = _scale(dense)
-    points = (dense.vertices.astype(np.float64) - origin) * scale
+    points, scale, origin = unit_box(dense.vertices)
     best: tuple[F64, Faces] | None = None
     opened: tuple[F64, Faces] | None = None
     for aggressiveness in AGGRESSIVENESS:
-        vertices, faces = _simplified(points, dense.faces, target, aggressiveness)
+        vertices, faces = simplified(points, dense.faces, target, aggressiveness)
         vertices, faces = split_apart(*without_bubbles(vertices, faces))
         if closed:  # after the removal of bubbles, holes with a simple border are left
             faces = filled(faces)
@@ -69,25 +67,12 @@ def decimated(dense: Mesh, target: int) -> Mesh:
     )
 
 
-def _scale(dense: Mesh) -> tuple[float, F64]:
-    low, high = dense.vertices.min(0).astype(np.float64), dense.vertices.max(0).astype(np.float64)
-    return UNIT / max(float((high - low).max()), 1e-30), low
-
-
-def _simplified(points: F64, faces: Faces, target: int, aggressiveness: float) -> tuple[F64, Faces]:
-    import fast_simplification
-
-    v, f = fast_simplification.simplify(points, faces, target_count=target, agg=aggressiveness)
-    return np.asarray(v, np.float64), np.asarray(f, np.int32)
-
-
 def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
     """Cut along crowded edges and keep the part with most faces, until none is crowded. Inputs (V, 3), (F, 3)."""
     for _ in range(ROUNDS):
-        label = _parts(faces, len(vertices))
-        if label is None:
+        if not is_crowded(faces, len(vertices)):
             break
-        faces = filled(faces[label == np.bincount(label).argmax()])
+        faces = filled(largest_part(faces, len(vertices)))
     v, f, _ = meshes.compact(vertices, faces)
     return np.asarray(v, np.float64), f
 
@@ -109,18 +94,6 @@ def filled(faces: Faces) -> Faces:
         if at == start and 3 <= len(loop) <= LOOP:
             added += [(loop[0], loop[i], loop[i + 1]) for i in range(1, len(loop) - 1)]
     return np.concatenate([faces, np.array(added, np.int32)]) if added else faces
-
-
-def _parts(faces: Faces, count: int) -> Indices | None:
-    """(F,) part of each face after a cut along crowded edges; None if there are none."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b, most = meshes.paired_edges(faces, count)
-    if most <= 2:
-        return None
-    graph = coo_array((np.ones(len(a), np.int8), (a % len(faces), b % len(faces))), shape=(len(faces), len(faces)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def normals_from(dense: Mesh, vertices: npt.NDArray[np.float32], faces: Faces) -> npt.NDArray[np.float32]:

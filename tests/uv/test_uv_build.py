@@ -332,7 +332,7 @@ def test_holes_that_met_in_a_vertex_are_closed(monkeypatch: pytest.MonkeyPatch) 
     around = np.flatnonzero((faces == shared).any(1))
     opposite = around[(centre[around] @ centre[around[0]]).argmin()]
     left = np.delete(faces, [around[0], opposite], axis=0)
-    monkeypatch.setattr(decimate, "_simplified", lambda *_: (np.asarray(whole.vertices, np.float64), left))
+    monkeypatch.setattr(decimate, "simplified", lambda *_: (np.asarray(whole.vertices, np.float64), left))
     dense = Mesh(fine.vertices.astype(np.float32), fine.vertex_normals.astype(np.float32), fine.faces.astype(np.int32))
     found = decimate.decimated(dense, len(faces))
     assert meshes.topology(found.faces, len(found.vertices)).manifold

@@ -123,14 +123,14 @@ def test_fragments_are_given_to_a_neighbour(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.slow
 def test_a_decimation_that_opens_the_mesh_is_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
     dense = surface_build(AnalyticField(sphere()), 24, quiet).mesh
-    simplified = decimate._simplified
+    simplified = decimate.simplified
 
     def torn(*given: object):
         v, f = simplified(*given)  # type: ignore[arg-type]
         far = np.setdiff1d(np.arange(len(f)), np.flatnonzero(np.isin(f, f[:1]).any(1)))
         return v, np.delete(f, far[:60], axis=0)  # a hole that is too wide to be filled
 
-    monkeypatch.setattr(decimate, "_simplified", torn)
+    monkeypatch.setattr(decimate, "simplified", torn)
     made = build(dense, Config(target_faces=800, proxy_faces=200, texture_size=256, padding=2), quiet)
     (opened,) = (f for f in made.findings if f.check == "opened")
     assert (

@@ -28,7 +28,7 @@ import numpy.typing as npt
 from pipeline import tiles
 from pipeline.colour import srgb_from_linear
 from pipeline.eyes.material import IOR, ROUGHNESS
-from pipeline.images import read_encoded, read_exr
+from pipeline.images import read_encoded, read_exr, stepped
 from pipeline.meshes import F32, Indices, Mask, split_at_seams, vertex_normals
 from stages.usd.write.eyes import EYES
 from stages.usd.write.mesh import UvSurface, tile_count
@@ -216,15 +216,11 @@ def _targets(vertex: Indices, rig: MeshRig, bent: list[F32], binary: _Binary) ->
         at = row[vertex[corner]]
         out.append(
             {
-                "POSITION": binary.sparse(corner, _stepped(shape.offsets[at], OFFSET_STEP), len(vertex)),
-                "NORMAL": binary.sparse(corner, _stepped(turned[at], TURN_STEP), len(vertex)),
+                "POSITION": binary.sparse(corner, stepped(shape.offsets[at], OFFSET_STEP), len(vertex)),
+                "NORMAL": binary.sparse(corner, stepped(turned[at], TURN_STEP), len(vertex)),
             }
         )
     return out
-
-
-def _stepped(values: npt.NDArray[np.floating], step: float) -> F32:
-    return np.asarray(np.round(values / step) * step, np.float32)
 
 
 def _index(count: int) -> type[np.uint16] | type[np.uint32]:
