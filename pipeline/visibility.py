@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from pipeline.transforms import inverse_rigid, matrix, project
 
 LIFT = 2e-3  # of the mesh's size: rays start this far above it, against self-occlusion of facets
 MIN_ALPHA = 0.5
+KEPT = 200_000_000  # bytes of masks that stay in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +105,9 @@ def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occlude
         framed = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
     live = np.flatnonzero((cosine > 0) & framed)
     if view.mask is not None:
-        live = live[picked(_alpha(view.mask), camera, uv[live]) > MIN_ALPHA]
+        live = live[picked(_MASKS.inside(view.mask), camera, uv[live])]
     if view.asked is not None:  # elsewhere the subject is not fitted, so that its colours there mean nothing
-        live = live[picked(_alpha(view.asked), camera, uv[live]) > MIN_ALPHA]
+        live = live[picked(_MASKS.inside(view.asked), camera, uv[live])]
     start = points[live] + LIFT * occluder.span * normals[live]
     out = np.zeros(len(points))
     if len(live):
@@ -119,7 +122,32 @@ def picked(image: npt.NDArray[Any], camera: Camera, uv: F64) -> npt.NDArray[Any]
     return np.asarray(image[row, column])
 
 
-def _alpha(mask: Path) -> npt.NDArray[np.float32]:
-    from pipeline.images import read_alpha
+class _Masks:
+    """What masks cover, one byte a pixel; the ones that were used last are kept, because every set of points asks all
+    photos again."""
 
-    return read_alpha(mask)
+    def __init__(self, most: int) -> None:
+        self._most, self._bytes, self._lock = most, 0, Lock()
+        self._kept: OrderedDict[tuple[Path, int, int], Mask] = OrderedDict()
+
+    def inside(self, path: Path) -> Mask:
+        """(H, W) where the mask's alpha is above MIN_ALPHA."""
+        from pipeline.images import read_alpha
+
+        found = path.stat()
+        key = path, found.st_mtime_ns, found.st_size
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+        inside: Mask = read_alpha(path) > MIN_ALPHA
+        with self._lock:
+            if key not in self._kept:
+                self._kept[key] = inside
+                self._bytes += inside.nbytes
+            while self._bytes > self._most:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return inside
+
+
+_MASKS = _Masks(KEPT)

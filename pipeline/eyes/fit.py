@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.eyes.ball import IRIS, RADIUS, SPREAD, Eye, sphere_on, turned
 from pipeline.eyes.iris import LEAST_PIXELS, Iris, find_iris
-from pipeline.eyes.picture import directions_at, plane, shown_between_lids, sights
+from pipeline.eyes.picture import directions_at, photos_of, plane, shown_between_lids, sights
 from pipeline.meshes import F64
 from pipeline.registration.scan import Scan
 from pipeline.visibility import FittedPhoto, Occluder
@@ -42,10 +42,13 @@ def fitted_eyes(
 ) -> dict[str, FittedBall]:
     """By part. balls: the vertices (n, 3) of the template's eyes where the skin puts them; axes (3, 3): rows to the
     person's left, up, front; lids: the head without its eyes; unit: world units of one metre."""
-    first = {name: _ball(ball, axes, scan, views, lids, unit, RADIUS * unit, SPREAD) for name, ball in balls.items()}
+    starts = {name: _start(ball, axes, unit, RADIUS * unit) for name, ball in balls.items()}
+    photos = {name: photos_of(eye, views, lids, SIDE) for name, eye in starts.items()}
+    first = {name: _ball(eye, scan, photos[name], lids, unit, SPREAD) for name, eye in starts.items()}
     radius = float(np.mean([eye.radius for eye, _ in first.values()])) if first else 0.0
-    same = {name: _ball(ball, axes, scan, views, lids, unit, radius, ALIKE) for name, ball in balls.items()}
-    return paired({name: _with_iris(eye, off, views, lids, unit) for name, (eye, off) in same.items()})
+    starts = {name: _start(ball, axes, unit, radius) for name, ball in balls.items()}
+    same = {name: _ball(eye, scan, photos[name], lids, unit, ALIKE) for name, eye in starts.items()}
+    return paired({name: _with_iris(eye, off, photos[name], lids, unit) for name, (eye, off) in same.items()})
 
 
 def unseen_eye(ball: F64, axes: F64, unit: float, reason: str) -> FittedBall:
@@ -69,26 +72,29 @@ def paired(found: Mapping[str, FittedBall]) -> dict[str, FittedBall]:
     return {name: replace(f, eye=replace(f.eye, iris=iris)) for name, f in found.items()}
 
 
-def _ball(
-    ball: F64, axes: F64, scan: Scan, views: Sequence[FittedPhoto], lids: Occluder, unit: float, radius: float,
-    spread: float,
-) -> tuple[Eye, float]:  # fmt: skip
-    """The ball on the fitted surface where it is seen between the lids, and the surface's median distance from it.
-    ball (n, 3): where the skin puts it; radius: the usual one, spread: its deviation in metres."""
+def _start(ball: F64, axes: F64, unit: float, radius: float) -> Eye:
+    """An eye of this radius whose front is that of a ball (n, 3) where the skin puts it."""
     middle = 0.5 * (ball.min(0) + ball.max(0))
     own = float(np.linalg.norm(ball - middle, axis=1).mean())
-    start = middle + (own - radius) * axes[2]  # its front stays where it is
-    eye, off = Eye(start, radius, axes, IRIS * unit), 0.0
+    return Eye(middle + (own - radius) * axes[2], radius, axes, IRIS * unit)
+
+
+def _ball(
+    start: Eye, scan: Scan, views: Sequence[FittedPhoto], lids: Occluder, unit: float, spread: float
+) -> tuple[Eye, float]:
+    """The ball on the fitted surface where it is seen between the lids, and the surface's median distance from it.
+    spread: deviation of its radius from that of the start, metres."""
+    eye, off = start, 0.0
     for _ in range(2):
         directions = directions_at(plane(SIDE)[shown_between_lids(eye, views, lids, SIDE)])
         if not len(directions):
             break
-        normals = directions @ axes
+        normals = directions @ eye.axes
         points = eye.points(directions)
         signed, weight = scan.along(points, normals, REACH * unit)
         use = np.isfinite(signed) & (weight > 0)
         there = points[use] + signed[use, None] * normals[use]
-        centre, size = sphere_on(there, weight[use], start, radius, unit, spread)
+        centre, size = sphere_on(there, weight[use], start.centre, start.radius, unit, spread)
         eye = replace(eye, centre=centre, radius=size)
         away = np.abs(np.linalg.norm(there - centre, axis=1) - size)
         off = float(np.median(away)) if len(away) else 0.0

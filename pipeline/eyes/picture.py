@@ -99,6 +99,11 @@ def shown_between_lids(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, s
     return np.asarray(np.any([s.cosine > 0 for s in best] or [np.zeros(side * side, bool)], 0).reshape(side, side))
 
 
+def photos_of(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) -> tuple[FittedPhoto, ...]:
+    """The photos that show the eye best; for an eye that is moved a little afterwards, only these need to be asked."""
+    return tuple(views[s.row] for s in _best_sights(eye, views, lids, side))
+
+
 def sights(eye: Eye, views: Sequence[FittedPhoto], lids: Occluder, side: int) -> Sights:
     """What the photos show of the eye between the lids (a mesh without the eye)."""
     best = _best_sights(eye, views, lids, side)

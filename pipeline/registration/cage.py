@@ -89,6 +89,33 @@ def cage_of(template: Template) -> Cage:
     )  # fmt: skip
 
 
+def part_of(cage: Cage, keep: Mask) -> Cage:
+    """The cage of some vertices keep (V,): with the quads, points and springs that need no other."""
+    number = np.cumsum(keep) - 1
+    own, points, springs = keep[cage.quads].all(1), points_of(cage, keep), rows_within(cage.difference, keep)
+
+    def cut(matrix: csr_array, rows: Indices) -> csr_array:
+        return csr_array(matrix[rows][:, np.flatnonzero(keep)])
+
+    return Cage(
+        cage.of_template[keep], number[cage.quads[own]], cage.region[own], cage.names,
+        cage.finer[:0], csr_array((0, int(keep.sum()))),
+        cut(cage.stencil, points), cut(cage.along, points), cut(cage.across, points),
+        cage.shown[points], cage.loose[points], cage.grows[points], cut(cage.difference, springs),
+        cage.stiffness[springs],
+    )  # fmt: skip
+
+
+def points_of(cage: Cage, keep: Mask) -> Indices:
+    """Rows of the limit points that depend on the vertices keep (V,) alone."""
+    return rows_within(cage.stencil, keep)
+
+
+def rows_within(matrix: csr_array, keep: Mask) -> Indices:
+    """Rows of a sparse matrix whose entries are all in columns keep (V,)."""
+    return np.flatnonzero(abs(matrix) @ (~keep).astype(np.float64) == 0)
+
+
 def _regions(template: Template, names: tuple[str, ...]) -> Indices:
     """(Q,) index into names of each quad of the template, -1 for none."""
     out = np.full(len(template.quads), -1, np.int64)

@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.meshes import F64, Faces, Indices, Mask, area_vectors, triangles_of, unique_edges, unit
-from pipeline.ray_casting import RayCaster
+from pipeline.meshes import F64, Faces, Indices, Mask, triangles_of, unique_edges
+from pipeline.registration.crossing_kernels import crossing
 
 LEAST = 0.1  # cosine between the corner's normal and that of the turned rest
-CLEAR = 0.02  # share of an edge at each end in which a hit is its own corner
-GRAZING = 1e-4  # cosine: an edge in the plane of a triangle does not pierce it
-PASSES = 4  # hits along an edge that are looked at
 SHORT = 0.05  # corner areas below this share of the rest's are degenerate
 
 
@@ -41,27 +38,8 @@ def _corners(x: F64, quads: Indices) -> F64:
 def piercing_edges(vertices: F64, faces: Faces) -> Indices:
     """(N, 2) edges of triangles (F, 3) that pass through a triangle that they do not touch. Two triangles that cross do
     so at an edge of one of them. Coplanar overlaps are not found."""
-    f = np.asarray(faces, np.int64)
-    ends = unique_edges(faces)
-    caster = RayCaster(vertices, faces)
-    way = vertices[ends[:, 1]] - vertices[ends[:, 0]]
-    length = np.linalg.norm(way, axis=1)
-    live = np.flatnonzero(length > 1e-6 * caster.span)
-    direction = way / np.maximum(length, 1e-30)[:, None]
-    at = CLEAR * length
-    pierced, facing = np.zeros(len(ends), np.bool_), unit(area_vectors(vertices, faces))
-    for _ in range(PASSES):
-        start = vertices[ends[live, 0]] + at[live, None] * direction[live]
-        far, hit = caster.hits(start, direction[live])
-        at[live] += far
-        near = at[live] < (1 - CLEAR) * length[live]
-        live, hit = live[near], hit[near]
-        own = (f[hit][:, :, None] == ends[live][:, None, :]).any((1, 2))
-        own |= np.abs((facing[hit] * direction[live]).sum(1)) < GRAZING
-        pierced[live[~own]] = True
-        live = live[own]
-        at[live] += CLEAR * length[live]
-    return np.asarray(ends[pierced], np.int64)
+    f, ends = np.asarray(faces, np.int64), unique_edges(faces)
+    return np.asarray(ends[crossing(np.asarray(vertices, np.float64), f, ends)], np.int64)
 
 
 def pierced_quads(points: F64, fine: Indices) -> Indices:

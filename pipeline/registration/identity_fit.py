@@ -28,7 +28,8 @@ from pipeline.transforms import apply, scale_of, similarity, umeyama
 
 LANDMARK_SIGMA = 0.003  # metres: scatter of the network's landmarks around the template's, on persons and scans
 MAX_RESIDUAL = 0.006  # metres, median: a template whose landmarks are further off does not fit this face
-ROUNDS = 12  # Gauss-Newton steps; 6 are enough on all captures
+ROUNDS = 12  # Gauss-Newton steps at most; 6 are enough on all captures
+STILL = 1e-7  # radians, metres and deviations: a smaller step is the last
 SOFT = 2.0  # sigmas at which a datum has half of its weight
 MIN_DATA = 8  # landmarks: fewer do not determine a similarity well
 SAMPLES = 200  # fours of landmarks: one of 16 is right if half of the landmarks are
@@ -108,12 +109,14 @@ def place(template: Template, data: tuple[Data, ...], start: PlacedHead | None =
         world, weights = start.world_from_template, start.weights
     basis = None if template.shape is None else template.shape.basis * template.shape.deviation[:, None, None]
     weights = np.zeros(0) if basis is None else np.resize(weights, len(basis)) if len(weights) else np.zeros(len(basis))
-    normal = np.eye(7 + len(weights))
+    normal, moves = np.eye(7 + len(weights)), [_moves(basis, part) for part in data]
     for _ in range(ROUNDS):
-        normal, right = _normal_equations(template, basis, data, world, weights)
+        normal, right = _normal_equations(template, moves, data, world, weights)
         step: F64 = np.asarray(np.linalg.solve(normal, right), np.float64)
         weights = weights + np.clip(step[7:], -STEP, STEP)
         world = _turned(world, step[:7])
+        if np.abs(step).max() < STILL:
+            break
     vertices = apply(world, template.identity(weights))
     residual = np.linalg.norm(_residual(template, every, world, weights)[0], axis=1)
     # the covariance is the inverse of the normal matrix; robust weights are taken as they are
@@ -163,24 +166,31 @@ def _residual(template: Template, data: Data, world: F64, weights: F64) -> tuple
     return np.asarray((shape[data.corners] * data.weights[..., None]).sum(1) - there, np.float64), there
 
 
+def _moves(basis: F64 | None, data: Data) -> F64:
+    """(N, 3, K) how each identity weight moves the template's points of N data. basis (K, V, 3)."""
+    if basis is None:
+        return np.zeros((len(data.where), 3, 0))
+    return np.asarray(np.einsum("knci,nc->nik", basis[:, data.corners], data.weights, order="C"), np.float64)
+
+
 def _normal_equations(
-    template: Template, basis: F64 | None, data: tuple[Data, ...], world: F64, weights: F64
+    template: Template, moves: list[F64], data: tuple[Data, ...], world: F64, weights: F64
 ) -> tuple[F64, F64]:
-    """Normal matrix and right side for (rotation, translation, log scale, identity), in the template's frame."""
+    """Normal matrix and right side for (rotation, translation, log scale, identity), in the template's frame. moves: of
+    each part of the data, see `_moves`."""
     size = 7 + len(weights)
     left, right = np.zeros((size, size)), np.zeros(size)
     left[range(7, size), range(7, size)] = 1.0
     right[7:] = -weights
     turn = world[:3, :3] / scale_of(world)
-    for part in data:
+    for part, moved in zip(data, moves, strict=True):
         r, there = _residual(template, part, world, weights)
         J = np.zeros((len(r), 3, size))
         # a small similarity of the world's points: y' = y + omega x y + tau + sigma y, and r = v - y'
         J[:, :, 0:3] = _cross(there)
         J[:, :, 3:6] = -np.eye(3)
         J[:, :, 6] = -there
-        if basis is not None:
-            J[:, :, 7:] = np.einsum("knci,nc->nik", basis[:, part.corners], part.weights)
+        J[:, :, 7:] = moved
         if part.normals is None:
             inlier = 1 / (1 + (np.linalg.norm(r, axis=1) / (SOFT * part.sigma)) ** 2)
             A, b = J.reshape(-1, size), r.ravel()

@@ -21,13 +21,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csr_array, diags_array
+from scipy.spatial import cKDTree
 
-from pipeline.meshes import F64, Indices
-from pipeline.registration.cage import Cage
+from pipeline.meshes import F64, Indices, Mask
+from pipeline.registration.cage import Cage, part_of, points_of, rows_within
 from pipeline.registration.cage_kernels import solved
 from pipeline.registration.folds import folded_quads, pierced_quads
-from pipeline.registration.outgrown import outgrown
+from pipeline.registration.outgrown import DRIFT, candidates, outgrown
 from pipeline.registration.scan import Scan
 
 # stiffness c, and metres of the template within which a pair counts; each for ROUNDS turns
@@ -40,6 +41,9 @@ LANDMARK = 1.0  # h_l over c of the same step: landmarks guide, and let go with 
 FIXED = 1e-6  # of c: keeps the system positive definite where nothing else does
 TOLERANCE, MOST = 0.01, 200  # of the solver: of the residual at its start, which the last round left; steps
 REPAIRS, DAMPING = 5, 4.0  # rounds of repair, and factor of the damping around a fault in each
+FAULT, EDGE = 2, 3  # rings around a fault that are damped; around what a repair moves, that it needs
+FREE = 0.03  # metres of the template around a fault that a repair moves
+HELD = 1e6  # of c: keeps what a repair does not move
 
 
 Steps = tuple[tuple[float, float], ...]
@@ -69,53 +73,86 @@ class Fitted:
 
 def fitted(cage: Cage, rest: F64, scan: Scan, guides: Guides, unit: float, check: Callable[[], None]) -> Fitted:
     """The cage with rest (V, 3) on the scan. unit: world units per metre of the template."""
-    damping = np.ones(len(rest))
-    near = _around(cage)
-    start, _ = _steps(cage, rest, rest, scan, guides, damping, unit, STEPS[:AGAIN], check)
-    repairs = 0
+    damping, everything = np.ones(len(rest)), np.ones(len(rest), np.bool_)
+    near, edges = _around(cage), cage.difference @ rest
+    whole = _Part(cage, rest, guides, candidates(cage.points(rest)[cage.grows], scan, DRIFT, unit), everything)
+    start = _steps(whole, rest, scan, damping, unit, STEPS[:AGAIN], check)
+    x, repairs = _steps(whole, start, scan, damping, unit, STEPS[AGAIN:], check), 0
     while True:
-        x, turn = _steps(cage, rest, start, scan, guides, damping, unit, STEPS[AGAIN:], check)
+        turn = rotations(cage, edges, cage.difference @ x, near)
         folded, pierced = folded_quads(rest, x, turn, cage.quads), pierced_quads(cage.at_finer @ x, cage.finer) > 0
         if not (folded | pierced).any() or repairs == REPAIRS:
             return Fitted(x, turn, int(folded.sum()), int(pierced.sum()), repairs)
         repairs += 1
-        hit = np.zeros(len(rest))
-        hit[cage.quads[folded | pierced]] = 1
-        damping = damping * np.where(near @ (near @ hit) > 0, DAMPING, 1.0)
+        hit = np.zeros(len(rest), np.bool_)
+        hit[cage.quads[folded | pierced]] = True
+        damping = damping * np.where(_grown(hit, near, FAULT), DAMPING, 1.0)
+        free = _with_guides(cKDTree(rest[hit]).query(rest)[0] < FREE * unit, guides)
+        part, keep = _part(whole, scan, np.where(free[:, None], start, x), free, _grown(free, near, EDGE), unit)
+        x = x.copy()
+        x[keep] = _steps(part, np.where(free[:, None], start, x)[keep], scan, damping[keep], unit, STEPS[AGAIN:], check)
 
 
-def _steps(
-    cage: Cage,
-    rest: F64,
-    x: F64,
-    scan: Scan,
-    guides: Guides,
-    damping: F64,
-    unit: float,
-    steps: Steps,
-    check: Callable[[], None],
-) -> tuple[F64, F64]:
-    """x (V, 3) after the steps, and the rotations there (V, 3, 3). damping (V,) >= 1: how much less the data
-    count there, and how much stiffer it is."""
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """cage of some vertices, or of all; rest (V, 3) and guides of these. among: vertices of the surface that may pull
+    it; free (V,): those that move."""
+
+    cage: Cage
+    rest: F64
+    guides: Guides
+    among: Indices
+    free: Mask
+
+
+def _part(whole: _Part, scan: Scan, x: F64, free: Mask, keep: Mask, unit: float) -> tuple[_Part, Mask]:
+    """The part of the vertices keep (V,), of which those of free (V,) move; x (V, 3) the whole. A vertex of the surface
+    whose nearest place is elsewhere does not pull the part."""
+    points, rows = whole.cage.points(x), points_of(whole.cage, keep)
+    own = np.zeros(len(points), np.bool_)
+    own[rows] = True
+    _, nearest = cKDTree(points).query(scan.mesh.vertices[whole.among])
+    guides, use = whole.guides, rows_within(whole.guides.stencil, keep)
+    some = Guides(csr_array(guides.stencil[use][:, np.flatnonzero(keep)]), guides.where[use], guides.least[use])
+    among = whole.among[own[nearest]]
+    return _Part(part_of(whole.cage, keep), whole.rest[keep], some, among, free[keep]), keep
+
+
+def _with_guides(some: Mask, guides: Guides) -> Mask:
+    """(V,) some vertices and those that a guide joins to them: closed lids move together."""
+    joined = abs(guides.stencil)
+    return np.asarray(some | (joined.T @ (joined @ some.astype(np.float64)) > 0), np.bool_)
+
+
+def _grown(some: Mask, near: csr_array, rings: int) -> Mask:
+    """(V,) some vertices and so many rings of neighbours."""
+    for _ in range(rings):
+        some = np.asarray(near @ some.astype(np.float64) > 0, np.bool_)
+    return some
+
+
+def _steps(part: _Part, x: F64, scan: Scan, damping: F64, unit: float, steps: Steps, check: Callable[[], None]) -> F64:
+    """x (V, 3) after the steps. damping (V,) >= 1: how much less the data count there, and how much stiffer it is."""
+    cage, rest, guides = part.cage, part.rest, part.guides
     around, edges = _around(cage), cage.difference @ rest
     size = abs(guides.stencil)
     less = (size @ np.ones(len(x))) / np.maximum(size @ damping, 1e-30)
     trust = 1 / (cage.stencil @ damping)
     cage = replace(cage, stiffness=cage.stiffness * 0.5 * (abs(cage.difference) @ damping))
-    fixed = csr_array(eye_array(len(x), format="csr"))
-    springs = csr_array(cage.difference.T @ diags_array(cage.stiffness) @ cage.difference)
+    held = np.where(part.free, FIXED, HELD)
+    springs = csr_array(cage.difference.T @ diags_array(cage.stiffness) @ cage.difference + diags_array(held))
     for c, reach in steps:
         pull = csr_array(guides.stencil.T @ diags_array(less * np.maximum(LANDMARK * c, guides.least)))
-        alike = csr_array(c * springs + c * FIXED * fixed + pull @ guides.stencil)
+        alike = csr_array(c * springs + pull @ guides.stencil)
         for _ in range(ROUNDS):
             check()
             turn = rotations(cage, edges, cage.difference @ x, around)
-            found = _data(cage, x, scan, trust, reach * unit, unit)
-            right = c * (_rigid_right(cage, edges, turn) + FIXED * x) + pull @ guides.where
+            found = _data(cage, x, scan, trust, reach * unit, unit, part.among)
+            right = c * (_rigid_right(cage, edges, turn) + held[:, None] * x) + pull @ guides.where
             stencil = csr_array(cage.stencil[found.rows])
             right = right + stencil.T @ ((found.weight * found.offset)[:, None] * found.normals)
             x, _ = solved(alike, stencil, found.normals, found.weight, np.ascontiguousarray(right), x, TOLERANCE, MOST)
-    return x, rotations(cage, edges, cage.difference @ x, around)
+    return x
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,19 +165,20 @@ class _Data:
     rows: Indices
 
 
-def _data(cage: Cage, x: F64, scan: Scan, trust: F64, reach: float, unit: float) -> _Data:
+def _data(cage: Cage, x: F64, scan: Scan, trust: F64, reach: float, unit: float, among: Indices) -> _Data:
     far = reach if scan.beneath is None else max(reach, STEPS[0][1] * unit)
-    pairs = scan.pairs(cage.points(x), cage.normals(x), far)
-    limit = np.where(pairs.hair, far, np.where(cage.loose, min(LOOSE_REACH * unit, reach), reach))
-    weight = trust * pairs.weight / (1 + (pairs.distance / (SOFT * limit)) ** 2)
-    weight[~cage.shown | (pairs.distance > limit)] = 0.0
-    rows = np.flatnonzero(weight > 1e-5)
-    more = outgrown(cage.points(x), cage.normals(x), cage.grows, scan, unit)
-    normals = np.concatenate([pairs.normals[rows], more.directions])
-    where = np.concatenate([pairs.where[rows], more.where])
+    points, facing, shown = cage.points(x), cage.normals(x), np.flatnonzero(cage.shown)
+    pairs = scan.pairs(points[shown], facing[shown], far)
+    limit = np.where(pairs.hair, far, np.where(cage.loose[shown], min(LOOSE_REACH * unit, reach), reach))
+    weight = trust[shown] * pairs.weight / (1 + (pairs.distance / (SOFT * limit)) ** 2)
+    weight[pairs.distance > limit] = 0.0
+    use = np.flatnonzero(weight > 1e-5)
+    more = outgrown(points, facing, cage.grows, scan, unit, among)
+    normals = np.concatenate([pairs.normals[use], more.directions])
+    where = np.concatenate([pairs.where[use], more.where])
     return _Data(
-        np.concatenate([weight[rows], trust[more.rows] * more.weight]), normals, (normals * where).sum(1),
-        np.concatenate([rows, more.rows]),
+        np.concatenate([weight[use], trust[more.rows] * more.weight]), normals, (normals * where).sum(1),
+        np.concatenate([shown[use], more.rows]),
     )  # fmt: skip
 
 

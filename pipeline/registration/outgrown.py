@@ -24,6 +24,7 @@ COVERED, REACH = 0.0015, 0.015  # metres of the template
 OUTSIDE = 0.6  # cosine
 SEEN = 0.05  # least sum of cosines of a point that counts
 MOST = 20_000  # points of the surface that are asked
+DRIFT = 0.02  # metres of the template that an ear moves while it is deformed
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +38,14 @@ class Outgrown:
     weight: F64
 
 
-def outgrown(points: F64, normals: F64, grows: Mask, scan: Scan, scale: float) -> Outgrown:
+def outgrown(
+    points: F64, normals: F64, grows: Mask, scan: Scan, scale: float, among: Indices | None = None
+) -> Outgrown:
     """Of the template's points (M, 3) with unit normals (M, 3), those that the surface outgrows. grows (M,): those of
-    regions that may grow; scale: world units per metre of the template."""
-    asked = _around(points[grows], scan, REACH * scale)
+    regions that may grow; scale: world units per metre of the template. among: vertices of the surface outside of which
+    none is asked (`candidates`); None: all."""
+    among = candidates(points[grows], scan, 0.0, scale) if among is None else among
+    asked = _around(points[grows], scan, REACH * scale, among)
     if not len(asked):
         return Outgrown(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     q = scan.mesh.vertices[asked].astype(np.float64)
@@ -66,14 +71,19 @@ def growing(points: F64, ears: Mask) -> Mask:
     return np.asarray(ears & (cKDTree(points[~ears]).query(points)[0] > ROOT), np.bool_)
 
 
-def _around(points: F64, scan: Scan, reach: float) -> Indices:
-    """At most MOST vertices of the scan that are seen and lie within `reach` of the points."""
+def candidates(points: F64, scan: Scan, drift: float, scale: float) -> Indices:
+    """Vertices of the scan that are seen and can pull one of the points (M, 3) while these move by at most `drift`
+    metres of the template."""
     seen = np.flatnonzero(scan.seen > SEEN)
-    seen = seen[_in_boxes(scan.mesh.vertices[seen], points, reach)]
-    if not len(points) or not len(seen):
+    return np.asarray(seen[_in_boxes(scan.mesh.vertices[seen], points, (REACH + drift) * scale)], np.int64)
+
+
+def _around(points: F64, scan: Scan, reach: float, among: Indices) -> Indices:
+    """At most MOST vertices of the scan, of some (n,), that lie within `reach` of the points."""
+    if not len(points) or not len(among):
         return np.zeros(0, np.int64)
-    near = np.isfinite(cKDTree(points).query(scan.mesh.vertices[seen], distance_upper_bound=reach)[0])
-    rows = seen[near]
+    near = np.isfinite(cKDTree(points).query(scan.mesh.vertices[among], distance_upper_bound=reach)[0])
+    rows = among[near]
     return np.asarray(rows[:: max(1, -(-len(rows) // MOST))], np.int64)
 
 

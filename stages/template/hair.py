@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -62,13 +62,13 @@ def under_hair(scan: Scan, hair: ToldHair) -> Scan:
     """The scan as the registration takes it: hair is unseen, and the skin lies beneath it."""
     if not hair.inside.any():
         return scan
-    return replace(scan, seen=np.where(hair.inside, 0.0, scan.seen), beneath=hair.beneath)
+    return scan.shown_as(np.where(hair.inside, 0.0, scan.seen), hair.beneath)
 
 
 def _of_the_face(template: Template, landmarks: F64, placed: PlacedHead, scan: Scan) -> PlacedHead:
     """The identity that the face alone makes probable: no hair pulls the skull."""
     face = on_face(scan.mesh.vertices.astype(np.float64), scan.mesh.normals, landmarks)
-    alone = replace(scan, seen=np.where(face, scan.seen, 0.0))
+    alone = scan.shown_as(np.where(face, scan.seen, 0.0))
     pairs = surface_data(template, placed, alone, FACE_REACH)
     return place(template, (landmark_data(template, landmarks), pairs), placed) if len(pairs.where) else placed
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.contract import Context
-from pipeline.images import read_encoded, read_exr, write_png
+from pipeline.images import read_alpha, read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.visibility import FittedPhoto, Occluder, best_cosine, view_cosines
 from stages.bake.build import Baked, Baker
@@ -204,3 +204,27 @@ def test_distances_to_a_mesh_by_hand() -> None:
     assert np.allclose(found[:2], 2 * length[:2], rtol=1e-5) and np.isinf(found[2:]).all()
     from_between = Occluder(mesh).distances(np.array([[0, 0, -1.0], [0, 0, -1]]), np.array([[0, 0, -1.0], [0, 0, 1]]))
     assert np.allclose(from_between, [2, 1], rtol=1e-5)
+
+
+def test_masks_that_were_read_are_kept_up_to_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import pipeline.images
+    from pipeline.visibility import _Masks
+
+    read: list[str] = []
+
+    def counted(path: Path) -> np.ndarray:
+        read.append(path.name)
+        return read_alpha(path)
+
+    monkeypatch.setattr(pipeline.images, "read_alpha", counted)
+    halves = np.zeros((3, 40, 50), np.float32)
+    halves[0, :20], halves[1, 20:], halves[2, :, :25] = 1, 1, 0.6
+    paths = [tmp_path / f"{i}.png" for i in range(3)]
+    for path, image in zip(paths, halves, strict=True):
+        write_png(path, image)
+    kept = _Masks(most=2 * 40 * 50)
+    for i in (0, 1, 0, 1, 2, 1, 0):  # of three, the one that was used longest ago is dropped
+        np.testing.assert_array_equal(kept.inside(paths[i]), halves[i] > 0.5)
+    assert read == ["0.png", "1.png", "2.png", "0.png"]
+    write_png(paths[0], 1 - np.tile(halves[0], (2, 1)))
+    assert kept.inside(paths[0]).shape == (80, 50) and not kept.inside(paths[0])[0].any()

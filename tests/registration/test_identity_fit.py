@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.errors import StageError
 from pipeline.meshes import F64, vertex_normals
-from pipeline.registration.identity_fit import Data, PlacedHead, _normal_equations, landmark_data, place
+from pipeline.registration.identity_fit import Data, PlacedHead, _moves, _normal_equations, landmark_data, place
 from pipeline.template.load import load_template
 from pipeline.transforms import apply, similarity
 
@@ -86,7 +86,7 @@ def test_the_normal_equations_are_those_of_finite_differences() -> None:
     basis = TEMPLATE.shape.basis * TEMPLATE.shape.deviation[:, None, None]
     weights = np.zeros(len(basis))
     world = similarity(1.5, Rotation.from_euler("xyz", [0.38, -1.05, 0.22]).as_matrix(), np.array([0.29, -0.2, 1.1]))
-    _, right = _normal_equations(TEMPLATE, basis, (marks,), world, weights)
+    _, right = _normal_equations(TEMPLATE, [_moves(basis, marks)], (marks,), world, weights)
 
     def residuals(step: F64) -> F64:
         turn = similarity(float(np.exp(step[6])), Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6])

@@ -60,3 +60,18 @@ def test_under_hair_only_what_lies_outside_counts() -> None:
     np.testing.assert_allclose(sunk, [0.004, 0.001, 0, 0], atol=1e-6)
     assert not Scan(ball, np.ones(len(hair))).over(points, way, 0.02).any()
     assert not scan.over(10 * points, way, 0.02).any()
+
+
+def test_a_surface_that_is_seen_otherwise_answers_as_a_new_one() -> None:
+    ball = ball_scan(0.1)
+    first = Scan(ball, np.ones(len(ball.vertices)))
+    seen, beneath = (ball.vertices[:, 0] > 0).astype(float), np.where(ball.vertices[:, 1] > 0, 0.002, 0.0)
+    points = 1.02 * ball.vertices[::7].astype(float)
+    normals = ball.normals[::7].astype(float)
+    same, new = (
+        first.shown_as(seen, beneath).pairs(points, normals, 0.01),
+        Scan(ball, seen, beneath).pairs(points, normals, 0.01),
+    )
+    for a, b in ((same.where, new.where), (same.weight, new.weight), (same.hair, new.hair)):
+        np.testing.assert_array_equal(a, b)
+    assert first.beneath is None and (first.seen == 1).all()
