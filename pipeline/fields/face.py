@@ -33,13 +33,16 @@ CHUNK = 131_072
 
 
 class FaceModel(nn.Module):
-    """Geometry, appearance, light and calibration of one capture. `beta` is the width of the Laplace density.
+    """Geometry, appearance, light and calibration of one capture. `beta` is the width of the Laplace density. `level`:
+    asset units, where the surface is for the stages after the fit (stages.inverse_rendering.outline_level); pictures of
+    the model do not depend on it.
 
     `shade` is the rendering equation [NeuFace eq. 1] in closed form; shadows and interreflections only if `shadowing`
     is on. The order in which the parts are constructed determines their random initialisation and the file.
     """
 
     beta: Tensor
+    level: Tensor
 
     def __init__(self, spec: FaceSpec, geometry: Geometry) -> None:
         super().__init__()
@@ -59,6 +62,7 @@ class FaceModel(nn.Module):
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
         self.uniform_albedo = False  # one albedo for all points, while the light is estimated
         self.register_buffer("beta", torch.tensor(geometry.cell))
+        self.register_buffer("level", torch.tensor(0.0))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor, stations: Stations | None = None) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]. stations: the cameras,
@@ -132,6 +136,7 @@ def load_model(path: Path, device: str = "cpu") -> FaceModel:
         )
     cell = float(spec.pop("cell"))
     known = FaceSpec.from_stored(spec)
+    arrays.setdefault("level", torch.tensor(0.0))  # files from before there was one
     model = FaceModel(known, build.system_of(known).geometry(known, arrays, cell))
     model.load_state_dict(arrays)
     return model.to(device)
@@ -196,9 +201,9 @@ class FittedField:
         return tuple(np.concatenate(p) for p in zip(*out, strict=True))
 
     def sdf_and_gradient(self, points: F32) -> tuple[F32, F32]:
-        """SDF (N,) and gradient (N, 3) at points (N, 3)."""
+        """SDF (N,) and gradient (N, 3) at points (N, 3); the SDF is 0 on the surface that the model's `level` says."""
         s, g = self._map(self.model.geometry, points)
-        return s, g
+        return s - np.float32(self.model.level), g
 
     def sdf(self, points: F32) -> F32:
         """(N,)."""

@@ -90,7 +90,7 @@ def _crossing(vertices, faces, boxes, ends, low, cell, shape, start, entry):
                         if boxes[f, 2] > z1 or boxes[f, 5] < z0:
                             continue
                         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-                        if i == a or i == b or i == c or j == a or j == b or j == c:
+                        if i in (a, b, c) or j in (a, b, c):
                             continue
                         out[e] = _meets(vertices, i, j, a, b, c)
     return out

@@ -37,6 +37,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.moving_light import light_frame
+    from stages.inverse_rendering.outline_level import set_outline_level
     from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
     from stages.inverse_rendering.preview import Preview
     from stages.inverse_rendering.registered_views import registered_views
@@ -100,6 +101,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     level = set_level(model, trainer.pixels, views, labels, names, wanted, light)
     if known is not None and wanted == "fitted":
         level["why"] = "the light's level is given"
+    outline = set_outline_level(model, views)
     model.save(context.workdir / "field.npz")
     write_light(model, context)
     held_out = predict_held_out(
@@ -108,7 +110,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     registered = registered_views(
         model, inputs.capture, inputs.poses.artifact, inputs.masks, held_out, settings, context
     )
-    facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level}
+    facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level, "outline": outline}
     if lit is not None:
         facts["light_frame"] = lit.facts()
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
@@ -144,7 +146,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=28,
+    version=29,
     inputs=Inputs,
     config=Config,
     output=FittedFace,
