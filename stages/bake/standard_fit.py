@@ -49,11 +49,11 @@ PLAIN_SPREAD = 0.3, 0.05  # inside everything else: of F0 as a share of its mean
 DELTA = 0.05  # step of the derivative by roughness
 ROUGHNESS_RANGE = (0.2, 0.85)
 DOUBT = 0.3  # share that a layer explains at which half of what it says about places is errors of light and shape
-HALF = 2.0  # of e / (1 - e), e the share that a layer explains: where evidence of skin's mean F0 counts as the prior
+HALF = 0.5  # of e / (1 - e), e the share that a layer explains: where evidence of skin's mean F0 counts as the prior
 SKIN_ROUGHNESS, ROUGHNESS_SPREAD = 0.45, 0.05
 HAIR_RANGE, HAIR_ROUGHNESS = (0.0, 0.046), 0.7  # keratin has index 1.55; a shell of many strands has no sharp highlight
 OBJECT_SPREAD = 0.15  # of roughness, about the same mean
-INDEPENDENT = 10  # observations that a group's roughness counts as: errors of light and shape are common to all others
+INDEPENDENT = 30  # observations that a group's roughness counts as: errors of light and shape are common to all others
 MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must explain to be measured
 MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
@@ -240,9 +240,14 @@ def _slopes(
     changed = (lobes[:, 2] - lobes[:, 0]) / (steps[2] - steps[0])
     parts = (lobes[:, 1, 0], f0 * changed[:, 0] + changed[:, 1], seen.colour[rows] - lobes[:, 1, 1])
     x, z, y = (_without_base(part, t, w, v, count) for part in parts)
-    products = (x * x, x * z, z * z, x * y, z * y, y * y)
-    sums = [np.asarray(np.bincount(v, w * p.sum(1), count), np.float64) for p in products]
-    return Slopes(*sums, 3 * np.bincount(v, w, count))
+
+    def total(a: F64, b: F64) -> F64:
+        return np.asarray(np.bincount(v, w * (a * b).sum(1), count), np.float64)
+
+    return Slopes(
+        xx=total(x, x), xz=total(x, z), zz=total(z, z), xy=total(x, y), zy=total(z, y), yy=total(y, y),
+        weight=3.0 * np.asarray(np.bincount(v, w, count), np.float64),
+    )  # fmt: skip
 
 
 def _without_base(z: F64, t: F64, w: F64, vertex: npt.NDArray[np.int64], count: int) -> F64:
