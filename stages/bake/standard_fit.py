@@ -280,7 +280,7 @@ def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
     if own.sum() < MIN_VERTICES:
         return _Group(prior.usual, prior.usual, prior.roughness, 0.0)
     h, g, q = (np.maximum(x[own].sum(0), 1e-30) if x is not sums.g else x[own].sum(0) for x in (sums.h, sums.g, sums.q))
-    mean = np.maximum(g / h, 0.0) if prior.usual else (g / h).clip(*prior.f0)
+    mean = (g / h).clip(*prior.f0)
     error = np.maximum(q - 2 * mean * g + mean**2 * h, 1e-30)
     cost = 0.5 * INDEPENDENT * np.log(error / error.min())
     cost += 0.5 * ((np.sqrt(ALPHAS) - prior.roughness) / prior.spread) ** 2

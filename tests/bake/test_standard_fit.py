@@ -140,6 +140,15 @@ def test_the_mean_f0_of_skin_is_as_usual_unless_photos_tell() -> None:
     assert shares == sorted(shares, reverse=True) and shares[1] == pytest.approx(0.0243, abs=2e-4)
 
 
+def test_skin_whose_photos_contradict_a_layer_is_as_usual() -> None:
+    """Errors of the light can make highlights darker than their surroundings: F0 below 0 is no F0."""
+    mesh, at, albedo, seen = scene(0.0, 0.5)
+    dark = 2 * seen.colour - scene(0.03, 0.45)[3].colour
+    n, skin = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
+    found = fits.fit(mesh, n, at, albedo, fits.Seen(seen.vertex, seen.wo, dark, dark), skin)
+    np.testing.assert_allclose(found.f0, fits.USUAL_F0, rtol=1e-2)
+
+
 def test_an_object_of_no_dielectric_is_refused() -> None:
     """As a flash on the camera makes one: the lobe's material is kept then. Beside skin, the rest only has no layer."""
     found = fitted(0.4, 0.45, skin=False)
