@@ -10,6 +10,7 @@ from pipeline.meshes import Mesh
 from stages.bake.gloss_field import LENGTH, Slopes, Spread, common, departures
 
 SPREAD = Spread(0.008, 0.05, -0.8)
+HALFWAY = 0.01  # variance at which the prior and the photos count alike
 
 
 def small_ball(radius: float) -> Mesh:
@@ -35,12 +36,14 @@ def test_exact_photos_are_followed_and_noise_is_not() -> None:
     """y = (m + u) x + v z with u = .004, v = -.03, and the same under much noise."""
     mesh = small_ball(0.1)
     count, m, u, v = len(mesh.vertices), 0.03, 0.004, -0.03
-    xx, xz, zz = 10.0, 0.002, 0.05
+    xx, xz, zz = 10.0, 0.5, 0.05
     xy, zy = (m + u) * xx + v * xz, (m + u) * xz + v * zz
     exact = (m + u) * xy + v * zy
     own = np.ones(count, bool)
     found = departures(mesh, own, sums(count, xx, xz, zz, xy, zy, exact), m, SPREAD)
     assert np.median(found[0]) == pytest.approx(u, rel=0.05) and np.median(found[1]) == pytest.approx(v, rel=0.1)
+    half = departures(mesh, own, sums(count, xx, xz, zz, xy, zy, exact + HALFWAY), m, SPREAD)
+    assert 0.2 * u < np.median(half[0]) < 0.8 * u  # nearly all of it if errors were not common to neighbours
     noisy = departures(mesh, own, sums(count, xx, xz, zz, xy, zy, exact + 100.0), m, SPREAD)
     assert np.abs(noisy[0]).max() < 0.2 * u and np.abs(noisy[1]).max() < -0.2 * v
 
