@@ -13,46 +13,54 @@ Symbols
     H, G, Q sums over a vertex's views of w x^2, w x y, w y^2 with x = A, y = I - B, after r was eliminated from both
             (its best value is subtracted, colour by colour), so that no albedo enters: only what changes with the view
 
-For each alpha of a list the error Q - 2 F0 G + F0^2 H is one parabola in F0. Over a vertex's surroundings the sums are
-pooled (WIDTH), because F0 varies slowly; towards the mean of its group a prior pulls where there is little evidence.
-alpha is one number a group: one still light of low order does not determine it from place to place.
+For each alpha of a list the error Q - 2 F0 G + F0^2 H of a group's sums is one parabola in F0. How F0 and roughness
+vary about the group's follows in gloss_field.py.
 
 The prior of skin: F0 in SKIN_RANGE, roughness about SKIN_ROUGHNESS, and USUAL_F0 where a layer does not explain
-MIN_EXPLAINED of what changes with the view. Hair that is a mesh of its own is matt: F0 is keratin's at most, roughness
-about HAIR_ROUGHNESS, and without evidence there is no layer. Everything else has no prior for F0, and then no layer;
-nor one where F0 would be above DIELECTRIC: the light moved then, as a flash does, or the photos are clipped. An object
-without any other material keeps the one that is read off NeuFace's lobe. At last r follows by linear least squares,
-pooled over EDGES edges.
+MIN_EXPLAINED of what changes with the view. Errors of light and shape in A and B make the F0 of a regression too small
+(attenuation by errors in the regressor): .0196 for .0222 of a rendered head, .025 for .029 of the demo. So the mean of
+skin is drawn to USUAL_F0, the more the less the layer explains (`drawn`). Hair that is a mesh of its own is matt: F0 is
+keratin's at most, roughness about HAIR_ROUGHNESS, and without evidence there is no layer. Everything else has no prior
+for F0, and then no layer, except that an object without a person has ASSUMED_F0 at the largest roughness if that costs
+nothing in the photos (FREE): no dielectric has F0 0. There is no layer where F0 would be above DIELECTRIC: the light
+moved then, as a flash does, or the photos are clipped. An object without any other material keeps the one that is read
+off NeuFace's lobe. At last r follows by linear least squares, pooled over EDGES edges.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.lighting import standard
 from pipeline.meshes import F32, F64, Mask, Mesh, areas
+from stages.bake.gloss_field import Slopes, Spread, departures
 from stages.bake.smooth import Smoother
 
 ALPHAS = np.array([0.09, 0.12, 0.16, 0.20, 0.25, 0.31, 0.38, 0.47, 0.6], np.float32)
-WIDTH = 0.005  # metres: F0 is pooled over it
-EDGES, LEAST_WIDTH = 0.7, 1.5  # mean edges of the mesh over which the albedo's correction is pooled, and F0 at least
+EDGES = 0.7  # mean edges of the mesh over which the albedo's correction is pooled, and groups meet
 SKIN_RANGE = (0.02, 0.045)
 USUAL_F0 = 0.028  # of skin, index 1.40; microfacet.SKIN_F0 is the convention that the light's level assumes
-F0_SPREAD, TRUST = 0.01, 3.0  # standard deviation of F0 inside a group; observations that count as one
+SKIN_SPREAD = Spread(0.008, 0.05, -0.8)  # inside skin, of F0, roughness and their correlation
+PLAIN_SPREAD = 0.3, 0.05  # inside everything else: of F0 as a share of its mean, and of roughness
+DELTA = 0.05  # step of the derivative by roughness
+ROUGHNESS_RANGE = (0.2, 0.85)
+DOUBT = 0.3  # share that a layer explains at which half of what it says about places is errors of light and shape
+HALF = 0.5  # of e / (1 - e), e the share that a layer explains: where evidence of skin's mean F0 counts as the prior
 SKIN_ROUGHNESS, ROUGHNESS_SPREAD = 0.45, 0.05
 HAIR_RANGE, HAIR_ROUGHNESS = (0.0, 0.046), 0.7  # keratin has index 1.55; a shell of many strands has no sharp highlight
 OBJECT_SPREAD = 0.15  # of roughness, about the same mean
 INDEPENDENT = 30  # observations that a group's roughness counts as: errors of light and shape are common to all others
 MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must explain to be measured
-CERTAIN = 1e3  # weight of a prior that no evidence changes, in the evidence of the whole group
 MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
 OUTLIER = 2.5  # robust standard deviations of the field's residual from which the weight falls
 CORRECTION = (0.4, 2.5)  # limits of r
+ASSUMED_F0 = 0.04  # of bone, stone, paint: index 1.5
+FREE = 0.02  # largest share of the view-dependent variance that an assumed layer may cost
 DIELECTRIC = 0.17  # F0 of diamond, the largest of a dielectric that is common
 TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the base
 
@@ -61,7 +69,8 @@ TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the
 class Prior:
     """What is known of a group's material before the photos. f0: its range; usual: F0 where the photos say nothing;
     roughness, spread: mean and standard deviation; most: F0 above which there is no layer; top: largest F0 of a
-    place."""
+    place; varies: whether it may vary inside the group; inside: how much, None for PLAIN_SPREAD; assumed: F0 where a
+    rough layer costs nothing in the photos."""
 
     f0: tuple[float, float]
     usual: float
@@ -69,11 +78,19 @@ class Prior:
     spread: float
     most: float = np.inf
     top: float = 1.0
+    varies: bool = True
+    inside: Spread | None = None
+    assumed: float = 0.0
+
+    def spread_of(self, f0: float) -> Spread:
+        """Of a group with this mean F0."""
+        return self.inside or Spread(max(PLAIN_SPREAD[0] * f0, 1e-4), PLAIN_SPREAD[1], 0.0)
 
 
-SKIN = Prior(SKIN_RANGE, USUAL_F0, SKIN_ROUGHNESS, ROUGHNESS_SPREAD)
-HAIR = Prior(HAIR_RANGE, 0.0, HAIR_ROUGHNESS, ROUGHNESS_SPREAD, top=HAIR_RANGE[1])
+SKIN = Prior(SKIN_RANGE, USUAL_F0, SKIN_ROUGHNESS, ROUGHNESS_SPREAD, inside=SKIN_SPREAD)
+HAIR = Prior(HAIR_RANGE, 0.0, HAIR_ROUGHNESS, ROUGHNESS_SPREAD, top=HAIR_RANGE[1], varies=False)
 REST = Prior((0.0, 1.0), 0.0, SKIN_ROUGHNESS, OBJECT_SPREAD, DIELECTRIC)
+OBJECT = replace(REST, assumed=ASSUMED_F0)  # a capture without a person
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,22 +154,31 @@ def fit(
     sums = _sums(normals, seen, w, lit, rows)
     often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
-    near = Smoother(mesh, max(WIDTH, LEAST_WIDTH * edge))
-    h, g = (near(x * often[:, None]) for x in (sums.h, sums.g))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
     figures: dict[str, float] = {}
-    for name, group, prior in (("skin", skin, SKIN), ("hair", hair, HAIR), ("rest", ~skin & ~hair, REST)):
+    others = REST if (skin | hair).any() else OBJECT
+    for name, group, prior in (("skin", skin, SKIN), ("hair", hair, HAIR), ("rest", ~skin & ~hair, others)):
         if not group.any():
             continue
         found = _group(sums, group & often, prior)
-        pulled = (g[:, found.k] + found.pull * found.f0) / (h[:, found.k] + found.pull)
-        f0[group] = pulled[group].clip(0, prior.top) if found.f0 > 0 else 0.0
-        rough[group], layered[group] = found.roughness, found.f0 > 0
-        figures |= {f"gloss_{name}_f0": float(f0[group].mean()), f"gloss_{name}_roughness": found.roughness}
+        f0[group], rough[group], layered[group] = found.f0, found.roughness, found.f0 > 0
+        if found.measured and prior.varies:
+            check()
+            own = group & often
+            slopes = _slopes(normals, seen, w, lit, rows[group[seen.vertex[rows]]], found.roughness, found.fitted)
+            u, v = departures(mesh, own, slopes, found.fitted, prior.spread_of(found.fitted))
+            trust = found.explained / (found.explained + DOUBT)
+            varied = found.f0 * (1 + trust * (u - u[own].mean()) / found.fitted)
+            f0[group] = varied[group].clip(*prior.f0).clip(0, prior.top)
+            rough[group] = (found.roughness + trust * v)[group].clip(*ROUGHNESS_RANGE)
+        figures |= {f"gloss_{name}_f0": float(f0[group].mean()), f"gloss_{name}_roughness": float(rough[group].mean())}
         figures[f"gloss_{name}_explained"] = found.explained
+        if found.assumed:
+            figures[f"gloss_{name}_assumed"] = 1.0
         if found.refused:
             figures[f"gloss_{name}_refused_f0"] = found.refused
     # groups meet without a step
+    near = Smoother(mesh, EDGES * edge)
     f0, roughness = near(np.stack([f0, rough], 1)).T
     f0 = np.where(near(layered[:, None])[:, 0] > 0.01, f0, 0.0).clip(0, 1)
     correction = _correction(mesh, normals, albedo, seen, w, lit, f0, roughness, edge)
@@ -188,45 +214,71 @@ def _sums(normals: F64, seen: Seen, weights: F64, lit: Lit, rows: npt.NDArray[np
     v, w, colour, count = seen.vertex[rows], weights[rows], seen.colour[rows], len(normals)
     cosine = (normals[v] * seen.wo[rows]).sum(1)
     h, g, q = (np.zeros((count, len(ALPHAS))) for _ in range(3))
-
-    def total(values: F64) -> F64:
-        return np.stack([np.bincount(v, values[:, i], count) for i in range(values.shape[1])], 1)
-
-    def without_base(z: F64, t: F64) -> F64:
-        """z (m, 3) less its best multiple of t (m, 3) at each vertex."""
-        norm = np.maximum(total(w[:, None] * t * t), 1e-12)
-        return np.asarray(z - (total(w[:, None] * z * t) / norm)[v] * t)
-
     lobes, shade = lit.lobes(rows, ALPHAS), lit.shade[rows]
     shade = np.maximum(shade / max(float(shade.mean()), 1e-12), 1e-6) if len(v) else shade
     for k, alpha in enumerate(ALPHAS):
         kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), alpha))
         t = kept[:, None] * shade
-        x, y = (without_base(z, t) for z in (lobes[:, k, 0].astype(np.float64), colour - lobes[:, k, 1]))
+        x, y = (_without_base(z, t, w, v, count) for z in (lobes[:, k, 0].astype(np.float64), colour - lobes[:, k, 1]))
         for out, product in ((h, x * x), (g, x * y), (q, y * y)):
             out[:, k] = np.bincount(v, w * product.sum(1), count)
-    y = without_base(colour, shade)
+    y = _without_base(colour, shade, w, v, count)
     bare, weight = (np.asarray(np.bincount(v, z, count), np.float64) for z in (w * (y * y).sum(1), w))
     return _Sums(h, g, q, bare, weight)
 
 
+def _slopes(
+    normals: F64, seen: Seen, weights: F64, lit: Lit, rows: npt.NDArray[np.int64], roughness: float, f0: float
+) -> Slopes:
+    """Sums for the departures from a roughness and F0, of the observations `rows` (m,)."""
+    v, w, count = seen.vertex[rows], weights[rows], len(normals)
+    steps = np.clip(roughness + DELTA * np.array([-1, 0, 1]), 0.1, 1.0)
+    lobes, shade = lit.lobes(rows, (steps**2).astype(np.float32)).astype(np.float64), lit.shade[rows]
+    cosine = (normals[v] * seen.wo[rows]).sum(1)
+    kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), steps[1] ** 2))
+    t = kept[:, None] * np.maximum(shade / max(float(shade.mean()), 1e-12), 1e-6)
+    changed = (lobes[:, 2] - lobes[:, 0]) / (steps[2] - steps[0])
+    parts = (lobes[:, 1, 0], f0 * changed[:, 0] + changed[:, 1], seen.colour[rows] - lobes[:, 1, 1])
+    x, z, y = (_without_base(part, t, w, v, count) for part in parts)
+
+    def total(a: F64, b: F64) -> F64:
+        return np.asarray(np.bincount(v, w * (a * b).sum(1), count), np.float64)
+
+    return Slopes(
+        xx=total(x, x), xz=total(x, z), zz=total(z, z), xy=total(x, y), zy=total(z, y), yy=total(y, y),
+        weight=3.0 * np.asarray(np.bincount(v, w, count), np.float64),
+    )  # fmt: skip
+
+
+def _without_base(z: F64, t: F64, w: F64, vertex: npt.NDArray[np.int64], count: int) -> F64:
+    """z (m, 3) less its best multiple of t (m, 3) at each vertex, colour by colour."""
+
+    def total(values: F64) -> F64:
+        return np.stack([np.bincount(vertex, values[:, i], count) for i in range(values.shape[1])], 1)
+
+    norm = np.maximum(total(w[:, None] * t * t), 1e-12)
+    return np.asarray(z - (total(w[:, None] * z * t) / norm)[vertex] * t)
+
+
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """A group's mean F0 (0: no layer), index of its alpha, roughness, weight of the prior in H's unit, and the share
-    of the view-dependent variance that its layer explains. refused: F0 above DIELECTRIC that was found, else 0."""
+    """A group's mean F0 (0: no layer), as the regression has it (fitted) and after the prior (f0), roughness, and the
+    share of the view-dependent variance that its layer explains. measured: whether that is enough. refused: F0 above
+    DIELECTRIC that was found, else 0; assumed: the layer is none that the photos tell."""
 
     f0: float
-    k: int
+    fitted: float
     roughness: float
-    pull: float
     explained: float
+    measured: bool = False
     refused: float = 0.0
+    assumed: bool = False
 
 
 def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
     """The material of a group by the evidence of its vertices `own` (V,)."""
     if own.sum() < MIN_VERTICES:
-        return _Group(prior.usual, 0, prior.roughness, 1.0, 0.0)
+        return _Group(prior.usual, prior.usual, prior.roughness, 0.0)
     h, g, q = (np.maximum(x[own].sum(0), 1e-30) if x is not sums.g else x[own].sum(0) for x in (sums.h, sums.g, sums.q))
     mean = (g / h).clip(*prior.f0)
     error = np.maximum(q - 2 * mean * g + mean**2 * h, 1e-30)
@@ -234,13 +286,27 @@ def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
     cost += 0.5 * ((np.sqrt(ALPHAS) - prior.roughness) / prior.spread) ** 2
     k = int(cost.argmin())
     explained = 1 - float(error[k]) / max(float(sums.bare[own].sum()), 1e-30)
-    variance = float(error[k]) / max(3 * float(sums.weight[own].sum()), 1e-30)
     if explained < MIN_EXPLAINED:  # the photos say nothing: skin is as usual, everything else has no layer
-        return _Group(prior.usual, k, prior.roughness, CERTAIN * float(h.max()), explained)
+        if prior.assumed and _is_free(prior.assumed, h[-1], g[-1], q[-1], float(sums.bare[own].sum())):
+            return _Group(prior.assumed, prior.assumed, float(np.sqrt(ALPHAS[-1])), explained, assumed=True)
+        return _Group(prior.usual, prior.usual, prior.roughness, explained)
     if mean[k] > prior.most:
-        return _Group(0.0, k, prior.roughness, CERTAIN * float(h.max()), explained, float(mean[k]))
-    rough = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost)
-    return _Group(float(mean[k]), k, rough, max(TRUST * variance / F0_SPREAD**2, 1e-12), explained)
+        return _Group(0.0, 0.0, prior.roughness, explained, refused=float(mean[k]))
+    rough, fitted = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost), float(mean[k])
+    f0 = float(np.clip(drawn(fitted, prior.usual, explained), *prior.f0)) if prior.usual else fitted
+    return _Group(f0, fitted, rough, explained, measured=f0 > 0)
+
+
+def _is_free(f0: float, h: float, g: float, q: float, bare: float) -> bool:
+    """Whether the photos allow the roughest layer of this F0: matt bone, stone and paint have one as well."""
+    return q - 2 * f0 * g + f0**2 * h < (1 + FREE) * bare
+
+
+def drawn(fitted: float, usual: float, explained: float) -> float:
+    """Mean F0 from that of the regression and the usual one, by the share that the layer explains."""
+    odds = explained / max(1 - explained, 1e-9)
+    weight = odds / (odds + HALF)
+    return weight * fitted + (1 - weight) * usual
 
 
 def _lowest(x: F64, cost: F64) -> float:

@@ -22,12 +22,22 @@ from stages.bake.standard_observe import carried
 RADIUS = 0.1
 
 
-def scene(f0: float, roughness: float, scale: float = 1.0) -> tuple[Mesh, standard.Arrivals, np.ndarray, fits.Seen]:
-    """A ball under a light with soft lamps, seen by 24 cameras. scale: true base colour over the field's albedo."""
+def unlit() -> Mesh:
+    """A ball."""
     made = ball(40, 20, height=1.0)
     x = made["vertices"] / np.linalg.norm(made["vertices"], axis=1).max() * RADIUS
-    n = (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float64)
-    mesh = Mesh(x.astype(np.float32), n.astype(np.float32), made["faces"])
+    n = x / np.linalg.norm(x, axis=1, keepdims=True)
+    return Mesh(x.astype(np.float32), n.astype(np.float32), made["faces"])
+
+
+def scene(
+    f0: float | np.ndarray, roughness: float | np.ndarray, scale: float = 1.0
+) -> tuple[Mesh, standard.Arrivals, np.ndarray, fits.Seen]:
+    """A ball under a light with soft lamps, seen by 24 cameras. f0, roughness: of all vertices, or of each; scale: true
+    base colour over the field's albedo."""
+    mesh = unlit()
+    x = mesh.vertices.astype(np.float64)
+    n = x / np.linalg.norm(x, axis=1, keepdims=True)
     w = latlong_directions(64, 32)
     image = 0.1 + sum(np.exp(8 * (w @ (d / np.linalg.norm(d)) - 1)) for d in np.array([[1, 1, 1.0], [-1, 0.3, 0.6]]))
     lit = lamps(np.repeat(image[..., None], 3, -1).astype(np.float32), 128)
@@ -40,7 +50,7 @@ def scene(f0: float, roughness: float, scale: float = 1.0) -> tuple[Mesh, standa
     wo /= np.linalg.norm(wo, axis=1, keepdims=True)
     one = np.zeros((len(vertex), 3), np.int32) + vertex[:, None].astype(np.int32)
     third = np.full((len(vertex), 3), 1 / 3, np.float32)
-    values = [np.full(len(vertex), v, np.float32) for v in (f0, roughness)]
+    values = [np.broadcast_to(np.asarray(v, np.float32), len(n))[vertex] for v in (f0, roughness)]
     base = (scale * albedo[vertex]).astype(np.float32)
     diffuse, specular = standard.radiance(at, one, third, n[vertex], wo, base, *values)
     return mesh, at, albedo, fits.Seen(vertex, wo, diffuse + specular, diffuse + specular)
@@ -96,6 +106,47 @@ def test_where_nothing_shines_objects_have_no_layer_and_skin_is_as_usual() -> No
     assert (dull.f0 == 0).all()
     np.testing.assert_allclose(np.median(dull.correction), 1, rtol=0.01)
     np.testing.assert_allclose(fitted(0.0, 0.5, skin=True).f0, fits.USUAL_F0, rtol=1e-2)
+
+
+def test_an_object_that_photos_hardly_tell_has_a_matt_layer() -> None:
+    """No bone or stone has F0 0. A layer as rough as can be is nearly diffuse light: noise hides it."""
+    mesh, at, albedo, seen = scene(0.0, 0.5)
+    noisy = seen.colour * (1 + 0.3 * np.random.default_rng(0).standard_normal(seen.colour.shape))
+    n, none = mesh.normals.astype(np.float64), np.zeros(len(albedo), bool)
+    found = fits.fit(mesh, n, at, albedo, fits.Seen(seen.vertex, seen.wo, noisy, seen.colour), none)
+    np.testing.assert_allclose(found.f0, fits.ASSUMED_F0, rtol=1e-3)
+    assert found.figures["gloss_rest_assumed"] == 1 and found.roughness.min() > 0.7
+
+
+def test_a_glossy_half_is_found() -> None:
+    """F0 and roughness of two halves of one material, each by itself and both as on skin. Where a higher F0 goes with a
+    higher roughness, the highlights of a soft light hardly change, and nothing would be found."""
+    left = unlit().vertices[:, 0] > 0
+    for shine, sharp in ((0.4, 0.0), (0.0, 0.06), (0.3, 0.05)):
+        f0, roughness = 0.04 * (1 + shine * (left - 0.5)), 0.48 - sharp * (2 * left - 1)
+        mesh, at, albedo, seen = scene(f0, roughness)
+        n, none = mesh.normals.astype(np.float64), np.zeros(len(albedo), bool)
+        found = fits.fit(mesh, n, at, albedo, seen, none)
+        inside = np.abs(mesh.vertices[:, 0]) > 0.4 * RADIUS
+        for got, true, size in ((found.f0, f0, 0.005), (found.roughness, roughness, 0.02)):
+            step, wanted = (np.median(v[inside & left]) - np.median(v[inside & ~left]) for v in (got, true))
+            assert step == pytest.approx(wanted, abs=max(0.6 * abs(wanted), size))
+
+
+def test_the_mean_f0_of_skin_is_as_usual_unless_photos_tell() -> None:
+    assert fits.drawn(0.02, 0.028, 0.0) == pytest.approx(0.028)
+    assert fits.drawn(0.02, 0.028, 1.0) == pytest.approx(0.02)
+    shares = [fits.drawn(0.02, 0.028, e) for e in (0.1, 0.3, 0.6, 0.9)]
+    assert shares == sorted(shares, reverse=True) and shares[1] == pytest.approx(0.0243, abs=2e-4)
+
+
+def test_skin_whose_photos_contradict_a_layer_is_as_usual() -> None:
+    """Errors of the light can make highlights darker than their surroundings: F0 below 0 is no F0."""
+    mesh, at, albedo, seen = scene(0.0, 0.5)
+    dark = 2 * seen.colour - scene(0.03, 0.45)[3].colour
+    n, skin = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
+    found = fits.fit(mesh, n, at, albedo, fits.Seen(seen.vertex, seen.wo, dark, dark), skin)
+    np.testing.assert_allclose(found.f0, fits.USUAL_F0, rtol=1e-2)
 
 
 def test_an_object_of_no_dielectric_is_refused() -> None:
