@@ -10,9 +10,9 @@ Pictures may lie elsewhere: `pictures` in lights.json says where (stage_pictures
 
 Pictures are linear: EXR, or 16-bit PNG or TIFF where lights.json says `"encoding": "linear"`. `direction` points from
 the stage's centre to the light, `axis` is where it shines; one of them, or `stage_centre` of the file, is needed. For
-all lights: `scale`, metres in one unit of the positions; `intensity_rgb` of lights without their own; `distance`, metres
-from the stage's centre of lights with `azimuth` and `elevation` in place of a position (degrees; 0, 0 is +z, azimuth
-grows to +x, elevation to +y).
+all lights: `scale`, metres in one unit of the positions; `intensity_rgb` of lights without their own; `distance`, in
+metres from the stage's centre, of lights with `azimuth` and `elevation` in place of a position (degrees; 0, 0 is +z,
+azimuth grows to +x, elevation to +y).
 """
 
 from __future__ import annotations

@@ -97,8 +97,8 @@ def _is_pattern(name: str, text: Any, where: str) -> bool:
     right = all(len(n & set(fields)) == 1 for n in needed) and set(fields) <= known
     inside = isinstance(text, str) and not text.startswith("/") and ".." not in text.split("/") and "*" not in text
     if not right or not inside:
-        raise fault("a pattern of a light stage's pictures can't be used", where, shown(text),
-                    "a path below the capture with " + " and ".join("{" + f + "}" for f in FIELDS[name]), REMEDY)  # fmt: skip
+        limit = "a path below the capture with " + " and ".join("{" + f + "}" for f in FIELDS[name])
+        raise fault("a pattern of a light stage's pictures can't be used", where, shown(text), limit, REMEDY)
     return True
 
 
