@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.lighting.standard import layer as kept_back
+from pipeline.meshes import Mesh
+from pipeline.ray_casting import RayCaster
+from stages.reflectance.bounces import Bounces
 from stages.reflectance.field import Lamp
 from stages.reflectance.layer import CELL, WIDTHS, Layers, lowest, pooled_errors, standard_of
 from stages.reflectance.layer_kernels import layers
 from stages.reflectance.openpbr import OpenPbr, reflection
 from tests.reflectance.test_field import field_of
+from tests.reflectance.test_reshape import globe
 from tests.reflectance.test_split import Made, rig_with
 
 F0, ROUGH = 0.035, 0.4
@@ -120,3 +124,22 @@ def test_no_layer_reflects_nothing() -> None:
     assert reflection(0 * one, 0.1 * one, one, one, one, 0.5 * one)[0] == 0
     mirror = reflection(one, 0.1 * one, one, one, one, one)[0]
     assert mirror == pytest.approx(1 / (4 * np.pi * 0.1**2), rel=1e-6)  # D of the mirror direction, G and F of 1
+
+
+def test_light_bounces_inside_a_hollow_ball_as_a_series_says() -> None:
+    """Every ray inside ends on the ball: E (a + a^2 + a^3) arrives by way of others. On its outside none does."""
+    outer = globe(4)
+    inner = Mesh(outer.vertices, -outer.normals, np.ascontiguousarray(outer.faces[:, ::-1]))
+    albedo, direct = np.tile([0.5, 0.2, 0.0], (len(outer.vertices), 1)), np.ones((len(outer.vertices), 3))
+    found = Bounces(inner, RayCaster(inner.vertices, inner.faces), albedo).of(direct)
+    np.testing.assert_allclose(found, np.tile([0.875, 0.248, 0], (len(found), 1)), rtol=1e-6)
+    assert not Bounces(outer, RayCaster(outer.vertices, outer.faces), albedo).of(direct).any()
+
+
+def test_only_what_cameras_saw_throws_shadows_if_it_is_asked() -> None:
+    field = field_of(np.array([0.4, 0.3, 0.2]))
+    field.arrays["coverage"] = np.zeros_like(field.arrays["coverage"])
+    rays = np.tile([0.0, 0, -1], (100, 1))
+    start = np.random.default_rng(0).uniform(-0.05, 0.05, (100, 3)) * [1, 1, 0] + [0, 0, 1]
+    hits = [(OpenPbr.of(field, trimmed=t).shadows.first_faces(start, rays) >= 0).sum() for t in (True, False)]
+    assert hits[1] == 100 and hits[0] < 20  # faces without a texel throw shadows all the same
