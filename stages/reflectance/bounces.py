@@ -5,6 +5,8 @@ E_0 direct,  E_k+1 = M a E_k,   M_ij = share of vertex i's cosine-weighted rays 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from pipeline import meshes
@@ -40,7 +42,7 @@ def _vertices(mesh: meshes.Mesh) -> Points:
     return Points(0, every, every, np.ones((len(every), 3)) / 3, mesh.vertices.astype(np.float64), normal)
 
 
-def _ends(mesh: meshes.Mesh, caster: RayCaster, points: Points) -> object:
+def _ends(mesh: meshes.Mesh, caster: RayCaster, points: Points) -> Any:
     """Sparse (V, V) M. A ray that meets the back of a triangle ends nowhere."""
     from scipy.sparse import coo_array
 
