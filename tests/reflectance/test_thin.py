@@ -73,7 +73,7 @@ def test_the_subject_is_what_any_light_shows(tmp_path: Path) -> None:
     """Two lights that light one half each; the border's pixels count as background."""
     paths = {}
     for n, half in enumerate((slice(0, 16), slice(0, 0), slice(0, 0), slice(16, 24))):
-        picture = np.zeros((32, 32, 3), np.float32)
+        picture = np.full((32, 32, 3), 0.004, np.float32)  # noise is no subject
         picture[8:24, half] = 1
         paths[0, n] = tmp_path / f"{n}.exr"
         write_exr(paths[0, n], picture, half=True)
