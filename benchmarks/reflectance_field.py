@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipeline import meshes
 from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.images import F32, read_linear, write_png
 from pipeline.maths.latlong import latlong_directions, latlong_weights
@@ -24,9 +25,12 @@ from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, apply, matrix, scale_of
 from stages.capture.readers.olat import pictures_of, read_lights
 from stages.reflectance.field import Field, load
+from stages.reflectance.openpbr import OpenPbr
 from stages.reflectance.relight import barycentric, look_up, picture, under_lamps
 from stages.reflectance.rig import Rig, rig_of
-from stages.reflectance.score import blended, camera_at, decibels, encoded, score
+from stages.reflectance.score import COVERED, blended, camera_at, decibels, encoded, score
+from stages.reflectance.texels import points_of
+from workflows.bench.captures_figures import read_run
 from workflows.cli.relight import environment
 from workflows.cli.render import capture_from_asset_of, given_cameras
 
@@ -145,6 +149,27 @@ def beside(field: Field, rig: Rig, pictures: dict, fitted: list[int], camera: in
     write_png(path, np.hstack([*shown, np.abs(shown[1] - shown[0]) * 4]).clip(0, 1))
 
 
+def standard(field: Field, run: Path, rig: Rig, capture: Path, basis: dict) -> dict:
+    """PSNR of left-out lights as standard shaders show them, over skin and eyes: on the field's mesh, of which all, or
+    only what cameras saw, throws shadows; and on the asset's mesh."""
+    place = {index: n for n, index in enumerate(rig.index)}
+    pictures = {(c, place[n]): p for (c, n), p in pictures_of(capture).single.items() if n in place}
+    fitted, held = [place[n] for n in basis["lights"]], [place[n] for n in basis["left_out"]]
+    mask = {c: labels_of(capture, rig.cameras[c].index) > 0 for c in range(len(rig.cameras))}
+    wanted = [(c, i) for i in held for c in range(len(rig.cameras))]
+    stored = read_run(run)
+    assert stored is not None
+    path = stored.path("uv", stored.manifest("uv")["mesh"])
+    mesh, charts = meshes.load(path), meshes.load_charts(path)
+    points, rows = points_of(mesh, charts, field.points.size), {}
+    asset = Field(mesh, charts, points, field.arrays, field.alphas, field.towards, field.centre)
+    for name, one, trimmed in (("whole", field, False), ("trimmed", field, True), ("the asset's mesh", asset, False)):
+        shown = OpenPbr.of(one, trimmed=trimmed)
+        found = score(one, rig, pictures, fitted, wanted, GAIN, lambda d, n: None, mask, shown)
+        rows[name] = decibels([s.standard for s in found])
+    return rows
+
+
 def environments(field: Field, run: Path, capture: Path, rig: Rig, out: Path | None, *, quick: bool) -> dict:
     """PSNR under the truth's environment of the field, and of the plain sum of the captured pictures."""
     lamps = environment(str(capture / "truth/relit/soft.exr"), capture_from_asset_of(run), quick=quick)
@@ -153,12 +178,14 @@ def environments(field: Field, run: Path, capture: Path, rig: Rig, out: Path | N
     rows = {}
     for (i, view), radiance in zip(views.items(), found, strict=True):
         truth, label = read_linear(capture / f"truth/relit/soft/{i}.exr"), labels_of(capture, i)
-        made = picture(view, look_up(field, view), radiance)[..., :3]
+        made = picture(view, look_up(field, view), radiance)
+        made, covered = made[..., :3], made[..., 3] > COVERED
         plain = plain_sum(capture, i)
         errors = {
             n: (encoded(p, SOFT_GAIN) - encoded(truth, SOFT_GAIN)) ** 2 for n, p in (("field", made), ("sum", plain))
         }
         rows[i] = {n: decibels([float(e[label > 0].mean())]) for n, e in errors.items()}
+        rows[i] |= {f"{n}, covered": decibels([float(e[(label > 0) & covered].mean())]) for n, e in errors.items()}
         rows[i] |= {f"{n}, eyes": decibels([float(e[label == EYE].mean())]) for n, e in errors.items()}
         if out is not None:
             shown = [encoded(p, SOFT_GAIN) for p in (truth, made, plain)]
@@ -238,7 +265,9 @@ def main() -> None:
     p.add_argument("--pictures", type=Path)
     p.add_argument("--camera", type=int, action="append", help="only these: of a run that left them out")
     p.add_argument("--quick", action="store_true", help="fewer lamps for the environment")
-    p.add_argument("--without", action="append", default=[], choices=["lights", "environment", "material", "motion"])
+    p.add_argument(
+        "--without", action="append", default=[], choices=["lights", "openpbr", "environment", "material", "motion"]
+    )
     options = p.parse_args()
     folder = options.run / "reflectance"
     field, basis = load(folder), json.loads((folder / "basis.json").read_text())
@@ -247,6 +276,7 @@ def main() -> None:
         "motion": lambda: motion(basis, options.capture, world),
         "material": lambda: material(field, Truth(options.capture / "truth"), world),
         "lights": lambda: single_lights(field, rig, options.capture, basis, options.camera, options.pictures),
+        "openpbr": lambda: standard(field, options.run, rig, options.capture, basis),
         "environment": lambda: environments(field, options.run, options.capture, rig, options.pictures,
                                             quick=options.quick),
     }  # fmt: skip

@@ -21,6 +21,7 @@ from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
 from stages.bake.dilate import HALO, nearest_rows
 from stages.bake.eyes import Eyes
+from stages.bake.lit import Measured
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.mouth import Inside
@@ -96,12 +97,13 @@ class Baker:
         region: Indices | None = None,
         hair: Mask | None = None,
         hair_code: int = -1,
+        measured: Measured | None = None,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
         `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
         vertex (unseen.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
-        is the last tile, with the label `hair_code`."""
+        is the last tile, with the label `hair_code`. `measured`: what a light stage says, of the first tile."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
@@ -110,6 +112,7 @@ class Baker:
         self._occluder = Occluder(mesh)
         around = ambient(mesh, self._occluder, lambda done, total: step(done, total, "ambient occlusion"))
         self._known = replace(_known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes)
+        self._measured = measured
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
         self.material_figures: dict[str, float] = {}
@@ -127,8 +130,8 @@ class Baker:
 
     @property
     def standard_fitted(self) -> bool:
-        """Whether the maps are those of the fitted standard material."""
-        return self._known.standard is not None
+        """Whether the maps are those of the fitted standard material, or measured by a light stage."""
+        return self._known.standard is not None or self._measured is not None
 
     def tile(self, number: int) -> Baked:
         """Bake all texels that a chart of this tile touches.
@@ -142,7 +145,8 @@ class Baker:
         def ahead(done: int, total: int, message: str) -> None:
             step(number * total + done, self.tiles * total, message)
 
-        texel, samples = _bands(self._field, mesh, charts, size, ahead, self._known, self._found, self._scratch)
+        known = replace(self._known, measured=self._measured if number == 0 else None)
+        texel, samples = _bands(self._field, mesh, charts, size, ahead, known, self._found, self._scratch)
         least = FEW_TEXELS if self.tiles == 1 else 1
         if len(texel) < least:
             raise StageError(

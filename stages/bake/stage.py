@@ -17,6 +17,7 @@ from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import Indices, Mask, Mesh
+from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.units import Texels
 
 F64 = npt.NDArray[np.float64]
@@ -25,8 +26,8 @@ SCAN = "scan"  # folder of the maps of the scan's mesh, if the asset has both me
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The mesh, the field, the cameras and masks for the visibility of texels, the photos for the fine detail, and
-    the registered head for its eyes."""
+    """The mesh, the field, the cameras and masks for the visibility of texels, the photos for the fine detail, the
+    registered head for its eyes, and what a light stage measured."""
 
     surface: Located[Surface]
     uv: Located[UvMesh]
@@ -35,6 +36,7 @@ class Inputs:
     masks: Located[MaskSet]
     capture: Located[Capture]
     template: Located[RegisteredHead]
+    reflectance: Located[ReflectanceField]
 
 
 class Config(StageConfig):
@@ -62,7 +64,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         return made
     inside = replace(context, workdir=context.workdir / SCAN)
     inside.workdir.mkdir(parents=True)
-    own = _baked(replace(inputs, uv=Located(second, inputs.uv.folder)), config, inside)
+    elsewhere = Located(ReflectanceField(present=False), inputs.reflectance.folder)  # the field has the first's charts
+    own = _baked(replace(inputs, uv=Located(second, inputs.uv.folder), reflectance=elsewhere), config, inside)
     return made.model_copy(update={"scan": own.model_copy(update={"maps": _within(own.maps, SCAN)})})
 
 
@@ -85,6 +88,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.eyes import painted_eyes
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
+    from stages.bake.lit import measured_of
     from stages.bake.mouth import hidden_tiles, inside_of
     from stages.bake.smaller import smaller
     from stages.bake.statistics import together
@@ -114,6 +118,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     baker = Baker(
         field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
         region, hair, labels.index("hair") if "hair" in labels else -1,
+        measured_of(inputs.reflectance, config.size),
     )  # fmt: skip
     parts, sides, counted, judged, areas = [], [], [], [], Counter[int]()
     for number in range(baker.tiles):

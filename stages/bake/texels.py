@@ -24,6 +24,7 @@ from pipeline.raster import Hits
 from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
 from stages.bake.eyes import Eyes
+from stages.bake.lit import Measured, with_measured
 from stages.bake.standard_fit import CORRECTION, Fitted
 
 NEWTON_STEPS = 3
@@ -70,7 +71,8 @@ class Samples:
 class Known:
     """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; replaced (V,): how far
     the albedo is replaced by albedo (V, 3), because no photo shows it well (unseen.py). standard: the fitted material
-    of standard shaders; None: it is converted from NeuFace's. eyes: the fitted eyes, if there are any."""
+    of standard shaders; None: it is converted from NeuFace's. eyes: the fitted eyes, if there are any; measured: what a
+    light stage says of the material, if there is one."""
 
     ambient: F32
     unseen: F32
@@ -78,6 +80,7 @@ class Known:
     albedo: F32
     standard: Fitted | None = None
     eyes: Eyes | None = None
+    measured: Measured | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +159,8 @@ def sample(
         unseen=unseen,
         clamped=np.abs(albedo - physical).max(1),
     )
+    if known is not None and known.measured is not None:
+        found = with_measured(found, at, hits.texel, known.measured)
     if known is not None and known.eyes is not None:
         found = _with_eyes(found, field, mesh, hits, at, known.eyes, known.standard)
     for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,9 @@ from stages.reflectance.evidence import FOLDER as SHOWN
 from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
 from stages.reflectance.judge import judge
+from stages.reflectance.layer import standard_of
+from stages.reflectance.openpbr import NAME as OPENPBR
+from stages.reflectance.openpbr import OpenPbr
 from stages.reflectance.paint import marked, read_masks, replaced
 from stages.reflectance.reshape import reshaped
 from stages.reflectance.rig import Rig, rig_of
@@ -84,12 +87,14 @@ def build(
     _enough(len(fitted), FEWEST_LIGHTS, "lights")
     rig = rig_of([stage.lights[i] for i in fitted], fitted_cameras, world, at)
     given = mesh
+    pictures = _pictures(capture, stage, rig)
     if config.reshape:
-        pictures = _pictures(capture, stage, rig)
         mesh = reshaped(mesh, rig, pictures, context.scratch, context.check, step)
         points, caster = points_of(mesh, charts, config.size), RayCaster(mesh.vertices, mesh.faces)
     pairs = pairs_of(points, fitted_cameras, caster)
-    field, parts = _field(capture, stage, mesh, charts, points, pairs, rig, config, context, step)
+    field, parts = fitted_field(
+        mesh, charts, points, pairs, rig, pictures, config, context.scratch, context.check, step
+    )
     motion = {str(f): rows(m.round(9)) for f, m in sorted(at.items())}
     record = {"lights": rig.index, "left_out": [whole.index[i] for i in left_out], "motion": motion}
     save(field, context.workdir / FOLDER, record)
@@ -174,37 +179,43 @@ def _tracked(
     return moves.path(poses, frames), pivot
 
 
-def _field(
-    capture: Located[Capture],
-    stage: LightStage,
+def fitted_field(
     mesh: meshes.Mesh,
     charts: meshes.Charts,
     points: Points,
     pairs: Pairs,
     rig: Rig,
+    pictures: Mapping[tuple[int, int], Path],
     config: Config,
-    context: Context,
+    scratch: Path,
+    check: Callable[[], None],
     step: Step,
 ) -> tuple[Field, Fitted]:
-    table = gather(context.scratch / "samples.npy", points, pairs, rig, _pictures(capture, stage, rig), step)
+    """The field of a mesh and what was fitted. pictures: as for `gather`; scratch: folder for samples, which are
+    removed."""
+    table = gather(scratch / "samples.npy", points, pairs, rig, pictures, step)
     lamps, axes = rig.lamps()
     step(0, 1, "shadows")
     blocker = RayCaster(mesh.vertices, known_surface(mesh, points, pairs.seen))
-    arrives = arriving_of_all(points, blocker, lamps, axes, context.check)
+    arrives = arriving_of_all(points, blocker, lamps, axes, check)
     alphas = chosen_widths(points, pairs, table, rig, arrives, config.normal_prior, step)
     parts = split(points, pairs, table, rig, arrives, alphas, config.normal_prior, config.order, step)
     step(0, 1, "filling what no camera saw")
     flat = parts.rest.reshape(len(parts.rest), -1)
     marks = marked(read_masks(Path(config.paint)), points) if config.paint else np.zeros(len(flat), np.bool_)
-    filled = replaced(np.concatenate([parts.albedo, parts.lobes, flat], 1), marks, pairs.seen, points.position)
+    standard = standard_of(parts.layers, points.position)
+    filled = replaced(
+        np.concatenate([parts.albedo, parts.lobes, standard, flat], 1), marks, pairs.seen, points.position
+    )
     parts = _unmarked(parts, marks, points)
     arrays: dict[str, npt.NDArray[Any]] = {
-        "albedo": filled[:, :3], "lobes": filled[:, 3:6], "normal": parts.normal, "rest": filled[:, 6:],
+        "albedo": filled[:, :3], "lobes": filled[:, 3:6], "normal": parts.normal, "rest": filled[:, 11:],
+        OPENPBR: filled[:, 6:11],
         "shadow": parts.shadow, "trust": parts.trust, "coverage": pairs.seen[:, None].astype(np.float32),
     }  # fmt: skip
     field = Field(mesh, charts, points, arrays, alphas, rig.towards, centre_of(rig.position, rig.axis))
-    (context.scratch / "samples.done").unlink()
-    (context.scratch / "samples.npy").unlink()
+    (scratch / "samples.done").unlink()
+    (scratch / "samples.npy").unlink()
     return field, parts
 
 
@@ -254,7 +265,8 @@ def _predicted(
         return _Predicted((), 1.0)
     tops = [float(np.quantile(read_linear(pictures[key]).max(2), BRIGHT)) for key in wanted]
     gain = LEVEL / max(float(np.quantile(tops, 0.75)), 1e-9)
-    found = score(field, rig, pictures, fitted, wanted, gain, lambda d, n: step(d, n, "predicting left-out lights"))
+    found = score(field, rig, pictures, fitted, wanted, gain, lambda d, n: step(d, n, "predicting left-out lights"),
+                  standard=OpenPbr.of(field))  # fmt: skip
     return _Predicted(tuple(found), gain)
 
 
@@ -267,6 +279,7 @@ def _scored(found: _Predicted, unseen: Sequence[int]) -> dict[str, float]:
         **({"left_out_camera_psnr": decibels(other)} if other else {}),
         "left_out_psnr": decibels([s.field for s in found.scores]),
         "blend_psnr": decibels([s.blend for s in found.scores]),
+        "openpbr_psnr": decibels([s.standard for s in found.scores]),
         "left_out_angle": round(float(np.mean([s.angle for s in found.scores])), 2),
         "display_gain": round(found.gain, 5),
     }

@@ -4,6 +4,7 @@
     lobes.exr      c0 c1 c2        s_j, weights of the global lobes
     normal.exr     c0 c1 c2        unit normal, asset coordinates
     rest.exr       c00 c01 ...     r_k, three colours of each of K harmonics
+    openpbr.exr    c0 ... c4       base colour, F0 and roughness of standard shaders (layer.py)
     shadow.exr     c00 c01 ...     V less what is traced, for each light of the stage
     trust.exr      c00 c01 ...     how far that is known, 0 to 1
     coverage.exr   Y               1 where a camera saw the texel, 0 where it was filled
@@ -186,7 +187,8 @@ def load(folder: Path) -> Field:
         size = int(basis["size"])
         points = points_of(mesh, charts, size)
         arrays = {}
-        for name in ("albedo", "lobes", "normal", "rest", "shadow", "trust", "coverage"):
+        optional = ["openpbr"] if (folder / "openpbr.exr").is_file() else []  # not in fields of older versions
+        for name in ("albedo", "lobes", "normal", "rest", "shadow", "trust", "coverage", *optional):
             picture, _ = read_exr(folder / f"{name}.exr")
             arrays[name] = picture.reshape(size * size, -1)[points.texel]
         towards, centre = np.array(basis["towards"], np.float64), np.array(basis["centre"], np.float64)

@@ -37,13 +37,14 @@ from stages.reflectance.answers import FLATTEST, WIDTH, AnswerMap, answer_maps, 
 from stages.reflectance.rig import Rig
 from stages.reflectance.samples import Step
 from stages.reflectance.texels import LIFT
+from stages.reflectance.thin import Held, subject
 
 # farthest way and number of ways tried, asset units (metres); new maps before each group
 ROUNDS = (((0.012, 33), (0.008, 33)), ((0.006, 25), (0.003, 21)))
 STEPS = (5, 3)  # Gauss-Newton steps of each round in the groups
 EDGE, STRONG = 0.05, 0.25  # s_e; sines of this size are more likely a step of the surface than an error
 AGREED = 10.0  # A: agreement is not independent of its neighbours', but not biased as sums of normals are
-STAY, UNSEEN_STAY = 0.05, 0.02  # s_0 seen, unseen, asset units (metres)
+STAY, UNSEEN_STAY, THIN_STAY = 0.05, 0.02, 5e-4  # s_0 seen, unseen, on thin sheets, asset units (metres)
 OUTLINE, OUTLIER = 5e-4, 3e-3  # s_o; farther off, the outline is another surface's
 RIM, FLAT_RIM = 0.3, 0.6  # most |n.v| at an outline, and outside of it
 BORDER = 3.0  # pixels at the frame that do not count
@@ -98,20 +99,24 @@ def reshaped(
 ) -> Mesh:
     """The mesh, with the same faces. pictures: (place of the camera in the rig, place of the light) -> linear picture.
     scratch: folder for samples, which are removed."""
-    first = mesh
+    first, mean = mesh, neighbour_mean(unique_edges(mesh.faces), len(mesh.vertices))
+    held = Held(mesh, mean, [subject(pictures, c) for c in range(len(rig.cameras))])
     for number, (rounds, steps) in enumerate(zip(ROUNDS, STEPS, strict=True)):
         maps = answer_maps(mesh, rig, pictures, scratch / f"answers_{number}", check, step)
         for done, (far, count) in enumerate(rounds):
             step(done, len(rounds), "moving the surface")
             check()
             mesh = moved(mesh, first, maps, [view_of(c, min(2 * WIDTH, c.width)) for c in rig.cameras],
-                         np.linspace(-far, far, count), steps)  # fmt: skip
+                         np.linspace(-far, far, count), steps, held)  # fmt: skip
     return mesh
 
 
-def moved(mesh: Mesh, first: Mesh, maps: Sequence[AnswerMap], views: Sequence[Any], tried: F64, steps: int) -> Mesh:
+def moved(
+    mesh: Mesh, first: Mesh, maps: Sequence[AnswerMap], views: Sequence[Any], tried: F64, steps: int, held: Held
+) -> Mesh:
     """One round: ways on which the cameras agree, then steps towards them and the maps' normals. first: the mesh as it
-    came; views: the maps' cameras in the size in which outlines are compared. Maps that know nothing move nothing."""
+    came; views: the maps' cameras in the size in which outlines are compared; held: what stays, which grows. Maps that
+    know nothing move nothing."""
     if not any(m.values[..., 6].any() for m in maps):
         return mesh
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces
@@ -121,22 +126,25 @@ def moved(mesh: Mesh, first: Mesh, maps: Sequence[AnswerMap], views: Sequence[An
     seen, well = _seen(vertices, normals, faces, maps)
     way, trust = ways(vertices, normals, seen, maps, mean, tried)
     goal = vertices + way[:, None] * normals
-    before = [outline(first, view) for view in views]
+    before, free = [outline(first, view) for view in views], 1 - held.share
     for _ in range(steps):
         vertices, whole = relaxed(vertices, faces, mean)
         normals = vertex_normals(vertices, faces).astype(np.float64)
-        system = _System(len(vertices))
-        _add_edges(system, vertices, normals, pairs, seen & whole, maps)
-        every = np.arange(len(vertices))
-        system.add([every], [np.ones(len(every))], ((goal - vertices) * normals).sum(1), AGREED * trust * whole)
-        off = ((first.vertices - vertices) * normals).sum(1)
-        system.add([every], [np.ones(len(every))], off, np.where(well, 1 / STAY**2, 1 / UNSEEN_STAY**2))
         now = Mesh(vertices.astype(np.float32), normals.astype(np.float32), faces)
+        system = _System(len(vertices))
+        _add_edges(system, vertices, normals, pairs, seen & whole, maps, free)
+        every = np.arange(len(vertices))
+        system.add([every], [np.ones(len(every))], ((goal - vertices) * normals).sum(1), AGREED * trust * whole * free)
+        off = ((first.vertices - vertices) * normals).sum(1)
+        stay = np.where(well, 1 / STAY**2, 1 / UNSEEN_STAY**2) + held.share / THIN_STAY**2
+        system.add([every], [np.ones(len(every))], off, stay)
         _add_outlines(system, vertices, normals, seen, views, before, [outline(now, view) for view in views])
         _add_bending(system, vertices, normals, pairs, mean, well & whole)
         vertices = vertices + np.clip(system.solved(), -FARTHEST, FARTHEST)[:, None] * normals
     vertices, _ = relaxed(vertices, faces, mean)
-    return Mesh(vertices.astype(np.float32), vertex_normals(vertices, faces), faces)
+    out = Mesh(vertices.astype(np.float32), vertex_normals(vertices, faces), faces)
+    held.grow(views, [outline(out, view) for view in views])
+    return out
 
 
 def neighbour_mean(pairs: Indices, count: int) -> Any:
@@ -163,9 +171,9 @@ def _seen(vertices: F64, normals: F64, faces: Faces, maps: Sequence[AnswerMap]) 
 
 
 def _add_edges(
-    system: _System, vertices: F64, normals: F64, pairs: Indices, seen: Bools, maps: Sequence[AnswerMap]
+    system: _System, vertices: F64, normals: F64, pairs: Indices, seen: Bools, maps: Sequence[AnswerMap], counts: F64
 ) -> None:
-    """Edges lie across the mean of their ends' normals."""
+    """Edges lie across the mean of their ends' normals. counts (V,): weight of edges at each vertex."""
     along = vertices[pairs[:, 1]] - vertices[pairs[:, 0]]
     length = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
     for visible, one in zip(seen, maps, strict=True):
@@ -175,7 +183,9 @@ def _add_edges(
         i, j = pairs[used].T
         across = unit(shown[i] + shown[j])
         sine = (across * along[used]).sum(1) / length[used]
-        weight = np.minimum(facing[i], facing[j]) / EDGE**2 / (1 + (sine / STRONG) ** 2)
+        weight = (
+            np.minimum(facing[i], facing[j]) * np.minimum(counts[i], counts[j]) / EDGE**2 / (1 + (sine / STRONG) ** 2)
+        )
         slope = [(across * normals[k]).sum(1) / length[used] for k in (i, j)]
         system.add([j, i], [slope[1], -slope[0]], -sine, weight)
 

@@ -25,8 +25,8 @@ FLOOR = 10**-9.9  # least error that is told: 99 dB
 @dataclass(frozen=True, slots=True)
 class Score:
     """Mean squared errors over covered pixels, display-encoded, one for each picture: of the field, of blending the
-    three nearest lights; angle to the nearest light of the fit, degrees; camera and light, places in the rig; level:
-    mean of the truth there, encoded."""
+    three nearest lights, and of the field as standard shaders show it (NaN: not asked); angle to the nearest light of
+    the fit, degrees; camera and light, places in the rig; level: mean of the truth there, encoded."""
 
     camera: int
     light: int
@@ -34,6 +34,7 @@ class Score:
     blend: float
     angle: float
     level: float = 1.0
+    standard: float = float("nan")
 
 
 def decibels(errors: Sequence[float]) -> float:
@@ -62,24 +63,32 @@ def score(
     gain: float,
     tick: Callable[[int, int], None],
     mask: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+    standard: Field | None = None,
 ) -> list[Score]:
     """A score for each wanted (camera, light). fitted: places of the lights in the fit, which are blended. gain: of the
-    display. mask: pixels (H, W) that count, by camera; those that the mesh covers, without."""
+    display. mask: pixels (H, W) that count, by camera; those that the mesh covers, without. standard: on the same
+    texels, what is scored as such."""
     positions, axes = rig.lamps()
-    arrives: dict[int, F32] = {}
+    arrives: dict[int, list[F32]] = {}
+    fields = [field, *([standard] if standard is not None else [])]
     out = []
     for done, (c, i) in enumerate(wanted):
         tick(done, len(wanted))
         lamp = Lamp(positions[i], axes[i], rig.strength[i])
         if i not in arrives:
-            arrives = {i: field.arrives(lamp)}
+            arrives = {i: [f.arrives(lamp) for f in fields]}
         camera = camera_at(rig, c, i)
-        made = picture(camera, look_up(field, camera), field.radiance(lamp, camera.eye, arrives[i]))
+        table = look_up(field, camera)
+        made, *other = (
+            picture(camera, table, f.radiance(lamp, camera.eye, a)) for f, a in zip(fields, arrives[i], strict=True)
+        )
         truth = encoded(read_linear(pictures[c, i]), gain)
         counted = made[..., 3] > COVERED if mask is None else mask[c]
         blend, angle = blended(rig, pictures, fitted, c, i)
-        errors = [float(np.mean((encoded(p, gain) - truth)[counted] ** 2)) for p in (made[..., :3], blend)]
-        out.append(Score(c, i, errors[0], errors[1], angle, float(np.mean(truth[counted]))))
+        shown = (made[..., :3], blend, *(p[..., :3] for p in other))
+        errors = [float(np.mean((encoded(p, gain) - truth)[counted] ** 2)) for p in shown]
+        level = float(np.mean(truth[counted]))
+        out.append(Score(c, i, errors[0], errors[1], angle, level, *errors[2:]))
     return out
 
 

@@ -20,6 +20,8 @@ import numpy.typing as npt
 
 from pipeline.images import F32
 from pipeline.transforms import F64
+from stages.reflectance.layer import WIDTHS as LAYER_WIDTHS
+from stages.reflectance.layer import Layers
 from stages.reflectance.rig import Rig
 from stages.reflectance.samples import F16, Step, part
 from stages.reflectance.texels import U8, Pairs, Points
@@ -43,7 +45,7 @@ WIDTHS = ((0.35, 0.25, 0.18), (0.15, 0.12, 0.09), (0.05, 0.03, 0.02))  # GGX alp
 @dataclass(frozen=True, slots=True)
 class Fitted:
     """albedo, lobes, normal (T, 3); rest (T, K, 3); shadow, trust (T, L): V less what is traced, and how far it is
-    known; error (T,): weighted RMS of y."""
+    known; error (T,): weighted RMS of y; layers: the same samples as one layer over a base."""
 
     albedo: F32
     lobes: F32
@@ -52,6 +54,7 @@ class Fitted:
     shadow: F16
     trust: F16
     error: F32
+    layers: Layers
 
 
 def harmonics(towards: F64, order: int) -> F64:
@@ -110,6 +113,7 @@ def split(
         shadow=np.zeros((count, lights), np.float16),
         trust=np.zeros((count, lights), np.float16),
         error=np.zeros(count, np.float32),
+        layers=Layers.empty(count),
     )
     seen = np.flatnonzero(pairs.seen)
     basis, penalty = harmonics(rig.towards, order), penalties(order)
@@ -127,6 +131,7 @@ def split(
         work.see(np.array(alphas))
         out.albedo[texels], out.lobes[texels], out.normal[texels] = work.albedo, work.lobes, work.normals
         out.rest[texels], out.error[texels] = rest, error
+        work.fit_layers(np.array(alphas), out.layers, texels)
         out.shadow[texels], out.trust[texels] = (work.share - work.traced) * (work.trust > 0), work.trust
     return out
 
@@ -205,6 +210,17 @@ class TexelFit:
         )
         self.rest = np.einsum("tkc,lk->tlc", out, basis).astype(np.float32)
         return out.astype(np.float32)
+
+    def fit_layers(self, alphas: F64, out: Layers, texels: npt.NDArray[np.int64]) -> None:
+        """Writes the fits with one layer of these texels into those of all."""
+        from stages.reflectance.layer_kernels import layers
+
+        own = Layers.empty(len(texels))
+        layers(self.points, self.normals, self.first, self.camera, self.weight, self.samples, self.arrives, self.rest,
+               self.lamps, self.axes, self.eyes, alphas, self.albedo, self.lobes, SPREAD, LAYER_WIDTHS, own.base,
+               own.f0, own.error, own.facing)  # fmt: skip
+        out.base[texels], out.f0[texels], out.error[texels] = own.base, own.f0, own.error
+        out.facing[texels] = own.facing
 
     def _left_over(self, alphas: F64, arrives: F32, most: float) -> F32:
         from stages.reflectance.fit_kernels import left_over

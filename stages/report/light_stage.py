@@ -50,6 +50,8 @@ def shown_field(r: Located[ReflectanceField], side: int) -> FieldShown | None:
             (f"{f['blend_psnr']:.1f} dB", "PSNR, blend", "of the pictures under the three nearest lights"),
             (f"{f['left_out_angle']:.0f}°", "to the nearest light", "mean of the lights that were left out"),
         ]
+    if "openpbr_psnr" in f:
+        headline.append((f"{f['openpbr_psnr']:.1f} dB", "PSNR, OpenPBR", "the same by the asset's material alone"))
     if "left_out_camera_psnr" in f:
         told = f"the same lights seen by {len(field.cameras)} cameras that the fit did not use"
         headline.append((f"{f['left_out_camera_psnr']:.1f} dB", "PSNR, other cameras", told))

@@ -25,7 +25,7 @@ from stages.uv.config import Config as UvConfig
 from stages.uv.decimate import decimated
 from stages.uv.unwrap import unwrap
 from tests.support.analytic_fields import AnalyticField, sphere
-from tests.support.ball_head import no_head
+from tests.support.ball_head import no_field, no_head
 from tests.support.field_artifacts import fitted, poses
 
 PNG = {
@@ -74,6 +74,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Inputs:
         Located(MaskSet(masks=(mask,)), tmp_path),
         photographed(tmp_path),
         no_head(tmp_path),
+        no_field(tmp_path),
     )
 
 

@@ -17,7 +17,7 @@ from stages.bake import stage as bake
 from stages.usd import stage as usd
 from stages.uv import stage as uv
 from tests.support.analytic_fields import AnalyticField, sphere
-from tests.support.ball_head import no_head
+from tests.support.ball_head import no_field, no_head
 from tests.support.field_artifacts import fitted, poses
 from tests.support.shreds import shredded, with_worthless_faces
 from tests.support.synthetic_asset import smooth_light
@@ -59,7 +59,7 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
     )
     at_uv = Located(textured, folders["uv"])
     maps = bake.run(
-        bake.Inputs(surface, at_uv, face, rig, masks, capture, no_head(surface.folder)),
+        bake.Inputs(surface, at_uv, face, rig, masks, capture, no_head(surface.folder), no_field(surface.folder)),
         bake.Config(size=256),
         context("bake"),
     )

@@ -16,6 +16,7 @@ from stages.reflectance.agree import ALBEDOS, MOST, NORMALS, SHARPEST, _cost, _l
 from stages.reflectance.answers import AnswerMap, answer_maps
 from stages.reflectance.reshape import _System, folded, moved, neighbour_mean, outline, relaxed
 from stages.reflectance.rig import Rig, rig_of
+from stages.reflectance.thin import Held
 from tests.reflectance.test_rig_and_motion import cameras_of, lights_of
 from tests.reflectance.test_split import silent
 from tests.support.light_stage import RADIUS, SIZE, K, albedo_at, make_stage, photograph
@@ -72,6 +73,11 @@ def ball_map(view: PinholeCamera, *, plain: bool = False) -> AnswerMap:
 
 
 MAPS = [ball_map(v) for v in VIEWS]
+
+
+def free(mesh: Mesh, cameras: int = len(VIEWS)) -> Held:
+    """Nothing is held: no picture shows the subject."""
+    return Held(mesh, neighbour_mean(unique_edges(mesh.faces), len(mesh.vertices)), [np.zeros((8, 8), bool)] * cameras)
 
 
 def faces_two(vertices: np.ndarray) -> np.ndarray:
@@ -167,14 +173,16 @@ def dented() -> Mesh:
 
 def test_a_bulge_is_taken_back(dented: Mesh) -> None:
     """To the ball, where two cameras see it and where only one does; the normals as well."""
-    found = moved(dented, dented, MAPS, VIEWS, TRIED, 5)
+    found = moved(dented, dented, MAPS, VIEWS, TRIED, 5, free(dented))
     two = faces_two(dented.vertices.astype(float))
     assert np.quantile(off(dented)[two], 0.9) > 1.3e-3 and np.quantile(off(found)[two], 0.9) < 4e-4
     before, after = (
         np.degrees(np.arccos(np.median((m.normals * unit(m.vertices)).sum(1)[two]))) for m in (dented, found)
     )
     assert before > 2 and after < 0.5
-    alone = moved(dented, dented, MAPS[1:2], VIEWS[1:2], TRIED, 8)  # its depth is not known, its shape is
+    alone = moved(
+        dented, dented, MAPS[1:2], VIEWS[1:2], TRIED, 8, free(dented, 1)
+    )  # its depth is not known, its shape is
     facing = (unit(VIEWS[1].eye - dented.vertices) * unit(dented.vertices)).sum(1) > 0.5
     spread = [float(np.std(np.linalg.norm(m.vertices.astype(float), axis=1)[facing])) for m in (dented, alone)]
     assert spread[1] < 0.3 * spread[0]
@@ -182,7 +190,7 @@ def test_a_bulge_is_taken_back(dented: Mesh) -> None:
 
 def test_what_is_right_stays() -> None:
     mesh = globe()
-    found = moved(mesh, mesh, MAPS, VIEWS, TRIED, 5)
+    found = moved(mesh, mesh, MAPS, VIEWS, TRIED, 5, free(mesh))
     seen = np.max([(unit(v.eye - mesh.vertices) * unit(mesh.vertices)).sum(1) for v in VIEWS], axis=0) > 0.2
     assert off(found)[seen].max() < 6e-4 and np.median(off(found)[seen]) < 1e-4
     assert off(found).max() < 4e-3  # at the back, which is smoothed as the octahedron's corners are
@@ -192,8 +200,8 @@ def test_what_is_right_stays() -> None:
 def test_maps_that_know_nothing_move_nothing() -> None:
     mesh = globe(2)
     empty = [replace(m, values=np.zeros_like(m.values)) for m in MAPS]
-    assert moved(mesh, mesh, empty, VIEWS, TRIED, 3) is mesh
-    assert moved(mesh, mesh, [], [], TRIED, 3) is mesh
+    assert moved(mesh, mesh, empty, VIEWS, TRIED, 3, free(mesh)) is mesh
+    assert moved(mesh, mesh, [], [], TRIED, 3, free(mesh, 0)) is mesh
 
 
 def test_outlines_are_the_balls_circle() -> None:

@@ -103,5 +103,7 @@ def test_a_left_out_camera_and_single_angles(tmp_path: Path) -> None:
     shown = shown_field(found, 100)
     assert shown is not None and shown.headline[-1][0] == "19.0 dB" and not shown.quick and not shown.rows
     assert field_figures(found.artifact)["cameras_left_out"] == [2]
+    standard = shown_field(field_in(tmp_path, figures=figures | {"openpbr_psnr": 20.04}, shown=()), 100)
+    assert standard is not None and ("20.0 dB", "PSNR, OpenPBR") in [h[:2] for h in standard.headline]
     alone = plot((LeftOutPicture(camera=0, light=0, angle=0, psnr=20, blend_psnr=20),))
     assert "nan" not in alone and alone.count("<circle") == 2

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.artifacts import Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import Mesh, unit
+from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.template.model import Points, Template
 
 RADIUS = 0.1
@@ -57,3 +58,8 @@ def ball_scan(radius: float, n: int = 40, centre: tuple[float, float, float] = (
 def no_head(folder: Path) -> Located[RegisteredHead]:
     """The template stage's artifact of a capture without a face."""
     return Located(RegisteredHead(registered=False, reason="no face"), folder)
+
+
+def no_field(folder: Path) -> Located[ReflectanceField]:
+    """The reflectance stage's artifact of a capture that is no light stage's."""
+    return Located(ReflectanceField(present=False), folder)

@@ -6,8 +6,13 @@
     olat/{camera}/{light}.exr         under one light
     tracking/{camera}/{frame}.exr     under all lights, now and then: they say how the head moved
 
+Pictures may lie elsewhere: `pictures` in lights.json says where (stage_pictures.py), such as one folder for each light.
+
 Pictures are linear: EXR, or 16-bit PNG or TIFF where lights.json says `"encoding": "linear"`. `direction` points from
-the stage's centre to the light, `axis` is where it shines; one of them, or `stage_centre` of the file, is needed.
+the stage's centre to the light, `axis` is where it shines; one of them, or `stage_centre` of the file, is needed. For
+all lights: `scale`, metres in one unit of the positions; `intensity_rgb` of lights without their own; `distance`, in
+metres from the stage's centre, of lights with `azimuth` and `elevation` in place of a position (degrees; 0, 0 is +z,
+azimuth grows to +x, elevation to +y).
 """
 
 from __future__ import annotations
@@ -23,11 +28,13 @@ from pipeline.capture_artifacts import StageLight
 from pipeline.errors import StageError
 from stages.capture.readers.described import PHOTO_SUFFIXES, Declared, Described, natural_key, read_json
 from stages.capture.readers.facescape import PARAMS, given_view, is_valid, read_params, view_indices
+from stages.capture.readers.stage_pictures import Pattern, read_patterns
 from stages.capture.readers.values import DIGITS, fault, label, number, printable, shown, table
 
 LIGHTS, FULL_ON, SINGLE, TRACKING = "lights.json", "full_on", "olat", "tracking"
 MAX_LIGHTS = 10_000
 FEWEST = 8  # lights: albedo, normal and three lobes are eight numbers a texel
+UNREADABLE, COPY = "lights.json can't be read", "copy the file again from the stage's calibration"
 UNLIKE_UNIT = 0.02  # a direction's length may differ from 1 by this
 
 
@@ -53,21 +60,31 @@ class Pictures:
 def find(folder: Path) -> list[Path]:
     """params.json and lights.json, if there are pictures under single lights too."""
     files = [folder / PARAMS, folder / LIGHTS]
-    return files if all(f.is_file() for f in files) and (folder / SINGLE).is_dir() else []
+    if not all(f.is_file() for f in files):
+        return []
+    return files if (folder / SINGLE).is_dir() or patterns(folder) else []
+
+
+def patterns(folder: Path) -> dict[str, Pattern]:
+    """Where the pictures are by lights.json: empty if it does not say. Raises StageError for a pattern that is none."""
+    path = folder / LIGHTS
+    content = read_json(path, UNREADABLE, COPY) if path.is_file() else {}
+    given = content.get("pictures") if isinstance(content, dict) else None
+    return {} if given is None else read_patterns(given, f"{LIGHTS}, pictures")
 
 
 def read(folder: Path, files: Sequence[Path]) -> Described:
     """The views under all lights. Invalid ones, and those without a picture, are left out."""
     params = read_params(files[0])
-    photos = _numbered(folder / FULL_ON, [])
+    photos, elsewhere = _full_on(folder), bool(patterns(folder))
     views, left_out, absent, warnings = [], [], [], []
     for index in view_indices(params):
         photo = photos.get(index)
-        name = photo.name if photo else f"{index}"
+        name = photo.name if photo and not elsewhere else f"{index}{photo.suffix if photo else ''}"
         if is_valid(params, index) and photo is not None:
             camera, size = given_view(params, index)
             serial = label(params.get(f"{index}_sn", ""), f"params.json, key {index}_sn")
-            views.append(Declared(index, photo.name, photo, camera, size, serial))
+            views.append(Declared(index, name, photo, camera, size, serial))
             continue
         absent.append(name)
         if photo is not None:
@@ -81,8 +98,27 @@ def read(folder: Path, files: Sequence[Path]) -> Described:
 def pictures_of(folder: Path) -> Pictures:
     """All pictures under single lights and all tracking pictures, by the numbers in their paths."""
     doubled: list[str] = []
+    found = patterns(folder)
+    if found:
+        frames = {} if found[SINGLE].by_light else _light_of_frame(folder / LIGHTS)
+        single = {(c, frames.get(n, n)): p for (c, n), p in found[SINGLE].matches(folder, doubled).items()
+                  if not frames or n in frames}  # fmt: skip
+        tracking = found[TRACKING].matches(folder, doubled) if TRACKING in found else {}
+        return Pictures(single, tracking, doubled)
     single, tracking = (_by_camera(folder / name, doubled) for name in (SINGLE, TRACKING))
     return Pictures(single, tracking, doubled)
+
+
+def _full_on(folder: Path) -> dict[int, Path]:
+    """The picture under all lights of each camera."""
+    found = patterns(folder)
+    if not found:
+        return _numbered(folder / FULL_ON, [])
+    return {camera: path for (camera, _), path in found[FULL_ON].matches(folder, []).items()}
+
+
+def _light_of_frame(path: Path) -> dict[int, int]:
+    return {light.frame: index for index, light in read_lights(path).lights.items()}
 
 
 def _by_camera(folder: Path, doubled: list[str]) -> dict[tuple[int, int], Path]:
@@ -110,7 +146,7 @@ def read_lights(path: Path) -> Lamps:
     An entry without position, direction or intensity is no error: its pictures are left out, and a note says so.
     Raises StageError if the file has no list of lights, a value is not a number, or too few lights are left.
     """
-    content = read_json(path, "lights.json can't be read", "copy the file again from the stage's calibration")
+    content = read_json(path, UNREADABLE, COPY)
     entries = content.get("lights") if isinstance(content, dict) else None
     if not isinstance(entries, list) or len(entries) > MAX_LIGHTS:
         raise fault("lights.json has no list of lights", path.name, shown(content),
@@ -151,7 +187,8 @@ def _light(entry: Any, place: int, content: Mapping[str, Any], notes: list[str])
         return None
     index = int(entry["index"])
     where = f"{LIGHTS}, light {index}"
-    position, intensity = (_three(entry.get(k), f"{where}, {k}") for k in ("position", "intensity_rgb"))
+    position = _position(entry, content, where)
+    intensity = _three(entry.get("intensity_rgb", content.get("intensity_rgb")), f"{where}, intensity_rgb")
     axis = _axis(entry, content, position, where)
     if position is None or intensity is None or axis is None or min(intensity) <= 0 or not 0 <= index < 10**DIGITS:
         missing = [k for k, v in (("position", position), ("intensity_rgb", intensity), ("direction", axis)) if not v]
@@ -163,6 +200,24 @@ def _light(entry: Any, place: int, content: Mapping[str, Any], notes: list[str])
         raise fault("a light's frame is not a whole number", f"{where}, frame", frame, "a whole number",
                     "number the pictures in the order in which they were taken")  # fmt: skip
     return StageLight(index=index, position=position, axis=axis, intensity=intensity, frame=round(frame))
+
+
+def _position(entry: Mapping[str, Any], content: Mapping[str, Any], where: str) -> Any:
+    """`position` in metres, or the place that `azimuth`, `elevation` and the file's `distance` say."""
+    scale = number(content.get("scale", 1.0), f"{LIGHTS}, scale")
+    if not scale > 0:
+        raise fault("the unit of the lights' positions is not positive", f"{LIGHTS}, scale", scale, "above 0",
+                    "write the metres in one unit: 0.001 for millimetres")  # fmt: skip
+    found = _three(entry.get("position"), f"{where}, position")
+    if found is not None:
+        return tuple(scale * x for x in found)
+    if any(k not in entry for k in ("azimuth", "elevation")) or "distance" not in content:
+        return None
+    far = number(content["distance"], f"{LIGHTS}, distance")
+    a, e = (np.radians(number(entry[k], f"{where}, {k}")) for k in ("azimuth", "elevation"))
+    centre = _three(content.get("stage_centre", [0, 0, 0]), f"{LIGHTS}, stage_centre") or (0.0, 0.0, 0.0)
+    towards = (np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a))
+    return tuple(float(scale * c + far * t) for c, t in zip(centre, towards, strict=True))
 
 
 def _three(value: Any, where: str) -> tuple[float, float, float] | None:
@@ -185,10 +240,13 @@ def _axis(entry: Mapping[str, Any], content: Mapping[str, Any], position: Any, w
                 raise fault("a light's direction is not a unit vector", f"{where}, {key}", f"length {length:.4g}",
                             "length 1", "divide it by its length")  # fmt: skip
             return tuple(sign * x / length for x in found)
-    centre = _three(content.get("stage_centre"), f"{LIGHTS}, stage_centre")
-    if centre is None or position is None or centre == position:
+    by_angles = "position" not in entry and position is not None
+    centre = _three(content.get("stage_centre", [0, 0, 0] if by_angles else None), f"{LIGHTS}, stage_centre")
+    if centre is None or position is None:
         return None
-    away = np.subtract(centre, position)
+    away = np.subtract([number(content.get("scale", 1.0), f"{LIGHTS}, scale") * x for x in centre], position)
+    if not np.linalg.norm(away) > 0:
+        return None
     return tuple(float(x) for x in away / np.linalg.norm(away))
 
 
