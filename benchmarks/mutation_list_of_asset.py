@@ -7,6 +7,23 @@ from benchmarks.mutation import Mutation
 SUPPORTED = "tests/masks/test_masks_support_object.py"
 
 OF_ASSET = (
+    # ---------------------------------------------------------------- registration of the template
+    Mutation("pipeline/registration/crossing_kernels.py", "if not CLEAR < t < 1 - CLEAR:", "if not 0 < t:",
+             "tests/registration/test_crossing.py::test_the_edges_of_a_heap_of_triangles"),
+    Mutation("pipeline/registration/crossing_kernels.py", "and u + v <= 1 + INSIDE", "and u + v <= 2",
+             "tests/registration/test_crossing.py::test_the_edges_of_a_heap_of_triangles"),
+    Mutation("pipeline/registration/crossing_kernels.py", "_cell(x1, low[0], cell, shape[0]) + 1",
+             "_cell(x1, low[0], cell, shape[0])",
+             "tests/registration/test_crossing.py::test_the_edges_of_a_heap_of_triangles"),
+    Mutation("pipeline/registration/nonrigid.py", "np.where(part.free, FIXED, HELD)", "FIXED * np.ones(len(part.free))",
+             "tests/registration/test_nonrigid_parts.py::test_what_is_free_meets_the_scan_and_the_rest_stays"),
+    Mutation("pipeline/registration/nonrigid.py", "some | (joined.T @", "some & (joined.T @",
+             "tests/registration/test_nonrigid_parts.py::test_vertices_that_a_guide_joins_move_together"),
+    Mutation("pipeline/registration/scan.py", 'object.__setattr__(other, "beneath", beneath)',
+             'object.__setattr__(other, "beneath", self.beneath)',
+             "tests/registration/test_scan.py::test_a_surface_that_is_seen_otherwise_answers_as_a_new_one"),
+    Mutation("pipeline/visibility.py", "self._kept.move_to_end(key)", "pass",
+             "tests/bake/test_bake_sight.py::test_masks_that_were_read_are_kept_up_to_a_limit"),
     # ---------------------------------------------------------------- registration of the head template
     Mutation("pipeline/registration/outgrown.py", ">= OUTSIDE * away", "<= OUTSIDE * away",
              "tests/registration/test_outgrown.py::test_the_places_are_those_that_stand_out"),

@@ -5,6 +5,18 @@ from __future__ import annotations
 from benchmarks.mutation import Mutation
 
 OF_FIT = (
+    # ---------------------------------------------------------------- the outline's level
+    Mutation("stages/inverse_rendering/outline_level.py", "np.quantile(least[rows], share)",
+             "np.quantile(least[rows], 1 - share)",
+             "tests/inverse_rendering/test_outline_level.py::test_the_level_is_that_of_the_masks"),
+    Mutation("stages/inverse_rendering/outline_level.py", "surface.values + depth", "surface.values",
+             "tests/inverse_rendering/test_outline_level.py::test_the_level_is_that_of_the_masks"),
+    Mutation("stages/inverse_rendering/outline_level.py", "1 - (deviation / found) ** 2", "1 - deviation / found",
+             "tests/inverse_rendering/test_outline_level.py::test_what_may_be_chance_is_drawn_to_0"),
+    Mutation("stages/inverse_rendering/outline_level.py", "<= BAND) & ~bad", "<= BAND)",
+             "tests/inverse_rendering/test_outline_level.py::test_what_does_not_count_moves_nothing"),
+    Mutation("pipeline/fields/face.py", "s - np.float32(self.model.level)", "s + np.float32(self.model.level)",
+             "tests/inverse_rendering/test_outline_level.py::test_the_stages_after_the_fit_see_the_surface_at_the_level"),
     # ---------------------------------------------------------------- registration of photos
     Mutation("stages/inverse_rendering/registration.py", "slope = 0.5 * (own + level.gradient) / level.side",
              "slope = 0.5 * (own + level.gradient)",

@@ -15,6 +15,7 @@ from stages.reflectance import stage
 from stages.reflectance.build import _unmarked
 from stages.reflectance.config import Config
 from stages.reflectance.field import load
+from stages.reflectance.layer import Layers
 from stages.reflectance.paint import marked, read_masks, replaced
 from stages.reflectance.split import Fitted
 from tests.reflectance.test_field import ball, field_of  # noqa: F401  (a fixture)
@@ -70,7 +71,10 @@ def test_a_made_up_blemish_vanishes_in_every_function() -> None:
     normal = points.normal.astype(np.float32)
     normal[near] = [1, 0, 0]
     parts = Fitted(
-        normal=normal, error=np.zeros(count, np.float32), **{k: v.astype(np.float32) for k, v in arrays.items()}
+        normal=normal,
+        error=np.zeros(count, np.float32),
+        layers=Layers.empty(count),
+        **{k: v.astype(np.float32) for k, v in arrays.items()},
     )
     found = _unmarked(parts, near, points)
     np.testing.assert_allclose(found.shadow, plain["shadow"], atol=2e-3)
