@@ -23,11 +23,10 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import binary_dilation, binary_erosion
 
-from benchmarks.reflectance_field import EYE, GAIN, Truth, labels_of, rig_of_run
+from benchmarks.reflectance_field import EYE, GAIN, Truth, labels_of, placed, rig_of_run
 from pipeline.images import F32, read_linear
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import apply, matrix, pixel_centres
-from stages.capture.readers.olat import pictures_of
 from stages.reflectance.field import Field, Lamp, load
 from stages.reflectance.relight import look_up, picture
 from stages.reflectance.rig import Rig
@@ -112,8 +111,7 @@ def main() -> None:
     folder = options.run / "reflectance"
     field, basis = load(folder), json.loads((folder / "basis.json").read_text())
     rig = rig_of_run(options.run, options.capture, basis)
-    place = {index: n for n, index in enumerate(rig.index)}
-    single = {(c, place[n]): path for (c, n), path in pictures_of(options.capture).single.items() if n in place}
+    place, single = placed(rig, options.capture)
     cameras = [n for n, c in enumerate(rig.cameras) if options.camera is None or c.index in options.camera]
     held = [place[n] for n in basis["left_out"]]
     found = measured(field, rig, single, held, cameras, options.capture, capture_from_asset_of(options.run))

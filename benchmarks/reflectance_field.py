@@ -93,6 +93,12 @@ def labels_of(capture: Path, camera: int) -> np.ndarray:
     return cv2.imread(str(capture / f"truth/labels/{camera}.png"), cv2.IMREAD_GRAYSCALE)
 
 
+def placed(rig: Rig, capture: Path) -> tuple[dict[int, int], dict[tuple[int, int], Path]]:
+    """Place in a rig of each of its lights, and the pictures under single lights by camera and place."""
+    place = {index: n for n, index in enumerate(rig.index)}
+    return place, {(c, place[n]): path for (c, n), path in pictures_of(capture).single.items() if n in place}
+
+
 def rig_of_run(run: Path, capture: Path, basis: dict) -> Rig:
     """All lights and cameras of a capture with the run's own motion."""
     from pipeline.artifacts import Camera
@@ -113,8 +119,7 @@ def single_lights(
     field: Field, rig: Rig, capture: Path, basis: dict, cameras: list[int] | None, out: Path | None
 ) -> dict:
     """PSNR of left-out lights, of the field and of blending; with cameras, of those alone, also of fitted lights."""
-    place = {index: n for n, index in enumerate(rig.index)}
-    pictures = {(c, place[n]): p for (c, n), p in pictures_of(capture).single.items() if n in place}
+    place, pictures = placed(rig, capture)
     fitted, held = [place[n] for n in basis["lights"]], [place[n] for n in basis["left_out"]]
     mask = {c: labels_of(capture, rig.cameras[c].index) > 0 for c in range(len(rig.cameras))}
     chosen = [n for n, c in enumerate(rig.cameras) if cameras is None or c.index in cameras]
@@ -152,8 +157,7 @@ def beside(field: Field, rig: Rig, pictures: dict, fitted: list[int], camera: in
 def standard(field: Field, run: Path, rig: Rig, capture: Path, basis: dict) -> dict:
     """PSNR of left-out lights as standard shaders show them, over skin and eyes: on the field's mesh, of which all, or
     only what cameras saw, throws shadows; and on the asset's mesh."""
-    place = {index: n for n, index in enumerate(rig.index)}
-    pictures = {(c, place[n]): p for (c, n), p in pictures_of(capture).single.items() if n in place}
+    place, pictures = placed(rig, capture)
     fitted, held = [place[n] for n in basis["lights"]], [place[n] for n in basis["left_out"]]
     mask = {c: labels_of(capture, rig.cameras[c].index) > 0 for c in range(len(rig.cameras))}
     wanted = [(c, i) for i in held for c in range(len(rig.cameras))]

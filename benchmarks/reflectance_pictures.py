@@ -15,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.reflectance_field import EYE, GAIN, SOFT_GAIN, labels_of, rig_of_run
+from benchmarks.reflectance_field import EYE, GAIN, SOFT_GAIN, labels_of, placed, rig_of_run
 from pipeline.images import F32, read_linear, write_png
 from pipeline.transforms import F64
-from stages.capture.readers.olat import pictures_of
 from stages.reflectance.field import Field, Lamp, load
 from stages.reflectance.openpbr import OpenPbr
 from stages.reflectance.relight import look_up, picture, under_lamps
@@ -120,8 +119,7 @@ def main() -> None:
     folder = options.run / "reflectance"
     field, basis = load(folder), json.loads((folder / "basis.json").read_text())
     rig = rig_of_run(options.run, options.capture, basis)
-    place = {index: n for n, index in enumerate(rig.index)}
-    single = {(c, place[n]): path for (c, n), path in pictures_of(options.capture).single.items() if n in place}
+    place, single = placed(rig, options.capture)
     held = [place[n] for n in basis["left_out"]]
     rows = []
     standard, left = OpenPbr.of(field), list(held)

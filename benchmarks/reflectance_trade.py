@@ -19,11 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.reflectance_field import GAIN, environments, labels_of, rig_of_run
+from benchmarks.reflectance_field import GAIN, environments, labels_of, placed, rig_of_run
 from pipeline import meshes
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, matrix
-from stages.capture.readers.olat import pictures_of
 from stages.reflectance.build import fitted_field
 from stages.reflectance.config import Config
 from stages.reflectance.field import Field, save
@@ -91,8 +90,7 @@ def main() -> None:
     options = p.parse_args()
     basis = json.loads((options.run / "reflectance/basis.json").read_text())
     rig = rig_of_run(options.run, options.capture, basis)
-    place = {index: n for n, index in enumerate(rig.index)}
-    single = {(c, place[n]): path for (c, n), path in pictures_of(options.capture).single.items() if n in place}
+    place, single = placed(rig, options.capture)
     fitted, held = [place[n] for n in basis["lights"]], [place[n] for n in basis["left_out"]]
     mask = {c: labels_of(options.capture, rig.cameras[c].index) > 0 for c in range(len(rig.cameras))}
     for name, lights, cameras, order in cases(rig, fitted):

@@ -203,7 +203,7 @@ class FittedField:
     def sdf_and_gradient(self, points: F32) -> tuple[F32, F32]:
         """SDF (N,) and gradient (N, 3) at points (N, 3); the SDF is 0 on the surface that the model's `level` says."""
         s, g = self._map(self.model.geometry, points)
-        return s - np.float32(self.model.level), g
+        return s - np.float32(float(self.model.level)), g
 
     def sdf(self, points: F32) -> F32:
         """(N,)."""

@@ -68,13 +68,17 @@ class GridSdf(nn.Module):
         out: tuple[Tensor, Tensor] = kernels.SplineSdf.apply(x, self.values, self.sink, self.lo, self.cell)  # type: ignore[no-untyped-call]
         return out
 
-    def trace(self, o: Tensor, d: Tensor, near: Tensor, far: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """t, hit and SDF of the first hit or the closest approach. [NeuFace section 4.4]
+    def trace(
+        self, o: Tensor, d: Tensor, near: Tensor, far: Tensor, depth: float = 0.0
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """t, hit and SDF of the first hit or the closest approach. [NeuFace section 4.4] depth: of the surface that is
+        met, below the zero set; the SDF is then that of this surface.
 
         Differs: factor 0.95 instead of 1.2. A spline of a hull's distance may have a slope above 1, and crossings are
         found by the sign, so that shorter steps cost little (measured in docs/benchmarks.md).
         """
-        return kernels.trace(self.values, self.lo, self.cell, o, d, near, far, min_step=0.3 * self.cell, factor=0.95)
+        values = self.values + depth if depth else self.values  # a spline of shifted coefficients is the shifted spline
+        return kernels.trace(values, self.lo, self.cell, o, d, near, far, min_step=0.3 * self.cell, factor=0.95)
 
     # ---------------------------------------------------------------- optimisation
     def find_band(self) -> None:

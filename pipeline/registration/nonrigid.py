@@ -88,9 +88,10 @@ def fitted(cage: Cage, rest: F64, scan: Scan, guides: Guides, unit: float, check
         hit[cage.quads[folded | pierced]] = True
         damping = damping * np.where(_grown(hit, near, FAULT), DAMPING, 1.0)
         free = _with_guides(cKDTree(rest[hit]).query(rest)[0] < FREE * unit, guides)
-        part, keep = _part(whole, scan, np.where(free[:, None], start, x), free, _grown(free, near, EDGE), unit)
-        x = x.copy()
-        x[keep] = _steps(part, np.where(free[:, None], start, x)[keep], scan, damping[keep], unit, STEPS[AGAIN:], check)
+        keep = _grown(free, near, EDGE)
+        x = np.where(free[:, None], start, x)
+        part = _part(whole, scan, x, free, keep)
+        x[keep] = _steps(part, x[keep], scan, damping[keep], unit, STEPS[AGAIN:], check)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,17 +106,17 @@ class _Part:
     free: Mask
 
 
-def _part(whole: _Part, scan: Scan, x: F64, free: Mask, keep: Mask, unit: float) -> tuple[_Part, Mask]:
+def _part(whole: _Part, scan: Scan, x: F64, free: Mask, keep: Mask) -> _Part:
     """The part of the vertices keep (V,), of which those of free (V,) move; x (V, 3) the whole. A vertex of the surface
     whose nearest place is elsewhere does not pull the part."""
-    points, rows = whole.cage.points(x), points_of(whole.cage, keep)
+    points = whole.cage.points(x)
     own = np.zeros(len(points), np.bool_)
-    own[rows] = True
+    own[points_of(whole.cage, keep)] = True
     _, nearest = cKDTree(points).query(scan.mesh.vertices[whole.among])
     guides, use = whole.guides, rows_within(whole.guides.stencil, keep)
     some = Guides(csr_array(guides.stencil[use][:, np.flatnonzero(keep)]), guides.where[use], guides.least[use])
     among = whole.among[own[nearest]]
-    return _Part(part_of(whole.cage, keep), whole.rest[keep], some, among, free[keep]), keep
+    return _Part(part_of(whole.cage, keep), whole.rest[keep], some, among, free[keep])
 
 
 def _with_guides(some: Mask, guides: Guides) -> Mask:

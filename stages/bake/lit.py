@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import Located
+from pipeline.map_lookup import bilinear
 from pipeline.meshes import F32, Indices
 from pipeline.reflectance_artifacts import ReflectanceField
 
@@ -35,12 +36,8 @@ class Measured:
 
     def at(self, texel: Indices) -> F32:
         """(N, 9) values at texels row * size + column, bilinear."""
-        side = len(self.values)
-        row, column = ((n + 0.5) / self.size * side - 0.5 for n in divmod(texel, self.size))
-        top, left = (np.clip(np.floor(x).astype(np.int64), 0, side - 2) for x in (row, column))
-        v, u = ((x - first).clip(0, 1)[:, None].astype(np.float32) for x, first in ((row, top), (column, left)))
-        a, b, c, d = (self.values[top + i, left + j] for i in (0, 1) for j in (0, 1))
-        return np.asarray((a * (1 - u) + b * u) * (1 - v) + (c * (1 - u) + d * u) * v, np.float32)
+        row, column = ((n + 0.5) / self.size for n in divmod(texel, self.size))
+        return bilinear(self.values, np.stack([column, 1 - row], 1))
 
 
 def measured_of(reflectance: Located[ReflectanceField], size: int) -> Measured | None:

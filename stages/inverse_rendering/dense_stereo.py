@@ -194,7 +194,11 @@ def hull_range(hull: Start, K: F64, world_from_cam: F64, mask: Bool) -> tuple[F3
 
 def pixel_rays(K: F64, world_from_cam: F64, rows: Ints, columns: Ints) -> tuple[Tensor, Tensor, F32]:
     """Origins and unit directions (N, 3) of pixels without distortion, and (N,) the length of a ray at depth 1."""
-    uv = np.stack([columns + 0.5, rows + 0.5], -1)
+    return rays_at(K, world_from_cam, np.stack([columns + 0.5, rows + 0.5], -1))
+
+
+def rays_at(K: F64, world_from_cam: F64, uv: F64) -> tuple[Tensor, Tensor, F32]:
+    """The same of places uv (N, 2) in pixels."""
     centre, d = transforms.rays(K, world_from_cam, np.zeros(5), uv)
     length = 1 / (d @ world_from_cam[:3, 2])
     direction = torch.from_numpy(d.astype(np.float32))

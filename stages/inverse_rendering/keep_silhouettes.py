@@ -23,7 +23,7 @@ from pipeline.maths.tracing import box_interval
 from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, evenly_spaced
-from stages.inverse_rendering.stereo import distances, without_distortion
+from stages.inverse_rendering.stereo import distances, reduced
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -77,16 +77,12 @@ def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView
 
 def _silhouette(view: PhotoView) -> tuple[F64, Bool]:
     """K and (h, w) certain pixels of the subject within its extent, without distortion."""
-    scale = min(1.0, SIDE / max(view.size))
-    w, h = (max(round(n * scale), 2) for n in view.size)
-    K = view.K.copy()
-    K[:2] *= np.array([[w / view.size[0]], [h / view.size[1]]])
+    K, small = reduced(view, SIDE)
     certain = view.alpha.astype(np.float32)
     if view.asked is not None:
         certain = certain * (view.asked > WHOLE)
     if view.doubtful is not None:
         certain = certain * ~view.doubtful
-    small = np.asarray(cv2.resize(certain, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    full = (without_distortion(small, K, view.distortion) > WHOLE).astype(np.uint8)
+    full = (small(certain) > WHOLE).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
     return K, np.asarray(cv2.erode(full, disc, borderValue=1)) > 0

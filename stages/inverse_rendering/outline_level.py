@@ -20,17 +20,15 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 
-from pipeline.fields import kernels
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths.tracing import box_interval
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.silhouettes import signed_pixels
-from pipeline.transforms import rays
+from stages.inverse_rendering.dense_stereo import rays_at
 from stages.inverse_rendering.ray_sampling import F32, PhotoView, evenly_spaced
-from stages.inverse_rendering.stereo import without_distortion
+from stages.inverse_rendering.stereo import reduced
 
 SIDE, VIEWS = 512, 24  # pixels of a silhouette's longest side; photos, evenly spaced over the views
 BAND = 2.0  # pixels on either side of the outline in which rays are cast, one a pixel
@@ -121,17 +119,9 @@ def _of_tiles(tile: Indices, least: F64, alpha: F64) -> F64:
 
 def _band(view: PhotoView) -> tuple[F64, F32, Mask]:
     """K, (h, w) alpha without distortion, and the pixels near the outline that count."""
-    scale = min(1.0, SIDE / max(view.size))
-    w, h = (max(round(n * scale), 2) for n in view.size)
-    K = view.K.copy()
-    K[:2] *= np.array([[w / view.size[0]], [h / view.size[1]]])
-
-    def small(image: F32) -> F32:
-        reduced = np.asarray(cv2.resize(image.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA), np.float32)
-        return without_distortion(reduced, K, view.distortion)
-
+    K, small = reduced(view, SIDE)
     alpha = small(view.alpha)
-    wrong = np.zeros((h, w), np.float32)
+    wrong = np.zeros_like(alpha)
     if view.asked is not None:
         wrong = np.maximum(wrong, 1 - small(view.asked))
     if view.doubtful is not None:
@@ -143,14 +133,8 @@ def _band(view: PhotoView) -> tuple[F64, F32, Mask]:
 
 def _least(surface: GridSdf, K: F64, world_from_cam: F64, at: F64) -> F64:
     """(N,) the least SDF along the rays of places at (N, 2) in pixels, asset units; not below -DEPTH cells."""
-    centre, d = rays(K, world_from_cam, np.zeros(5), at)
-    direction = torch.from_numpy(d.astype(np.float32))
-    o = torch.from_numpy(centre.astype(np.float32)).expand_as(direction).contiguous()
+    o, direction, _ = rays_at(K, world_from_cam, at)
     near, far = box_interval(o, direction, *surface.box())
     depth = DEPTH * surface.cell
-    # a spline of shifted coefficients is the shifted spline: a ray that misses the smaller surface tells how nearly
-    _, hit, closest = kernels.trace(
-        surface.values + depth, surface.lo, surface.cell, o, direction, near, far,
-        min_step=0.3 * surface.cell, factor=0.95,
-    )  # fmt: skip
+    _, hit, closest = surface.trace(o, direction, near, far, depth)  # a ray that misses it tells how nearly
     return np.where(hit.numpy(), -depth, closest.numpy().astype(np.float64) - depth)

@@ -170,6 +170,21 @@ def without_distortion(image: F32, K: F64, distortion: F64) -> F32:
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
+def reduced(view: PhotoView, side: int) -> tuple[F64, Callable[[F32], F32]]:
+    """K of a view of at most `side` pixels, and what makes a picture (H, W) of the whole photo so small, without
+    distortion."""
+    scale = min(1.0, side / max(view.size))
+    size = (max(round(view.size[0] * scale), 2), max(round(view.size[1] * scale), 2))
+    K = view.K.copy()
+    K[:2] *= np.array([[size[0] / view.size[0]], [size[1] / view.size[1]]])
+
+    def small(image: F32) -> F32:
+        resized = cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        return without_distortion(np.asarray(resized, np.float32), K, view.distortion)
+
+    return K, small
+
+
 def surface_points(values: F32, lo: F32, cell: float) -> tuple[F64, F64]:
     """Up to POINTS random points (N, 3) of the zero set of the SDF (X, Y, Z), smoothed over one cell, and their normals
     (N, 3)."""

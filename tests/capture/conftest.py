@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from stages.capture.scan import scan_capture
 from stages.capture.stage import Config, Inputs, run
+from tests.support.light_stage import Stage, make_stage, write_stage
+from tests.support.spread import made_once
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 
 SIZE = (96, 80)
@@ -38,3 +41,16 @@ def gather(tmp_path: Path) -> Callable[..., Located[Capture]]:
         return Located(capture, work)
 
     return go
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A light stage's capture."""
+    return made_once(tmp_path_factory, "light_stage", lambda folder: write_stage(folder, make_stage()))
+
+
+@pytest.fixture
+def capture(made: Path, tmp_path: Path) -> tuple[Path, Stage]:
+    """A copy that a test may damage."""
+    shutil.copytree(made, tmp_path / "capture")
+    return tmp_path / "capture", make_stage()

@@ -14,20 +14,7 @@ from pipeline.errors import StageError
 from pipeline.images import read_linear, write_exr, write_png
 from stages.capture.light_stage_checks import Sequences, Single, additive, brightness, drift, exchanged, gap
 from stages.capture.scan import scan_capture
-from tests.support.light_stage import DISTANCE, SIZE, Stage, make_stage, photograph, write_lights, write_stage
-from tests.support.spread import made_once
-
-
-@pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_once(tmp_path_factory, "light_stage", lambda folder: write_stage(folder, make_stage()))
-
-
-@pytest.fixture
-def capture(made: Path, tmp_path: Path) -> tuple[Path, Stage]:
-    """A copy that a test may damage."""
-    shutil.copytree(made, tmp_path / "capture")
-    return tmp_path / "capture", make_stage()
+from tests.support.light_stage import DISTANCE, SIZE, Stage, make_stage, photograph, write_lights
 
 
 def level(found, check: str) -> str:

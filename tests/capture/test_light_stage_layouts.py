@@ -12,19 +12,7 @@ import pytest
 from pipeline.errors import StageError
 from stages.capture.readers.olat import FULL_ON, SINGLE, TRACKING, patterns, pictures_of, read_lights
 from stages.capture.scan import scan_capture
-from tests.support.light_stage import DISTANCE, Stage, make_stage, write_stage
-from tests.support.spread import made_once
-
-
-@pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return made_once(tmp_path_factory, "light_stage", lambda folder: write_stage(folder, make_stage()))
-
-
-@pytest.fixture
-def capture(made: Path, tmp_path: Path) -> tuple[Path, Stage]:
-    shutil.copytree(made, tmp_path / "capture")
-    return tmp_path / "capture", make_stage()
+from tests.support.light_stage import DISTANCE
 
 
 def put(source: Path, target: Path) -> None:
