@@ -2,26 +2,19 @@
 
 The reflectance stage has measured them at the texels of the same charts, with far more evidence than photos under one
 light. They replace what was fitted to those photos, also where the field was continued from what cameras saw, so that
-there is no seam; `seen` says which is which. The fitted eyes of the template stay.
+there is no seam; `coverage` says which is which. The fitted eyes of the template stay.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from pipeline.artifacts import Located
 from pipeline.map_lookup import bilinear
 from pipeline.meshes import F32, Indices
 from pipeline.reflectance_artifacts import ReflectanceField
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from stages.bake.texels import Placed, Samples
 
 OPENPBR, NORMAL, COVERAGE = "openpbr.exr", "normal.exr", "coverage.exr"
 
@@ -47,24 +40,5 @@ def measured_of(reflectance: Located[ReflectanceField], size: int) -> Measured |
     files = {f.path.rsplit("/", 1)[-1]: f for f in reflectance.artifact.files}
     if not reflectance.artifact.present or OPENPBR not in files:
         return None
-    parts: Sequence[npt.NDArray[np.float32]] = [
-        np.atleast_3d(read_exr(reflectance.path(files[n]))[0]) for n in (OPENPBR, NORMAL, COVERAGE)
-    ]
+    parts = [np.atleast_3d(read_exr(reflectance.path(files[n]))[0]) for n in (OPENPBR, NORMAL, COVERAGE)]
     return Measured(np.concatenate(parts, 2).astype(np.float32), size)
-
-
-def with_measured(found: Samples, at: Placed, texel: Indices, measured: Measured) -> Samples:
-    """The samples of texels with what the single lights say."""
-    from stages.bake.texels import ALBEDO_RANGE, in_frame
-
-    values = measured.at(texel)
-    length = np.linalg.norm(values[:, 5:8], axis=1, keepdims=True)
-    normal = np.where(length > 0.1, values[:, 5:8] / np.maximum(length, 1e-9), at.world)
-    return replace(
-        found,
-        base_color=values[:, :3].clip(*ALBEDO_RANGE),
-        f0=values[:, 3].clip(0, 1),
-        roughness=values[:, 4].clip(0.1, 1),
-        normal=in_frame(normal.astype(np.float64), at.t, at.b, at.n),
-        unseen=(values[:, 8] < 0.5).astype(np.float32),
-    )

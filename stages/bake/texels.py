@@ -9,7 +9,7 @@ Symbols
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from pipeline.raster import Hits
 from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
 from stages.bake.eyes import Eyes
-from stages.bake.lit import Measured, with_measured
+from stages.bake.lit import Measured
 from stages.bake.standard_fit import CORRECTION, Fitted
 
 NEWTON_STEPS = 3
@@ -160,12 +160,26 @@ def sample(
         clamped=np.abs(albedo - physical).max(1),
     )
     if known is not None and known.measured is not None:
-        found = with_measured(found, at, hits.texel, known.measured)
+        found = _with_measured(found, at, known.measured.at(hits.texel))
     if known is not None and known.eyes is not None:
         found = _with_eyes(found, field, mesh, hits, at, known.eyes, known.standard)
     for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
         _check(name, getattr(found, name))
     return found
+
+
+def _with_measured(found: Samples, at: Placed, values: F32) -> Samples:
+    """The samples with what a light stage's single lights say, values (N, 9) of `Measured.at`."""
+    length = np.linalg.norm(values[:, 5:8], axis=1, keepdims=True)
+    normal = np.where(length > 0.1, values[:, 5:8] / np.maximum(length, 1e-9), at.world)
+    return replace(
+        found,
+        base_color=values[:, :3].clip(*ALBEDO_RANGE),
+        f0=values[:, 3].clip(0, 1),
+        roughness=values[:, 4].clip(0.1, 1),
+        normal=in_frame(normal.astype(np.float64), at.t, at.b, at.n),
+        unseen=(values[:, 8] < 0.5).astype(np.float32),
+    )
 
 
 def _with_eyes(
