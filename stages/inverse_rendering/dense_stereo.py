@@ -105,16 +105,21 @@ def depth_maps(
         if len(neighbours[i]) >= kernels.MIN_OTHERS:
             _depth_of_view(i, neighbours[i], coarse, fine, poses, planes[i], score[i])
 
-    with ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, torch.get_num_threads()))) as pool:
+    with _threads() as pool:
         list(pool.map(one, range(len(views))))
     return _consistent(planes, score, neighbours, fine, poses)
+
+
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(1, min(os.cpu_count() or 1, torch.get_num_threads())))
 
 
 # ------------------------------------------------------------------ pictures
 def pictures_of(views: list[PhotoView], hull: Start | None, side: int) -> Pictures:
     """Grey pictures, gamma-encoded, in which the subject's longest side has at most `side` pixels. hull: None if the
     ranges of the rays are not needed."""
-    parts = [_picture(view, side) for view in views]
+    with _threads() as pool:
+        parts = list(pool.map(lambda view: _picture(view, side), views))
     h, w = (max(p[0].shape[a] for p in parts) for a in (0, 1))
     grey = np.full((len(parts), h, w), np.nan, np.float32)
     usable = np.zeros(grey.shape, bool)
@@ -164,9 +169,11 @@ def _picture(view: PhotoView, side: int) -> tuple[F32, Bool, F64, float]:
 def _blank(view: PhotoView) -> Bool:
     """(H, W) pixels without a usable value: doubtful ones, and those whose channels are all clipped. With one clipped
     channel the others still show texture."""
-    bad = ~np.isfinite(view.rgb).all(-1)
+    red, green, blue = (view.rgb[..., k] for k in range(3))  # planes: numpy is slow along an axis of three
+    bad = ~(np.isfinite(red) & np.isfinite(green) & np.isfinite(blue))
     if view.clipped is not None:
-        bad |= (view.clipped > 0) & (view.rgb.min(-1) > WHITE * np.nanmax(view.rgb))
+        least = np.minimum(np.minimum(red, green), blue)
+        bad |= (view.clipped > 0) & (least > WHITE * np.nanmax(view.rgb))
     if view.doubtful is not None:
         bad |= view.doubtful
     return np.asarray(bad)

@@ -71,7 +71,7 @@ def _learn(spatial: SpatialField, x: Tensor, wanted: Tensor) -> None:
         {"params": [spatial.encoding.table], "lr": TABLE_RATE},
         {"params": list(spatial.net.parameters()), "lr": NET_RATE},
     ]
-    optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
+    optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
     for step in range(STEPS):
         for group in optimiser.param_groups:
             group["lr"] *= 1 if step < STEPS // 2 else 0.97

@@ -11,49 +11,60 @@ Source: Calakli and Taubin, SSD: smooth signed distance surface reconstruction (
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse.linalg import LinearOperator, cg
+
+from stages.inverse_rendering import smoothest_kernels as kernels
 
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 ITERATIONS, TOLERANCE = 80, 1e-4  # of conjugate gradients
 
 
+@dataclass(frozen=True, slots=True)
+class Laplacian:
+    """L for N nodes. near (N, 6): the numbers of a node's neighbours, -1 where one is not solved for; degree (N,): how
+    many it has: nodes at the grid's faces have only those that exist; border (N,): the part of L f that neighbours that
+    are not solved for contribute."""
+
+    near: npt.NDArray[np.int32]
+    degree: F64
+    border: F64
+
+    def __call__(self, f: F64) -> F64:
+        """(N,) L f, without the border's part."""
+        out = np.empty_like(f)
+        kernels.laplace(self.near, self.degree, f, out)
+        return out
+
+    def squared_diagonal(self) -> F64:
+        """(N,) diagonal of L^T L."""
+        return np.asarray(self.degree**2 + (self.near >= 0).sum(1))
+
+
+def laplacian(inside: Bool, around: F64) -> Laplacian:
+    """L for the nodes of `inside` (X, Y, Z); around (X, Y, Z): values of the other nodes."""
+    flat = np.flatnonzero(inside)
+    number = np.full(inside.size, -1, np.int32)
+    number[flat] = np.arange(len(flat))
+    near, degree, border = np.empty((len(flat), 6), np.int32), np.empty(len(flat)), np.empty(len(flat))
+    values = np.ascontiguousarray(around, np.float64).reshape(-1)
+    kernels.neighbours(flat, number, values, inside.shape, near, degree, border)
+    return Laplacian(near, degree, border)
+
+
 def smoothest(inside: Bool, around: F64, weight: F64, target: F64, first: F64, iterations: int = ITERATIONS) -> F64:
     """(N,) the minimum, by conjugate gradients from first (N,). inside (X, Y, Z): the part; around (X, Y, Z): values
     of the other nodes; weight, target (N,), in the order of inside's nodes."""
-    operator, border = laplacian(inside, around)
-    diagonal = weight + np.asarray(operator.multiply(operator).sum(0)).ravel()
-    n = len(weight)
-    product = LinearOperator((n, n), lambda f: weight * f + operator.T @ (operator @ f), dtype=np.float64)
-    jacobi = LinearOperator((n, n), lambda f: f / diagonal, dtype=np.float64)
-    right = weight * target - operator.T @ border
-    found, _ = cg(product, right, first, rtol=TOLERANCE, maxiter=iterations, M=jacobi)
-    return np.asarray(found, np.float64)
+    return solved(laplacian(inside, around), weight, target, first, iterations)
 
 
-def laplacian(inside: Bool, around: F64) -> tuple[sparse.csr_matrix, F64]:
-    """L (N, N) for the nodes of `inside`, and (N,) the part of L f that their neighbours outside contribute. Nodes at
-    the grid's faces have only the neighbours that exist."""
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(int(inside.sum()))
-    node = np.argwhere(inside)
-    own, n = number[inside], len(node)
-    border, degree = np.zeros(n), np.zeros(n)
-    rows, columns = [], []
-    for axis in range(3):
-        for step in (-1, 1):
-            at = node.copy()
-            at[:, axis] += step
-            exists = (at[:, axis] >= 0) & (at[:, axis] < inside.shape[axis])
-            there = tuple(at[exists].T)
-            degree[exists] += 1
-            other = number[there]
-            border[exists] += np.where(other < 0, around[there], 0)
-            rows.append(own[exists][other >= 0])
-            columns.append(other[other >= 0])
-    row, column = np.concatenate([*rows, own]), np.concatenate([*columns, own])
-    value = np.concatenate([np.ones(len(row) - n), -degree])
-    return sparse.csr_matrix((value, (row, column)), (n, n)), border
+def solved(operator: Laplacian, weight: F64, target: F64, first: F64, iterations: int = ITERATIONS) -> F64:
+    """The same for a Laplacian that is known."""
+    weight, found = np.ascontiguousarray(weight, np.float64), np.array(first, np.float64)
+    right = weight * target - operator(operator.border)
+    diagonal = weight + operator.squared_diagonal()
+    kernels.conjugate_gradients(operator.near, operator.degree, weight, diagonal, right, found, TOLERANCE, iterations)
+    return found

@@ -146,7 +146,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=29,
+    version=30,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

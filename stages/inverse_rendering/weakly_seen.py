@@ -40,7 +40,7 @@ from stages.inverse_rendering.footprint import footprint, surface_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.observations import unoccluded
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
-from stages.inverse_rendering.smoothest import smoothest
+from stages.inverse_rendering.smoothest import laplacian, solved
 
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
@@ -92,9 +92,9 @@ def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, wrong: Call
     inside, out = np.zeros(values.shape, np.bool_), values.copy()
     inside[tuple(node.T)] = True  # in the order of node: both are sorted
     before = values[inside]
-    found = before
+    found, operator = before, laplacian(inside, values)
     for _ in range(ROUNDS):
-        found = smoothest(inside, values, weight, before, found, ITERATIONS)
+        found = solved(operator, weight, before, found, ITERATIONS)
         held = (weight < HELD) & wrong(before, found)
         if not held.any():
             break

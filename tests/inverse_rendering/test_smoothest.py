@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
@@ -35,9 +36,10 @@ def test_it_is_the_least_squares_solution() -> None:
     expected = np.linalg.lstsq(a, b, rcond=None)[0]
     found = smoothest(inside, around, weight, target, target, iterations=2000)
     assert found == pytest.approx(expected, abs=2e-3)
-    operator, border = laplacian(inside, around)
-    assert operator.toarray() == pytest.approx(np.array(rows))
-    assert border == pytest.approx(-np.array(right))
+    operator = laplacian(inside, around)
+    assert np.stack([operator(unit) for unit in np.eye(len(node))], 1) == pytest.approx(np.array(rows))
+    assert operator.squared_diagonal() == pytest.approx((np.array(rows) ** 2).sum(0))
+    assert operator.border == pytest.approx(-np.array(right))
 
 
 @pytest.mark.parametrize("q", [1.0, 2.0, 4.0])
@@ -69,3 +71,27 @@ def test_extremes() -> None:
     for weight, expected in ((1e12, 5.0), (1e-12, 1.0)):
         found = smoothest(inside, around, np.array([weight]), np.array([5.0]), np.array([5.0]))
         assert found == pytest.approx([expected], rel=1e-6)
+
+
+def test_the_number_of_threads_does_not_matter() -> None:
+    """The same bytes with one thread and with several: a fit repeats bit by bit."""
+    rng = np.random.default_rng(1)
+    around = rng.normal(size=(40, 41, 42))
+    inside = np.ones(around.shape, np.bool_)
+    inside[0] = False
+    weight = rng.uniform(0.01, 4, int(inside.sum()))
+    found = []
+    for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+        numba.set_num_threads(threads)
+        found.append(smoothest(inside, around, weight, around[inside], around[inside]).tobytes())
+    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
+    assert found[0] == found[1]
+
+
+def test_zeros_stay_zeros() -> None:
+    """Without any data the residual is 0 from the start: nothing is divided by it."""
+    around = np.zeros((4, 5, 6))
+    inside = np.ones(around.shape, np.bool_)
+    zeros = np.zeros(around.size)
+    assert (smoothest(inside, around, np.ones(around.size), zeros, zeros) == 0).all()
+    assert len(smoothest(np.zeros_like(inside), around, zeros[:0], zeros[:0], zeros[:0])) == 0
