@@ -15,13 +15,35 @@ CaptureKind = Literal[
 ]  # fmt: skip
 
 
+class Bracket(Artifact):
+    """Photos of one view at several exposures.
+
+    name: of the view. photo: path of the photo that stands in the source's `photos`; others: the rest. exposures: as
+    stated by names or by brackets.json, of `photo` and of the others in their order, relative; empty if not stated.
+    """
+
+    name: str
+    photo: str
+    others: tuple[FileRef, ...]
+    exposures: tuple[float, ...] = ()
+
+
+class PolarisedPair(Artifact):
+    """Two photos of one view under polarised light. cross: path of the one in the source's `photos`, whose filter takes
+    the mirror reflection away; parallel: the one whose filter lets it pass."""
+
+    cross: str
+    parallel: FileRef
+
+
 class CaptureSource(Artifact):
     """The files in the user's folder, by content; the folder itself is not part of it.
 
     photos: or the single video file. cameras: files that describe cameras, for the kinds that have them. plates: photos
     of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the face along +Z, if
     a file beside the capture contains it. passed_over: names of pictures whose format is not supported. stage: the
-    pictures under single lights and the tracking pictures of a light stage.
+    pictures under single lights and the tracking pictures of a light stage. brackets: views that were photographed at
+    several exposures; pairs: under polarised light.
     """
 
     kind: CaptureKind
@@ -32,6 +54,8 @@ class CaptureSource(Artifact):
     metres_from_world: Matrix | None = None
     passed_over: tuple[str, ...] = ()
     stage: tuple[FileRef, ...] = ()
+    brackets: tuple[Bracket, ...] = ()
+    pairs: tuple[PolarisedPair, ...] = ()
 
 
 class GivenCamera(Artifact):
@@ -52,7 +76,9 @@ class CaptureView(Artifact):
     place_m: east, north and up in metres, relative to the capture's first photo with a GPS position. clipped: mask
     (255) of the pixels at the end of the file's range, whose value is only a lower bound. exposure: relative to the
     median photo of the capture, from EXIF; linear values are proportional to it; 1 if unknown. flash: whether a flash
-    fired, None if the metadata do not say it.
+    fired, None if the metadata do not say it. parallel: the parallel-polarised photo of a view whose `image` is the
+    cross-polarised one, its clipped pixels, and its exposure over that of `image` (pipeline/polarised.py). merged:
+    number of exposures in the image, 1 for a plain photo.
     """
 
     index: int
@@ -69,6 +95,10 @@ class CaptureView(Artifact):
     clipped: FileRef | None = None
     exposure: float = 1.0
     flash: bool | None = None
+    parallel: FileRef | None = None
+    parallel_clipped: FileRef | None = None
+    parallel_exposure: float = 1.0
+    merged: int = 1
     holdout: bool = False
 
 
@@ -155,3 +185,8 @@ class Capture(Artifact):
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def polarised(self) -> bool:
+        """Whether the views are cross-polarised photos: they show no mirror reflection."""
+        return any(v.parallel is not None for v in self.views)

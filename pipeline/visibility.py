@@ -27,7 +27,7 @@ KEPT = 200_000_000  # bytes of masks that stay in memory
 @dataclass(frozen=True, slots=True)
 class FittedPhoto:
     """A fitted photo and its camera; its mask, clipped pixels, labels and the pixels that count in the fit, if they
-    exist."""
+    exist; the parallel-polarised photo of its pair with its clipped pixels and its exposure over the photo's."""
 
     camera: Camera
     mask: Path | None
@@ -35,6 +35,9 @@ class FittedPhoto:
     clipped: Path | None = None
     labels: Path | None = None
     asked: Path | None = None
+    parallel: Path | None = None
+    parallel_clipped: Path | None = None
+    parallel_exposure: float = 1.0
 
 
 def seen_by(
@@ -55,6 +58,9 @@ def seen_by(
             None if photo is None or photo.clipped is None else capture.path(photo.clipped),
             None if mask is None or mask.labels is None else masks.path(mask.labels),
             None if mask is None or mask.asked is None else masks.path(mask.asked),
+            None if photo is None or photo.parallel is None else capture.path(photo.parallel),
+            None if photo is None or photo.parallel_clipped is None else capture.path(photo.parallel_clipped),
+            1.0 if photo is None else photo.parallel_exposure,
         )
 
     return tuple(view(c) for c in cameras_of(poses, fitted).cameras if c.index in used)

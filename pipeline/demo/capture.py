@@ -1,7 +1,8 @@
 """Write the demo capture: photos and cameras in FaceScape's format, and the ground truth.
 
 Folder
-    {i}.png            8-bit sRGB, black background
+    {i}.png            8-bit sRGB, black background; of a polarised capture the cross-polarised photo
+    parallel/{i}.png   of a polarised capture: the parallel-polarised photo
     params.json        FaceScape's keys; pixel centres at integers, so cx = (W - 1) / 2
     truth/alpha        coverage of every view, 8 bit
     truth/albedo       linear RGB, every fifth view (i % 5 == 2), the photo's pixels
@@ -43,8 +44,12 @@ VERSION = 1
 """Increased whenever the same arguments give another capture."""
 
 MARKER = "demo.json"
+PARALLEL = "parallel"
 EXPOSURE = 0.52
 """Scale of the studio light: it sets the photos' brightness, like a camera's exposure."""
+
+POLARISED_EXPOSURE = 1.6
+"""Exposure of a polarised capture over that of a plain one: a filter passes half of the diffuse light."""
 
 _ENV_HEIGHT = 128
 _TRUTH_STEP = 0.0027  # metres; gives some 60 000 faces
@@ -62,10 +67,15 @@ class Request:
     seed: int
     shadows: bool
     version: int = VERSION
+    polarised: bool = False
 
     def digest(self) -> str:
         """Hash of the arguments, hexadecimal."""
-        return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+        return hashlib.sha256(json.dumps(self.plain(), sort_keys=True).encode()).hexdigest()
+
+    def plain(self) -> dict[str, object]:
+        """The arguments; those of a capture that is not polarised are as they were before there was a choice."""
+        return {k: v for k, v in asdict(self).items() if k != "polarised" or v}
 
 
 def write_demo_capture(
@@ -77,15 +87,17 @@ def write_demo_capture(
     mesh_step: float = 0.001,
     seed: int = 0,
     shadows: bool = False,
+    polarised: bool = False,
     progress: Progress | None = None,
 ) -> None:
     """Write the demo capture to `folder`, or return at once if it already contains the requested one.
 
     `views` photos of `size` x `size` pixels; `samples` (a power of two) light samples for each lobe in each
-    quarter pixel; `mesh_step` metres, the grid of the traced mesh; `progress(done, total, what)`.
+    quarter pixel; `mesh_step` metres, the grid of the traced mesh; `polarised`: a cross- and a
+    parallel-polarised photo of each view; `progress(done, total, what)`.
     A folder with any other content is not overwritten: FileExistsError.
     """
-    request = Request(views, size, samples, mesh_step, seed, shadows)
+    request = Request(views, size, samples, mesh_step, seed, shadows, polarised=polarised)
     _check(request)
     if is_complete(folder, request):
         return
@@ -124,6 +136,8 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     """Fill `folder`, which is empty; the marker comes last."""
     for name in ("alpha", "albedo", "normal"):
         (folder / "truth" / name).mkdir(parents=True)
+    if request.polarised:
+        (folder / PARALLEL).mkdir()
     cameras = rig_cameras(request.views, request.size, request.seed)
     _write_json(folder / "params.json", facescape_params(cameras))
     total = request.views + 1
@@ -135,7 +149,8 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
     _write_light(folder / "truth", coefficients)
     scene = scene_from_mesh(mesh, coefficients, request.samples, request.seed, request.shadows)
     with ThreadPoolExecutor(max_workers=min(os.cpu_count() or 1, 4)) as pool:
-        jobs = [pool.submit(_write_view, folder, scene, camera, i) for i, camera in enumerate(cameras)]
+        jobs = [pool.submit(_write_view, folder, scene, camera, i, request.polarised)
+                for i, camera in enumerate(cameras)]  # fmt: skip
         try:
             for i, job in enumerate(jobs):
                 progress(i + 1, total, f"photo {i + 1} of {len(jobs)}")
@@ -143,7 +158,7 @@ def _write(folder: Path, request: Request, progress: Progress) -> None:
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    _write_json(folder / MARKER, {"digest": request.digest(), **asdict(request)})
+    _write_json(folder / MARKER, {"digest": request.digest(), **request.plain()})
     progress(total, total, "done")
 
 
@@ -173,9 +188,21 @@ def srgb_from_linear(linear: F64) -> npt.NDArray[np.uint8]:
     return np.asarray(np.rint(255.0 * encoded), dtype=np.uint8)
 
 
-def _write_view(folder: Path, scene: Scene, camera: Camera, i: int) -> None:
-    picture = render(scene, camera, i)
-    _write_png(folder / f"{i}.png", srgb_from_linear(picture.radiance)[..., ::-1])
+def through_filters(picture: Picture) -> tuple[F64, F64]:
+    """Cross- and parallel-polarised radiance (H, W, 3): half of the diffuse light, and with all of the mirror
+    reflection, which keeps its polarisation."""
+    assert picture.specular is not None
+    cross = 0.5 * POLARISED_EXPOSURE * (picture.radiance - picture.specular)
+    return cross, cross + POLARISED_EXPOSURE * picture.specular
+
+
+def _write_view(folder: Path, scene: Scene, camera: Camera, i: int, polarised: bool) -> None:
+    picture = render(scene, camera, i, apart=polarised)
+    photo = picture.radiance
+    if polarised:
+        photo, parallel = through_filters(picture)
+        _write_png(folder / PARALLEL / f"{i}.png", srgb_from_linear(parallel)[..., ::-1])
+    _write_png(folder / f"{i}.png", srgb_from_linear(photo)[..., ::-1])
     _write_png(folder / "truth" / "alpha" / f"{i}.png", np.rint(255.0 * picture.alpha).astype(np.uint8))
     if i % _TRUTH_EVERY == _TRUTH_AT:
         _write_truth(folder / "truth", picture, i)

@@ -13,7 +13,7 @@ single-bounce model can explain. With `shadows` each light sample is tested agai
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,12 +54,14 @@ class Picture:
     """`radiance`, `albedo` (H, W, 3) linear; `normal` (H, W, 3) world, unit; `alpha` (H, W) in [0, 1].
 
     Radiance is already covered by alpha; albedo and normal are means over the covered part of a pixel.
+    `specular`: the mirror reflection's part of the radiance, if it was asked for.
     """
 
     radiance: F64
     albedo: F64
     normal: F64
     alpha: F64
+    specular: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +95,12 @@ def scene_from_mesh(mesh: Mesh, coefficients: F64, samples: int, seed: int, shad
     return Scene(embree, table, net, seed, shadows)
 
 
-def render(scene: Scene, camera: Camera, stream: int) -> Picture:
-    """Render one picture; `stream` selects its random numbers, for example the view's number."""
+def render(scene: Scene, camera: Camera, stream: int, apart: bool = False) -> Picture:
+    """Render one picture; `stream` selects its random numbers, for example the view's number. `apart`: the mirror
+    reflection alone as well, with the same samples."""
     pixels = camera.size * camera.size
     shift = np.random.default_rng((scene.seed, stream)).random((pixels, 2))
-    radiance, albedo, normal = (np.zeros((pixels, 3)) for _ in range(3))
+    radiance, albedo, normal, specular = (np.zeros((pixels, 3)) for _ in range(4))
     count = np.zeros(pixels)
     quarter = len(scene.net) // len(_CORNERS)
     for corner, offset in enumerate(_CORNERS):
@@ -105,6 +108,9 @@ def render(scene: Scene, camera: Camera, stream: int) -> Picture:
         look = skin.material(hits.points, scene.seed)
         net = scene.net[corner * quarter : (corner + 1) * quarter]
         radiance[hits.pixel] += _shade(scene, hits, look, shift[hits.pixel], net)
+        if apart:
+            mirror = replace(look, albedo=np.zeros_like(look.albedo))
+            specular[hits.pixel] += _shade(scene, hits, mirror, shift[hits.pixel], net)
         albedo[hits.pixel] += look.albedo
         normal[hits.pixel] += hits.normals
         count[hits.pixel] += 1.0
@@ -116,6 +122,7 @@ def render(scene: Scene, camera: Camera, stream: int) -> Picture:
         (albedo / covered).reshape(*shape, 3),
         (normal / length).reshape(*shape, 3),
         (count / len(_CORNERS)).reshape(shape),
+        (specular / len(_CORNERS)).reshape(*shape, 3) if apart else None,
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,11 +31,23 @@ U16 = npt.NDArray[np.uint16]
 @dataclass(frozen=True, slots=True)
 class Photos:
     """cameras (views, ROW) as in detail_kernels; pixels (P, 3); depth (D,) metres, 0 where a photo must not be used;
-    clipped (P,), empty if no pixel is clipped."""
+    clipped (P,), empty if no pixel is clipped. parallel: the same of the parallel-polarised photos of pairs, None
+    without any."""
 
     cameras: F64
     pixels: U16
     depth: F32
+    clipped: U8
+    parallel: Parallel | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Parallel:
+    """The parallel-polarised photos, at the places of their cross-polarised ones. peaks (views,): radiance of code
+    65535 in the unit of those; 0 for a photo without a pair. pixels (P, 3), clipped (P,) as in Photos."""
+
+    peaks: F64
+    pixels: U16
     clipped: U8
 
 
@@ -48,6 +61,7 @@ def read_photos(
     """
     occluder = Occluder(mesh)
     rows, pixels, depths, clipped = [], [], [], []
+    others = []
     places = [0, 0]
     for i, view in enumerate(views):
         step(i, len(views))
@@ -59,7 +73,8 @@ def read_photos(
         depth = _depth(view, alpha, occluder)
         peak = max(float(photo.max()), 1e-6)
         rows.append(_row(view, responses[i], factor, photo.shape, depth.shape, peak, places))
-        pixels.append(np.round(np.sqrt(photo.clip(0) / peak) * CODE).astype(np.uint16).reshape(-1, 3))
+        pixels.append(_coded(photo, peak))
+        others.append(_parallel(view, photo.shape, factor))
         depths.append(depth.ravel())
         clipped.append(_clipped(view, photo.shape, factor))
         places = [places[0] + len(pixels[-1]), places[1] + depth.size]
@@ -69,14 +84,37 @@ def read_photos(
     reach = np.linalg.norm(cameras[:, 27:30] - centre, axis=1)
     cameras[:, 40] *= _sharpness(pixels, cameras) / np.median(cameras[:, 40] / reach)
     ends = np.concatenate(clipped) if any(c.any() for c in clipped) else np.zeros(0, np.uint8)
-    return Photos(cameras, np.concatenate(pixels), np.concatenate(depths), ends)
+    parallel = None
+    if any(view.parallel is not None for view in views):
+        peaks, coded, over = zip(*others, strict=True)
+        parallel = Parallel(np.array(peaks), np.concatenate(coded), np.concatenate(over))
+    return Photos(cameras, np.concatenate(pixels), np.concatenate(depths), ends, parallel)
+
+
+def _coded(photo: F32, peak: float) -> U16:
+    """(h w, 3) the square root of linear values, `peak` at the largest code."""
+    return np.round(np.sqrt(photo.clip(0) / peak) * CODE).astype(np.uint16).reshape(-1, 3)
+
+
+def _parallel(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> tuple[float, U16, U8]:
+    """Peak, pixels and clipped pixels of a view's parallel-polarised photo; peak 0 without one."""
+    count = shape[0] * shape[1]
+    if view.parallel is None:
+        return 0.0, np.zeros((count, 3), np.uint16), np.ones(count, np.uint8)
+    photo = shrink_whole(read_linear(view.parallel), factor) / np.float32(view.parallel_exposure)
+    peak = max(float(photo.max()), 1e-6)
+    return peak, _coded(photo, peak), _ends(view.parallel_clipped, shape, factor)
 
 
 def _clipped(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> U8:
     """(h w,) 1 where a block of `factor` x `factor` photo pixels contains a clipped pixel."""
-    if view.clipped is None:
+    return _ends(view.clipped, shape, factor)
+
+
+def _ends(clipped: Path | None, shape: tuple[int, ...], factor: int) -> U8:
+    if clipped is None:
         return np.zeros(shape[0] * shape[1], np.uint8)
-    return (shrink_whole(read_alpha(view.clipped), factor) > 0).astype(np.uint8).ravel()
+    return (shrink_whole(read_alpha(clipped), factor) > 0).astype(np.uint8).ravel()
 
 
 def _factor(view: FittedPhoto, mesh: Mesh, texel: float) -> int:

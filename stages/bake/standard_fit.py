@@ -13,6 +13,10 @@ Symbols
     H, G, Q sums over a vertex's views of w x^2, w x y, w y^2 with x = A, y = I - B, after r was eliminated from both
             (its best value is subtracted, colour by colour), so that no albedo enters: only what changes with the view
 
+Polarised pairs (pipeline/polarised.py) show the two parts apart: y = S - B with S the mirror reflection itself, and
+nothing is eliminated. F0 and roughness are then those of the whole reflection and not only of what changes with the
+view, and r is that of the cross-polarised photos, which show r a S (1 - R) alone.
+
 For each alpha of a list the error Q - 2 F0 G + F0^2 H of a group's sums is one parabola in F0. How F0 and roughness
 vary about the group's follows in gloss_field.py.
 
@@ -96,12 +100,14 @@ OBJECT = replace(REST, assumed=ASSUMED_F0)  # a capture without a person
 @dataclass(frozen=True, slots=True)
 class Seen:
     """M observations of the mesh's vertices. vertex (M,); wo (M, 3) unit; colour (M, 3) linear, without the photo's
-    colour response; predicted (M, 3) by the field."""
+    colour response; predicted (M, 3) by the field. mirror (M, 3): the mirror reflection of a polarised pair, whose
+    colour shows none, NaN where it is not known; None without pairs."""
 
     vertex: npt.NDArray[np.int64]
     wo: F64
     colour: F64
     predicted: F64
+    mirror: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +157,8 @@ def fit(
     lit = at if isinstance(at, Lit) else under_dome(at, normals, seen)
     check()
     rows = np.arange(len(w)) if asked is None else np.flatnonzero(asked[seen.vertex])
+    if seen.mirror is not None:
+        rows = rows[np.isfinite(seen.mirror[rows]).all(1)]
     sums = _sums(normals, seen, w, lit, rows)
     often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
@@ -211,7 +219,8 @@ def _weights(normals: F64, seen: Seen) -> F64:
 
 def _sums(normals: F64, seen: Seen, weights: F64, lit: Lit, rows: npt.NDArray[np.int64]) -> _Sums:
     """Of the observations `rows` (m,)."""
-    v, w, colour, count = seen.vertex[rows], weights[rows], seen.colour[rows], len(normals)
+    v, w, colour, count = seen.vertex[rows], weights[rows], _shown(seen)[rows], len(normals)
+    base = _eliminated(seen, w, v, count)
     cosine = (normals[v] * seen.wo[rows]).sum(1)
     h, g, q = (np.zeros((count, len(ALPHAS))) for _ in range(3))
     lobes, shade = lit.lobes(rows, ALPHAS), lit.shade[rows]
@@ -219,10 +228,10 @@ def _sums(normals: F64, seen: Seen, weights: F64, lit: Lit, rows: npt.NDArray[np
     for k, alpha in enumerate(ALPHAS):
         kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), alpha))
         t = kept[:, None] * shade
-        x, y = (_without_base(z, t, w, v, count) for z in (lobes[:, k, 0].astype(np.float64), colour - lobes[:, k, 1]))
+        x, y = (base(z, t) for z in (lobes[:, k, 0].astype(np.float64), colour - lobes[:, k, 1]))
         for out, product in ((h, x * x), (g, x * y), (q, y * y)):
             out[:, k] = np.bincount(v, w * product.sum(1), count)
-    y = _without_base(colour, shade, w, v, count)
+    y = base(colour, shade)
     bare, weight = (np.asarray(np.bincount(v, z, count), np.float64) for z in (w * (y * y).sum(1), w))
     return _Sums(h, g, q, bare, weight)
 
@@ -238,8 +247,9 @@ def _slopes(
     kept = 1 - standard.layer(cosine, np.full(len(v), TYPICAL_F0), np.full(len(v), steps[1] ** 2))
     t = kept[:, None] * np.maximum(shade / max(float(shade.mean()), 1e-12), 1e-6)
     changed = (lobes[:, 2] - lobes[:, 0]) / (steps[2] - steps[0])
-    parts = (lobes[:, 1, 0], f0 * changed[:, 0] + changed[:, 1], seen.colour[rows] - lobes[:, 1, 1])
-    x, z, y = (_without_base(part, t, w, v, count) for part in parts)
+    parts = (lobes[:, 1, 0], f0 * changed[:, 0] + changed[:, 1], _shown(seen)[rows] - lobes[:, 1, 1])
+    base = _eliminated(seen, w, v, count)
+    x, z, y = (base(part, t) for part in parts)
 
     def total(a: F64, b: F64) -> F64:
         return np.asarray(np.bincount(v, w * (a * b).sum(1), count), np.float64)
@@ -248,6 +258,18 @@ def _slopes(
         xx=total(x, x), xz=total(x, z), zz=total(z, z), xy=total(x, y), zy=total(z, y), yy=total(y, y),
         weight=3.0 * np.asarray(np.bincount(v, w, count), np.float64),
     )  # fmt: skip
+
+
+def _shown(seen: Seen) -> F64:
+    """(M, 3) what the layer is fitted to: the photos, or of polarised pairs the mirror reflection alone."""
+    return seen.colour if seen.mirror is None else seen.mirror
+
+
+def _eliminated(seen: Seen, w: F64, vertex: npt.NDArray[np.int64], count: int) -> Callable[[F64, F64], F64]:
+    """z (m, 3), t (m, 3) -> z without its best multiple of t; z itself where the photos show no base."""
+    if seen.mirror is not None:
+        return lambda z, t: z
+    return lambda z, t: _without_base(z, t, w, vertex, count)
 
 
 def _without_base(z: F64, t: F64, w: F64, vertex: npt.NDArray[np.int64], count: int) -> F64:
@@ -332,6 +354,8 @@ def _correction(
         lobes = lit.lobes(rows, ALPHAS[one : one + 1])[:, 0]
         specular[rows] = f0[v[rows], None] * lobes[:, 0] + lobes[:, 1]
     kept = 1 - standard.layer(cosine, f0[v], alpha[v])
+    if seen.mirror is not None:
+        specular[:] = 0  # the photos are cross-polarised
     m = albedo[v] * lit.shade * kept[:, None]
     above, below = (
         np.stack([np.bincount(v, w * z[:, i], len(normals)) for i in range(3)], 1).astype(np.float64)

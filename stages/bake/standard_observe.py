@@ -14,12 +14,14 @@ from pipeline.lighting.moving import MovingLight, Standpoint
 from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.lighting.standard import COUNT, Arrivals, arrivals
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh, unit
+from pipeline.polarised import specular
 from pipeline.thinning import thinned
 from pipeline.transforms import inverse_rigid, matrix, project
 from pipeline.visibility import FittedPhoto
 from stages.bake import detail_kernels as kernels
 from stages.bake import standard_fit
 from stages.bake.detail import Detail, shade
+from stages.bake.detail_views import Photos
 from stages.bake.regions import Poll
 from stages.bake.skin import skin_of
 from stages.bake.smooth import continued
@@ -101,8 +103,24 @@ def _observed(
     wo = away / np.linalg.norm(away, axis=1, keepdims=True)
     own = found.relative[view, vertex] if len(found.relative) else 1.0
     predicted = base[vertex] * own + found.gloss[view, vertex]
-    observations = standard_fit.Seen(vertex, wo, colour[view, vertex], predicted)
+    mirror = _mirrors(found.photos, x, normals, colour)
+    observations = standard_fit.Seen(
+        vertex, wo, colour[view, vertex], predicted, None if mirror is None else mirror[view, vertex]
+    )
     return observations, view, _face(views, x, cosines, skin_code)
+
+
+def _mirrors(photos: Photos, x: F64, normals: F64, cross: F64) -> F64 | None:
+    """(views, V, 3) the mirror reflection of polarised pairs, NaN where a pair does not show it; None without pairs.
+    cross (views, V, 3): colours in the cross-polarised photos."""
+    other = photos.parallel
+    if other is None:
+        return None
+    cameras = photos.cameras.copy()
+    cameras[:, 39] = other.peaks
+    colour, cosines = np.zeros_like(cross), np.zeros(cross.shape[:2])
+    kernels.observed(cameras, other.pixels, photos.depth, other.clipped, x, normals, colour, cosines)
+    return np.where((cosines > 0)[..., None], specular(cross, colour), np.nan)
 
 
 def _face(views: Sequence[FittedPhoto], x: F64, cosines: F64, code: int) -> Mask:

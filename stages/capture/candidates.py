@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 from pipeline.artifacts import FileRef, Located
-from pipeline.capture_artifacts import CaptureSource, GivenCamera
+from pipeline.capture_artifacts import Bracket, CaptureSource, GivenCamera
 from pipeline.errors import StageError
 from stages.capture.quality import blurred
 from stages.capture.readers import describe
@@ -23,7 +23,8 @@ MOST_COPIES = 0.5  # share of photos with given cameras that may be copies of an
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A photo that may be used. size: (width, height) in pixels. serial: the camera body. plate: the clean plate."""
+    """A photo that may be used. size: (width, height) in pixels. serial: the camera body. plate: the clean plate.
+    bracket: the view's other exposures. parallel: the other photo of a polarised pair."""
 
     index: int
     name: str
@@ -33,6 +34,8 @@ class Candidate:
     serial: str = ""
     mask: FileRef | None = None
     plate: FileRef | None = None
+    bracket: Bracket | None = None
+    parallel: FileRef | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +56,21 @@ class Selection:
 
 def candidates_of(source: Located[CaptureSource]) -> Selection:
     """All photos that the folder, or its cameras' file, lists, in the order of their numbers."""
+    found = _listed(source)
+    brackets = {b.photo: b for b in source.artifact.brackets}
+    parallel = {p.cross: p.parallel for p in source.artifact.pairs}
+    return replace(found, candidates=[
+        replace(c, bracket=brackets.get(c.ref.path), parallel=parallel.get(c.ref.path)) for c in found.candidates
+    ])  # fmt: skip
+
+
+def _listed(source: Located[CaptureSource]) -> Selection:
     photos = source.artifact.photos
     by_stem, plates = ({PurePath(f.path).stem: f for f in files}
                        for files in (source.artifact.masks, source.artifact.plates))  # fmt: skip
     if not source.artifact.cameras:
-        names = [PurePath(p.path).name for p in photos]
+        views = {b.photo: b.name for b in source.artifact.brackets if PurePath(b.photo).parent.name == b.name}
+        names = [views.get(p.path, PurePath(p.path).stem) + PurePath(p.path).suffix for p in photos]
         candidates = [Candidate(i, n, p, mask=_of(by_stem, n), plate=_of(plates, n))
                  for i, n, p in zip(indices_of(names), names, photos, strict=True)]  # fmt: skip
         return Selection(sorted(candidates, key=lambda c: c.index), [], [], [])
@@ -65,9 +78,10 @@ def candidates_of(source: Located[CaptureSource]) -> Selection:
     refs, masks = ({f.path: f for f in files} for files in (photos, source.artifact.masks))
     out = []
     for v in described.views:
-        if v.photo is None:
+        path = "" if v.photo is None else v.photo.relative_to(source.folder).as_posix()
+        if path not in refs:  # it is missing, or another exposure or the other half of a pair
             continue
-        ref = refs[v.photo.relative_to(source.folder).as_posix()]
+        ref = refs[path]
         own = masks.get(v.mask.relative_to(source.folder).as_posix()) if v.mask is not None else None
         out.append(Candidate(v.index, v.name, ref, v.camera, v.size, v.serial, own or _of(by_stem, v.name),
                               _of(plates, v.name)))  # fmt: skip

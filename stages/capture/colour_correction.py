@@ -89,6 +89,8 @@ def correct_colours(
         changed = {"image": FileRef.of(folder, recoloured(folder / view.image.path, m))}
         if view.plate is not None:
             changed["plate"] = FileRef.of(folder, recoloured(folder / view.plate.path, m))
+        if view.parallel is not None:
+            changed["parallel"] = FileRef.of(folder, recoloured(folder / view.parallel.path, m))
         out.append(view.model_copy(update=changed))
     return out
 

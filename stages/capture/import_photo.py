@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import FileRef, sha256_of
 from pipeline.errors import StageError
-from pipeline.images import read_encoded, refuse_bombs
+from pipeline.images import read_encoded, refuse_bombs, write_exr
 from pipeline.sharpness import detail
 from stages.capture.colour_checker import Patches, find_chart
 from stages.capture.develop import Developed, develop
@@ -58,21 +58,41 @@ def turn_upright(image: Image, orientation: int) -> Image:
     return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)
 
 
-def import_photo(
-    path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False
-) -> ImportedPhoto:
-    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated or developed).
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A photo's stored pixels (H, W, C), as it lies in the file, with its metadata. developed: of a HEIC or raw file.
+    clipped (H, W): pixels that are clipped in every exposure of a merged photo, None to find them in the pixels."""
 
-    chart: search for a colour checker.
+    image: Image
+    exif: Exif
+    profile: str | None
+    developed: bool = False
+    clipped: npt.NDArray[np.bool_] | None = None
+
+
+def decoded(path: Path, ref: FileRef) -> Decoded:
+    """Read one photo. Raises StageError if the file is incomplete, too large, or not finite."""
+    data = _read(path, ref)
+    made = _developed(path, data)
+    if made is not None:
+        return Decoded(made.image, made.exif, made.profile, developed=True)
+    return Decoded(_decode(path, data), read_exif(data), profile_name(data))
+
+
+def import_photo(
+    path: Path, ref: FileRef, target: Path, declared: tuple[int, int] | None, *, chart: bool = False,
+    merged: Decoded | None = None,
+) -> ImportedPhoto:  # fmt: skip
+    """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated or developed, and .exr
+    if it was merged from several).
+
+    chart: search for a colour checker. merged: pixels to take in place of the file's.
     declared: (width, height) from the camera's description, or None. If the stored pixels have this size, the given
     camera belongs to them, and the photo is not rotated, whatever its EXIF orientation.
     Raises StageError if the file is incomplete, too small or large, not finite, or not of the declared size.
     """
-    data = _read(path, ref)
-    developed = _developed(path, data)
-    image = _decode(path, data) if developed is None else developed.image
-    exif = read_exif(data) if developed is None else developed.exif
-    profile = profile_name(data) if developed is None else developed.profile
+    found = decoded(path, ref) if merged is None else merged
+    image, exif, profile = found.image, found.exif, found.profile
     h, w = image.shape[:2]
     upright = (h, w) if exif.orientation >= 5 else (w, h)
     turn = exif.orientation != 1 and (declared is None or (w, h) != declared == upright)
@@ -94,14 +114,20 @@ def import_photo(
             remedy="use the original photo, not a preview",
         )
     target.parent.mkdir(parents=True, exist_ok=True)
-    if turn or developed is not None:
+    ends = clipped(image) if found.clipped is None else found.clipped
+    if turn:
+        image = turn_upright(image, exif.orientation)
+        ends = np.asarray(turn_upright(ends[..., None], exif.orientation)[..., 0], np.bool_)
+    if merged is not None:
+        target = target.with_suffix(".exr")
+        write_exr(target, np.asarray(image, np.float32), half=True)
+    elif turn or found.developed:
         target = target.with_suffix(".png")
-        image = turn_upright(image, exif.orientation) if turn else image
         _write_png(target, image)
     else:
-        target.write_bytes(data)
+        target.write_bytes(path.read_bytes())
     grey = small_grey(image)
-    blank, ends = is_blank(grey), clipped(image)
+    blank = is_blank(grey)
     return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile,
                     _write_clipped(ends, target), mean_light(grey), find_chart(image) if chart else None,
                     None if blank else measure_photo(image, grey, ends))  # fmt: skip

@@ -2,7 +2,8 @@
 
 Supported: a folder with a cameras' file (`stages.capture.readers`), a plain folder of photos, a folder with one video.
 Beside photos, `mask/` or `masks/` may have one file per photo, matched by stem, and `clean_plate/` the same views
-without the subject. Hidden files and other sub-folders are ignored.
+without the subject. `shots.py` says how several photos of one view are recognised. Hidden files and other sub-folders
+are ignored.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from stages.capture.readers.described import (
 from stages.capture.readers.facescape_scale import metres_from_world
 from stages.capture.readers.olat import Pictures, pictures_of
 from stages.capture.readers.values import printable
+from stages.capture.shots import Shots, grouped
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".bmp",
@@ -61,7 +63,8 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
     found = find_reader(folder)
     if found is not None:
         return _described(folder, *found)
-    photos = _photos(folder)
+    shots = grouped(folder, _photos(folder), _photos, given=False)
+    photos = shots.photos
     videos = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
     if not photos and len(videos) == 1:
         return _video(videos[0])
@@ -69,7 +72,7 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
         raise _no_photos(folder, videos)
     _enough(folder, [p.name for p in photos])
     masks, plates = _beside(folder, photos, MASK_FOLDERS, "mask"), _beside(folder, photos, PLATE_FOLDERS, "plate")
-    return Located(_source("photos", folder, photos, [], masks, plates), folder)
+    return Located(_source("photos", folder, photos, [], masks, plates, shots), folder)
 
 
 def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Located[CaptureSource]:
@@ -78,12 +81,13 @@ def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Locate
     if not photos:
         raise _none_named(folder, files[0], described)
     _once(described.views)
+    shots = grouped(folder, photos, _photos, given=True)
     masks = {v.photo: v.mask for v in described.views if v.photo is not None and v.mask is not None}
     by_stem = (
         _beside(folder, [p for p in photos if p not in masks], MASK_FOLDERS, "mask") if len(masks) < len(photos) else []
     )
     plates = _beside(folder, photos, PLATE_FOLDERS, "plate")
-    return Located(_source(kind, folder, photos, files, [*masks.values(), *by_stem], plates), folder)
+    return Located(_source(kind, folder, shots.photos, files, [*masks.values(), *by_stem], plates, shots), folder)
 
 
 def _source(
@@ -93,16 +97,18 @@ def _source(
     cameras: Sequence[Path],
     masks: Sequence[Path],
     plates: Sequence[Path],
+    shots: Shots,
 ) -> CaptureSource:
     pictures = pictures_of(folder) if kind == "olat" else Pictures()
     stage = sorted([*pictures.single.values(), *pictures.tracking.values()])
-    for path in (*photos, *cameras, *masks, *plates, *stage):
+    for path in (*photos, *cameras, *masks, *plates, *stage, *shots.files()):
         _can_be_written(path)
     refs = [tuple(FileRef.of(folder, p) for p in files) for files in (photos, cameras, masks, plates, stage)]
     world = metres_from_world(folder) if kind == "facescape" else None
+    brackets, pairs = shots.manifest(folder)
     return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
                          metres_from_world=None if world is None else rows(world),
-                         passed_over=_passed_over(photos), stage=refs[4])  # fmt: skip
+                         passed_over=_passed_over(photos), stage=refs[4], brackets=brackets, pairs=pairs)  # fmt: skip
 
 
 def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:

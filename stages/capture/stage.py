@@ -37,6 +37,18 @@ class Config(StageConfig):
         "photos' white and unit. auto: if it is found; on: an error if it is not found; off: no search",
     )
 
+    brackets: Literal["auto", "off"] = Field(
+        "auto",
+        description="photos of one view at several exposures. auto: they are merged to one linear photo; off: one "
+        "exposure of each view is used",
+    )
+    polarised: Literal["auto", "off"] = Field(
+        "auto",
+        description="pairs of cross- and parallel-polarised photos. auto: shape and albedo come from the "
+        "cross-polarised ones, F0 and roughness from the difference; off: the cross-polarised ones are fitted as any "
+        "photos",
+    )
+
     @field_validator("holdout")
     @classmethod
     def _grammar(cls, rule: str) -> str:
@@ -51,18 +63,21 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
 
     Raises:
         StageError: an incomplete file or one of the wrong size, a bad camera, too few views, a colour checker that is
-            required and not found.
+            required and not found, exposures or polarised pairs that do not belong together.
     """
     from stages.capture import views as made
+    from stages.capture.brackets import merged_photos
     from stages.capture.candidates import candidates_of, useful, without_duplicates
     from stages.capture.judge import Photo, given_masks, judge
+    from stages.capture.polarised import with_pairs
 
     source = _photos_of_video(inputs.source, config, context)
     selection = candidates_of(source)
     described = set(selection.absent)
     candidates = without_duplicates(selection, given=source.artifact.cameras != ())
     look = config.colour_checker != "off"
-    photos = [made.photo_of(source, c, (n, len(candidates)), look, context) for n, c in enumerate(candidates)]
+    merged = None if config.brackets == "off" else merged_photos(source, candidates, selection.warnings, context)
+    photos = [made.photo_of(source, c, (n, len(candidates)), look, context, merged) for n, c in enumerate(candidates)]
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
     candidates, photos = useful(candidates, photos, selection, config.drop_blurred, held)
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
@@ -71,6 +86,10 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     _enough(len(candidates) - len(held), len(held), selection.left_out, config.min_views)
     views = [made.view_of(source, c, p, c.index in held, selection.warnings, context)
              for c, p in zip(candidates, photos, strict=True)]  # fmt: skip
+    if merged is not None:
+        views = [v.model_copy(update={"merged": merged.count(v.index)}) for v in views]
+    if config.polarised == "auto":
+        views = with_pairs(source, candidates, views, photos, selection.warnings, context)
     views = made.with_exposures(made.with_places(views, photos), photos, selection.warnings)
     views, chart = made.with_chart(views, photos, selection.warnings, config.colour_checker == "on", context)
     drift = made.colours_drift(views, photos)
@@ -91,7 +110,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     warnings = (
         selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
     )
-    warnings += made.partly_masked(views) + made.mixed_kinds(candidates)
+    warnings += made.partly_masked(views) + made.mixed_kinds(candidates) + made.contradicting_flash(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world, stage=stage,
                    left_out=tuple(selection.left_out), warnings=tuple(warnings), findings=findings)  # fmt: skip
@@ -119,4 +138,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=9, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)
+STAGE = Stage(name="capture", version=10, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)

@@ -9,6 +9,7 @@ from pathlib import Path, PurePath
 from pipeline.artifacts import FileRef, Located
 from pipeline.capture_artifacts import CaptureSource, CaptureView, ColourChart
 from pipeline.contract import Context
+from stages.capture.brackets import MergedPhotos
 from stages.capture.candidates import Candidate
 from stages.capture.colour_correction import correct_colours, read_charts
 from stages.capture.develop import is_raw
@@ -21,14 +22,19 @@ NAMED = 20  # file names in one warning
 
 
 def photo_of(
-    source: Located[CaptureSource], candidate: Candidate, done: tuple[int, int], chart: bool, context: Context
-) -> ImportedPhoto:
+    source: Located[CaptureSource], candidate: Candidate, done: tuple[int, int], chart: bool, context: Context,
+    merged: MergedPhotos | None = None,
+) -> ImportedPhoto:  # fmt: skip
     """Check and copy the photo of a candidate. done: number of finished photos, of all. chart: search for a colour
-    checker."""
+    checker. merged: photos of several exposures, which are taken in place of the files."""
     context.check()
     context.progress(*done, f"checking {candidate.name}")
     target = context.workdir / "photos" / _stored_name(candidate)
-    return import_photo(source.path(candidate.ref), candidate.ref, target, candidate.size, chart=chart)
+    own = None if merged is None else merged.photo(candidate.index)
+    found = import_photo(source.path(candidate.ref), candidate.ref, target, candidate.size, chart=chart, merged=own)
+    if merged is not None:
+        merged.release(candidate.index)
+    return found
 
 
 def _stored_name(candidate: Candidate) -> str:
@@ -60,6 +66,19 @@ def view_of(
         flash=photo.exif.flash,
         holdout=held,
     )  # fmt: skip
+
+
+def contradicting_flash(views: Sequence[CaptureView]) -> list[str]:
+    """A warning if EXIF says of some photos that the flash fired, and of others that it did not."""
+    fired = {on: [v.name for v in views if v.flash is on] for on in (True, False)}
+    if not fired[True] or not fired[False]:
+        return []
+    on = len(fired[True]) <= len(fired[False])
+    few = fired[on]
+    some = ", ".join(few[:NAMED]) + (", ..." if len(few) > NAMED else "")
+    return [f"the flash fired in {len(fired[True])} photos and not in {len(fired[False])}, by their EXIF: "
+            f"{some} {'with' if on else 'without'} flash; one light is fitted to all photos, so take these out, or "
+            "photograph all with or all without flash"]  # fmt: skip
 
 
 def with_places(views: list[CaptureView], photos: list[ImportedPhoto]) -> list[CaptureView]:

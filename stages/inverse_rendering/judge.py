@@ -15,7 +15,7 @@ from pipeline.people import shows_person
 from pipeline.verdict import Finding, Limits, judged
 from stages.inverse_rendering.config import PRIORS
 from stages.inverse_rendering.cross_validation import more
-from stages.inverse_rendering.model_selection import GIVEN, MIN_SPECULAR, Facts
+from stages.inverse_rendering.model_selection import CROSSED, GIVEN, MIN_SPECULAR, Facts
 from stages.inverse_rendering.residuals import ViewError, decibels
 
 # Drafts of measured captures, all subject pixels of the fitted photos, the photos' noise subtracted: scanned head
@@ -201,7 +201,7 @@ def _specular(f: Fitted) -> list[Finding]:
     """The check of the specular term: its absence is an error for skin, but may be right for objects."""
     fact = f.facts.get("specular", {})
     without, best = _number(f.facts, "specular", "error_without"), _number(f.facts, "specular", "error_with")
-    if fact.get("why") == "setting" or without is None or best is None:
+    if fact.get("why") in ("setting", CROSSED) or without is None or best is None:
         return []
     value = max(more(without, best), 0.0) / max(best, 1e-9)
     if fact.get("modelled"):

@@ -11,6 +11,9 @@ known light, the radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99
 The ratio of band 0 to the others changes least with the view, so it is the least accurate. The bands from 1 on are
 scaled by the factor that makes the albedo pi D_p / E(n_p) most uniform; their shape and band 0 are unchanged.
 
+Polarised pairs show the lobe alone: s_pv = w(n . wo) sum_lm A_l L_lm Y_lm(w_r). Then no D_p is eliminated, and band 0
+is as accurate as the others.
+
 Differs: not in the paper, which learns light, albedo and lobe together from a white light.
 """
 
@@ -89,6 +92,28 @@ def light_from_lobe(seen: Observations, order: int, gain: F64, attenuation: str)
     if scale is None:
         return None
     return LightEstimate(np.concatenate([b[:1], scale * b[1:]]), explained, scale)
+
+
+def light_from_mirror(seen: Observations, order: int, gain: F64, attenuation: str) -> LightEstimate | None:
+    """The light up to SH `order` from observations whose colours are the mirror reflection alone; None if they do not
+    follow one light.
+
+    gain: (V, 3) of each view's camera, 1 if all are equal.
+    """
+    if order < 1 or len(seen.point) < MIN_POINTS:
+        return None
+    y = (seen.colour / gain[seen.view]).mean(1)
+    usual = torch.full((1,), TYPICAL_INV_KAPPA, dtype=torch.float64)
+    falls = ATTENUATIONS[attenuation](usual, order).numpy()
+    f = lobe_basis(seen.mirror, falls) * reflectance(seen.cosine)[:, None]
+    gram = f.T @ f
+    gram += RIDGE * max(float(np.trace(gram)) / len(gram), 1e-300) * np.eye(len(gram))
+    b = np.linalg.solve(gram, f.T @ y)
+    left = y - f @ b
+    explained = 1 - float((left * left).sum() / max(((y - y.mean()) ** 2).sum(), 1e-300))
+    if explained < MIN_EXPLAINED or b[0] <= 0:
+        return None
+    return LightEstimate(b, explained, 1.0)
 
 
 def _evenest(

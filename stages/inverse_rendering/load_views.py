@@ -8,8 +8,9 @@ import numpy as np
 
 from pipeline import transforms
 from pipeline.artifacts import Camera, CameraSet, FileRef, Located, MaskSet
-from pipeline.capture_artifacts import Capture
+from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.images import read_alpha, read_encoded, read_linear, shrink_whole
+from pipeline.polarised import specular
 from stages.inverse_rendering.albedo_level import FACE
 from stages.inverse_rendering.ray_sampling import F32, U8, Bool, PhotoView, factor_for
 
@@ -27,11 +28,12 @@ def read_views(
     views = []
     for i in indices:
         c = cameras[i]
+        rgb = read_linear(capture.path(photos[i].image)) / np.float32(photos[i].exposure)
         views.append(
             shrunk(
                 PhotoView(
                     i,
-                    read_linear(capture.path(photos[i].image)) / np.float32(photos[i].exposure),
+                    rgb,
                     read_alpha(masks.path(alphas[i].mask)),
                     transforms.matrix(c.K),
                     transforms.matrix(c.world_from_cam),
@@ -39,6 +41,7 @@ def read_views(
                     _clipped(capture, photos[i].clipped),
                     asked=_asked(masks, alphas[i].asked),
                     skin=_skin(masks, alphas[i].labels),
+                    mirror=_mirror(capture, photos[i], rgb),
                 ),
                 side,
             )
@@ -66,8 +69,9 @@ def shrunk(view: PhotoView, side: int) -> PhotoView:
     clipped = None if view.clipped is None else shrink_whole(view.clipped, f)
     rgb, alpha = shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)
     asked = None if view.asked is None else shrink_whole(view.asked, f)
+    mirror = None if view.mirror is None else shrink_whole(view.mirror, f)
     skin = None if view.skin is None else shrink_whole(view.skin.astype(np.float32), f) == 1
-    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, skin=skin, K=K)
+    return replace(view, rgb=rgb, alpha=alpha, clipped=clipped, asked=asked, skin=skin, mirror=mirror, K=K)
 
 
 def _clipped(capture: Located[Capture], file: FileRef | None) -> F32 | None:
@@ -84,6 +88,15 @@ def _skin(masks: Located[MaskSet], file: FileRef | None) -> Bool | None:
     if file is None or FACE not in names:
         return None
     return np.asarray(read_encoded(masks.path(file))[..., 0] == names.index(FACE), np.bool_)
+
+
+def _mirror(capture: Located[Capture], photo: CaptureView, rgb: F32) -> F32 | None:
+    """The mirror reflection of a polarised pair, in the unit of its cross-polarised photo rgb (H, W, 3)."""
+    if photo.parallel is None:
+        return None
+    return specular(
+        rgb, read_linear(capture.path(photo.parallel)) / np.float32(photo.exposure), photo.parallel_exposure
+    )
 
 
 def camera_only(c: Camera) -> PhotoView:

@@ -25,7 +25,7 @@ from stages.inverse_rendering import cross_validation
 from stages.inverse_rendering.config import AUTO, Config
 from stages.inverse_rendering.cross_validation import NEGLIGIBLE, ValidationSamples, more
 from stages.inverse_rendering.initial_geometry import Start
-from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lobe, reflectance
+from stages.inverse_rendering.light_estimate import LightEstimate, light_from_lobe, light_from_mirror, reflectance
 from stages.inverse_rendering.observations import observe, pictures, surface_points
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable, Rays, evenly_spaced
 
@@ -36,6 +36,7 @@ SEED = 715_517
 MIN_VIEWS = 8  # fewest views for validation views
 VALIDATION_SHARE, MAX_VALIDATION = 0.12, 6
 DIFFUSE_ORDER = 3  # SH order that diffuse skin determines [NeuFace eq. 15]
+MIRROR_ORDER = 6  # that the mirror reflection of polarised pairs determines
 MIN_DIFFERENCE = (
     0.02  # of the mean radiance: smaller differences of cameras can't be separated from the lobe's residual
 )
@@ -43,6 +44,7 @@ MIN_SPECULAR = 0.3  # of the remaining error: smaller lobes are noise. Heads hav
 MAX_REST = 0.75  # of the lobe's size: with a larger remaining error, the rank can't be determined (docs/model.md)
 SILHOUETTE = 0.01  # share of the validation views' rays: allowed excess of the prior's silhouette error
 
+CROSSED = "cross-polarised photos show no highlights"
 SELECTED = "cross-validation"  # reason of a decision, in the report
 GIVEN = "given"  # the light's: it was measured
 Facts = dict[str, dict[str, str | float | bool]]
@@ -119,7 +121,8 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
     given."""
     s, model = fit.settings, fit.model
     out = given = given_model(s, calibrated=model.spec.calibrated)
-    wanted = s.estimates_light and s.specular != "off" and not fit.light_given
+    paired = polarised(fit.views)
+    wanted = s.estimates_light and (s.specular != "off" or paired) and not fit.light_given
     if not fit.validation and not wanted:
         return (_with_given_light(out, fit.light_given) if fit.light_given else out), None
     shots = pictures(fit.views)
@@ -128,7 +131,7 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
     found = cross_validation.validation_samples(seen, fit.validation, model) if fit.validation else None
     gain = np.ones((len(fit.views), 3))
     if found is not None:
-        out = _judge_colours(given, s, found, model)
+        out = _judge_colours(given, s, found, model, MIRROR_ORDER if paired else DIFFUSE_ORDER)
         if out.calibrated:
             gain = cross_validation.solve_response(found, out.light_order, gain=True).gain
         if s.refine_geometry == AUTO and fit.prior is not None:
@@ -136,11 +139,19 @@ def select_model(fit: Fit) -> tuple[Choices, LightEstimate | None]:
     elif fit.validation:
         out = replace(given, facts=facts_of(given, s, "too few points are visible in enough views"))
     estimate = None
-    if wanted and out.specular:
+    if wanted and paired:
+        mirrors = [replace(v, rgb=v.mirror) for v in fit.views if v.mirror is not None]
+        kept = np.array([v.mirror is not None for v in fit.views])
+        shiny = observe(model.geometry, pictures(mirrors), seen.x, seen.n)
+        estimate = light_from_mirror(
+            shiny, min(out.light_order, MAX_ESTIMATE_ORDER), gain[kept], model.spec.attenuation
+        )
+        out = replace(out, facts={**out.facts, "specular": {**out.facts["specular"], "why": CROSSED}})
+    elif wanted and out.specular:
         estimate = light_from_lobe(seen, min(out.light_order, MAX_ESTIMATE_ORDER), gain, model.spec.attenuation)
     if fit.light_given:
         return _with_given_light(out, fit.light_given), None
-    return _with_light_source(out, estimate), estimate
+    return _with_light_source(out, estimate, paired), estimate
 
 
 def _with_given_light(c: Choices, source: str) -> Choices:
@@ -149,12 +160,17 @@ def _with_given_light(c: Choices, source: str) -> Choices:
     return replace(c, light_known=True, facts={**c.facts, "light": light})
 
 
-def _with_light_source(c: Choices, estimate: LightEstimate | None) -> Choices:
+def polarised(views: list[PhotoView]) -> bool:
+    """Whether the photos are cross-polarised: their pairs show the mirror reflection, they do not."""
+    return any(v.mirror is not None for v in views)
+
+
+def _with_light_source(c: Choices, estimate: LightEstimate | None, paired: bool = False) -> Choices:
     """The choices with the source of the light."""
     light: dict[str, str | float | bool] = {"from": "uniform albedo"}
     if estimate is not None:
         figures = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
-        light = {"from": "view-dependent residuals", **figures}
+        light = {"from": "polarised pairs" if paired else "view-dependent residuals", **figures}
     return replace(c, light_known=estimate is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
 
 
@@ -197,8 +213,11 @@ def _exact_rays(fit: Fit, seed: int) -> Rays:
     return batch.rays[exact]
 
 
-def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceModel) -> Choices:
-    """Select lobe, calibration, order and rank, in an order in which each uses the previous results."""
+def _judge_colours(
+    given: Choices, s: Config, t: ValidationSamples, model: FaceModel, least: int = DIFFUSE_ORDER
+) -> Choices:
+    """Select lobe, calibration, order and rank, in an order in which each uses the previous results. least: SH order
+    that the light has at least."""
     full, facts = model.spec.light_order, facts_of(given, s, "not tested")
     most = _best_order(t, full) if given.specular else None
     one, gains = cross_validation.alike(t), cross_validation.solve_response(t, most, gain=True)
@@ -222,7 +241,7 @@ def _judge_colours(given: Choices, s: Config, t: ValidationSamples, model: FaceM
     order = given.light_order
     if s.light_order == AUTO:
         order = next(o for o in range(full + 1) if more(orders[o], best) < NEGLIGIBLE) if specular else 0
-        order = max(order, DIFFUSE_ORDER)
+        order = min(max(order, least), full)
         facts["light"] = {"order": order, "why": SELECTED, "error_of_order": _listed(orders)}
     columns = given.columns
     if s.rank == AUTO and not specular:

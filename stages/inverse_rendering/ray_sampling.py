@@ -40,7 +40,8 @@ class PhotoView:
     K: (3, 3) pixels; world_from_cam: (4, 4); distortion: k1 k2 p1 p2 k3. clipped: (H, W) clipped share of each pixel,
     None if none is clipped. doubtful: (H, W) where the mask contradicts the other views; these pixels are not fitted;
     None if nowhere. asked: (H, W) in [0, 1], below 1 where the subject is beyond its extent; only 1 is fitted; None if
-    all pixels count. skin: (H, W) bare skin of the face, None if unknown.
+    all pixels count. skin: (H, W) bare skin of the face, None if unknown. mirror: (H, W, 3) the mirror reflection
+    alone, of a polarised pair, whose photo shows none; None without a pair.
     """
 
     index: int
@@ -53,6 +54,7 @@ class PhotoView:
     doubtful: Bool | None = None
     asked: F32 | None = None
     skin: Bool | None = None
+    mirror: F32 | None = None
 
     @property
     def size(self) -> tuple[int, int]:

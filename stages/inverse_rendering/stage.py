@@ -62,6 +62,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
             remedy="add photos, or hold out fewer with --holdout",
         )
     context.progress(0, settings.steps, "reading photos")
+    if inputs.capture.artifact.polarised and settings.specular == AUTO:
+        settings = settings.changed(specular="off")  # cross-polarised photos show no highlights
     views = read_views(inputs.capture, inputs.poses.artifact, inputs.masks, usable, settings.image_side)
     cameras = [c for c in inputs.poses.artifact.cameras if c.index in set(usable)]
     context.progress(0, settings.steps, "visual hull")

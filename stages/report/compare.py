@@ -9,7 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import HeldOutView, Located, RegisteredView, ViewMask
+from pipeline.capture_artifacts import CaptureView
 from pipeline.images import read_alpha, read_encoded, read_exr, read_linear, shrink
+from pipeline.polarised import unpolarised
 from stages.report.by_label import LabelErrors, label_errors
 from stages.report.collect import Results, own_colours
 from stages.report.metrics import Scores, matched, score
@@ -61,7 +63,8 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         if i not in predicted.keys() | rendered.keys() or i not in masks:
             continue
         factor = (predicted.get(i) or rendered[i]).scale
-        photo = shrink(read_linear(r.capture.path(view.image)), factor)
+        fitted = shrink(read_linear(r.capture.path(view.image)), factor)
+        photo = _without_filters(r, view, fitted, factor)
         asked = _asked(r, masks[i], factor)
         mask = shrink(read_alpha(r.masks.path(masks[i].mask)), factor) * asked
         shown = (
@@ -71,13 +74,22 @@ def judged_views(r: Results) -> Iterator[JudgedView]:
         )
         model, asset, again = (None if x is None else np.asarray(x * asked[..., None], np.float32) for x in shown)
         scores = [
-            score(x, photo, mask) if x is not None and (mask > 0.5).any() else None for x in (model, asset, again)
+            score(x, p, mask) if x is not None and (mask > 0.5).any() else None
+            for x, p in ((model, fitted), (asset, photo), (again, fitted))
         ]
-        errors = [_by_label(r, masks[i], x, photo, mask, factor) for x in (model, asset)]
+        errors = [_by_label(r, masks[i], x, p, mask, factor) for x, p in ((model, fitted), (asset, photo))]
         yield JudgedView(
             i, view.name, view.holdout, photo, mask, model, asset, scores[0], scores[1], scores[2], own, errors[0],
             errors[1], masks[i].source,
         )  # fmt: skip
+
+
+def _without_filters(r: Results, view: CaptureView, fitted: F32, factor: int) -> F32:
+    """(H, W, 3) the photo that the asset should look like: the fitted one, or of a polarised pair what a camera without
+    a filter shows. The field is compared with the fitted one, which shows no highlights, and neither does the field."""
+    if view.parallel is None:
+        return fitted
+    return unpolarised(fitted, shrink(read_linear(r.capture.path(view.parallel)), factor), view.parallel_exposure)
 
 
 def _asked(r: Results, mask: ViewMask, factor: int) -> F32:

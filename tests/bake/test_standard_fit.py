@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -254,3 +256,52 @@ def test_photos_at_grazing_angles_do_not_tell_the_albedo(wrong: float) -> None:
     wanted = fits.fit(mesh, n, at, albedo, clean, np.zeros(len(albedo), bool))
     np.testing.assert_allclose(found.correction, wanted.correction, rtol=2e-3)
     np.testing.assert_allclose(found.f0, wanted.f0, rtol=0.02, atol=1e-4)
+
+
+def in_pairs(f0: float | np.ndarray, roughness: float | np.ndarray) -> tuple:
+    """The ball in polarised pairs: base and mirror reflection apart."""
+    mesh, at, albedo, seen = scene(f0, roughness)
+    n, v = mesh.normals.astype(np.float64), seen.vertex
+    one = np.zeros((len(v), 3), np.int32) + v[:, None].astype(np.int32)
+    third = np.full((len(v), 3), 1 / 3, np.float32)
+    values = [np.broadcast_to(np.asarray(x, np.float32), len(n))[v] for x in (f0, roughness)]
+    base, mirror = standard.radiance(at, one, third, n[v], seen.wo, albedo[v].astype(np.float32), *values)
+    return mesh, at, albedo, fits.Seen(v, seen.wo, base, base, mirror.astype(np.float64))
+
+
+@pytest.mark.parametrize(("f0", "roughness"), [(0.03, 0.45), (0.08, 0.6), (0.04, 0.3)])
+def test_polarised_pairs_tell_the_layer_and_the_base(f0: float, roughness: float) -> None:
+    mesh, at, albedo, seen = in_pairs(f0, roughness)
+    found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, seen, np.zeros(len(albedo), bool))
+    assert np.median(found.f0) == pytest.approx(f0, rel=0.05)
+    assert np.median(found.roughness) == pytest.approx(roughness, abs=0.02)
+    assert np.median(found.correction) == pytest.approx(1, rel=0.01)
+    assert found.figures["gloss_rest_explained"] > 0.95
+
+
+def test_a_wrong_base_colour_does_not_move_what_pairs_tell() -> None:
+    """Texture finer than a pixel, as noise that differs from photo to photo: it is in both photos of a pair alike."""
+    mesh, at, albedo, seen = in_pairs(0.035, 0.45)
+    grain = 1 + 0.2 * np.random.default_rng(0).normal(size=(len(seen.vertex), 1))
+    n, skin = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
+    paired = fits.fit(mesh, n, at, albedo, replace(seen, colour=seen.colour * grain), skin)
+    alone = fits.fit(mesh, n, at, albedo, fits.Seen(
+        seen.vertex, seen.wo, seen.colour * grain + seen.mirror, seen.colour + seen.mirror), skin)  # fmt: skip
+    assert np.median(paired.f0) == pytest.approx(0.035, rel=0.05)
+    assert np.abs(paired.f0 - 0.035).mean() < 0.5 * np.abs(alone.f0 - 0.035).mean()
+
+
+def test_pairs_that_are_not_there_do_not_count() -> None:
+    mesh, at, albedo, seen = in_pairs(0.04, 0.45)
+    mirror = seen.mirror.copy()
+    mirror[::2] = np.nan
+    found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, replace(seen, mirror=mirror),
+                     np.zeros(len(albedo), bool))  # fmt: skip
+    assert np.median(found.f0) == pytest.approx(0.04, rel=0.05) and np.isfinite(found.correction).all()
+
+
+def test_pairs_without_a_mirror_reflection_have_no_layer() -> None:
+    mesh, at, albedo, seen = in_pairs(0.04, 0.45)
+    dark = replace(seen, mirror=np.zeros_like(seen.mirror))
+    found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, dark, np.zeros(len(albedo), bool))
+    assert (found.f0 < 0.01).all() or "gloss_rest_assumed" in found.figures

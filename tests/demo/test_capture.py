@@ -223,3 +223,25 @@ def test_rig_gives_every_view_a_place_of_its_own(views: int) -> None:
     if views >= 12:
         assert (centres[:, 2] > 0).mean() > 0.5, "most views see the face"
         assert (centres[:, 2] < -0.4).any(), "some see the back"
+
+
+def test_a_polarised_pair_adds_up_to_the_plain_photo(folder: Path, tmp_path: Path) -> None:
+    """P + X is what a camera without a filter shows, at its own exposure; and X has no mirror reflection: it is even
+    where the plain photo is not."""
+    out = tmp_path / "pairs"
+    write_demo_capture(out, views=VIEWS, size=SIZE, samples=16, mesh_step=0.003, polarised=True)
+    assert len(list((out / "parallel").glob("*.png"))) == VIEWS
+    for i in (0, 6):
+        plain, cross, parallel = (linear_photo(f, i) for f in (folder, out, out / "parallel"))
+        inside = (alpha_of(folder, i) > 0.99) & (parallel.max(2) < 0.98)
+        total = (cross + parallel)[inside] / capture.POLARISED_EXPOSURE
+        assert np.abs(total - plain[inside]).mean() < 0.003 and np.abs(total - plain[inside]).max() < 0.02
+        mirror = (parallel - cross)[inside] / capture.POLARISED_EXPOSURE
+        assert mirror.min() > -0.012 and 0.005 < mirror.mean() < 0.2 * plain[inside].mean()
+        assert np.ptp(mirror.mean(0)) < 0.1 * mirror.mean() + 0.004  # the mirror reflection has no colour of the skin
+
+
+def test_the_plain_capture_keeps_its_hash() -> None:
+    request = capture.Request(3, 24, 2, 0.006, 0, False)
+    assert "polarised" not in request.plain()
+    assert request.digest() != capture.Request(3, 24, 2, 0.006, 0, False, polarised=True).digest()

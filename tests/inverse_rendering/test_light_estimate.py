@@ -15,7 +15,7 @@ from pipeline.maths import sh
 from pipeline.maths.ggx_width import gauge_alpha
 from pipeline.maths.microfacet import SKIN_F0
 from stages.inverse_rendering import light_estimate as lamp_module
-from stages.inverse_rendering.light_estimate import MIN_EXPLAINED, light_from_lobe, reflectance
+from stages.inverse_rendering.light_estimate import MIN_EXPLAINED, light_from_lobe, light_from_mirror, reflectance
 from stages.inverse_rendering.observations import MIN_COSINE, Observations
 
 F64 = npt.NDArray[np.float64]
@@ -216,3 +216,31 @@ def test_the_scale_is_that_which_makes_the_albedo_even(index: int) -> None:
     total = lit + scale * glow + even * light[0]
     found = lamp_module._evenest(seen, light, total, glow, even, np.ones(400, bool))
     assert (lit > 0.05 * lit.mean()).all() and found == pytest.approx(scale, rel=1e-9)
+
+
+def mirrors_alone(light: F64, noise: float = 0.0) -> Observations:
+    """What polarised pairs show of `observations`: with black skin nothing but the lobe is left."""
+    seen, dull = observations(light, noise), observations(light, lobe=0.0)
+    return Observations(seen.x, seen.n, seen.point, seen.view, seen.colour - dull.colour, seen.wo)
+
+
+@pytest.mark.parametrize("ratio", [0.9, 1.6, 4.0])
+def test_polarised_pairs_tell_the_light_with_its_mean(ratio: float) -> None:
+    light = true_light(ratio=ratio)
+    found = light_from_mirror(mirrors_alone(light), ORDER, np.ones((VIEWS, 3)), "exponential")
+    assert found.explained > 0.99 and found.scale == 1
+    assert np.allclose(found.coefficients, light, atol=0.03)
+
+
+def test_noise_moves_it_less_than_it_moves_the_estimate_from_residuals() -> None:
+    light = true_light(2)
+    found = light_from_mirror(mirrors_alone(light, 0.01), ORDER, np.ones((VIEWS, 3)), "exponential")
+    other = solved(observations(light, noise=0.01))
+    off = [float(np.abs(c.coefficients - light).max()) for c in (found, other)]
+    assert off[0] < off[1] and off[0] < 0.1
+
+
+def test_pairs_without_highlights_tell_no_light() -> None:
+    gain = np.ones((VIEWS, 3))
+    assert light_from_mirror(mirrors_alone(0 * true_light(), 0.01), ORDER, gain, "exponential") is None
+    assert light_from_mirror(mirrors_alone(true_light()), 0, gain, "exponential") is None

@@ -4,6 +4,7 @@ limit. test_cross_validation.py has them on photos."""
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,9 +15,9 @@ import torch
 from stages.inverse_rendering import cross_validation, model_selection
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.light_estimate import LightEstimate
-from stages.inverse_rendering.model_selection import apply_light, given_model, strongest
+from stages.inverse_rendering.model_selection import apply_light, given_model, select_model, strongest
 from tests.inverse_rendering.test_cross_validation import trainer
-from tests.support.balls import Ball
+from tests.support.balls import Ball, gloss
 
 FULL = 4
 
@@ -107,3 +108,24 @@ def test_an_estimated_light_replaces_all_of_the_old_one() -> None:
     light = model.light().detach()
     assert torch.equal(light[:16], torch.arange(1.0, 17.0)[:, None].expand(16, 3)) and not light[16:].any()
     assert any(p is model.light.coefficients for p in changed)
+
+
+def paired() -> Any:
+    """A fit of a ball's cross-polarised photos, with the mirror reflection of each view beside them."""
+    fit = trainer(Ball(), specular="off", light_order="auto")
+    shiny = Ball(gloss(5)).photos()
+    fit.views = [replace(v, mirror=s.rgb - v.rgb) for v, s in zip(fit.views, shiny, strict=True)]
+    return fit
+
+
+def test_polarised_pairs_tell_the_light_of_a_model_without_a_lobe() -> None:
+    """The dull ball's photos alone tell no light beyond order 3; the lobe is of band 5."""
+    choices, estimate = select_model(paired())
+    assert not choices.specular and choices.light_known and choices.light_order >= 5
+    assert choices.facts["light"]["from"] == "polarised pairs"
+    assert choices.facts["specular"]["why"] == model_selection.CROSSED
+    assert estimate is not None and estimate.explained > 0.9
+    bands = [float(np.abs(estimate.coefficients[b * b : (b + 1) ** 2]).max()) for b in range(1, 7)]
+    assert int(np.argmax(bands)) + 1 == 5
+    alone, none = select_model(trainer(Ball(), specular="off", light_order="auto"))
+    assert none is None and not alone.light_known and alone.light_order == 3
