@@ -142,8 +142,10 @@ class Compared:
 def compare(base: Stored, other: Stored, exposure: float) -> Compared:
     """Compare two decoded files of one size. exposure: of the other over that of the base."""
     factor = max(1, round(max(base.shape[:2]) / SMALL))
-    a, b = (_reduced(linear(p).mean(2), factor) for p in (base, other))
-    both = (a > DARK) & (a < LIGHT) & (b > DARK) & (b < LIGHT)
+    pictures = [_reduced(linear(p), factor) for p in (base, other)]
+    a, b = (p.mean(2) for p in pictures)
+    tells, shown = (_tells(p) for p in pictures)
+    both = tells & shown
     if both.sum() < FEWEST:
         return Compared((0.0, 0.0), 0.0, 0.0, known=False)
     stops = float(np.median(np.log2(b[both] / a[both])) - np.log2(exposure))
@@ -153,17 +155,24 @@ def compare(base: Stored, other: Stored, exposure: float) -> Compared:
     if max(abs(s) for s in shift) > FARTHEST * max(a.shape):
         return Compared((shift[0] * factor, shift[1] * factor), stops, 1.0, known=True)
     back = _back(b, shift)
-    both = (a > DARK) & (a < LIGHT) & (back > DARK) & (back < LIGHT)
+    both = tells & (_back(shown.astype(np.float32), shift) > 0.999)
+    both = cv2.erode(both.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0  # clipped neighbours are in the mean below
     level = exposure * 2.0**stops
     soft = [cv2.blur(x, (3, 3)) for x in (a, back / level)]
     differ = np.abs(soft[0] - soft[1]) > DIFFERENT * 0.5 * (soft[0] + soft[1])
-    share = float(differ[both].mean()) if both.sum() >= FEWEST else 1.0
-    return Compared((shift[0] * factor, shift[1] * factor), stops, share, known=True)
+    share = float(differ[both].mean()) if both.any() else 0.0
+    known = both.sum() >= FEWEST / 4 or shift != (0.0, 0.0)
+    return Compared((shift[0] * factor, shift[1] * factor), stops, share, known=bool(known))
 
 
 def _reduced(image: F32, factor: int) -> F32:
     h, w = image.shape[0] // factor, image.shape[1] // factor
     return np.asarray(cv2.resize(image[: h * factor, : w * factor], (w, h), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _tells(image: F32) -> Bool:
+    """(H, W) pixels none of whose channels is clipped or lost in the dark."""
+    return np.asarray((image.min(2) > DARK) & (image.max(2) < LIGHT))
 
 
 def _structure(image: F32, known: Bool) -> F32:

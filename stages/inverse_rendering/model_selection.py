@@ -242,7 +242,8 @@ def _judge_colours(
     if s.light_order == AUTO:
         order = next(o for o in range(full + 1) if more(orders[o], best) < NEGLIGIBLE) if specular else 0
         order = min(max(order, least), full)
-        facts["light"] = {"order": order, "why": SELECTED, "error_of_order": _listed(orders)}
+        why = SELECTED if least == DIFFUSE_ORDER else "the mirror reflection of polarised pairs"
+        facts["light"] = {"order": order, "why": why, "error_of_order": _listed(orders)}
     columns = given.columns
     if s.rank == AUTO and not specular:
         facts["rank"]["why"] = "no specular lobe, so its bases are not used"

@@ -11,8 +11,8 @@ import trimesh
 from pipeline.images import write_exr, write_png
 from pipeline.meshes import F64, Mesh
 from pipeline.visibility import FittedPhoto
-from stages.bake import detail_views
 from stages.bake import detail_kernels as kernels
+from stages.bake import detail_views
 from stages.bake.standard_observe import _mirrors
 from tests.bake.test_bake_moving_light import PIXELS, RADIUS, camera, photograph
 

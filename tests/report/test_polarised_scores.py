@@ -1,4 +1,4 @@
-"""Views of polarised pairs: the field is compared with the photo it was fitted to, the asset with what it should show."""
+"""Views of polarised pairs: the field is compared with the fitted photo, the asset with what it should show."""
 
 from __future__ import annotations
 
