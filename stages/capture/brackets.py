@@ -63,7 +63,7 @@ class MergedPhotos:
         view = self._views[index]
         values = np.asarray(read_encoded(view.values)[..., :3], np.float32) * np.float32(self._scale(view) * self.gain)
         exif = view.exif if self._common is None else replace(view.exif, exposure=self._common)
-        return Decoded(values, exif, view.profile, clipped=np.load(view.ends))
+        return Decoded(values, exif, view.profile, clipped=np.load(view.ends, allow_pickle=False))
 
     def count(self, index: int) -> int:
         """Number of exposures in a view's photo."""

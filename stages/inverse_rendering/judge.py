@@ -47,6 +47,8 @@ SPECULAR = Limits(MIN_SPECULAR, 0.0)
 # Error of a light that moves over a still one's, where it was chosen: .64 for a skull under a flash, .64 for a head on
 # a turntable; people in a still light have .97. Never good, because shadows are not modelled then.
 MOVES = Limits(0.0, 1.0, lower=False)
+# Share of the photos that had no flash by their EXIF, where a flash on the camera is modelled: they had another light.
+UNLIT = Limits(0.0, 0.3, lower=False)
 ALWAYS = Limits(0.0, 0.0)
 MAX_NAMED = 12
 
@@ -160,7 +162,7 @@ def fell(f: Fitted) -> list[Finding]:
 
 def choices(f: Fitted) -> list[Finding]:
     """The checks of the model selection's figures."""
-    return [*_light_moves(f), *_photos_agree(f), *_specular(f), *_colours(f), *_light(f)]
+    return [*_light_moves(f), *_flash_fired(f), *_photos_agree(f), *_specular(f), *_colours(f), *_light(f)]
 
 
 def _light_moves(f: Fitted) -> list[Finding]:
@@ -181,6 +183,18 @@ def _light_moves(f: Fitted) -> list[Finding]:
         "inverse_rendering.light_frame=world"
     )
     return [judged("light_moves", own / max(still, 1e-9), MOVES, message, remedy)]
+
+
+def _flash_fired(f: Fitted) -> list[Finding]:
+    """Whether the photos of a flash on the camera all have it, by those whose EXIF says whether it fired."""
+    told = [v for v in f.capture.views if v.flash is not None and not v.holdout]
+    dark = [v.name for v in told if not v.flash]
+    if f.facts.get("light_frame", {}).get("frame") != FLASH or not told or len(dark) == len(told):
+        return []  # all say no: the flash was another program's or a lamp on the camera
+    value = len(dark) / len(told)
+    message = f"a flash on the camera is modelled; by their EXIF it did not fire in {len(dark)} of {len(told)} photos"
+    remedy = "take the named photos out, or photograph all with flash: one light is fitted to all photos"
+    return [judged("flash_fired", value, UNLIT, message, remedy, views=dark[:MAX_NAMED])]
 
 
 def _photos_agree(f: Fitted) -> list[Finding]:

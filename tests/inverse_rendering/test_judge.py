@@ -302,3 +302,22 @@ def test_a_light_that_moves_is_told(frame: str, words: str) -> None:
     given = {"light_frame": facts["light_frame"] | {"why": "setting"}}
     for other in (still, given, {}):
         assert "light_moves" not in {f.check for f in findings(sound(facts=other))}
+
+
+def flashed(fired: list[bool | None], frame: str = "flash") -> Fitted:
+    """A fit of a flash on the camera, whose first photos say whether it fired."""
+    fit = sound(facts={"light_frame": {"frame": frame, "why": "cross-validation"}})
+    views = [v.model_copy(update={"flash": f}) for v, f in zip(fit.capture.views, fired, strict=False)]
+    return replace(fit, capture=fit.capture.model_copy(update={"views": (*views, *fit.capture.views[len(fired) :])}))
+
+
+@pytest.mark.parametrize(("dark", "level"), [(0, "good"), (2, "usable"), (6, "unusable")])
+def test_photos_without_the_flash_that_is_modelled_are_named(dark: int, level: str) -> None:
+    found = only(flashed([False] * dark + [True] * (12 - dark)), "flash_fired")
+    assert found.level == level and found.value == pytest.approx(dark / 12, abs=1e-5)
+    assert found.views == tuple(f"p{i}.jpg" for i in range(dark))
+
+
+def test_exif_that_says_nothing_of_a_flash_or_of_none_is_no_contradiction() -> None:
+    for fit in (flashed([None] * 12), flashed([False] * 12), flashed([False, True] * 6, "world")):
+        assert "flash_fired" not in {f.check for f in findings(fit)}
