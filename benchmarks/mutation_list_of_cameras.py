@@ -7,6 +7,8 @@ from benchmarks.mutation import Mutation
 HELD_OUT, MERGE = "tests/poses/test_poses_held_out.py", "tests/poses/test_poses_merge.py"
 WEAK, KEPT = "tests/inverse_rendering/test_weakly_seen.py", "tests/inverse_rendering/test_keep_silhouettes.py"
 ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/test_steering.py"
+HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
+PAIRS = "tests/capture/test_polarised_pairs.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
 OF_CAMERAS = (
@@ -140,4 +142,53 @@ OF_CAMERAS = (
              f"{IMAGES}::test_half_exr_is_close"),
     Mutation("pipeline/fields/face.py", "np.savez_compressed(path, spec=", "np.savez(path, spec=",
              "tests/fields/test_face.py::test_same_model_same_bytes"),
+    # ---------------------------------------------------------------- several photos of one view
+    Mutation("stages/capture/hdr.py", "expected * np.float32(e)", "z",
+             f"{HDR}::test_it_is_as_good_as_the_best_unbiased_estimate"),
+    Mutation("stages/capture/hdr.py", "w = e * e / variance(", "w = e / variance(",
+             f"{HDR}::test_it_is_as_good_as_the_best_unbiased_estimate"),
+    Mutation("stages/capture/hdr.py", "(1 / (levels * steep)) ** 2 / 12", "(1 / (levels * steep)) ** 2",
+             f"{HDR}::test_variance_of_rounding_is_that_of_rounded_values"),
+    Mutation("stages/capture/hdr.py", "* free[..., None]", "",
+             f"{HDR}::test_the_range_is_that_of_all_exposures"),
+    Mutation("stages/capture/hdr.py", "/ exposures[shortest]", "",
+             f"{HDR}::test_clipped_where_every_exposure_is_and_a_lower_limit_there"),
+    Mutation("stages/capture/hdr.py", "- np.log2(exposure))", ")",
+             f"{HDR}::test_what_moved_and_what_is_not_as_bright_as_it_says"),
+    Mutation("stages/capture/hdr.py", "flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP", "flags = cv2.INTER_LINEAR",
+             f"{HDR}::test_a_small_shift_is_found_and_taken_back"),
+    Mutation("stages/capture/brackets.py", "self._common / view.exposure", "1.0",
+             f"{BRACKETS}::test_views_of_different_middle_exposures_have_one_unit"),
+    Mutation("stages/capture/brackets.py", "if abs(off[worst]) > STATED:", "if False:",
+             f"{BRACKETS}::test_names_that_contradict_exif"),
+    Mutation("stages/capture/polarised.py", "if share > BRIGHTER:", "if False:",
+             f"{PAIRS}::test_a_cross_photo_that_is_brighter"),
+    Mutation("stages/capture/polarised.py", "parallel / np.float32(exposure), (photo", "parallel, (photo",
+             f"{PAIRS}::test_a_cross_photo_is_compared_at_one_exposure"),
+    Mutation("pipeline/polarised.py", "(parallel / exposure - cross) * SHARE", "parallel / exposure - cross",
+             f"{PAIRS}::test_each_way_of_naming"),
+    Mutation("pipeline/polarised.py", "(parallel / exposure + cross) * SHARE", "parallel / exposure * SHARE",
+             f"{PAIRS}::test_each_way_of_naming"),
+    Mutation("stages/bake/standard_fit.py", "return lambda z, t: z\n",
+             "return lambda z, t: _without_base(z, t, w, vertex, count)\n",
+             "tests/bake/test_standard_fit.py::test_pairs_tell_the_mean_of_the_reflection_and_not_only_what_changes"),
+    Mutation("stages/bake/standard_fit.py", "        specular[:] = 0", "        pass",
+             "tests/bake/test_standard_fit.py::test_polarised_pairs_tell_the_layer_and_the_base"),
+    Mutation("stages/bake/standard_observe.py", "cameras[:, 39] = other.peaks", "pass",
+             "tests/bake/test_polarised_views.py::test_the_mirror_reflection_at_the_vertices"),
+    Mutation("stages/bake/detail_views.py", "/ np.float32(view.parallel_exposure)", "",
+             "tests/bake/test_polarised_views.py::test_the_mirror_reflection_at_the_vertices"),
+    Mutation("stages/inverse_rendering/light_estimate.py",
+             "y = (seen.colour / gain[seen.view]).mean(1)\n    usual", "y = seen.colour.sum(1)\n    usual",
+             "tests/inverse_rendering/test_light_estimate.py::test_polarised_pairs_tell_the_light_with_its_mean"),
+    Mutation("stages/inverse_rendering/model_selection.py", "order = min(max(order, least), full)",
+             "order = min(max(order, DIFFUSE_ORDER), full)",
+             "tests/inverse_rendering/test_model_selection.py"
+             "::test_polarised_pairs_tell_the_light_of_a_model_without_a_lobe"),
+    Mutation("stages/report/compare.py", "((model, fitted), (asset, photo), (again, fitted))",
+             "((model, fitted), (asset, fitted), (again, fitted))",
+             "tests/report/test_polarised_scores.py::test_the_asset_is_scored_against_the_photo_without_filters"),
+    Mutation("stages/inverse_rendering/judge.py", "len(dark) == len(told):", "False:",
+             "tests/inverse_rendering/test_judge.py"
+             "::test_exif_that_says_nothing_of_a_flash_or_of_none_is_no_contradiction"),
 )  # fmt: skip

@@ -7,7 +7,7 @@ merged keeps its middle exposure, in the same unit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
@@ -44,14 +44,15 @@ class MergedView:
 
 
 class MergedPhotos:
-    """The merged photos of a capture. `photo` gives one in the common unit; `count` the exposures in it."""
+    """The merged photos of a capture. `photo` gives one in the common unit; `count` the exposures in it. held: numbers
+    of held-out views, which do not decide the gain."""
 
-    def __init__(self, views: dict[int, MergedView]) -> None:
+    def __init__(self, views: dict[int, MergedView], held: Set[int]) -> None:
         self._views = views
         known = [v.exposure for v in views.values()]
         exposures = [e for e in known if e is not None]
         self._common = float(np.median(exposures)) if len(exposures) == len(known) and exposures else None
-        tops = [v.top * self._scale(v) for v in views.values()]
+        tops = [v.top * self._scale(v) for n, v in views.items() if n not in held]
         top = float(np.median(tops)) if tops else 0.0
         self.gain = round(min(1.0, LEVEL / top), 6) if top > 0 else 1.0
 
@@ -76,8 +77,9 @@ class MergedPhotos:
 
 
 def merged_photos(
-    source: Located[CaptureSource], candidates: Sequence[Candidate], warnings: list[str], context: Context
-) -> MergedPhotos | None:
+    source: Located[CaptureSource], candidates: Sequence[Candidate], held: Set[int], warnings: list[str],
+    context: Context,
+) -> MergedPhotos | None:  # fmt: skip
     """Merge the exposures of every view; None for a capture without brackets. Views that keep one exposure are named.
 
     Raises:
@@ -97,7 +99,7 @@ def merged_photos(
     if single:
         warnings.append(f"{len(single)} of {len(candidates)} views have one exposure only, such as {single[0]}; they "
                         "are used as they are")  # fmt: skip
-    return MergedPhotos(views)
+    return MergedPhotos(views, held)
 
 
 def _view(source: Located[CaptureSource], candidate: Candidate, folder: Path, warnings: list[str]) -> MergedView:

@@ -76,9 +76,11 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     described = set(selection.absent)
     candidates = without_duplicates(selection, given=source.artifact.cameras != ())
     look = config.colour_checker != "off"
-    merged = None if config.brackets == "off" else merged_photos(source, candidates, selection.warnings, context)
-    photos = [made.photo_of(source, c, (n, len(candidates)), look, context, merged) for n, c in enumerate(candidates)]
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
+    merged = None
+    if config.brackets == "auto":
+        merged = merged_photos(source, candidates, held, selection.warnings, context)
+    photos = [made.photo_of(source, c, (n, len(candidates)), look, context, merged) for n, c in enumerate(candidates)]
     candidates, photos = useful(candidates, photos, selection, config.drop_blurred, held)
     held = held_out(config.holdout, [(c.index, c.name) for c in candidates], selection.absent)
     if config.holdout != "none" and not held:

@@ -305,3 +305,16 @@ def test_pairs_without_a_mirror_reflection_have_no_layer() -> None:
     dark = replace(seen, mirror=np.zeros_like(seen.mirror))
     found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, dark, np.zeros(len(albedo), bool))
     assert (found.f0 < 0.01).all() or "gloss_rest_assumed" in found.figures
+
+
+def test_pairs_tell_the_mean_of_the_reflection_and_not_only_what_changes() -> None:
+    """Noise as large as what changes with the view, and far below the reflection's mean: the layer explains most."""
+    mesh, at, albedo, seen = in_pairs(0.04, 0.6)
+    v, count = seen.vertex, len(albedo)
+    mean = np.bincount(v, seen.mirror.mean(1), count) / np.maximum(np.bincount(v, minlength=count), 1)
+    changes = float(np.std(seen.mirror.mean(1) - mean[v]))
+    noise = changes * np.random.default_rng(0).normal(size=seen.mirror.shape)
+    found = fits.fit(mesh, mesh.normals.astype(np.float64), at, albedo, replace(seen, mirror=seen.mirror + noise),
+                     np.zeros(count, bool))  # fmt: skip
+    assert found.figures["gloss_rest_explained"] > 0.6
+    assert np.median(found.f0) == pytest.approx(0.04, rel=0.2)

@@ -41,7 +41,7 @@ def bracketed(folder: Path, name: str = "{view}_ev{stops:+.0f}.jpg", exif: bool 
     """Views of three exposures each."""
     for v in range(views):
         for k, stops in enumerate(STOPS):
-            path = folder / name.format(view="abcde"[v], stops=stops, k=k)
+            path = folder / name.format(view="abcdefg"[v], stops=stops, k=k)
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(jpeg(photo(radiance(v), 2.0**stops), BASE * 2**stops if exif else None))
     return folder
@@ -182,3 +182,55 @@ def test_given_cameras_name_one_photo_of_each_bracket(facescape, gather) -> None
     found = gather(folder).artifact
     assert [v.merged for v in found.views] == [3] * 6 and all(v.camera is not None for v in found.views)
     assert [v.index for v in found.views] == list(range(6))
+
+
+def test_views_of_different_middle_exposures_have_one_unit(tmp_path: Path, gather) -> None:
+    """The second view was photographed at twice the exposure throughout; a surface has one value nevertheless."""
+    folder = bracketed(tmp_path / "c", "brackets/{view}/{k}.jpg")
+    for k, stops in enumerate(STOPS):
+        (folder / f"brackets/b/{k}.jpg").write_bytes(jpeg(photo(radiance(1), 2 * 2.0**stops), 2 * BASE * 2**stops))
+    found = gather(folder)
+    gains = [float(np.median(read_linear(found.path(v.image))[:, 8:-8] / radiance(n)[:, 8:-8]))
+             for n, v in enumerate(found.artifact.views)]  # fmt: skip
+    assert max(gains) < 1.02 * min(gains) and [v.exposure for v in found.artifact.views] == [1, 1, 1]
+
+
+def test_a_turned_camera_turns_the_merged_photo_with_its_clipped_pixels(tmp_path: Path, gather) -> None:
+    folder = tmp_path / "c"
+    for n, view in enumerate("abc"):
+        true = radiance(n).copy()
+        true[20:60, 20:50] = 100.0  # clipped in every exposure
+        for stops in STOPS:
+            image = photo(true, 2.0**stops)[..., ::-1]
+            entries = [(0x829A, 5, 1, struct.pack("<II", round(BASE * 2**stops * 1e6), 1_000_000)),
+                       (0x829D, 5, 1, struct.pack("<II", 8, 1)), (0x8827, 3, 1, struct.pack("<H", 100))]  # fmt: skip
+            turned = [(0x112, 3, 1, struct.pack("<H", 6))]
+            folder.mkdir(exist_ok=True)
+            data = exif_jpeg(tiff_block("<", turned, entries), image)
+            (folder / f"{view}_ev{stops:+.0f}.jpg").write_bytes(data)
+    found = gather(folder)
+    view = found.artifact.views[0]
+    assert (view.width, view.height) == (160, 200) and view.merged == 3 and view.clipped is not None
+    values, ends = read_linear(found.path(view.image)), read_alpha(found.path(view.clipped)) > 0
+    assert values.shape == (200, 160, 3) and ends.shape == (200, 160)
+    assert ends[25:45, 105:135].all() and not ends[60:180].any()  # a quarter turn clockwise: (x, y) to (159 - y, x)
+
+
+def test_held_out_views_do_not_decide_the_gain(tmp_path: Path, gather) -> None:
+    """Four of seven views are far brighter; the gain is that of the others where the bright ones are held out."""
+    folder = bracketed(tmp_path / "c", "brackets/{view}/{k}.jpg", views=7)
+    for v, view in enumerate("defg"):
+        for k, stops in enumerate(STOPS):
+            data = jpeg(photo(4 * radiance(v + 3), 2.0**stops), BASE * 2**stops)
+            (folder / f"brackets/{view}/{k}.jpg").write_bytes(data)
+
+    def gain(**settings: object) -> float:
+        found = gather(folder, **settings)
+        return float(np.median(read_linear(found.path(found.artifact.views[0].image))[:, 8:-8] / radiance(0)[:, 8:-8]))
+
+    held = gain(holdout="names:d,e,f,g")
+    for view in "defg":
+        for path in (folder / f"brackets/{view}").iterdir():
+            path.unlink()
+        (folder / f"brackets/{view}").rmdir()
+    assert held == pytest.approx(gain(), rel=1e-3)

@@ -179,3 +179,12 @@ def test_flash_that_fired_in_some_photos_only(tmp_path: Path, gather) -> None:
     assert len(told) == 1 and "3 photos and not in 1" in told[0] and "3.jpg without flash" in told[0]
     (folder / "3.jpg").unlink()
     assert not [w for w in gather(folder).artifact.warnings if "flash" in w]
+
+
+def test_a_cross_photo_is_compared_at_one_exposure(tmp_path: Path, gather) -> None:
+    """Parallel photos that are brighter only because their exposure was longer."""
+    folder = paired(tmp_path / "c")
+    for n, view in enumerate("abc"):
+        (folder / f"{view}_parallel.jpg").write_bytes(jpeg(photo(0.8 * 0.5 * parts(n)[0], 2.0), 2 * BASE))
+    error = refused(gather, folder)
+    assert "is brighter than its parallel" in str(error) and float(error.value.split()[0]) == pytest.approx(1.25, 0.02)
