@@ -187,9 +187,11 @@ def _light_moves(f: Fitted) -> list[Finding]:
 
 def _flash_fired(f: Fitted) -> list[Finding]:
     """Whether the photos of a flash on the camera all have it, by those whose EXIF says whether it fired."""
+    if f.facts.get("light_frame", {}).get("frame") != FLASH:
+        return []
     told = [v for v in f.capture.views if v.flash is not None and not v.holdout]
     dark = [v.name for v in told if not v.flash]
-    if f.facts.get("light_frame", {}).get("frame") != FLASH or not told or len(dark) == len(told):
+    if not told or len(dark) == len(told):
         return []  # all say no: the flash was another program's or a lamp on the camera
     value = len(dark) / len(told)
     message = f"a flash on the camera is modelled; by their EXIF it did not fire in {len(dark)} of {len(told)} photos"
