@@ -14,6 +14,7 @@ from pipeline import footprint, meshes, raster, tangents, tiles
 from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
+from pipeline.smoothing import continued
 from pipeline.visibility import FittedPhoto, Occluder, best_cosine
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
@@ -26,8 +27,9 @@ from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.mouth import Inside
 from stages.bake.regions import Votes, areas, unanimous
-from stages.bake.smooth import continued
-from stages.bake.standard_observe import standard_material
+from stages.bake.relief import relief
+from stages.bake.sources import sources
+from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
 from stages.bake.unseen import CLEAR, LENGTH, region_colours, replaced_share
@@ -111,7 +113,12 @@ class Baker:
         self._hair_code = hair_code if hair is not None else -1
         self._occluder = Occluder(mesh)
         around = ambient(mesh, self._occluder, lambda done, total: step(done, total, "ambient occlusion"))
-        self._known = replace(_known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes)
+        shape = relief(
+            mesh, surface_normals(field, mesh), self._occluder, lambda done, total: step(done, total, "thickness")
+        )
+        self._known = replace(
+            _known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes, relief=shape
+        )
         self._measured = measured
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
@@ -127,6 +134,8 @@ class Baker:
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
+        told = sources(self._known.unseen, self._known.replaced, self._known.standard)
+        self._known = replace(self._known, sources=told)
 
     @property
     def standard_fitted(self) -> bool:
@@ -173,6 +182,13 @@ class Baker:
             votes = unanimous(self._hair_code)
         regions = areas(mesh, charts, votes) if labelled else {}
         return Baked(size, texel, nearest, samples, seen.confidence, self.lut, found, votes, regions)
+
+
+def surface_normals(field: Field, mesh: Mesh) -> F64:
+    """(V, 3) the field's unit normals at the vertices, the mesh's own where it is not the zero set (the inside of a
+    mouth, the cut of the neck)."""
+    near = np.abs(field.sdf_and_gradient(mesh.vertices)[0]) < field.cell
+    return np.where(near[:, None], field_normals(field, mesh), meshes.unit(mesh.normals))
 
 
 def _per_tile(side: int, count: int) -> int:

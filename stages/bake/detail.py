@@ -28,9 +28,9 @@ from pipeline.fields.protocol import Field
 from pipeline.lighting.moving import Standpoint
 from pipeline.maths import brdf, sh
 from pipeline.meshes import F32, F64, Mesh
+from pipeline.smoothing import Smoother
 from stages.bake import detail_kernels as kernels
 from stages.bake.detail_views import Photos
-from stages.bake.smooth import Smoother
 
 WIDTH = 0.004  # metres: what the field itself resolves
 EDGES = 1.5  # mean edges of the mesh: least WIDTH, because the low band is stored at vertices

@@ -9,7 +9,7 @@ Symbols
     u, v     departures of F0 and roughness from the group's
     C        their prior covariance at one place: spreads s_u, s_v and correlation c. Where skin is oily or moist its F0
              is higher and its roughness lower [Weyrich 2006]
-    M, K     of smooth.py; the prior's precision over the surface is C^-1 x (M + LENGTH^2 K) / (4 pi LENGTH^2), the
+    M, K     of smoothing.py; the prior's precision over the surface is C^-1 x (M + LENGTH^2 K) / (4 pi LENGTH^2), the
              field whose correlation falls over LENGTH [Lindgren 2011], drawn to the mean where nothing is known
     s^2      variance of the noise. Errors of shape and light are common to all views and to neighbours: all
              observations within LENGTH count as 1 / TRUST of their number
@@ -26,7 +26,7 @@ from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from pipeline.meshes import F64, Mask, Mesh
-from stages.bake.smooth import laplacian
+from pipeline.smoothing import laplacian
 
 LENGTH = 0.02  # metres: a forehead, a nose, a lip
 TRUST = 10.0

@@ -84,6 +84,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from pipeline.people import shows_person
     from pipeline.visibility import seen_by
     from stages.bake.build import Baker, Photos
+    from stages.bake.delighting import figures_of, shown
     from stages.bake.deviation import zero_set_rms
     from stages.bake.eyes import painted_eyes
     from stages.bake.judge import chosen, judge
@@ -120,7 +121,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         region, hair, labels.index("hair") if "hair" in labels else -1,
         measured_of(inputs.reflectance, config.size),
     )  # fmt: skip
-    parts, sides, counted, judged, areas = [], [], [], [], Counter[int]()
+    parts, sides, counted, judged, shades, areas = [], [], [], [], [], Counter[int]()
     for number in range(baker.tiles):
         baked = baker.tile(number)
         factor = config.beside if uv.artifact.of_template and number > 0 else 1
@@ -128,13 +129,14 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
         parts.append(write_maps(written, context, number, baker.tiles))
         sides.append(written.size)
         counted.append(baked.statistics)
+        shades.append(shown(baked.samples, baked.texel, baked.size, baked.votes))
         judged.append(chosen(baked.samples, baked.texel, baked.size, baked.votes, labels))
         areas.update(baked.regions)
         del baked, written
     maps, all_tiles = joined(parts, [s.texels for s in counted], context), together(counted)
     pixel = footprint.pixel(mesh, (v.camera for v in views))
     sizes = {"texel_mm": footprint.texel(mesh, charts, config.size), "photo_pixel_mm": pixel}
-    figures = all_tiles.figures(detail=baker.detailed) | baker.material_figures
+    figures = all_tiles.figures(detail=baker.detailed) | baker.material_figures | figures_of(shades, labels)
     hidden = hidden_tiles(inputs.template, charts) if uv.artifact.of_template else frozenset[int]()
     outside = together([s for number, s in enumerate(counted) if number not in hidden])
     figures["unseen"] = outside.figures(detail=False)["unseen"]
@@ -208,4 +210,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=26, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=27, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -34,15 +34,15 @@ off NeuFace's lobe. At last r follows by linear least squares, pooled over EDGES
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.lighting import standard
 from pipeline.meshes import F32, F64, Mask, Mesh, areas
+from pipeline.smoothing import Smoother
 from stages.bake.gloss_field import Slopes, Spread, departures
-from stages.bake.smooth import Smoother
 
 ALPHAS = np.array([0.09, 0.12, 0.16, 0.20, 0.25, 0.31, 0.38, 0.47, 0.6], np.float32)
 EDGES = 0.7  # mean edges of the mesh over which the albedo's correction is pooled, and groups meet
@@ -123,7 +123,8 @@ class Lit:
 @dataclass(frozen=True, slots=True)
 class Fitted:
     """At the vertices: correction (V, 3) of the albedo, f0 (V,), roughness (V,); received (V, 3): S. figures: for the
-    report. plausible: false if the only material is none that exists."""
+    report. plausible: false if the only material is none that exists. measured (V, 2): share of the photos in F0 and in
+    roughness (sources.py)."""
 
     correction: F32
     f0: F32
@@ -131,6 +132,7 @@ class Fitted:
     received: F32
     figures: dict[str, float]
     plausible: bool = True
+    measured: F32 = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +165,7 @@ def fit(
     often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
+    told = np.zeros((len(normals), 2))
     figures: dict[str, float] = {}
     others = REST if (skin | hair).any() else OBJECT
     for name, group, prior in (("skin", skin, SKIN), ("hair", hair, HAIR), ("rest", ~skin & ~hair, others)):
@@ -170,6 +173,7 @@ def fit(
             continue
         found = _group(sums, group & often, prior)
         f0[group], rough[group], layered[group] = found.f0, found.roughness, found.f0 > 0
+        told[group & often] = found.told
         if found.measured and prior.varies:
             check()
             own = group & often
@@ -194,6 +198,7 @@ def fit(
         correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
         lit.received.astype(np.float32),
         {k: round(v, 5) for k, v in figures.items()}, bool(skin.any()) or "gloss_rest_refused_f0" not in figures,
+        told.astype(np.float32),
     )  # fmt: skip
 
 
@@ -286,7 +291,8 @@ def _without_base(z: F64, t: F64, w: F64, vertex: npt.NDArray[np.int64], count: 
 class _Group:
     """A group's mean F0 (0: no layer), as the regression has it (fitted) and after the prior (f0), roughness, and the
     share of the view-dependent variance that its layer explains. measured: whether that is enough. refused: F0 above
-    DIELECTRIC that was found, else 0; assumed: the layer is none that the photos tell."""
+    DIELECTRIC that was found, else 0; assumed: the layer is none that the photos tell. told: share of the photos in F0
+    and in roughness."""
 
     f0: float
     fitted: float
@@ -295,6 +301,7 @@ class _Group:
     measured: bool = False
     refused: float = 0.0
     assumed: bool = False
+    told: tuple[float, float] = (0.0, 0.0)
 
 
 def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
@@ -316,7 +323,10 @@ def _group(sums: _Sums, own: Mask, prior: Prior) -> _Group:
         return _Group(0.0, 0.0, prior.roughness, explained, refused=float(mean[k]))
     rough, fitted = _lowest(np.sqrt(ALPHAS).astype(np.float64), cost), float(mean[k])
     f0 = float(np.clip(drawn(fitted, prior.usual, explained), *prior.f0)) if prior.usual else fitted
-    return _Group(f0, fitted, rough, explained, measured=f0 > 0)
+    if f0 <= 0:
+        return _Group(f0, fitted, rough, explained)
+    told = (weight_of(explained) if prior.usual else 1.0, precision_share(np.sqrt(ALPHAS), cost, prior.spread))
+    return _Group(f0, fitted, rough, explained, measured=True, told=told)
 
 
 def _is_free(f0: float, h: float, g: float, q: float, bare: float) -> bool:
@@ -326,9 +336,22 @@ def _is_free(f0: float, h: float, g: float, q: float, bare: float) -> bool:
 
 def drawn(fitted: float, usual: float, explained: float) -> float:
     """Mean F0 from that of the regression and the usual one, by the share that the layer explains."""
-    odds = explained / max(1 - explained, 1e-9)
-    weight = odds / (odds + HALF)
+    weight = weight_of(explained)
     return weight * fitted + (1 - weight) * usual
+
+
+def weight_of(explained: float) -> float:
+    """Weight of the photos in the mean F0 of a material with a usual one, by the share that the layer explains."""
+    odds = max(explained, 0.0) / max(1 - explained, 1e-9)
+    return odds / (odds + HALF)
+
+
+def precision_share(x: npt.NDArray[np.floating], cost: F64, spread: float) -> float:
+    """Share of the photos in the precision of a roughness, in [0, 1]: 1 - prior'' / cost'' at the least of the costs
+    (K,) over x (K,), negative log likelihoods that include the prior's of this standard deviation."""
+    k = int(np.clip(cost.argmin(), 1, len(x) - 2))
+    curve = 2 * float(np.polyfit(x[k - 1 : k + 2].astype(np.float64), cost[k - 1 : k + 2], 2)[0])
+    return float(np.clip(1 - spread**-2 / max(curve, 1e-12), 0, 1))
 
 
 def _lowest(x: F64, cost: F64) -> float:

@@ -15,6 +15,7 @@ from pipeline.lighting.moving_standard import MovingLamps
 from pipeline.lighting.standard import COUNT, Arrivals, arrivals
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh, unit
 from pipeline.polarised import specular
+from pipeline.smoothing import continued
 from pipeline.thinning import thinned
 from pipeline.transforms import inverse_rigid, matrix, project
 from pipeline.visibility import FittedPhoto
@@ -24,7 +25,6 @@ from stages.bake.detail import Detail, shade
 from stages.bake.detail_views import Photos
 from stages.bake.regions import Poll
 from stages.bake.skin import skin_of
-from stages.bake.smooth import continued
 
 DOME_WIDTH = 256  # columns of the picture that is cut into lamps
 MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradient

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import tangents
+from pipeline.colour import LUMA
 from pipeline.errors import StageError
 from pipeline.eyes import material
 from pipeline.fields.protocol import Field
@@ -25,6 +26,7 @@ from pipeline.tangents import Frames
 from stages.bake.detail import Detail, Points, shade
 from stages.bake.eyes import Eyes
 from stages.bake.lit import Measured
+from stages.bake.relief import FAR, Relief
 from stages.bake.standard_fit import CORRECTION, Fitted
 
 NEWTON_STEPS = 3
@@ -47,7 +49,9 @@ class Samples:
     rho (N,); coefficients (N, k), the c_j without rho; inv_kappa (N,); irradiance_ratio (N, 3); normal (N, 3) in
     tangent space, unit; displacement (N,) metres; ambient (N,): ambient occlusion. landed (N,): False where no zero set
     is near the mesh (the cap). support (N,): weight of the photos in the detail. unseen (N,): 1 where no photo shows
-    the point. clamped (N,): largest change of an albedo channel by clamping to ALBEDO_RANGE.
+    the point. clamped (N,): largest change of an albedo channel by clamping to ALBEDO_RANGE. curvature (1/m), cavity,
+    thickness (m) (N,): relief.py; measured (N, 3): sources.py. lit (N,): luminance of the irradiance over pi that the
+    fitted light predicts.
     """
 
     albedo: F32
@@ -65,12 +69,18 @@ class Samples:
     support: F32
     unseen: F32
     clamped: F32
+    curvature: F32
+    cavity: F32
+    thickness: F32
+    measured: F32
+    lit: F32
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
     """Data at the mesh's vertices. ambient (V,); unseen (V,): 1 where no photo shows the vertex; replaced (V,): how far
-    the albedo is replaced by albedo (V, 3), because no photo shows it well (unseen.py). standard: the fitted material
+    the albedo is replaced by albedo (V, 3), because no photo shows it well (unseen.py). relief: of the shape; sources
+    (V, 3): sources.py. standard: the fitted material
     of standard shaders; None: it is converted from NeuFace's. eyes: the fitted eyes, if there are any; measured: what a
     light stage says of the material, if there is one."""
 
@@ -78,6 +88,8 @@ class Known:
     unseen: F32
     replaced: F32
     albedo: F32
+    relief: Relief | None = None
+    sources: F32 | None = None
     standard: Fitted | None = None
     eyes: Eyes | None = None
     measured: Measured | None = None
@@ -126,10 +138,12 @@ def sample(
     roughness = microfacet.roughness_from_inv_kappa(own.inv_kappa)
     albedo, support = np.asarray(own.albedo, np.float32), np.zeros(len(x), np.float32)
     _check("albedo", albedo)
+    here = points(field, mesh, hits, at, albedo, ratio)
     if detail is not None:
-        more, support = detail.added(points(field, mesh, hits, at, albedo, ratio))
+        more, support = detail.added(here)
         albedo = albedo + more
     around, unseen = np.ones(len(x), np.float32), np.zeros(len(x), np.float32)
+    shape, told = _shape(known, mesh, hits), np.ones((len(x), 3), np.float32)
     if known is not None:
         corner = mesh.faces[hits.face]
         around = tangents.dot(known.ambient[corner], hits.weights)
@@ -137,6 +151,8 @@ def sample(
         nearby = tangents.mixed(known.albedo[corner], hits.weights)
         replaced = tangents.dot(known.replaced[corner], hits.weights)
         albedo = np.asarray(albedo + replaced[:, None] * (nearby - albedo), np.float32)
+        if known.sources is not None:
+            told = tangents.mixed(known.sources[corner], hits.weights).astype(np.float32)
     physical = base = albedo.clip(*ALBEDO_RANGE)
     if known is not None and known.standard is not None:
         fitted, corner = known.standard, mesh.faces[hits.face]
@@ -158,6 +174,11 @@ def sample(
         support=support,
         unseen=unseen,
         clamped=np.abs(albedo - physical).max(1),
+        curvature=shape[0],
+        cavity=shape[1],
+        thickness=shape[2],
+        measured=told,
+        lit=np.asarray(here.shade @ np.array(LUMA, np.float32), np.float32),
     )
     if known is not None and known.measured is not None:
         found = _with_measured(found, at, known.measured.at(hits.texel))
@@ -166,6 +187,19 @@ def sample(
     for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
         _check(name, getattr(found, name))
     return found
+
+
+def _shape(known: Known | None, mesh: Mesh, hits: Hits) -> tuple[F32, F32, F32]:
+    """(N,) curvature, cavity and thickness; those of a plane without end where they are not known."""
+    count = len(hits.face)
+    if known is None or known.relief is None:
+        return np.zeros(count, np.float32), np.full(count, 0.5, np.float32), np.full(count, FAR, np.float32)
+    shape, corner = known.relief, mesh.faces[hits.face]
+    curvature, cavity, thick = (
+        np.asarray(tangents.dot(v[corner], hits.weights), np.float32)
+        for v in (shape.curvature, shape.cavity, shape.thickness)
+    )
+    return curvature, cavity, thick
 
 
 def _with_measured(found: Samples, at: Placed, values: F32) -> Samples:
@@ -179,6 +213,7 @@ def _with_measured(found: Samples, at: Placed, values: F32) -> Samples:
         roughness=values[:, 4].clip(0.1, 1),
         normal=in_frame(normal.astype(np.float64), at.t, at.b, at.n),
         unseen=(values[:, 8] < 0.5).astype(np.float32),
+        measured=np.repeat((values[:, 8:9] >= 0.5).astype(np.float32), 3, 1),
     )
 
 
@@ -199,6 +234,7 @@ def _with_eyes(
     changed["albedo"][rows] = albedo.clip(*ALBEDO_RANGE)
     changed["base_color"][rows] = base.clip(*ALBEDO_RANGE)
     changed["f0"][rows], changed["roughness"][rows] = material.F0, material.ROUGHNESS
+    changed["measured"][rows, 1:] = 0
     changed["normal"][rows], changed["displacement"][rows] = (0, 0, 1), 0
     changed["clamped"][rows] = np.abs(albedo - albedo.clip(*ALBEDO_RANGE)).max(1)
     return Samples(**changed)

@@ -3,7 +3,7 @@
 A photo that sees the surface at a grazing angle mixes it with what lies behind, so that the last seen rim has wrong
 colours, and continuing them gives smears; and a mean over the whole head makes the back of a dark-haired head bald.
 Hence only well seen vertices are kept, and others are drawn, over the length L, to the median of the seen albedo of
-their region of the head template (scalp, ears, face, bands of the neck; the rest): smooth.continued. The neck is
+their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
 divided by height, because a collar or long hair ends at about one height all around it.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.

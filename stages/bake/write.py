@@ -27,6 +27,8 @@ from stages.bake.texels import Samples
 
 FOLDER = "textures"
 MM = 1000.0
+CURVATURE = 0.001  # metres: curvatures of -500 to 500 1/m fill the PNG, flat is .5
+THICK = 100.0  # mm: white in the PNG; relief.FAR
 MIN_INV_KAPPA = 1e-6
 UNSEEN = 0.5  # value in the map `coverage` of a covered texel that no photo shows
 OPTIONAL = ("clamped", "region")  # maps that are removed if they are empty
@@ -41,7 +43,8 @@ Function = Callable[..., npt.NDArray[Any]]
 class MapKind:
     """How a map is computed from arrays (N, ...) of the samples, and how it is stored. png: bits, 0 for none; encoded:
     the png contains v/2 + 1/2; codes: values are integers, also in the png; colour: the three channels are a colour;
-    units: of the values, for the EXR's header. step: the EXR has multiples of it; wide: in 32 bits, not 16."""
+    units: of the values, for the EXR's header. step: the EXR has multiples of it; wide: in 32 bits, not 16. shown:
+    values of the png from those of the EXR, if they are not the same."""
 
     sources: tuple[str, ...]
     function: Function = lambda values: values
@@ -54,6 +57,7 @@ class MapKind:
     units: str = ""
     step: float = 0.0
     wide: bool = False
+    shown: Function | None = None
 
     def values(self, samples: Samples, rows: Any = slice(None)) -> F32:
         """(N, channels) values of all samples, or of some rows."""
@@ -75,6 +79,12 @@ KINDS: dict[str, MapKind] = {
     "normal": MapKind(("normal",), png=8, encoded=True, step=NORMAL_STEP),
     "irradiance_ratio": MapKind(("irradiance_ratio",), png=8, colour=True),
     "ambient_occlusion": MapKind(("ambient",), png=8),
+    "curvature": MapKind(("curvature",), png=8, units="1/m", shown=lambda h: 0.5 + CURVATURE * h),
+    "cavity": MapKind(("cavity",), png=8),
+    "thickness": MapKind(
+        ("thickness",), lambda d: d * np.float32(MM), png=8, units="mm", shown=lambda d: d / np.float32(THICK)
+    ),
+    "measured": MapKind(("measured",), png=8),
     "displacement": MapKind(("displacement",), lambda d: d * np.float32(MM), units="mm", step=HEIGHT_STEP, wide=True),
     "clamped": MapKind(("clamped",), lambda c: (c > 0).astype(np.float32), png=8),
 }
@@ -205,7 +215,8 @@ def _store(name: str, image: F32, figures: tuple[float, float, float], kind: Map
         else:
             if kind.codes:
                 image /= 255
-            write_png(path, image, kind.png, signed=kind.encoded)
+            stored = image if kind.shown is None else kind.shown(image)
+            write_png(path, stored, kind.png, signed=kind.encoded)
         files[png] = place.context.file(f"{FOLDER}/{name}.{png}")
     minimum, mean, maximum = figures
     return TextureMap(

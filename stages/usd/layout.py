@@ -16,7 +16,8 @@ OLD_LIGHT = "light.json"  # where it was in assets of older versions
 # Maps of standard shaders, by their name without the asset's.
 FOR_ARTISTS = frozenset({
     "albedo", "albedo_acescg", "normal", "roughness", "f0", "specular_color", "ambient_occlusion", "displacement",
-    "cage_displacement",
+    "cage_displacement", "cage_displacement_low", "cage_displacement_high", "curvature", "cavity", "thickness",
+    "measured",
 })  # fmt: skip
 READ = re.compile(r"_(basis_rgb\d+|coefficients_rgb\d+|inv_kappa|neuface_albedo)\.(\d{4}\.)?(exr|png)$")
 

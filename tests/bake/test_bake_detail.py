@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from pipeline import raster
+from pipeline import raster, smoothing
 from pipeline.artifacts import Camera
 from pipeline.fields.protocol import F32, Material
 from pipeline.images import write_exr, write_png
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
 from pipeline.visibility import FittedPhoto
-from stages.bake import detail, detail_kernels, detail_views, smooth
+from stages.bake import detail, detail_kernels, detail_views
 from stages.bake.build import Baker, Photos
 from stages.bake.texels import ALBEDO_RANGE
 from stages.uv import unwrap
@@ -214,7 +214,7 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
 def test_smoother_keeps_constants_and_has_its_width(scene: Scene) -> None:
     """On a ball the harmonic of degree 1 falls by 1 / (1 + s^2 / 4 * 2 / R^2) in each of the two steps."""
     width = 0.02
-    flow = smooth.Smoother(scene.mesh, width)
+    flow = smoothing.Smoother(scene.mesh, width)
     one = np.ones((len(scene.mesh.vertices), 1))
     assert np.allclose(flow(one), 1, atol=1e-9)
     y = scene.mesh.vertices[:, 1:2].astype(np.float64)
@@ -232,7 +232,7 @@ def test_continuation_is_harmonic(scene: Scene) -> None:
     ordinate = np.log(np.tan(np.pi / 4 + latitude.clip(-1.5, 1.5) / 2))
     limit = np.log(np.tan(np.radians(75)))
     expected = (ordinate / limit).clip(-1, 1)
-    got = smooth.continued(scene.mesh, expected[:, None], known)[:, 0]
+    got = smoothing.continued(scene.mesh, expected[:, None], known)[:, 0]
     assert np.abs(got - expected).max() < 0.1
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.meshes import Mesh
 from pipeline.registration.identity_fit import PlacedHead
+from pipeline.smoothing import continued
 from pipeline.template.load import load_template
-from stages.bake.smooth import continued
 from stages.bake.unseen import (
     BAND_HEIGHT,
     CLEAR,
