@@ -35,7 +35,7 @@ from pipeline.tangents import any_across
 from pipeline.visibility import Occluder
 
 FINE, COARSE = 0.001, 0.008  # metres: standard deviations of the two smoothings
-CAVITY = 0.003  # metres: a crease of mean curvature -1 / 3 mm has cavity .15
+CAVITY = 0.006  # metres: a crease of mean curvature -1 / 6 mm has cavity .15
 RAYS, CONE, FAR = 32, np.pi / 4, 0.1  # per vertex; half angle; metres
 LIFT = 1e-5  # of the head's size: rays start this far below the surface; 5 micrometres on a head
 SMALLEST = 1e-14  # m^2: the area of a triangle without a plane

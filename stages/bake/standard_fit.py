@@ -163,6 +163,7 @@ def fit(
         rows = rows[np.isfinite(seen.mirror[rows]).all(1)]
     sums = _sums(normals, seen, w, lit, rows)
     often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
+    shown = np.bincount(seen.vertex[w > 0], minlength=len(normals)) >= MIN_VIEWS
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
     told = np.zeros((len(normals), 2))
@@ -173,7 +174,7 @@ def fit(
             continue
         found = _group(sums, group & often, prior)
         f0[group], rough[group], layered[group] = found.f0, found.roughness, found.f0 > 0
-        told[group & often] = found.told
+        told[group & shown] = found.told
         if found.measured and prior.varies:
             check()
             own = group & often

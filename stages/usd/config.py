@@ -10,8 +10,10 @@ from pydantic import Field, field_validator, model_validator
 from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
 from pipeline.errors import UsageError
-from pipeline.units import ContentHash, Pixels, Triangles
+from pipeline.units import ContentHash, Millimetres, Pixels, Triangles
+from stages.usd.colour_spaces import SRGB, check_space
 from stages.usd.naming import check_name
+from stages.usd.texture_names import DEFAULT, check_pattern
 
 
 class Config(StageConfig):
@@ -41,6 +43,19 @@ class Config(StageConfig):
         True, description="divide the shadows and interreflections of the captured light out of the albedo"
     )
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
+    displacement_bands: Millimetres = Field(
+        5.0, ge=0.5, le=100, description="wavelength between the low and the high band of the displacement"
+    )
+    texture_name: str = Field(
+        DEFAULT,
+        description="names of the files in textures/, of the words {asset}, {map} and {udim}; with one tile {udim} and "
+        "the separator before it are left out",
+    )
+    colour_space: str = Field(
+        SRGB,
+        description="base colour that MaterialX networks read: srgb_texture (8-bit PNG), lin_rec709 or acescg (EXR of "
+        "16-bit floats); UsdPreviewSurface always reads the PNG",
+    )
     proxy: bool = Field(True, description="write the coarse mesh as geo/proxy")
     high: bool = Field(True, description="write the dense mesh as high.usdc, for the variant lod=high")
     high_faces: Triangles = Field(
@@ -71,6 +86,16 @@ class Config(StageConfig):
     @classmethod
     def _valid(cls, name: str) -> str:
         return check_name(name)  # a UsageError of its own, before the first stage
+
+    @field_validator("texture_name")
+    @classmethod
+    def _valid_pattern(cls, pattern: str) -> str:
+        return check_pattern(pattern)
+
+    @field_validator("colour_space")
+    @classmethod
+    def _valid_space(cls, space: str) -> str:
+        return check_space(space)
 
 
 def _digest(path: Path) -> str:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from stages.usd.texture_names import DEFAULT, pattern_of, texture_name
+
 TEXTURES, INTERNAL = "textures", "internal"
 LIGHT = f"{INTERNAL}/light.json"
 OLD_LIGHT = "light.json"  # where it was in assets of older versions
@@ -28,14 +30,16 @@ def folder_of(which: str) -> str:
 
 
 def map_file(asset: Path, name: str, which: str, form: str) -> Path:
-    """The file of a map. name: of the asset; form: "exr", "1001.png", ..."""
-    return asset / folder_of(which) / f"{name}_{which}.{form}"
+    """The file of a map. name: of the asset; form: "exr", "1001.png", ... Names: texture_names.py."""
+    udim, _, kind = form.rpartition(".")
+    pattern = pattern_of(asset) if folder_of(which) == TEXTURES else DEFAULT
+    return asset / folder_of(which) / f"{texture_name(pattern, name, which, udim)}.{kind}"
 
 
 def existing(asset: Path, name: str, which: str, form: str) -> Path:
     """The same; of an asset of an older version, which had all maps in textures/, its file there."""
     path = map_file(asset, name, which, form)
-    old = asset / TEXTURES / path.name
+    old = asset / TEXTURES / f"{name}_{which}.{form}"
     return old if not path.is_file() and old.is_file() else path
 
 

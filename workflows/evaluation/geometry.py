@@ -113,8 +113,11 @@ def albedo_map(textures: Path) -> F32:
     """The asset's albedo; of several tiles, side by side."""
     from pipeline import tiles
     from pipeline.images import read_exr
+    from stages.usd.texture_names import pattern_of, texture_name
 
-    files = list(textures.glob("*_albedo.exr")) or sorted(textures.glob("*_albedo.[0-9]*.exr"))
+    pattern = pattern_of(textures.parent)
+    one, several = (f"{texture_name(pattern, '*', 'albedo', udim)}.exr" for udim in ("", "[0-9]" * 4))
+    files = list(textures.glob(one)) or sorted(textures.glob(several))
     return tiles.side_by_side([read_exr(f)[0][..., :3] for f in files])
 
 

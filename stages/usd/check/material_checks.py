@@ -8,10 +8,12 @@ from typing import Any
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 
 from stages.usd.check.findings import Finding
+from stages.usd.colour_spaces import ACESCG, DATA, LINEAR, SRGB
 
 COLOURS = ("diffuseColor", "specularColor", "emissiveColor")  # inputs of UsdPreviewSurface whose 8-bit maps are sRGB
 EIGHT_BIT = (".png", ".jpg", ".jpeg")
-SRGB_NAMES = ("srgb_texture", "srgb", "sRGB")
+SRGB_NAMES = (SRGB, "srgb", "sRGB")
+KNOWN_SPACES = (*SRGB_NAMES, DATA, LINEAR, ACESCG, "Raw")
 VALUE_TYPES = {
     "float": "float",
     "int": "integer",
@@ -62,7 +64,10 @@ def colour_findings(stage: Usd.Stage) -> list[Finding]:
             path = file.Get().path if file and file.Get() else ""
             found = file.GetAttr().GetColorSpace() if file else ""
             want = _is_colour(path, identifier in ("ND_image_color3", "ND_image_color4"))
-            if path and want != (found in SRGB_NAMES):
+            if path and found and found not in KNOWN_SPACES:
+                message = f"{path} has the colour space {found}, which is none of {', '.join(KNOWN_SPACES)}"
+                out.append(Finding("error", "colour_space", message, str(file.GetAttr().GetPath())))
+            elif path and want != (found in SRGB_NAMES):
                 out.append(_swapped(path, found or "none", want, str(file.GetAttr().GetPath())))
     return list(dict.fromkeys(out))
 

@@ -21,6 +21,7 @@ from pipeline.images import write_exr
 from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
 from stages.usd.config import Config
 from stages.usd.layout import LIGHT
+from stages.usd.texture_names import check_apart, keep_pattern
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.dense import coarser
@@ -75,14 +76,18 @@ def export(
     high, left_out = _high(surface, mesh, config.high_faces) if config.high else (None, [])
     notes += left_out
     check()
+    if uv.artifact.scan is not None:
+        check_apart(config.texture_name, (name, f"{name}_{SCAN}"))
+    names = keep_pattern(folder, config.texture_name)
     fitted_light = face.path(face.artifact.light)
     light, moving = read_light(fitted_light), read_moving(fitted_light)
     maps = write_maps(
         bake, mesh, light, name, folder, check,
         divide=config.divide_shadows and moving is None, acescg=config.acescg,
         heights=None if head is None else head.heights, hair=uv.artifact.hair_faces > 0,
+        bands=config.displacement_bands / 1000, space=config.colour_space,
     )  # fmt: skip
-    written, look = maps.written, maps.look
+    written, look = maps.written + names, maps.look
     scan = _scan(uv, bake, light, config, folder, check)
     written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
@@ -191,7 +196,8 @@ def _scan(
         return None
     mesh = read_mesh(uv.path(uv.artifact.scan.mesh), paired=uv.artifact.scan.quads > 0)
     baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
-    made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg)
+    made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg,
+                      space=config.colour_space)  # fmt: skip
     return mesh, made
 
 

@@ -14,15 +14,18 @@ from pipeline import raster, tiles
 from pipeline.artifacts import Located, TextureSet
 from pipeline.colour import ACESCG, acescg_from_linear
 from pipeline.errors import StageError
-from pipeline.images import read_alpha, read_exr, write_exr, write_png, write_png_from_linear
+from pipeline.images import read_alpha, read_exr, stepped, write_exr, write_png, write_png_from_linear
 from pipeline.lighting.dome import environment
 from pipeline.lighting.median_cut import lamps
 from pipeline.lighting.transport import BRIGHTEST_ALBEDO, Transport, occlusion
 from pipeline.map_lookup import bilinear
 from pipeline.maths import microfacet, sh
-from pipeline.meshes import Charts
+from pipeline.meshes import Charts, Mesh
 from pipeline.nearest import filled
+from pipeline.smoothing import Smoother
 from pipeline.store import link_or_copy
+from stages.usd.colour_spaces import ACESCG as SPACE_OF_ACES
+from stages.usd.colour_spaces import FILES, SRGB
 from stages.usd.layout import INTERNAL, TEXTURES, map_file
 from stages.usd.render.exported import CAGE_HEIGHT, numbered
 from stages.usd.write.ggx_conversion import GROUP, LobeFit, basis_table, fit_figures, in_groups, lobe_fit
@@ -64,15 +67,17 @@ def write_maps(
     acescg: bool = False,
     heights: F32 | None = None,
     hair: bool = False,
+    bands: float = 0.005,
+    space: str = SRGB,
 ) -> Maps:
     """Write textures/ and internal/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also
-    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it. hair: the last
-    tile is hair's."""
+    write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it; bands: wavelength
+    (m) between its two bands. hair: the last tile is hair's. space: of the base colour in MaterialX networks."""
     for folder in (TEXTURES, INTERNAL):
         (asset / folder).mkdir(parents=True, exist_ok=True)
     written = copy_maps(bake, name, asset)
     if heights is not None:
-        written += write_heights(bake, mesh, heights, name, asset)
+        written += write_heights(bake, mesh, heights, name, asset, bands)
     figures: dict[str, float] = {}
     if divide and not shadows_fitted(bake) and not bake.artifact.standard_fitted:
         shown, found = divided_albedo(bake, mesh, light, name, asset, check)
@@ -85,15 +90,15 @@ def write_maps(
     fits = []
     for tile in range(bake.artifact.tiles):
         check()
-        shown, fit = _derived(bake, tile, name, asset, basis, acescg=acescg)
+        shown, fit = _derived(bake, tile, name, asset, basis, acescg=acescg or space == SPACE_OF_ACES)
         written += shown
         fits += [] if fit is None else [fit]
     check()
     every, own = range(bake.artifact.tiles), None
     if hair:
         every = every[:-1]
-        own = replace(look_of(bake, name, asset, range(bake.artifact.tiles)[-1:]), displacement=None)
-    return Maps(written, look_of(bake, name, asset, every), figures | fit_figures(fits), own)
+        own = replace(look_of(bake, name, asset, range(bake.artifact.tiles)[-1:], space), displacement=None)
+    return Maps(written, look_of(bake, name, asset, every, space), figures | fit_figures(fits), own)
 
 
 def _derived(
@@ -213,15 +218,32 @@ def vertex_occlusion(mesh: UvSurface, light: F32, albedo: F64, check: Callable[[
     return occlusion(transport, lit, unblocked, albedo, check)
 
 
-def write_heights(bake: Located[TextureSet], mesh: UvSurface, heights: F32, name: str, asset: Path) -> list[Path]:
+def write_heights(
+    bake: Located[TextureSet], mesh: UvSurface, heights: F32, name: str, asset: Path, wavelength: float
+) -> list[Path]:
     """NAME_cage_displacement.exr: metres along the cage's limit normal. heights (V,) at the vertices of the textured
-    mesh. (NAME_displacement.exr is the bake's: from the textured mesh to the zero set.)"""
+    mesh. (NAME_displacement.exr is the bake's: from the textured mesh to the zero set.) The same in two bands beside
+    it, as _low and _high: all are multiples of HEIGHT_STEP, so that the bands' sum is the whole to the last bit."""
     count, written = bake.artifact.tiles, []
+    low = low_band(mesh, heights.astype(np.float64), wavelength)
+    values = np.stack([heights.astype(np.float64), low], 1)
     for tile in range(count):
-        written.append(map_file(asset, name, CAGE_HEIGHT, tiles.form("exr", tile, count)))
-        image = vertex_image(on_tile(mesh, tile, count), heights[:, None].astype(np.float64), bake.artifact.side(tile))
-        write_exr(written[-1], image, step=HEIGHT_STEP, primaries=None, units="m")
+        whole, smooth = np.moveaxis(vertex_image(on_tile(mesh, tile, count), values, bake.artifact.side(tile)), -1, 0)
+        whole, smooth = stepped(whole, HEIGHT_STEP), stepped(smooth, HEIGHT_STEP)
+        for ending, image in (("", whole), ("_low", smooth), ("_high", whole - smooth)):
+            written.append(map_file(asset, name, CAGE_HEIGHT + ending, tiles.form("exr", tile, count)))
+            write_exr(written[-1], image[..., None], step=HEIGHT_STEP, primaries=None, units="m")
     return written
+
+
+def low_band(mesh: UvSurface, heights: F64, wavelength: float) -> F64:
+    """(V,) heights (V,) without what is finer than a wavelength (m), of which the low band keeps half.
+
+    A wave of length L keeps (1 + (pi w / L)^2)^-2 (pipeline/smoothing.py), which is 1/2 at L = pi w / (2^.5 - 1)^.5.
+    """
+    width = wavelength * float(np.sqrt(np.sqrt(2) - 1)) / np.pi
+    smooth = Smoother(Mesh(mesh.vertices, mesh.normals, mesh.faces), width)
+    return np.asarray(smooth(heights[:, None])[:, 0])
 
 
 def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
@@ -237,7 +259,9 @@ def vertex_image(mesh: UvSurface, values: F64, size: int) -> F32:
 
 
 # ------------------------------------------------------------------ what the material reads
-def look_of(bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequence[int] | None = None) -> Look:
+def look_of(
+    bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequence[int] | None = None, space: str = SRGB
+) -> Look:
     """The files for the material's networks, and the index of refraction of the mean F0 over covered texels of some
     tiles; None: of all."""
 
@@ -275,6 +299,8 @@ def look_of(bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequenc
         basis=counted("basis", 1),
         displacement=found(CAGE_HEIGHT, "exr"),
         neuface_albedo=found("neuface_albedo", "png"),
+        base_color=None if space == SRGB else found(*FILES[space]),
+        base_space=space,
     )
 
 

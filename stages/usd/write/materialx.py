@@ -15,12 +15,12 @@ from __future__ import annotations
 from pxr import Sdf, Usd, UsdShade
 
 from pipeline import tiles
+from stages.usd.colour_spaces import DATA, SRGB
 from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0, REFERENCE_IOR
 from stages.usd.write.shading import HEIGHT, Look, T, connect, shader
 
 SURFACE, DISPLACEMENT = "ND_open_pbr_surface_surfaceshader", "ND_displacement_float"
 CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
-SRGB, DATA = "srgb_texture", "raw"
 LARGEST_F0 = 0.16  # `specular_weight` = 4: limits the reflectance of a failed fit
 
 
@@ -82,7 +82,7 @@ def eye_network(stage: Usd.Stage, material: UsdShade.Material, look: Look, ior: 
     path = f"{material.GetPath()}/openpbr"
     nodes = _Nodes(stage, path)
     surface = shader(stage, f"{path}/surface", SURFACE)
-    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, look.albedo, SRGB))
+    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, *look.base()))
     for name, value in (
         ("base_weight", 1.0),
         ("specular_weight", 1.0),
@@ -121,8 +121,8 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
     nodes = _Nodes(stage, path)
     surface = shader(stage, f"{path}/surface", SURFACE)
     surface.CreateInput("base_weight", T.Float).Set(1.0)
-    colour = look.neuface_albedo if basis and look.neuface_albedo else look.albedo
-    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, colour, SRGB))
+    colour = (look.neuface_albedo, SRGB) if basis and look.neuface_albedo else look.base()
+    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, *colour))
     roughness = nodes.image("roughness", "float", T.Float, str(look.roughness), DATA)
     connect(surface.CreateInput("specular_roughness", T.Float), roughness)
     surface.CreateInput("specular_ior", T.Float).Set(REFERENCE_IOR)

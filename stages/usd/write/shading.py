@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdShade
 
 from pipeline import tiles
+from stages.usd.colour_spaces import SRGB
 
 T = Sdf.ValueTypeNames
 MATERIAL = "captured"
@@ -23,6 +24,7 @@ class Look:
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     displacement: metres along the normal, of a mesh that is subdivided.
     neuface_albedo: the field's own albedo, if `albedo` is the base colour of a fitted standard material.
+    base_color, base_space: picture and colour space of the base colour in MaterialX networks; None: `albedo`.
     """
 
     albedo: str
@@ -37,6 +39,12 @@ class Look:
     basis: tuple[str, ...] = ()
     displacement: str | None = None
     neuface_albedo: str | None = None
+    base_color: str | None = None
+    base_space: str = SRGB
+
+    def base(self) -> tuple[str, str]:
+        """The picture of the base colour for MaterialX networks, and its colour space."""
+        return self.base_color or self.albedo, self.base_space if self.base_color else SRGB
 
     def on_tile(self, tile: int) -> Look:
         """The same look with the files of one tile."""
