@@ -37,6 +37,7 @@ SKIPPED_MAPS = ("basis_lut",)  # a table, not a picture of the surface
 FIXED_RANGES = {  # the same in every report, so that assets can be compared
     "f0": (0.0, 0.06), "roughness": (0.0, 1.0), "ambient_occlusion": (0.0, 1.0), "confidence": (0.0, 1.0),
     "inv_kappa": (0.0, 0.5), "specular_intensity": (0.0, 0.2), "displacement": (-2.0, 2.0),
+    "cavity": (0.0, 1.0), "curvature": (-250.0, 250.0), "thickness": (0.0, 100.0), "measured": (0.0, 1.0),
 }  # fmt: skip
 REGISTERED = ("psnr", "psnr_matched")  # scores that are also given from the held-out photos' registered cameras
 ENVIRONMENT, LOBE_FIT = "asset/environment.exr", "_lobe_fit."

@@ -39,6 +39,10 @@ PNG = {
     "confidence",
     "coverage",
     "ambient_occlusion",
+    "curvature",
+    "cavity",
+    "thickness",
+    "measured",
 }
 ALL = PNG | {"specular_coefficients", "shininess", "inv_kappa", "displacement", "basis_lut"}
 
