@@ -162,8 +162,8 @@ def fit(
     if seen.mirror is not None:
         rows = rows[np.isfinite(seen.mirror[rows]).all(1)]
     sums = _sums(normals, seen, w, lit, rows)
-    often = np.bincount(seen.vertex[rows][w[rows] > 0], minlength=len(normals)) >= MIN_VIEWS
-    shown = np.bincount(seen.vertex[w > 0], minlength=len(normals)) >= MIN_VIEWS
+    often = _in_enough(seen.vertex[rows], w[rows], len(normals))
+    shown = _in_enough(seen.vertex, w, len(normals))
     edge = float(np.sqrt(2.3 * float(areas(mesh.vertices, mesh.faces).sum()) / max(len(mesh.faces), 1)))
     f0, rough, layered = (np.zeros(len(normals)) for _ in range(3))
     told = np.zeros((len(normals), 2))
@@ -212,6 +212,11 @@ def under_dome(at: standard.Arrivals, normals: F64, seen: Seen) -> Lit:
         return standard.lobes(at, vertex, normals[vertex], seen.wo[rows], alphas)
 
     return Lit(lobes, received[seen.vertex], received)
+
+
+def _in_enough(vertex: npt.NDArray[np.int64], weights: F64, count: int) -> Mask:
+    """(count,) vertices with MIN_VIEWS observations of some weight. vertex, weights (m,)."""
+    return np.asarray(np.bincount(vertex[weights > 0], minlength=count) >= MIN_VIEWS)
 
 
 def _weights(normals: F64, seen: Seen) -> F64:

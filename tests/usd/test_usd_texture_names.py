@@ -122,7 +122,7 @@ def test_the_base_colour_has_its_colour_space(made: Path) -> None:
     assert found["preview"] == {(".png", "sRGB")}
 
 
-def test_an_unknown_colour_space_in_a_file_is_found(made: Path, tmp_path: Path) -> None:
+def test_an_unknown_colour_space_in_a_file_is_found() -> None:
     stage = Usd.Stage.CreateInMemory()
     shader = UsdShade.Shader.Define(stage, "/a")
     shader.CreateIdAttr("ND_image_color3")
