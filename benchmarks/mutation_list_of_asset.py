@@ -215,7 +215,8 @@ OF_ASSET = (
              "tests/usd/test_usd_texture_names.py::test_the_low_band_keeps_half_at_its_wavelength"),
     Mutation("stages/usd/texture_names.py", '{"map", "udim"} <= set(words)', '{"map"} <= set(words)',
              "tests/usd/test_usd_texture_names.py::test_a_bad_pattern_has_a_named_error"),
-    Mutation("stages/usd/texture_names.py", "< len(assets):", "< 0:", "tests/usd/test_usd_texture_names.py::test_two_meshes_need_two_names"),
+    Mutation("stages/usd/texture_names.py", "< len(assets):", "< 0:",
+             "tests/usd/test_usd_texture_names.py::test_two_meshes_need_two_names"),
     Mutation("stages/usd/check/material_checks.py", "found not in KNOWN_SPACES", "False",
              "tests/usd/test_usd_texture_names.py::test_an_unknown_colour_space_in_a_file_is_found"),
 )  # fmt: skip
