@@ -126,6 +126,15 @@ OF_FIT = (
              "tests/inverse_rendering/test_model_selection.py"),
     Mutation("stages/inverse_rendering/model_selection.py", "        light.coefficients.zero_()\n", "",
              "tests/inverse_rendering/test_model_selection.py"),
+    # ---------------------------------------------------------------- smoothing
+    Mutation("stages/inverse_rendering/smoothest_kernels.py", "total += around[there]", "total -= around[there]",
+             "tests/inverse_rendering/test_smoothest.py::test_it_is_the_least_squares_solution"),
+    Mutation("stages/inverse_rendering/smoothest_kernels.py", "if square <= limit:", "if square >= limit:",
+             "tests/inverse_rendering/test_smoothest.py"),
+    Mutation("stages/inverse_rendering/smoothest_kernels.py", "share = scaled / before",
+             "share = before / scaled", "tests/inverse_rendering/test_smoothest.py"),
+    Mutation("stages/inverse_rendering/smoothest.py", "self.degree**2 + (self.near >= 0).sum(1)", "self.degree**2",
+             "tests/inverse_rendering/test_smoothest.py::test_it_is_the_least_squares_solution"),
     # ---------------------------------------------------------------- standard material and detail
     Mutation("stages/bake/standard_fit.py", "kept = 1 - standard.layer(cosine, f0[v], alpha[v])",
              "kept = 1 + standard.layer(cosine, f0[v], alpha[v])",
