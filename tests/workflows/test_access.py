@@ -85,7 +85,7 @@ def test_every_setting_that_names_a_file_is_known() -> None:
         if field.annotation is str and any(w in (field.description or "") for w in (" file", "checkpoint", "folder"))
     }
     digests = {(s, n) for s, n in told if n.endswith(("_sha256", "_digest"))}
-    others = {("usd", "name")}  # the name of a file inside the asset
+    others = {("usd", "name"), ("usd", "texture_name")}  # names of files inside the asset
     assert told - digests - others == {(s, n) for s, names in FILE_SETTINGS.items() for n in names}
 
 
