@@ -108,8 +108,12 @@ def _decoded(path: Path) -> npt.NDArray[Any] | None:
 
 def read_linear(path: Path) -> F32:
     """(H, W, 3) linear Rec.709 float32. Integer files are taken as sRGB, float files as linear."""
-    image = read_encoded(path)
-    rgb = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
+    return linear_of(read_encoded(path))
+
+
+def linear_of(stored: npt.NDArray[Any]) -> F32:
+    """The same of a file's decoded pixels (H, W, C)."""
+    rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
     if not np.issubdtype(rgb.dtype, np.integer):
         return rgb.astype(np.float32)
     levels = np.iinfo(rgb.dtype).max

@@ -23,8 +23,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.colour import linear_from_srgb, srgb_from_linear
-from pipeline.images import F32
+from pipeline.colour import srgb_from_linear
+from pipeline.images import F32, linear_of
 from stages.capture.photometry import clipped
 
 GAIN, READ = 2e-4, 1e-3  # photon noise of a pixel that holds 5,000 electrons; read noise of 5 of them
@@ -39,17 +39,6 @@ class Merged:
 
     radiance: F32
     clipped: Bool
-
-
-def linear(stored: Stored) -> F32:
-    """(H, W, 3) linear values of a decoded file: integers are sRGB, floats linear."""
-    rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
-    if not np.issubdtype(rgb.dtype, np.integer):
-        return np.asarray(rgb, np.float32)
-    top = int(np.iinfo(rgb.dtype.name).max)
-    table: F32 = linear_from_srgb(np.arange(top + 1) / top).astype(np.float32)
-    out: F32 = table[rgb]
-    return out
 
 
 def variance(z: F32, levels: int) -> F32:
@@ -83,13 +72,13 @@ def merge(photos: Sequence[Stored], exposures: Sequence[float], shifts: Sequence
         total = np.zeros((*photos[0].shape[:2], 3), np.float64)
         weight = np.zeros_like(total)
         for photo, e, free, shift in zip(photos, exposures, usable, moved, strict=True):
-            z = _back(linear(photo), shift)
+            z = _back(linear_of(photo), shift)
             likely = z if expected is None else expected * np.float32(e)
             w = e * e / variance(likely, levels_of(photo)) * free[..., None]
             total += w * (z / e)
             weight += w
         found = total / np.where(weight > 0, weight, 1)
-        lowest = _back(linear(photos[shortest]), moved[shortest]) / exposures[shortest]
+        lowest = _back(linear_of(photos[shortest]), moved[shortest]) / exposures[shortest]
         expected = np.where(weight > 0, found, lowest).astype(np.float32)
     assert expected is not None
     return Merged(expected, ~np.any(usable, axis=0))
@@ -142,7 +131,7 @@ class Compared:
 def compare(base: Stored, other: Stored, exposure: float) -> Compared:
     """Compare two decoded files of one size. exposure: of the other over that of the base."""
     factor = max(1, round(max(base.shape[:2]) / SMALL))
-    pictures = [_reduced(linear(p), factor) for p in (base, other)]
+    pictures = [_reduced(linear_of(p), factor) for p in (base, other)]
     a, b = (p.mean(2) for p in pictures)
     tells, shown = (_tells(p) for p in pictures)
     both = tells & shown

@@ -61,6 +61,7 @@ def turn_upright(image: Image, orientation: int) -> Image:
 @dataclass(frozen=True, slots=True)
 class Decoded:
     """A photo's stored pixels (H, W, C), as it lies in the file, with its metadata. developed: of a HEIC or raw file.
+    data: the file, whose hash was checked.
     clipped (H, W): pixels that are clipped in every exposure of a merged photo, None to find them in the pixels."""
 
     image: Image
@@ -68,6 +69,7 @@ class Decoded:
     profile: str | None
     developed: bool = False
     clipped: npt.NDArray[np.bool_] | None = None
+    data: bytes = b""
 
 
 def decoded(path: Path, ref: FileRef) -> Decoded:
@@ -76,7 +78,7 @@ def decoded(path: Path, ref: FileRef) -> Decoded:
     made = _developed(path, data)
     if made is not None:
         return Decoded(made.image, made.exif, made.profile, developed=True)
-    return Decoded(_decode(path, data), read_exif(data), profile_name(data))
+    return Decoded(_decode(path, data), read_exif(data), profile_name(data), data=data)
 
 
 def import_photo(
@@ -125,7 +127,7 @@ def import_photo(
         target = target.with_suffix(".png")
         _write_png(target, image)
     else:
-        target.write_bytes(path.read_bytes())
+        target.write_bytes(found.data)
     grey = small_grey(image)
     blank = is_blank(grey)
     return ImportedPhoto(target, size[0], size[1], exif, turn, None if blank else detail(grey), profile,

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.images import linear_of
 from stages.capture import hdr
 
 
@@ -42,7 +43,7 @@ def test_the_range_is_that_of_all_exposures() -> None:
     inside = (slice(None), slice(4, -12))
     off = np.abs(made.radiance / true - 1)[inside]
     assert np.quantile(off, 0.95) < 0.03
-    alone = hdr.linear(photo(true, 1.0))
+    alone = linear_of(photo(true, 1.0))
     assert (np.abs(alone / true - 1)[inside] > 0.03).mean() > 0.2  # what one photo does
 
 
