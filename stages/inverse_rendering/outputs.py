@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import CameraSet, HeldOutView, Matrix
-from pipeline.capture_artifacts import Capture
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel, FittedField
 from pipeline.images import write_exr, write_png_from_linear
-from pipeline.transforms import rows
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.load_views import camera_only
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
@@ -42,34 +40,16 @@ def write_light(model: FaceModel, context: Context) -> None:
     (context.workdir / "light.json").write_text(json.dumps(content, indent=1))
 
 
-def held_out_responses(model: FaceModel, capture: Capture, fitted: Sequence[int]) -> dict[int, Matrix]:
-    """Rows (3, 3) of e_n A_g for every held-out view: its exposure times the mean colour response of the fitted photos
-    (indices in the model's order) of the same camera; the identity if there are none. [NeuFace eq. 19]
-
-    Differs: the paper has one camera, and scores each test view after a 3 x 3 matrix fitted to that view. Here the
-    response of a camera comes from its fitted photos only.
-    """
-    group = {v.index: v.camera_group for v in capture.views}
-    matrices = model.calibration().detach().cpu().double().numpy() if model.spec.calibrated else None
-    out = {}
-    for view in (v for v in capture.views if v.holdout):
-        alike = [n for n, i in enumerate(fitted) if group[i] == view.camera_group]
-        mean = matrices[alike].mean(0) if matrices is not None and alike else np.eye(3)
-        out[view.index] = rows(view.exposure * mean)
-    return out
-
-
 def predict_held_out(
     model: FaceModel,
-    capture: Capture,
     poses: CameraSet,
-    fitted: Sequence[int],
+    responses: Mapping[int, Matrix],
     side: int,
     samples: int,
     context: Context,
 ) -> tuple[HeldOutView, ...]:
-    """Write EXR and PNG of every held-out view, at the photo's size or an integer factor smaller."""
-    responses = held_out_responses(model, capture, fitted)
+    """Write EXR and PNG of every held-out view, at the photo's size or an integer factor smaller. responses: of the
+    held-out photos, by index (held_out_colour.py)."""
     known = [c for c in poses.cameras if c.index in responses]
     out = []
     for n, c in enumerate(known):

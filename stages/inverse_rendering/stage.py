@@ -33,6 +33,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.exposure import DRIFT, exposures_differ
     from stages.inverse_rendering.footprint import footprint, supported
     from stages.inverse_rendering.given_light import given_light
+    from stages.inverse_rendering.held_out_colour import held_out_colours
     from stages.inverse_rendering.initial_geometry import agreed
     from stages.inverse_rendering.judge import Fitted, findings
     from stages.inverse_rendering.load_views import read_labels, read_views
@@ -106,13 +107,16 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     outline = set_outline_level(model, views)
     model.save(context.workdir / "field.npz")
     write_light(model, context)
+    colours = held_out_colours(model, inputs.capture.artifact, inputs.poses.artifact, usable)
     held_out = predict_held_out(
-        model, inputs.capture.artifact, inputs.poses.artifact, usable, config.image_side, config.samples, context
+        model, inputs.poses.artifact, colours.responses, config.image_side, config.samples, context
     )
     registered = registered_views(
         model, inputs.capture, inputs.poses.artifact, inputs.masks, held_out, settings, context
     )
     facts = {**model_facts(trainer, looked, chosen.facts), "albedo": level, "outline": outline}
+    if colours.facts:
+        facts["held_out_colours"] = colours.facts
     if lit is not None:
         facts["light_frame"] = lit.facts()
     left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
@@ -148,7 +152,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=30,
+    version=31,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

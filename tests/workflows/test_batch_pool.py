@@ -153,7 +153,9 @@ def test_a_night_with_a_killed_worker_server_and_database(
     failed = summary["captures"][0]
     assert failed["name"] == "2/1_neutral" and PHOTO in failed["fault"]
     assert "2/1_neutral: trying again (capture)" not in notify, "a torn photo stays torn"
-    ended = [notify.count(f"2/1_neutral: {how}") for how in ("FAILED", "trying again (lost)")]  # lost: the server's kill
+    ended = [
+        notify.count(f"2/1_neutral: {how}") for how in ("FAILED", "trying again (lost)")
+    ]  # lost: the server's kill
     assert ended[0] >= 1 and sum(ended) == failed["attempts"], notify
     assert len(list((tmp_path / "out").glob("*/*/asset/*.usd"))) == 5
     assert len(list(store.glob("*/*/manifest.json"))) == 5 * STAGES and damaged(store) == []
