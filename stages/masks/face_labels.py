@@ -1,9 +1,10 @@
 """Label pictures: face, eyes and hair in a photo.
 
-Labels are codes, LABELS their names. The face is the convex hull of its landmarks, the eyes are the areas between the
-lids (pipeline.faces). Closed eyes are labelled like open ones: the landmarks hardly differ. Hair is labelled only with
-the user's network, because no such network may be redistributed; without it hair is subject, or face. Colour does not
-separate it: the stubble of shaved heads is as different from their skin as fair hair from other skin.
+Labels are codes (pipeline/faces/labels.py). The face is the convex hull of its landmarks, the eyes are the areas
+between the lids (pipeline.faces). Closed eyes are labelled like open ones: the landmarks hardly differ. Hair is
+labelled only with the user's network, because no such network may be redistributed; without it hair is subject, or
+face. Colour does not separate it: the stubble of shaved heads is as different from their skin as fair hair from other
+skin.
 """
 
 from __future__ import annotations
@@ -13,12 +14,11 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face, find_face
+from pipeline.faces.labels import EYES, FACE, HAIR, SUBJECT
 from pipeline.transforms import F64
 from stages.masks.region import F32, U8, Disc, eroded
 from stages.masks.user_model import UserModel
 
-LABELS = ("background", "subject", "face", "eyes", "hair")
-SUBJECT, FACE, EYES, HAIR = 1, 2, 3, 4
 REACH = 1.2  # radii of the region of interest in which a face is searched
 CROP, SURE = 1.3, 0.5  # half-edge of the hair network's crop in such radii; smallest probability of hair
 INSIDE = 0.85  # smallest share of the landmarks on the subject: excludes faces in pictures on a wall

@@ -19,13 +19,14 @@ from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
 from pipeline.faces.find import Face
+from pipeline.faces.labels import LABELS
 from pipeline.faces.landmarks3d import HeadFrame, head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.meshes import F64
 from pipeline.support import Support
 from stages.masks.config import Config
 from stages.masks.extent import BUST, MAX_OPEN, asked, cut_by_head, outline_points, share_beyond, whole_hull
-from stages.masks.face_labels import LABELS, labels_with, subjects_face
+from stages.masks.face_labels import labels_with, subjects_face
 from stages.masks.grabcut import cut
 from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, trimap
 from stages.masks.judge import Seen, extent_finding, judge, open_share

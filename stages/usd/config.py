@@ -43,6 +43,11 @@ class Config(StageConfig):
         True, description="divide the shadows and interreflections of the captured light out of the albedo"
     )
     acescg: bool = Field(False, description="also write NAME_albedo_acescg.exr, the albedo in ACEScg")
+    subsurface: bool = Field(
+        False,
+        description="also write look=subsurface, OpenPBR skin that scatters light below its surface with a person's "
+        "measured free paths; needs a metric scale",
+    )
     displacement_bands: Millimetres = Field(
         5.0, ge=0.5, le=100, description="wavelength between the low and the high band of the displacement"
     )

@@ -19,7 +19,7 @@ OLD_LIGHT = "light.json"  # where it was in assets of older versions
 FOR_ARTISTS = frozenset({
     "albedo", "albedo_acescg", "normal", "roughness", "f0", "specular_color", "ambient_occlusion", "displacement",
     "cage_displacement", "cage_displacement_low", "cage_displacement_high", "curvature", "cavity", "thickness",
-    "measured",
+    "measured", "subsurface",
 })  # fmt: skip
 READ = re.compile(r"_(basis_rgb\d+|coefficients_rgb\d+|inv_kappa|neuface_albedo)\.(\d{4}\.)?(exr|png)$")
 

@@ -9,7 +9,8 @@ import pytest
 from skimage import data
 
 from pipeline.faces.find import LEFT_EYE, RIGHT_EYE, Face
-from stages.masks.face_labels import EYES, FACE, HAIR, LABELS, SUBJECT, labels_with, on_subject, subjects_face
+from pipeline.faces.labels import EYES, FACE, HAIR, LABELS, SUBJECT
+from stages.masks.face_labels import labels_with, on_subject, subjects_face
 from stages.masks.region import Disc
 from stages.masks.user_model import UserModel
 from tests.masks.test_masks_user_model import write_network, write_red_detector

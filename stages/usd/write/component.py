@@ -24,6 +24,7 @@ from stages.usd.write.tile_materials import (
     Made,
     TileMaterial,
     bind_tiles,
+    scattering,
     skins,
     split_by_tile,
     tile_materials,
@@ -116,7 +117,8 @@ def root_layer(
     if thumbnail:
         previews = UsdMedia.AssetPreviewsAPI.Apply(prim)
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
-    write_looks(stage, prim, look, skins([*materials, *scan]))
+    shown = [*materials, *scan]
+    write_looks(stage, prim, look, skins(shown), scattering(shown) if look.subsurface else ())
     write_levels(stage, prim, beside=beside, scan=bool(scan), high=high, proxy=proxy)
     if look.displacement:
         without_displacement(stage, prim, look, skins([m for m in materials if m.displaced]))

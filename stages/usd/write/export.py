@@ -38,6 +38,7 @@ from stages.usd.write.variants import HIGH_FILE, SCAN, SCAN_MATERIAL
 
 NEAR_HIGH = 4  # candidate triangles for each triangle of the dense mesh, which is finer than the textured mesh
 BLENDER = "open_in_blender.py"  # a script for the user, copied as it lies beside this module
+SCATTER = "scatter_in_blender.py"  # likewise, of an asset with look=subsurface
 THUMBNAIL = "./thumbnails/default.png"  # rendered by the stage after the export
 
 
@@ -75,6 +76,9 @@ def export(
     notes += left_out
     high, left_out = _high(surface, mesh, config.high_faces) if config.high else (None, [])
     notes += left_out
+    scatters = config.subsurface and poses.artifact.metric
+    if config.subsurface and not scatters:
+        notes.append("look=subsurface was left out: the asset's scale is not metric; set poses.unit if you know it")
     check()
     if uv.artifact.scan is not None:
         check_apart(config.texture_name, (name, f"{name}_{SCAN}"))
@@ -86,9 +90,10 @@ def export(
         divide=config.divide_shadows and moving is None, acescg=config.acescg,
         heights=None if head is None else head.heights, hair=uv.artifact.hair_faces > 0,
         bands=config.displacement_bands / 1000, space=config.colour_space,
+        scatters=scatters,
     )  # fmt: skip
     written, look = maps.written + names, maps.look
-    scan = _scan(uv, bake, light, config, folder, check)
+    scan = _scan(uv, bake, light, config, folder, check, scatters=scatters)
     written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
     boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
@@ -128,8 +133,10 @@ def export(
     domes = [] if moving is None else write_domes(moving, folder, config.environment_width)
     figures = maps.figures | environment_figures(light, dome)
     (folder / LIGHT).write_text(light_json(light, face.artifact.attenuation, moving))
-    shutil.copyfile(Path(__file__).with_name(BLENDER), folder / BLENDER)
-    written += [folder / f for f in (*layers, "environment.exr", LIGHT, BLENDER)] + domes
+    scripts = (BLENDER, *([SCATTER] if scatters else []))
+    for script in scripts:
+        shutil.copyfile(Path(__file__).with_name(script), folder / script)
+    written += [folder / f for f in (*layers, "environment.exr", LIGHT, *scripts)] + domes
     check()
     light_mesh, light_rig, light_eyes = replace(mesh, paired=False), None, None  # viewers want triangles
     if head is not None:
@@ -151,7 +158,9 @@ def export(
 
 def _plain(look: Look) -> Look:
     """The look of the preview surface's metallic workflow alone."""
-    return replace(look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None)
+    return replace(
+        look, specular=None, f0=None, inv_kappa=None, coefficients=(), basis=(), displacement=None, subsurface=None
+    )
 
 
 def write_layer(layer: Sdf.Layer, path: Path, form: str) -> None:
@@ -190,6 +199,8 @@ def _scan(
     config: Config,
     folder: Path,
     check: Callable[[], None],
+    *,
+    scatters: bool,
 ) -> tuple[UvSurface, Maps] | None:
     """The scan's mesh beside the template's, and its maps NAME_scan_*; None if there is none."""
     if uv.artifact.scan is None or bake.artifact.scan is None:
@@ -197,7 +208,7 @@ def _scan(
     mesh = read_mesh(uv.path(uv.artifact.scan.mesh), paired=uv.artifact.scan.quads > 0)
     baked, name = Located(bake.artifact.scan, bake.folder), f"{config.name}_{SCAN}"
     made = write_maps(baked, mesh, light, name, folder, check, divide=config.divide_shadows, acescg=config.acescg,
-                      space=config.colour_space)  # fmt: skip
+                      space=config.colour_space, scatters=scatters)  # fmt: skip
     return mesh, made
 
 

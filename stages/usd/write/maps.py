@@ -31,6 +31,8 @@ from stages.usd.render.exported import CAGE_HEIGHT, numbered
 from stages.usd.write.ggx_conversion import GROUP, LobeFit, basis_table, fit_figures, in_groups, lobe_fit
 from stages.usd.write.mesh import UvSurface, on_tile
 from stages.usd.write.shading import Look, ior_from_f0
+from stages.usd.write.subsurface import MAP as SUBSURFACE
+from stages.usd.write.subsurface import write_weights
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -69,15 +71,18 @@ def write_maps(
     hair: bool = False,
     bands: float = 0.005,
     space: str = SRGB,
+    scatters: bool = False,
 ) -> Maps:
     """Write textures/ and internal/. `divide`: divide shadows and interreflections out of the albedo. `acescg`: also
     write that albedo in ACEScg. heights (V,): displacement at the vertices, if there is a map of it; bands: wavelength
-    (m) between its two bands. hair: the last tile is hair's. space: of the base colour in MaterialX networks."""
+    (m) between its two bands. hair: the last tile is hair's. space: of the base colour in MaterialX networks. scatters:
+    write where skin scatters light below its surface."""
     for folder in (TEXTURES, INTERNAL):
         (asset / folder).mkdir(parents=True, exist_ok=True)
     written = copy_maps(bake, name, asset)
     if heights is not None:
         written += write_heights(bake, mesh, heights, name, asset, bands)
+    written += write_weights(bake, name, asset) if scatters else []
     figures: dict[str, float] = {}
     if divide and not shadows_fitted(bake) and not bake.artifact.standard_fitted:
         shown, found = divided_albedo(bake, mesh, light, name, asset, check)
@@ -301,6 +306,7 @@ def look_of(
         neuface_albedo=found("neuface_albedo", "png"),
         base_color=None if space == SRGB else found(*FILES[space]),
         base_space=space,
+        subsurface=found(SUBSURFACE, "exr"),
     )
 
 

@@ -1,6 +1,7 @@
-"""The material's two MaterialX networks, of standard nodes only, because importers fail on custom node definitions.
+"""The material's MaterialX networks, of standard nodes only, because importers fail on custom node definitions.
 
 `openpbr`        OpenPBR with albedo, roughness, normal, and F0 as `specular_weight`
+`openpbr_subsurface`  the same, of skin that scatters light below its surface (subsurface.py)
 `neuface_basis`  OpenPBR whose specular tint is the learned lobe itself:
 
     tint = sum_j c_j(x) T_j(n.v, 1/kappa(x)),     T_j = B_j / R of the layer
@@ -12,15 +13,17 @@ View direction and normal are connected explicitly, because renderers have diffe
 
 from __future__ import annotations
 
-from pxr import Sdf, Usd, UsdShade
+from pxr import Gf, Sdf, Usd, UsdShade
 
 from pipeline import tiles
 from stages.usd.colour_spaces import DATA, SRGB
 from stages.usd.write.ggx_conversion import INV_KAPPA_SCALE, REFERENCE_F0, REFERENCE_IOR
 from stages.usd.write.shading import HEIGHT, Look, T, connect, shader
+from stages.usd.write.subsurface import radius_and_scale
 
 SURFACE, DISPLACEMENT = "ND_open_pbr_surface_surfaceshader", "ND_displacement_float"
 CONFIG_SCHEMA, VERSION = "MaterialXConfigAPI", "1.39"
+SCATTERS = "openpbr_subsurface"
 LARGEST_F0 = 0.16  # `specular_weight` = 4: limits the reflectance of a failed fit
 
 
@@ -69,6 +72,9 @@ def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look
     if look.roughness and look.f0:
         made.append("openpbr")
         _surface(stage, f"{path}/openpbr", look, basis=False)
+        if look.subsurface:
+            made.append(SCATTERS)
+            _scatter(stage, f"{path}/{SCATTERS}", look)
     if look.roughness and look.coefficients and look.inv_kappa:
         made.append("neuface_basis")
         _surface(stage, f"{path}/neuface_basis", look, basis=True)
@@ -139,6 +145,19 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
         )
         connect(surface.CreateInput("specular_weight", T.Float), weight)
     surface.CreateOutput("out", T.Token)
+
+
+def _scatter(stage: Usd.Stage, path: str, look: Look) -> None:
+    """The network `openpbr` whose base scatters where the map says so."""
+    _surface(stage, path, look, basis=False)
+    surface = UsdShade.Shader.Get(stage, f"{path}/surface")
+    weight = _Nodes(stage, path).image("scatters", "float", T.Float, str(look.subsurface), DATA)
+    connect(surface.CreateInput("subsurface_weight", T.Float), weight)
+    albedo = UsdShade.Shader.Get(stage, f"{path}/albedo").GetOutput("out")
+    connect(surface.CreateInput("subsurface_color", T.Color3f), albedo)
+    radius, scale = radius_and_scale()
+    surface.CreateInput("subsurface_radius", T.Float).Set(radius)
+    surface.CreateInput("subsurface_radius_scale", T.Color3f).Set(Gf.Vec3f(*scale))
 
 
 def _normal(nodes: _Nodes, look: Look) -> UsdShade.Output:

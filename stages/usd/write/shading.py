@@ -24,6 +24,7 @@ class Look:
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     displacement: metres along the normal, of a mesh that is subdivided.
     neuface_albedo: the field's own albedo, if `albedo` is the base colour of a fitted standard material.
+    subsurface: picture of where skin scatters light below its surface.
     base_color, base_space: picture and colour space of the base colour in MaterialX networks; None: `albedo`.
     """
 
@@ -41,6 +42,7 @@ class Look:
     neuface_albedo: str | None = None
     base_color: str | None = None
     base_space: str = SRGB
+    subsurface: str | None = None
 
     def base(self) -> tuple[str, str]:
         """The picture of the base colour for MaterialX networks, and its colour space."""

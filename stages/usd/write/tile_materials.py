@@ -74,6 +74,12 @@ def skins(materials: Sequence[TileMaterial]) -> tuple[str, ...]:
     return tuple(m.name for m in materials if not m.eyes)
 
 
+def scattering(materials: Sequence[TileMaterial]) -> tuple[str, ...]:
+    """Names of the materials that show skin: those that may scatter light below the surface."""
+    other = (MOUTH, EYES_AND_MOUTH, CLOTHES, HAIR)
+    return tuple(m.name for m in materials if not m.eyes and not m.name.startswith(other))
+
+
 def names_on(mesh: UvSurface, materials: Sequence[TileMaterial]) -> tuple[str, ...]:
     """Names of the materials that a mesh without eyes of its own needs (the dense mesh)."""
     used = set(_tiles(mesh))
@@ -94,6 +100,8 @@ def write_materials(
     for m in materials:
         own = hair if m.name == HAIR and hair is not None else look if m.displaced else replace(look, displacement=None)
         path, part = f"{scope}/{m.name}", Part(m.tile, across)
+        if m.name not in scattering(materials):
+            own = replace(own, subsurface=None)
         if m.eyes:
             made[m] = eye_material(stage, path, own, part)
             continue

@@ -9,9 +9,10 @@ from itertools import product
 
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
+from stages.usd.write.materialx import SCATTERS
 from stages.usd.write.shading import HEIGHT, MATERIAL, Look
 
-STANDARD, SPECULAR, BASIS = "standard", "specular_workflow", "neuface_basis"
+STANDARD, SPECULAR, BASIS, SUBSURFACE = "standard", "specular_workflow", "neuface_basis", "subsurface"
 HIGH, RENDER, PROXY = "high", "render", "proxy"
 REST = "rest"  # beside the template: clothes, and hair that was not told apart
 HAIR = "hair"  # a mesh and its material
@@ -20,20 +21,26 @@ SCAN_MATERIAL = f"{MATERIAL}_{SCAN}"
 HIGH_FILE = "high.usdc"
 
 
-def write_looks(stage: Usd.Stage, prim: Usd.Prim, look: Look, names: Sequence[str]) -> None:
-    """Variant set `look`: which network of the materials of these names is their surface. Each variant contains only
-    the differences; the payload alone equals the first variant."""
-    materials = [prim.GetPath().AppendPath(f"mtl/{n}") for n in names]
+def write_looks(
+    stage: Usd.Stage, prim: Usd.Prim, look: Look, names: Sequence[str], scattering: Sequence[str] = ()
+) -> None:
+    """Variant set `look`: which network of the materials of these names is their surface. scattering: names of those
+    that have a network with subsurface scattering. Each variant contains only the differences; the payload alone equals
+    the first variant."""
     outputs = {STANDARD: {}, SPECULAR: {"outputs:surface": "preview_specular.outputs:surface"}}
     if not look.specular:
         del outputs[SPECULAR]
     if look.coefficients and look.inv_kappa and look.roughness:
         outputs[BASIS] = {"outputs:mtlx:surface": "neuface_basis/surface.outputs:out"}
+    if scattering:
+        outputs[SUBSURFACE] = {"outputs:mtlx:surface": f"{SCATTERS}/surface.outputs:out"}
     looks = prim.GetVariantSets().AddVariantSet("look")
     for variant, connections in outputs.items():
         looks.AddVariant(variant)
         looks.SetVariantSelection(variant)
         with looks.GetVariantEditContext():
+            changed = scattering if variant == SUBSURFACE else names
+            materials = [prim.GetPath().AppendPath(f"mtl/{n}") for n in changed]
             for material, (output, source) in product(materials, connections.items()):
                 over = stage.OverridePrim(material)
                 attribute = over.CreateAttribute(output, Sdf.ValueTypeNames.Token, custom=False)
