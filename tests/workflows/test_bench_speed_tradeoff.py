@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -18,6 +21,7 @@ from workflows.bench.tradeoff_measure import Measured
 from workflows.bench.tradeoff_plot import plot
 from workflows.cli.console import Console
 from workflows.cli.main import parser
+from workflows.evaluation import demo_material
 from workflows.run import host_info
 
 
@@ -138,6 +142,63 @@ def test_a_bench_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "Two seeds differ by" in text and "**" in text
     tradeoff.run(trade(tmp_path, "--points", "k = 5", "--steps", "7"), Console())
     assert list(json.loads((out / "tradeoff.json").read_text())["points"]) == ["k = 5"]
+
+
+def test_the_split_has_columns_where_there_is_a_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the demo's capture only; a point without a lobe has no F0 that varies, so no correlation."""
+    split = {"f0": 0.5, "f0_error": 0.01, "roughness": 0.25, "roughness_error": 0.05, "light": 0.9}
+
+    def apart(work: Any, knob: Any, given: Any) -> Measured:
+        return dataclasses.replace(measured(10, 30), **split) if knob.name == "middle" else measured(20, 31)
+
+    monkeypatch.setattr(host_info, "apart", apart)
+    tradeoff.run(trade(tmp_path), Console())
+    lines = (tmp_path / "out/tradeoff.md").read_text().splitlines()
+    head = next(i for i, line in enumerate(lines) if line.startswith("| point"))
+    assert lines[head].count("|") == lines[head + 1].count("|") == 14
+    assert lines[head + 2].endswith("| 0.500 | 0.010 | 0.250 | 0.050 | 0.900 |")
+    assert lines[head + 3].endswith("| - | - | - | - | - |")
+
+
+def test_the_split_is_that_of_the_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No figure of a capture that is not the demo's; else those of demo_material.compare, placed by the cameras."""
+    assert tradeoff_measure.split_of({}, tmp_path) == {}
+    (tmp_path / "demo.json").write_text("{}")
+    place = np.diag([2.0, 2.0, 2.0, 1.0])
+
+    def compare(field: Path, folder: Path, capture: Any, where: np.ndarray, out: Path) -> Any:
+        assert (field, folder, capture) == (Path("field.npz"), tmp_path, "photos") and out.is_dir()
+        assert np.array_equal(where, place)
+        f0, roughness = (SimpleNamespace(correlation=c, error=e) for c, e in ((0.5, 0.01), (0.25, 0.05)))
+        return SimpleNamespace(f0=f0, roughness=roughness, light_correlation=0.9)
+
+    monkeypatch.setattr(demo_material, "compare", compare)
+    fitted = SimpleNamespace(artifact=SimpleNamespace(field="field.npz"), path=Path)
+    found = {
+        "inverse_rendering": fitted,
+        "poses": SimpleNamespace(artifact=SimpleNamespace(capture_from_asset=place.tolist())),
+        "capture": SimpleNamespace(artifact="photos"),
+    }
+    assert tradeoff_measure.split_of(found, tmp_path) == {
+        "f0": 0.5,
+        "f0_error": 0.01,
+        "roughness": 0.25,
+        "roughness_error": 0.05,
+        "light": 0.9,
+    }
+
+
+def test_without_a_lobe_nothing_correlates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A constant has no correlation: NaN, which JSON does not have."""
+    (tmp_path / "demo.json").write_text("{}")
+    none = SimpleNamespace(correlation=math.nan, error=0.03)
+    figures = SimpleNamespace(f0=none, roughness=none, light_correlation=0.9)
+    monkeypatch.setattr(demo_material, "compare", lambda *given: figures)
+    fitted = SimpleNamespace(artifact=SimpleNamespace(field="field.npz"), path=Path)
+    poses = SimpleNamespace(artifact=SimpleNamespace(capture_from_asset=np.eye(4).tolist()))
+    found = {"inverse_rendering": fitted, "poses": poses, "capture": SimpleNamespace(artifact="photos")}
+    split = tradeoff_measure.split_of(found, tmp_path)
+    assert (split["f0"], split["roughness"], split["f0_error"]) == (None, None, 0.03)
 
 
 def test_presets_are_points_as_they_are(tmp_path: Path) -> None:

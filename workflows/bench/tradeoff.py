@@ -23,6 +23,13 @@ from workflows.cli.console import Console
 from workflows.run import host_info
 
 MIDDLE = Knob("middle")
+SPLIT = {
+    "f0": "F0: correlation",
+    "f0_error": "median error",
+    "roughness": "roughness: correlation",
+    "roughness_error": "median error",
+    "light": "light: correlation",
+}
 PRESETS = tuple(Knob(f"preset {name}", preset=name) for name in ("draft", "studio", "film"))
 KNOBS = (
     MIDDLE,
@@ -103,20 +110,24 @@ def front(found: dict[str, Measured]) -> list[str]:
 # ------------------------------------------------------------------ what people read
 def report(about: dict[str, Any], budget: dict[str, Any], found: dict[str, Measured]) -> list[str]:
     """Markdown: a row a point, the front marked."""
+    split = [f for f in SPLIT if any(getattr(m, f) is not None for m in found.values())]
     lines = [
         f"`neuface bench tradeoff`, capture {budget['capture']}, held out {budget['holdout']}. Middle: "
         f"{budget['steps']} steps of {budget['batch']} rays, photos of {budget['side']} px, {budget['cells']} cells, "
         f"the whole model; presets as they are. All points are scored at {budget['side']} px.",
         f"Machine: {host_info.describe(about)}.",
         "",
-        "| point | s | MB | PSNR (dB) | SSIM | FLIP | chamfer (mm) | albedo (dB) |",
-        "|---|---|---|---|---|---|---|---|",
+        "| point | s | MB | PSNR (dB) | SSIM | FLIP | chamfer (mm) | albedo (dB) |"
+        + "".join(f" {SPLIT[f]} |" for f in split),
+        "|---|---|---|---|---|---|---|---|" + "---|" * len(split),
     ]
     ahead = front(found)
     for name, m in found.items():
         row = [f"{m.seconds:.1f}", f"{m.memory_mb:.0f}", f"{m.psnr:.2f}", f"{m.ssim:.4f}", f"{m.flip:.4f}"]
         shown = f"**{name}**" if name in ahead else name
-        lines.append(f"| {shown} | " + " | ".join([*row, f"{m.chamfer:.3f}", f"{m.albedo:.1f}"]) + " |")
+        row += [f"{m.chamfer:.3f}", f"{m.albedo:.1f}"]
+        row += ["-" if (value := getattr(m, f)) is None else f"{value:.3f}" for f in split]
+        lines.append(f"| {shown} | " + " | ".join(row) + " |")
     lines += ["", "Bold: on the Pareto front of seconds against PSNR."]
     pair = [found[k].psnr for k in (MIDDLE.name, "another seed") if k in found]
     if len(pair) == 2:

@@ -32,7 +32,8 @@ class Knob:
 @dataclass(frozen=True, slots=True)
 class Measured:
     """Seconds of the fit's stage, peak memory (MB); dB, -, - over held-out views; mm and dB against the truth if it is
-    there (else NaN)."""
+    there (else NaN). Of the demo's capture also the split into diffuse and specular (workflows/evaluation/
+    demo_material.py): correlation and median error of F0 and of roughness, correlation of the light."""
 
     seconds: float
     memory_mb: float
@@ -41,6 +42,11 @@ class Measured:
     flip: float
     chamfer: float
     albedo: float
+    f0: float | None = None
+    f0_error: float | None = None
+    roughness: float | None = None
+    roughness_error: float | None = None
+    light: float | None = None
 
 
 def settings_of(knob: Knob, given: argparse.Namespace) -> tuple[str, ...]:
@@ -87,7 +93,33 @@ def measure(knob: Knob, given: argparse.Namespace) -> Measured:
         float(mean[3]),
         chamfer(found, folder),
         albedo_error(found, model, folder),
+        **split_of(found, folder),
     )
+
+
+def split_of(found: dict[str, Any], folder: Path) -> dict[str, float | None]:
+    """The last fields of `Measured`, None for a correlation with a constant; nothing if the capture is not the
+    demo's."""
+    import tempfile
+
+    from pipeline.demo.capture import MARKER
+    from pipeline.transforms import matrix
+    from workflows.evaluation.demo_material import compare
+
+    if not (folder / MARKER).is_file():
+        return {}
+    fitted, place = found["inverse_rendering"], matrix(found["poses"].artifact.capture_from_asset)
+    with tempfile.TemporaryDirectory() as scratch:
+        field = fitted.path(fitted.artifact.field)
+        truth = compare(field, folder, found["capture"].artifact, place, Path(scratch))
+    figures = {
+        "f0": truth.f0.correlation,
+        "f0_error": truth.f0.error,
+        "roughness": truth.roughness.correlation,
+        "roughness_error": truth.roughness.error,
+        "light": truth.light_correlation,
+    }
+    return {k: v if math.isfinite(v) else None for k, v in figures.items()}
 
 
 def looks(found: dict[str, Any], model: FaceModel, side: int, samples: int) -> npt.NDArray[np.float64]:
