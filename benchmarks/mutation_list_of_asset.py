@@ -219,4 +219,12 @@ OF_ASSET = (
              "tests/usd/test_usd_texture_names.py::test_two_meshes_need_two_names"),
     Mutation("stages/usd/check/material_checks.py", "found not in KNOWN_SPACES", "False",
              "tests/usd/test_usd_texture_names.py::test_an_unknown_colour_space_in_a_file_is_found"),
+    Mutation("stages/usd/write/subsurface.py", "1 / (s + a) for s, a", "1 / s for s, a",
+             "tests/usd/test_usd_subsurface.py::test_free_paths_are_those_of_measured_skin"),
+    Mutation("stages/usd/write/subsurface.py", "(EYES, HAIR))", "(HAIR,))",
+             "tests/usd/test_usd_subsurface.py::test_hair_and_eyes_do_not_scatter"),
+    Mutation("stages/usd/write/tile_materials.py", "not m.name.startswith(other))", "m.name)",
+             "tests/usd/test_usd_subsurface.py::test_only_skin_scatters"),
+    Mutation("stages/usd/write/export.py", "config.subsurface and poses.artifact.metric", "config.subsurface",
+             "tests/usd/test_usd_subsurface.py::test_without_a_metric_scale_it_is_left_out"),
 )  # fmt: skip

@@ -18,6 +18,18 @@ OF_FIT = (
     Mutation("pipeline/fields/face.py", "s - np.float32(float(self.model.level))",
              "s + np.float32(float(self.model.level))",
              "tests/inverse_rendering/test_outline_level.py::test_the_stages_after_the_fit_see_the_surface_at_the_level"),
+    # ---------------------------------------------------------------- colours of held-out photos
+    Mutation("stages/inverse_rendering/held_out_colour.py", "/ np.diag(inverse)[:, None]", "",
+             "tests/inverse_rendering/test_held_out_colour.py::test_the_error_is_that_of_leaving_out_each_photo"),
+    Mutation("stages/inverse_rendering/held_out_colour.py", "entries.mean(0)) * (count / (count - 1))",
+             "entries.mean(0))",
+             "tests/inverse_rendering/test_held_out_colour.py::test_the_error_is_that_of_leaving_out_each_photo"),
+    Mutation("stages/inverse_rendering/held_out_colour.py", "GAIN * of_mean**2 and", "of_mean**2 and",
+             "tests/inverse_rendering/test_held_out_colour.py::test_responses_without_order_keep_their_mean"),
+    Mutation("stages/inverse_rendering/held_out_colour.py", "_kernel(y, x, how.length)", "_kernel(x, x, how.length)",
+             "tests/inverse_rendering/test_held_out_colour.py"),
+    Mutation("stages/inverse_rendering/held_out_colour.py", "v.exposure * matrix", "matrix",
+             "tests/inverse_rendering/test_held_out_colour.py::test_the_mean_of_its_own_kind"),
     # ---------------------------------------------------------------- registration of photos
     Mutation("stages/inverse_rendering/registration.py", "slope = 0.5 * (own + level.gradient) / level.side",
              "slope = 0.5 * (own + level.gradient)",
