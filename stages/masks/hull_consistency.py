@@ -93,12 +93,13 @@ def _iou(a: Bool, b: Bool, where: Bool) -> float | None:
     return float((a & b & where).sum() / union) if union else None
 
 
-def contradiction(inside: Bool, opinion: Opinion) -> float:
-    """Area that the hull contradicts beyond its resolution (missing, or in empty space), as a share of the mask's.
-    inside: (h, w)."""
-    missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here
+def contradiction(inside: Bool, opinion: Opinion, *, filled: bool) -> float:
+    """Area that the hull contradicts beyond its resolution, as a share of the mask's: what lies in empty space, and, if
+    `filled`, what the mask lacks. A hull is an upper limit of the subject: what few views see, it makes too large, so
+    that only of a mask that is an outlier its missing parts are believed. inside: (h, w)."""
     extra = inside & ~dilated(opinion.possible, opinion.margin)
     extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
+    missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here if filled else np.zeros_like(inside)
     return float(missing.sum() + extra.sum()) / max(1, int(inside.sum()))
 
 
@@ -108,19 +109,22 @@ def hole(inside: Bool, opinion: Opinion) -> float:
     return float((enclosed & eroded(opinion.silhouette, opinion.margin)).sum()) / max(1, int(inside.sum()))
 
 
-def trimap(inside: Bool, opinion: Opinion) -> np.typing.NDArray[np.uint8]:
+def trimap(inside: Bool, opinion: Opinion, *, filled: bool) -> np.typing.NDArray[np.uint8]:
     """Trimap (h, w) for GrabCut when a view is segmented again: from the hull where it is clear, else from the mask
-    `inside` (h, w)."""
+    `inside` (h, w). filled: the hull's inside is the subject's; else only in the mask's holes."""
     out = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     near = dilated(inside, opinion.margin) & ~eroded(inside, opinion.margin)
     out[eroded(inside, opinion.margin)] = cv2.GC_FGD
     out[~inside & ~near] = cv2.GC_BGD
     clear = eroded(opinion.silhouette, opinion.margin)
+    if not filled:
+        clear &= ndimage.binary_fill_holes(inside)
     empty = ~dilated(opinion.silhouette, opinion.margin)
     # a mask without most of the subject is not used outside of the region of interest either
     lost = (inside & opinion.silhouette).sum() < 0.3 * opinion.silhouette.sum()
     here = np.ones_like(inside) if lost else opinion.here
-    out[here & ~clear & ~empty] = np.where(opinion.silhouette, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
+    full = opinion.silhouette & (inside if not filled else True)
+    out[here & ~clear & ~empty] = np.where(full, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
     agreed = here & ~clear & ~empty & near  # undecided by both: the view's own contour is the better start
     out[agreed] = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[agreed]
     out[here & clear] = cv2.GC_FGD

@@ -97,7 +97,7 @@ def segment(
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     first = _seen(masked, [])
     if config.resegment and _agreement(masked) >= MIN_AGREEMENT:  # else the hull knows no better than the masks
-        bad = _outliers(masked)
+        bad = [a or _wrong_held_out(m) for a, m in zip(_outliers(masked), masked, strict=True)]
         corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
                           list(zip(masked, found, bad, strict=True)), context, "checking masks")  # fmt: skip
         if any(a is not b for a, b in zip(corrected, masked, strict=True)):
@@ -278,13 +278,22 @@ def _outliers(masked: list[Masked]) -> list[bool]:
     return [f or (m.useless and not m.view.holdout) for f, m in zip(found, masked, strict=True)]
 
 
+def _wrong_held_out(m: Masked) -> bool:
+    """Whether a held-out view's mask is nothing like the hull of the fitted ones. Less may be the hull's own fault."""
+    return m.view.holdout and not m.useless and m.iou is not None and m.iou < MIN_AGREEMENT
+
+
 def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, context: Context) -> Masked:
-    """The view with a new mask if the hull contradicts the old one; unchanged if the new one is no better."""
-    inside = made.small >= 0.5
-    if made.source in ("given", INVERTED) or made.view.holdout or (made.source == "key" and made.useless):
+    """The view with a new mask if the hull contradicts the old one; unchanged if the new one is no better. bad: it is
+    an outlier, or held out and wrong. Of a held-out view only that counts, and the hull is its limit, not its shape:
+    the hull is carved without it, and wrong by what fitted masks lack."""
+    inside, filled = made.small >= 0.5, bad and not made.view.holdout
+    if made.source in ("given", INVERTED) or (made.source == "key" and made.useless):
         return made  # a photo of background only has no subject to segment
-    doubtful = made.source in COMPUTED and (
-        contradiction(inside, opinion) > CONTRADICTED or hole(inside, opinion) > HOLE
+    doubtful = (
+        not made.view.holdout
+        and made.source in COMPUTED
+        and (contradiction(inside, opinion, filled=filled) > CONTRADICTED or hole(inside, opinion) > HOLE)
     )
     if not (bad or doubtful):
         return made
@@ -293,11 +302,12 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     opinion_here = _at_size(opinion, w, h)
     prior = np.asarray(resized(made.small, w, h)) >= 0.5
     small = np.asarray(resized(image, w, h), np.uint8)
-    new = cut(distinct(small) if made.source == "object" else small, trimap(prior, opinion_here), config.seed)
+    shown = distinct(small) if made.source == "object" else small
+    new = cut(shown, trimap(prior, opinion_here, filled=filled), config.seed)
     if made.source in LEARNED:
         new = settled(small, new)
     new = of_subject(new, made.view.disc.scaled(w / image.shape[1]))
-    before, after = contradiction(prior, opinion_here), contradiction(new, opinion_here)
+    before, after = (contradiction(m, opinion_here, filled=filled) + hole(m, opinion_here) for m in (prior, new))
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
         return made
     return _keep(made.view, made.camera, to_full_size(image, new), f"{made.source}+hull", context)

@@ -284,14 +284,62 @@ def test_contradiction_and_trimap() -> None:
     y, x = np.mgrid[:100, :100]
     body = np.hypot(x - 50, y - 50) < 30
     opinion = Opinion(body, body, np.ones_like(body), 3, 1.0)
-    assert contradiction(body, opinion) == 0
+    assert contradiction(body, opinion, filled=True) == 0
     half = body & (x < 50)
-    assert contradiction(half, opinion) == pytest.approx(0.9, abs=0.15)
-    assert contradiction(np.ones_like(body), opinion) > 0.6
-    found = trimap(half, opinion)
+    assert contradiction(half, opinion, filled=True) == pytest.approx(0.9, abs=0.15)
+    for filled in (True, False):
+        assert contradiction(np.ones_like(body), opinion, filled=filled) > 0.6
+    found = trimap(half, opinion, filled=True)
     assert found[50, 70] == cv2.GC_FGD and found[5, 5] == cv2.GC_BGD
     elsewhere = replace(opinion, here=x < 0)
-    assert (trimap(half, elsewhere)[:, 60:][body[:, 60:]] == cv2.GC_BGD).all()  # outside the region: its own word
+    there = trimap(half, elsewhere, filled=True)[:, 60:]
+    assert (there[body[:, 60:]] == cv2.GC_BGD).all()  # outside the region: its own word
+
+
+def test_a_hull_is_an_upper_limit_of_a_mask_that_is_no_outlier() -> None:
+    """What the hull adds is no part of the subject by that alone; what it lacks is none, and a hole is one."""
+    import cv2
+
+    y, x = np.mgrid[:100, :100]
+    disc = np.hypot(x - 50, y - 50)
+    opinion = Opinion(disc < 30, disc < 30, np.ones_like(disc, bool), 3, 1.0)
+    small = (disc < 20) & ~(np.hypot(x - 52, y - 52) < 5)
+    assert contradiction(small, opinion, filled=False) == 0 < contradiction(small, opinion, filled=True)
+    found = trimap(small, opinion, filled=False)
+    beyond = found[(disc > 24) & (disc < 32)]  # the hull goes on there, the mask does not
+    assert np.isin(beyond, (cv2.GC_BGD, cv2.GC_PR_BGD)).all() and found[52, 52] == cv2.GC_FGD
+    large = disc < 45
+    found = trimap(large, opinion, filled=False)
+    assert (found[disc > 34] == cv2.GC_BGD).all() and (found[disc < 24] == cv2.GC_FGD).all()
+
+
+def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A chair beside the ball in the held-out photo and in a fitted one. The hull is only a limit: a held-out mask of
+    half of the ball stays as it is."""
+    y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
+    chair = (abs(x) < 45) & (y > 0)
+
+    def made(lacks: bool) -> Any:
+        def mask(view: PhotoToMask, *_: Any) -> tuple[F32, str]:
+            alpha = ball_alpha(scene.cameras[view.index])
+            if view.index not in (2, 7):
+                return alpha, "grabcut"
+            return np.where(
+                lacks & (x > 0), np.float32(0), np.where(chair & (not lacks), np.float32(1), alpha)
+            ), "grabcut"
+
+        return mask
+
+    monkeypatch.setattr(segment, "mask", made(lacks=False))
+    found, alphas = run(scene, tmp_path / "a", faces=False)
+    for i in (2, 7):
+        assert found.masks[i].source == "grabcut+hull"
+        assert iou(alphas[i], ball_alpha(scene.cameras[i])) > 0.9
+    monkeypatch.setattr(segment, "mask", made(lacks=True))
+    found, alphas = run(scene, tmp_path / "b", faces=False)
+    assert found.masks[2].source == "grabcut" and found.masks[7].source == "grabcut+hull"  # this one is an outlier
 
 
 def test_a_hole_counts_where_the_hull_has_none() -> None:
