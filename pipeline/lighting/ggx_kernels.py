@@ -16,8 +16,8 @@ scaled to that,
     plain part   times a / sum_k D V n.l (1 - c) W_k,      rim   times b / sum_k D V n.l c W_k,
 
 each factor between 1 / MOST and MOST. Lamps without a solid angle (points) are not scaled. The loops over lamps are
-in parts: lamps below the horizon, about half, are left out first; then a loop has no sums, so that it vectorises
-under strict arithmetic.
+in parts: lamps below the horizon, about half, are left out first, and what is needed of the others is gathered once;
+then a loop has neither gathers nor sums, so that it vectorises under strict arithmetic.
 """
 
 # mypy: disable-error-code=no-untyped-def
@@ -34,15 +34,21 @@ LEAST_COSINE = np.float32(1e-3)  # of n.v: the masking's limit at 0 is finite, i
 
 
 @njit(error_model="numpy", cache=True)
-def _above(normal, lamp, which, cosine):
-    """The lamps above the horizon of a normal (3,), in their order: writes their indices and n.l, returns their
-    number. The others would add 0."""
-    count = 0
+def _cosines(x, y, z, lamp, out):
+    """Cosines (N,) between a direction and the lamps."""
     for i in range(lamp.shape[1]):
-        nl = normal[0] * lamp[0, i] + normal[1] * lamp[1, i] + normal[2] * lamp[2, i]
-        if nl > ZERO:
-            which[count], cosine[count] = i, nl
-            count += 1
+        out[i] = x * lamp[0, i] + y * lamp[1, i] + z * lamp[2, i]
+
+
+@njit(error_model="numpy", cache=True)
+def _above(every, which, cosine):
+    """The lamps above the horizon, in their order: writes their indices and n.l, returns their number. The others would
+    add 0. every (N,): n.l of all lamps; which, cosine (N + 1,): the place after the last one is written too, because a
+    loop without a branch is faster."""
+    count = 0
+    for i in range(len(every)):
+        which[count], cosine[count] = i, every[i]
+        count += every[i] > ZERO
     return count
 
 
@@ -74,6 +80,26 @@ def _scale(share, total):
     return min(max(share / total, ONE / MOST), MOST)
 
 
+@njit(error_model="numpy", cache=True)
+def _parts(cosine, nv, nh, hv, fresnel, a2, spread, plain, rim):
+    """Write D V n.l (1 - c) and D V n.l c of n lamps, (n,) each."""
+    for j in range(len(plain)):
+        w, c = _reflected(cosine[j], nv, nh[j], hv[j], a2, spread[j]), fresnel[j]
+        plain[j], rim[j] = w * (ONE - c), w * c
+
+
+@njit(error_model="numpy", cache=True)
+def _totals(plain, rim, light):
+    """Sums over n lamps of both parts (n,) times their light (n, 4): flux and solid angle."""
+    p0, p1, p2, c0, c1, c2, ps, cs = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+    for j in range(len(plain)):
+        e0, e1, e2, solid = light[j, 0], light[j, 1], light[j, 2], light[j, 3]
+        ps, cs = ps + plain[j] * solid, cs + rim[j] * solid
+        p0, p1, p2 = p0 + plain[j] * e0, p1 + plain[j] * e1, p2 + plain[j] * e2
+        c0, c1, c2 = c0 + rim[j] * e0, c1 + rim[j] * e1, c2 + rim[j] * e2
+    return p0, p1, p2, c0, c1, c2, ps, cs
+
+
 @njit(parallel=True, error_model="numpy", cache=True)
 def lobes(vertex, normal, wo, arriving, lamp, alphas, share, out):
     """Write the specular radiance of each of M observations for K widths, in two parts: out (M, K, 2, 3), such that the
@@ -85,29 +111,27 @@ def lobes(vertex, normal, wo, arriving, lamp, alphas, share, out):
     count = lamp.shape[1]
     for m in prange(len(vertex)):
         own = arriving[vertex[m]]
-        nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
         vx, vy, vz = wo[m, 0], wo[m, 1], wo[m, 2]
-        nv = max(nx * vx + ny * vy + nz * vz, LEAST_COSINE)
-        which, cosine = np.empty(count, np.int64), np.empty(count, np.float32)
-        lit = _above(normal[m], lamp, which, cosine)
+        nv = max(normal[m, 0] * vx + normal[m, 1] * vy + normal[m, 2] * vz, LEAST_COSINE)
+        every, which, cosine = (
+            np.empty(count, np.float32),
+            np.empty(count + 1, np.int64),
+            np.empty(count + 1, np.float32),
+        )
+        _cosines(normal[m, 0], normal[m, 1], normal[m, 2], lamp, every)
+        lit = _above(every, which, cosine)
         nh, hv, fresnel = np.empty(lit, np.float32), np.empty(lit, np.float32), np.empty(lit, np.float32)
+        spread, light = np.empty(lit, np.float32), np.empty((lit, 4), np.float32)
         for j in range(lit):
             i = which[j]
             lv = vx * lamp[0, i] + vy * lamp[1, i] + vz * lamp[2, i]
             nh[j], hv[j], fresnel[j] = _half(cosine[j], nv, lv)
+            spread[j] = lamp[3, i]
+            light[j, 0], light[j, 1], light[j, 2], light[j, 3] = own[i, 0], own[i, 1], own[i, 2], lamp[4, i]
         plain, rim = np.empty(lit, np.float32), np.empty(lit, np.float32)
         for k in range(len(alphas)):
-            a2 = alphas[k] * alphas[k]
-            for j in range(lit):
-                w, c = _reflected(cosine[j], nv, nh[j], hv[j], a2, lamp[3, which[j]]), fresnel[j]
-                plain[j], rim[j] = w * (ONE - c), w * c
-            p0, p1, p2, c0, c1, c2, ps, cs = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-            for j in range(lit):
-                i = which[j]
-                e0, e1, e2, solid = own[i, 0], own[i, 1], own[i, 2], lamp[4, i]
-                ps, cs = ps + plain[j] * solid, cs + rim[j] * solid
-                p0, p1, p2 = p0 + plain[j] * e0, p1 + plain[j] * e1, p2 + plain[j] * e2
-                c0, c1, c2 = c0 + rim[j] * e0, c1 + rim[j] * e1, c2 + rim[j] * e2
+            _parts(cosine, nv, nh, hv, fresnel, alphas[k] * alphas[k], spread, plain, rim)
+            p0, p1, p2, c0, c1, c2, ps, cs = _totals(plain, rim, light)
             ps, cs = _scale(share[0, m, k], ps), _scale(share[1, m, k], cs)
             out[m, k, 0, 0], out[m, k, 0, 1], out[m, k, 0, 2] = p0 * ps, p1 * ps, p2 * ps
             out[m, k, 1, 0], out[m, k, 1, 1], out[m, k, 1, 2] = c0 * cs, c1 * cs, c2 * cs
@@ -124,32 +148,35 @@ def shade(normal, wo, corner, weights, f0, alpha, arriving, lamp, share, diffuse
     for m in prange(len(normal)):
         pa, pb, pc = arriving[corner[m, 0]], arriving[corner[m, 1]], arriving[corner[m, 2]]
         wa, wb, wc = weights[m, 0], weights[m, 1], weights[m, 2]
-        nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
         vx, vy, vz = wo[m, 0], wo[m, 1], wo[m, 2]
-        nv = max(nx * vx + ny * vy + nz * vz, LEAST_COSINE)
-        a2 = alpha[m] * alpha[m]
-        which, cosine = np.empty(count, np.int64), np.empty(count, np.float32)
-        lit = _above(normal[m], lamp, which, cosine)
+        nv = max(normal[m, 0] * vx + normal[m, 1] * vy + normal[m, 2] * vz, LEAST_COSINE)
+        every, which, cosine = (
+            np.empty(count, np.float32),
+            np.empty(count + 1, np.int64),
+            np.empty(count + 1, np.float32),
+        )
+        _cosines(normal[m, 0], normal[m, 1], normal[m, 2], lamp, every)
+        lit = _above(every, which, cosine)
+        _cosines(vx, vy, vz, lamp, every)
+        nh, hv, fresnel = np.empty(lit, np.float32), np.empty(lit, np.float32), np.empty(lit, np.float32)
+        spread, light = np.empty(lit, np.float32), np.empty((lit, 4), np.float32)
+        for j in range(lit):
+            i = which[j]
+            nh[j], hv[j], fresnel[j] = _half(cosine[j], nv, every[i])
+            spread[j] = lamp[3, i]
+            for c in range(3):
+                light[j, c] = wa * pa[i, c] + wb * pb[i, c] + wc * pc[i, c]
+            light[j, 3] = lamp[4, i]
         plain, rim = np.empty(lit, np.float32), np.empty(lit, np.float32)
-        ps, cs = ZERO, ZERO
+        _parts(cosine, nv, nh, hv, fresnel, alpha[m] * alpha[m], spread, plain, rim)
+        ps, cs, d0, d1, d2 = ZERO, ZERO, ZERO, ZERO, ZERO
         for j in range(lit):
-            i = which[j]
-            lv = vx * lamp[0, i] + vy * lamp[1, i] + vz * lamp[2, i]
-            nh, hv, c = _half(cosine[j], nv, lv)
-            w = _reflected(cosine[j], nv, nh, hv, a2, lamp[3, i])
-            plain[j], rim[j] = w * (ONE - c), w * c
-        for j in range(lit):
-            solid = lamp[4, which[j]]
-            ps, cs = ps + plain[j] * solid, cs + rim[j] * solid
+            ps, cs = ps + plain[j] * light[j, 3], cs + rim[j] * light[j, 3]
+            d0, d1, d2 = d0 + cosine[j] * light[j, 0], d1 + cosine[j] * light[j, 1], d2 + cosine[j] * light[j, 2]
         ps, cs = f0[m] * _scale(share[0, m], ps), _scale(share[1, m], cs)
-        d0, d1, d2, s0, s1, s2 = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
+        s0, s1, s2 = ZERO, ZERO, ZERO
         for j in range(lit):
-            i = which[j]
-            e0 = wa * pa[i, 0] + wb * pb[i, 0] + wc * pc[i, 0]
-            e1 = wa * pa[i, 1] + wb * pb[i, 1] + wc * pc[i, 1]
-            e2 = wa * pa[i, 2] + wb * pb[i, 2] + wc * pc[i, 2]
-            d0, d1, d2 = d0 + cosine[j] * e0, d1 + cosine[j] * e1, d2 + cosine[j] * e2
             glossy = ps * plain[j] + cs * rim[j]
-            s0, s1, s2 = s0 + glossy * e0, s1 + glossy * e1, s2 + glossy * e2
+            s0, s1, s2 = s0 + glossy * light[j, 0], s1 + glossy * light[j, 1], s2 + glossy * light[j, 2]
         diffuse[m, 0], diffuse[m, 1], diffuse[m, 2] = d0, d1, d2
         specular[m, 0], specular[m, 1], specular[m, 2] = s0, s1, s2
