@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from hashlib import blake2b
+from threading import Lock
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +22,9 @@ class RayCaster:
     """First hits of rays with a mesh: vertices (V, 3) in any unit, faces (F, 3). span: longest side of its box."""
 
     def __init__(self, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.integer]) -> None:
-        from embreex import rtcore_scene
-        from embreex.mesh_construction import TriangleMesh
-
         self.span = max(float(np.ptp(vertices, axis=0).max()), 1e-9)
         self._scale = EMBREE_SIZE / self.span
-        self._scene = rtcore_scene.EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, (vertices * self._scale).astype(np.float32), faces)
-        self._cast(np.zeros((1, 3)), np.eye(3)[:1], False)  # builds the tree, which two threads must not do at once
+        self._scene = _scene_of((vertices * self._scale).astype(np.float32), np.asarray(faces))
 
     def first_faces(
         self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating]
@@ -61,4 +59,33 @@ class RayCaster:
 
     def _cast(self, origins: npt.NDArray[np.floating], directions: npt.NDArray[np.floating], output: bool) -> Any:
         starts = np.ascontiguousarray(origins * self._scale, np.float32)
-        return self._scene.run(starts, np.ascontiguousarray(directions, np.float32), output=output)
+        return self._scene.tree.run(starts, np.ascontiguousarray(directions, np.float32), output=output)
+
+
+class _Scene:
+    """Embree's tree over triangles: vertices (V, 3) and faces (F, 3) in its own unit."""
+
+    def __init__(self, vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.integer]) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        self.tree = rtcore_scene.EmbreeScene()
+        self._mesh = TriangleMesh(self.tree, vertices, faces)
+        self.tree.run(np.zeros((1, 3), np.float32), np.eye(3, dtype=np.float32)[:1])  # builds it: not in two threads
+
+
+_SCENES: WeakValueDictionary[bytes, _Scene] = WeakValueDictionary()
+_BUILDING = Lock()
+
+
+def _scene_of(vertices: npt.NDArray[np.float32], faces: npt.NDArray[np.integer]) -> _Scene:
+    """The scene of a mesh; the one that another caster of an equal mesh still holds, because filling one takes Embree's
+    wrapper three microseconds a triangle."""
+    digest = blake2b(np.ascontiguousarray(vertices).data, digest_size=16)
+    digest.update(str((vertices.shape, faces.shape, faces.dtype)).encode())
+    digest.update(np.ascontiguousarray(faces).data)
+    with _BUILDING:
+        found = _SCENES.get(digest.digest())
+        if found is None:
+            found = _SCENES[digest.digest()] = _Scene(vertices, faces)
+    return found

@@ -17,7 +17,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.fitted_cameras import cameras_of
 from pipeline.meshes import F64, Mask, Mesh
 from pipeline.ray_casting import RayCaster
-from pipeline.transforms import inverse_rigid, matrix, project
+from pipeline.transforms import inverse_rigid, matrix
 
 LIFT = 2e-3  # of the mesh's size: rays start this far above it, against self-occlusion of facets
 MIN_ALPHA = 0.5
@@ -99,26 +99,32 @@ def best_cosine(points: F64, normals: F64, views: Sequence[FittedPhoto], occlude
 
 
 def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:
-    """(N,) cosine towards the camera if the view sees the point, else 0; (N, 2) position in the photo, pixels. points,
-    normals (N, 3)."""
+    """(N,) cosine towards the camera if the view sees the point, else 0; (N, 2) position in the photo, pixels, NaN for
+    points that face away or lie outside of it. points, normals (N, 3)."""
+    from pipeline.visibility_kernels import facing
+
     camera = view.camera
-    world_from_cam = matrix(camera.world_from_cam)
-    away = world_from_cam[:3, 3] - points
-    toward = away / np.linalg.norm(away, axis=1, keepdims=True)
-    cosine = (toward * normals).sum(1)
-    uv, depth = project(matrix(camera.K), inverse_rigid(world_from_cam), np.array(camera.distortion), points)
-    with np.errstate(invalid="ignore"):
-        framed = (depth > 0) & (uv >= 0).all(1) & (uv[:, 0] < camera.width) & (uv[:, 1] < camera.height)
-    live = np.flatnonzero((cosine > 0) & framed)
+    cosine, uv = np.empty(len(points)), np.full((len(points), 2), np.nan)
+    facing(_row(camera), np.ascontiguousarray(points), np.ascontiguousarray(normals), cosine, uv)
+    live = np.flatnonzero(cosine)
     if view.mask is not None:
         live = live[picked(_MASKS.inside(view.mask), camera, uv[live])]
     if view.asked is not None:  # elsewhere the subject is not fitted, so that its colours there mean nothing
         live = live[picked(_MASKS.inside(view.asked), camera, uv[live])]
-    start = points[live] + LIFT * occluder.span * normals[live]
     out = np.zeros(len(points))
     if len(live):
-        out[live] = np.where(occluder.blocks(start, toward[live]), 0.0, cosine[live])
+        away = matrix(camera.world_from_cam)[:3, 3] - points[live]
+        toward = away / np.linalg.norm(away, axis=1, keepdims=True)
+        start = points[live] + LIFT * occluder.span * normals[live]
+        out[live] = np.where(occluder.blocks(start, toward), 0.0, cosine[live])
     return out, uv
+
+
+def _row(camera: Camera) -> F64:
+    """A camera's numbers in the order of visibility_kernels."""
+    pose, lens = matrix(camera.world_from_cam), np.array(camera.distortion, np.float64)
+    size = [camera.width, camera.height]
+    return np.concatenate([inverse_rigid(pose)[:3].ravel(), matrix(camera.K)[:2].ravel(), lens, pose[:3, 3], size])
 
 
 def picked(image: npt.NDArray[Any], camera: Camera, uv: F64) -> npt.NDArray[Any]:

@@ -194,7 +194,7 @@ def fit(
     near = Smoother(mesh, EDGES * edge)
     f0, roughness = near(np.stack([f0, rough], 1)).T
     f0 = np.where(near(layered[:, None])[:, 0] > 0.01, f0, 0.0).clip(0, 1)
-    correction = _correction(mesh, normals, albedo, seen, w, lit, f0, roughness, edge)
+    correction = _correction(near, normals, albedo, seen, w, lit, f0, roughness)
     return Fitted(
         correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
         lit.received.astype(np.float32),
@@ -370,8 +370,8 @@ def _lowest(x: F64, cost: F64) -> float:
 
 
 def _correction(
-    mesh: Mesh, normals: F64, albedo: F64, seen: Seen, w: F64, lit: Lit, f0: F64, roughness: F64, edge: float,
-) -> F64:  # fmt: skip
+    smooth: Smoother, normals: F64, albedo: F64, seen: Seen, w: F64, lit: Lit, f0: F64, roughness: F64
+) -> F64:
     """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R); 1 where nothing is seen."""
     v = seen.vertex
     alpha = roughness**2
@@ -390,7 +390,6 @@ def _correction(
         np.stack([np.bincount(v, w * z[:, i], len(normals)) for i in range(3)], 1).astype(np.float64)
         for z in (m * (seen.colour - specular), m * m)
     )
-    smooth = Smoother(mesh, EDGES * edge)
     dark = albedo**2 + 1e-12  # so that the pull to 1 does not depend on how dark the surface is
     typical = 1e-3 * dark * (below / dark)[below > 0].mean() if (below > 0).any() else np.ones(1)
     return np.asarray(((smooth(above) + typical) / (smooth(below) + typical)).clip(*CORRECTION))

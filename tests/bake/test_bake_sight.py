@@ -11,6 +11,7 @@ import pytest
 from pipeline.contract import Context
 from pipeline.images import read_alpha, read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
+from pipeline.transforms import inverse_rigid, project
 from pipeline.visibility import FittedPhoto, Occluder, best_cosine, view_cosines
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
@@ -228,3 +229,27 @@ def test_masks_that_were_read_are_kept_up_to_a_limit(tmp_path: Path, monkeypatch
     assert read == ["0.png", "1.png", "2.png", "1.png"]
     write_png(paths[0], 1 - np.tile(halves[0], (2, 1)))
     assert kept.inside(paths[0]).shape == (80, 50) and not kept.inside(paths[0])[0].any()
+
+
+@pytest.mark.parametrize("lens", [(0.0,) * 5, (0.1, -0.05, 0.01, -0.02, 0.03)])
+def test_places_and_cosines_are_those_of_the_projection(lens: tuple[float, ...]) -> None:
+    """Against transforms.project, with points beside the photo, behind the camera and at its centre, and a normal of no
+    length; a nearer wall hides nothing here."""
+    one = camera(3, 0.4, size=64, focal=90.0)
+    pose = np.array(one.world_from_cam)
+    view = FittedPhoto(one.model_copy(update={"distortion": lens, "width": 80, "height": 50}), None)
+    rng = np.random.default_rng(5)
+    points, normals = rng.normal(scale=0.4, size=(4000, 3)), rng.normal(size=(4000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points[0], normals[1] = pose[:3, 3], 0
+    far = Mesh(np.float32([[9, 9, 9], [9.1, 9, 9], [9, 9.1, 9]]), np.zeros((3, 3), np.float32), np.int32([[0, 1, 2]]))
+    found, uv = view_cosines(view, points, normals, Occluder(far))
+    wanted, depth = project(np.array(one.K), inverse_rigid(pose), np.array(lens), points)
+    away = pose[:3, 3] - points
+    with np.errstate(invalid="ignore"):
+        cosine = (away / np.linalg.norm(away, axis=1, keepdims=True) * normals).sum(1)
+        seen = (cosine > 0) & (depth > 0) & (wanted >= 0).all(1) & (wanted[:, 0] < 80) & (wanted[:, 1] < 50)
+    assert 100 < seen.sum() < 1500
+    np.testing.assert_allclose(found, np.where(seen, cosine, 0), atol=1e-14)
+    np.testing.assert_allclose(uv[seen], wanted[seen], atol=1e-9)
+    assert np.isnan(uv[~seen]).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from support.ball_head import RADIUS, ball_scan
@@ -35,3 +37,19 @@ def test_hits_of_a_sphere_are_those_of_its_equation() -> None:
     far, face = RayCaster(mesh.vertices, mesh.faces).hits(3 * RADIUS * out, -out)
     assert (face >= 0).all()
     np.testing.assert_allclose(far, 2 * RADIUS, rtol=1e-3)
+
+
+def test_casters_of_equal_meshes_share_a_scene_and_others_do_not() -> None:
+    mesh, turned = ball_scan(RADIUS, 24), np.array([[0, 0, 1], [0, 1, 0], [-1, 0, 0]], np.float32)
+    first, again = RayCaster(mesh.vertices, mesh.faces), RayCaster(mesh.vertices.copy(), mesh.faces.copy())
+    assert first._scene is again._scene
+    for vertices, faces in (
+        (mesh.vertices @ turned, mesh.faces),
+        (mesh.vertices, mesh.faces[:-1]),
+        (mesh.vertices, mesh.faces[::-1]),
+        (mesh.vertices, mesh.faces.astype(np.int64)),
+    ):
+        assert RayCaster(vertices, faces)._scene is not first._scene
+    held = weakref.ref(first._scene)
+    del first, again
+    assert held() is None  # nothing keeps a scene that no caster uses
