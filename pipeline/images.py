@@ -116,10 +116,14 @@ def linear_of(stored: npt.NDArray[Any]) -> F32:
     rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
     if not np.issubdtype(rgb.dtype, np.integer):
         return rgb.astype(np.float32)
-    levels = np.iinfo(rgb.dtype).max
-    table = linear_from_srgb(np.arange(levels + 1, dtype=np.float64) / levels).astype(np.float32)
-    out: F32 = table[rgb]
+    out: F32 = linear_levels(rgb.dtype)[rgb]
     return out
+
+
+def linear_levels(kind: np.dtype[Any]) -> F32:
+    """Linear value of each level of a picture of unsigned integers, taken as sRGB: 256 or 65536 values."""
+    levels = np.iinfo(kind).max
+    return np.asarray(linear_from_srgb(np.arange(levels + 1, dtype=np.float64) / levels), np.float32)
 
 
 def read_alpha(path: Path) -> F32:

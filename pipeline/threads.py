@@ -5,7 +5,14 @@ cores, a step of the fit takes forty times as long. Passive threads sleep instea
 Settings of the user are kept.
 """
 
+from __future__ import annotations
+
 import os
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+A = TypeVar("A")
+B = TypeVar("B")
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
@@ -34,3 +41,26 @@ def in_use() -> list[str]:
     """
     cores = str(len(os.sched_getaffinity(0)))
     return [os.environ.get(name) or cores for name in NAMES]
+
+
+def side_by_side(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+    """work(item) of each item, in their order, made in as many threads as compiled loops have. No more results wait
+    than there are threads. For work that leaves Python's lock: decoding, array operations, rays, triangular solves; not
+    for compiled loops that are parallel themselves."""
+    from collections import deque
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    threads = of_compiled_loops()
+    if threads < 2:
+        yield from map(work, items)
+        return
+    pool, waiting = ThreadPoolExecutor(threads), deque[Future[B]]()
+    try:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)

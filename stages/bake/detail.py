@@ -29,6 +29,7 @@ from pipeline.lighting.moving import Standpoint
 from pipeline.maths import brdf, sh
 from pipeline.meshes import F32, F64, Mesh
 from pipeline.smoothing import Smoother
+from pipeline.threads import side_by_side
 from stages.bake import detail_kernels as kernels
 from stages.bake.detail_views import Photos
 
@@ -61,21 +62,21 @@ def joined(parts: Sequence[Points]) -> Points:
 
 @dataclass(frozen=True, slots=True)
 class Detail:
-    """Data for the fine band. gloss, low (views, V, 3): g_v and F r_v at the mesh's vertices; relative (views, V, 3):
-    the light of each photo over the still one, (0, 0, 3) under a still light."""
+    """Data for the fine band. gloss (views, V, 3): g_v at the mesh's vertices; bands (V, views, 6): g_v and F r_v
+    there; relative (views, V, 3): the light of each photo over the still one, (0, 0, 3) under a still light."""
 
     photos: Photos
     gloss: F32
-    low: F32
+    bands: F32
     relative: F32
 
     def added(self, p: Points) -> tuple[F32, F32]:
         """(N, 3) detail to add to the albedo, and (N,) weight: 1 for one sharp photo from straight ahead."""
         mean, support = np.zeros((len(p.x), 3), np.float32), np.zeros((len(p.x), 2), np.float32)
-        photos = self.photos
+        photos, order = self.photos, np.argsort(p.corner[:, 0], kind="stable")
         kernels.fine(
-            photos.cameras, photos.pixels, photos.depth, photos.clipped, p.x, p.n, p.corner, p.weights,
-            self.gloss, self.low, self.relative, p.albedo, p.shade, mean, support,
+            photos.cameras, photos.pixels, photos.depth, photos.clipped, order, p.x, p.n, p.corner, p.weights,
+            self.bands, self.relative, p.albedo, p.shade, mean, support,
         )  # fmt: skip
         weight, spread = support.T
         trust = weight / (weight + HALF_WEIGHT) / (1 + (spread / DISAGREEMENT) ** 2)
@@ -90,21 +91,25 @@ def prepare(
     x = mesh.vertices.astype(np.float64)[mesh.faces]
     edge = float(np.linalg.norm(x[:, 1] - x[:, 0], axis=1).mean())
     smooth = Smoother(mesh, max(WIDTH, EDGES * edge))
-    low = np.zeros_like(gloss)
-    for v in range(len(gloss)):
-        step(v, len(gloss))
+    bands = np.empty((len(mesh.vertices), len(gloss), 6), np.float32)
+
+    def low_band(v: int) -> F64:
         values, cosines = np.zeros((len(sparse.x), 3), np.float32), np.zeros(len(sparse.x), np.float32)
         lit = sparse.shade
         if len(relative):
             lit = lit * np.einsum("nc,ncd->nd", sparse.weights, relative[v][sparse.corner])
         kernels.residual(
-            photos.cameras[v], photos.pixels, photos.depth, photos.clipped, sparse.x, sparse.n, sparse.corner,
+            photos.cameras, v, photos.pixels, photos.depth, photos.clipped, sparse.x, sparse.n, sparse.corner,
             sparse.weights, gloss[v], sparse.albedo, lit, values, cosines,
         )  # fmt: skip
         sums, total = np.zeros((len(mesh.vertices), 3)), np.zeros(len(mesh.vertices))
         kernels.splat(sparse.corner, sparse.weights, values, cosines**2, sums, total)
-        low[v] = smooth.mean(sums / np.maximum(total, 1e-9)[:, None], total)
-    return Detail(photos, gloss, low, relative)
+        return smooth.mean(sums / np.maximum(total, 1e-9)[:, None], total)
+
+    for v, low in enumerate(side_by_side(low_band, range(len(gloss)))):
+        step(v, len(gloss))
+        bands[:, v, :3], bands[:, v, 3:] = gloss[v], low
+    return Detail(photos, gloss, bands, relative)
 
 
 def relative_light(field: Field, mesh: Mesh, cameras: F64) -> F32:

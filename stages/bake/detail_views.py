@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.images import read_alpha, read_linear, shrink_whole
+from pipeline.images import linear_levels, linear_of, read_alpha, read_encoded, read_linear, shrink_whole
 from pipeline.meshes import F32, F64, Mask, Mesh
+from pipeline.threads import side_by_side
 from pipeline.transforms import inverse_rigid, matrix, rays
 from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake import detail_kernels as kernels
@@ -63,21 +65,18 @@ def read_photos(
     rows, pixels, depths, clipped = [], [], [], []
     others = []
     places = [0, 0]
-    for i, view in enumerate(views):
+
+    def read(view: FittedPhoto) -> _Read:
+        return _read(view, _factor(view, mesh, texel), occluder)
+
+    for i, one in enumerate(side_by_side(read, views)):
         step(i, len(views))
-        assert view.photo is not None
-        photo = read_linear(view.photo)
-        alpha = np.ones(photo.shape[:2], np.float32) if view.mask is None else read_alpha(view.mask)
-        factor = _factor(view, mesh, texel)
-        photo = shrink_whole(photo, factor)
-        depth = _depth(view, alpha, occluder)
-        peak = max(float(photo.max()), 1e-6)
-        rows.append(_row(view, responses[i], factor, photo.shape, depth.shape, peak, places))
-        pixels.append(_coded(photo, peak))
-        others.append(_parallel(view, photo.shape, factor))
-        depths.append(depth.ravel())
-        clipped.append(_clipped(view, photo.shape, factor))
-        places = [places[0] + len(pixels[-1]), places[1] + depth.size]
+        rows.append(_row(views[i], responses[i], one.factor, one.shape, one.depth.shape, one.peak, places))
+        pixels.append(one.pixels)
+        others.append(one.parallel)
+        depths.append(one.depth.ravel())
+        clipped.append(one.clipped)
+        places = [places[0] + len(pixels[-1]), places[1] + one.depth.size]
     cameras = np.array(rows)
     # weight 1: a sharp photo from straight ahead at the median distance and focal length
     centre = 0.5 * (mesh.vertices.min(0) + mesh.vertices.max(0))
@@ -91,9 +90,45 @@ def read_photos(
     return Photos(cameras, np.concatenate(pixels), np.concatenate(depths), ends, parallel)
 
 
-def _coded(photo: F32, peak: float) -> U16:
-    """(h w, 3) the square root of linear values, `peak` at the largest code."""
-    return np.round(np.sqrt(photo.clip(0) / peak) * CODE).astype(np.uint16).reshape(-1, 3)
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """One photo, not finer than `factor` pixels: shape (h, w, 3), pixels (h w, 3) and their radiance at the largest
+    code, its depth picture, clipped (h w,), and the same of the parallel-polarised photo."""
+
+    factor: int
+    shape: tuple[int, ...]
+    pixels: U16
+    peak: float
+    depth: F32
+    clipped: U8
+    parallel: tuple[float, U16, U8]
+
+
+def _read(view: FittedPhoto, factor: int, occluder: Occluder) -> _Read:
+    assert view.photo is not None
+    stored = read_encoded(view.photo)
+    pixels, peak, shape = _coded_photo(stored, factor)
+    alpha = np.ones(stored.shape[:2], np.float32) if view.mask is None else read_alpha(view.mask)
+    depth = _depth(view, alpha, occluder)
+    return _Read(factor, shape, pixels, peak, depth, _clipped(view, shape, factor), _parallel(view, shape, factor))
+
+
+def _coded_photo(stored: npt.NDArray[Any], factor: int) -> tuple[U16, float, tuple[int, ...]]:
+    """Codes (h w, 3) of a photo as it is stored (H, W, C), their peak, and (h, w, 3). Of 8-bit photos in full size each
+    level is coded once, not each pixel: the codes are the same."""
+    if factor > 1 or stored.dtype != np.uint8:
+        photo = shrink_whole(linear_of(stored), factor)
+        peak = max(float(photo.max()), 1e-6)
+        return _coded(photo, peak).reshape(-1, 3), peak, photo.shape
+    rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
+    levels = linear_levels(rgb.dtype)
+    peak = max(float(levels[rgb.max()]), 1e-6)
+    return _coded(levels, peak)[rgb].reshape(-1, 3), peak, rgb.shape
+
+
+def _coded(linear: F32, peak: float) -> U16:
+    """The square root of linear values, `peak` at the largest code."""
+    return np.round(np.sqrt(linear.clip(0) / peak).clip(0, 1) * CODE).astype(np.uint16)
 
 
 def _parallel(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> tuple[float, U16, U8]:
@@ -103,7 +138,7 @@ def _parallel(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> tuple[f
         return 0.0, np.zeros((count, 3), np.uint16), np.ones(count, np.uint8)
     photo = shrink_whole(read_linear(view.parallel), factor) / np.float32(view.parallel_exposure)
     peak = max(float(photo.max()), 1e-6)
-    return peak, _coded(photo, peak), _ends(view.parallel_clipped, shape, factor)
+    return peak, _coded(photo, peak).reshape(-1, 3), _ends(view.parallel_clipped, shape, factor)
 
 
 def _clipped(view: FittedPhoto, shape: tuple[int, ...], factor: int) -> U8:
@@ -148,19 +183,21 @@ def _row(
 
 
 def _depth(view: FittedPhoto, alpha: F32, occluder: Occluder) -> F32:
-    """(h, w) distance to the mesh through each pixel's centre; 0 outside the mesh or the mask, and near depth edges."""
+    """(h, w) distance to the mesh through each pixel's centre; 0 outside the mesh or the mask, and near depth edges.
+    Rays are cast inside the mask alone, and one pixel around, for the edges."""
     camera = view.camera
     shrunk = max(1, -(-max(camera.width, camera.height) // DEPTH_SIDE))
     h, w = camera.height // shrunk, camera.width // shrunk
-    place = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).reshape(-1, 2)
-    place *= np.array([camera.width / w, camera.height / h])
-    origin, directions = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), place)
-    distance = occluder.distance(origin, directions).reshape(h, w)
-    far = np.where(np.isfinite(distance), distance, 1e9).astype(np.float32)
     window = np.ones((3, 3), np.uint8)
+    solid = cv2.erode(cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA), window) > MIN_ALPHA
+    row, column = np.nonzero(cv2.dilate(solid.astype(np.uint8), window))
+    place = np.stack([column + 0.5, row + 0.5], -1) * np.array([camera.width / w, camera.height / h])
+    origin, directions = rays(matrix(camera.K), matrix(camera.world_from_cam), np.array(camera.distortion), place)
+    distance = np.full((h, w), np.inf)
+    distance[row, column] = occluder.distance(origin, directions)
+    far = np.where(np.isfinite(distance), distance, 1e9).astype(np.float32)
     jump = JUMP * shrunk / matrix(camera.K)[0, 0]
     uneven = cv2.dilate(far, window) - cv2.erode(far, window) > jump * far
-    solid = cv2.erode(cv2.resize(alpha, (w, h), interpolation=cv2.INTER_AREA), window) > MIN_ALPHA
     return np.where(solid & ~uneven & np.isfinite(distance), far, 0).astype(np.float32)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +17,7 @@ from pipeline.fields.protocol import F32, Material
 from pipeline.images import write_exr, write_png
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
-from pipeline.visibility import FittedPhoto
+from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake import detail, detail_kernels, detail_views
 from stages.bake.build import Baker, Photos
 from stages.bake.texels import ALBEDO_RANGE
@@ -197,7 +198,7 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
     nothing, zero = np.zeros((len(x), 3), np.float32), np.zeros((len(x), 3), np.int32)
     out, cosines = np.zeros((len(x), 3), np.float32), np.zeros(len(x), np.float32)
     detail_kernels.residual(
-        photos.cameras[0], photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
+        photos.cameras, 0, photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
         np.full_like(nothing, 10), out, cosines,
     )  # fmt: skip
     world_from_cam = matrix(c.world_from_cam)
@@ -209,6 +210,19 @@ def test_points_are_looked_up_where_the_camera_projects_them(scene: Scene, tmp_p
     assert np.allclose(cosines[seen], cosine[seen], atol=1e-5)
     assert np.abs(10 * out[seen, :2] * PIXELS - uv[seen]).max() < 0.02  # the square root's 16 bits
     assert seen[cosine > 0.5].all()
+
+
+def test_depth_inside_the_mask_is_that_of_all_rays(scene: Scene) -> None:
+    """Rays outside of the mask are not cast: the depths, and the edges that are left out, stay the same."""
+    view, occluder = FittedPhoto(CAMERAS[0], None), Occluder(scene.mesh)
+    alpha = np.zeros((PIXELS, PIXELS), np.float32)
+    whole = detail_views._depth(view, np.ones_like(alpha), occluder)
+    assert (whole > 0).any()
+    alpha[: PIXELS // 2 + 3, PIXELS // 2 - 5 :] = 1
+    found = detail_views._depth(view, alpha, occluder)
+    inside = cv2.erode(alpha, np.ones((3, 3), np.uint8)) > detail_views.MIN_ALPHA
+    np.testing.assert_array_equal(found, np.where(inside, whole, 0))
+    assert not detail_views._depth(view, np.zeros_like(alpha), occluder).any()
 
 
 def test_smoother_keeps_constants_and_has_its_width(scene: Scene) -> None:
@@ -265,7 +279,7 @@ def test_clipped_pixels_have_no_say(scene: Scene, tmp_path: Path) -> None:
         assert (photos.clipped.sum() == PIXELS / 2) if view is burnt else not len(photos.clipped)
         nothing, cosines = np.zeros((len(x), 3), np.float32), np.zeros(len(x), np.float32)
         detail_kernels.residual(
-            photos.cameras[0], photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
+            photos.cameras, 0, photos.pixels, photos.depth, photos.clipped, x, n, zero, nothing, nothing[:1], nothing,
             np.ones_like(nothing), np.zeros_like(nothing), cosines,
         )  # fmt: skip
         empty = np.zeros((1, len(x), 3), np.float32)

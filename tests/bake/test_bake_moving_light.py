@@ -102,7 +102,7 @@ def test_detail_is_found_under_a_light_that_moves(ball: Mesh, tmp_path: Path) ->
     left = np.sqrt(((added - freckles(x))[seen] ** 2).mean())
     plain = np.sqrt((freckles(x)[seen] ** 2).mean())
     assert left < 0.5 * plain
-    wrong, _ = detail.Detail(photos, found.gloss, found.low, np.zeros((0, 0, 3), np.float32)).added(points)
+    wrong, _ = detail.Detail(photos, found.gloss, found.bands, np.zeros((0, 0, 3), np.float32)).added(points)
     assert np.sqrt(((wrong - freckles(x))[seen] ** 2).mean()) > 1.3 * left
 
 

@@ -36,7 +36,8 @@ def looked(p: detail_views.Photos, albedo: float, shade: float = 1.0) -> tuple[n
     """Detail (3,) and weight of the point."""
     empty = np.zeros((len(p.cameras), 3, 3), F32)
     point = detail.Points(X, N, CORNER, WEIGHTS, np.full((1, 3), albedo, F32), np.full((1, 3), shade, F32))
-    added, weight = detail.Detail(p, empty, empty, np.zeros((0, 0, 3), F32)).added(point)
+    bands = np.zeros((3, len(p.cameras), 6), F32)
+    added, weight = detail.Detail(p, empty, bands, np.zeros((0, 0, 3), F32)).added(point)
     return added[0], float(weight[0])
 
 
@@ -47,7 +48,7 @@ def test_the_residual_is_the_photos_albedo_less_the_fields() -> None:
     albedo, shade = np.array([[0.2, 0.2, 0.1]], F32), np.array([[1.2, 0.8, 1.5]], F32)
     out, cosines = np.zeros((1, 3), F32), np.zeros(1, F32)
     detail_kernels.residual(
-        p.cameras[0], p.pixels, p.depth, p.clipped, X, N, CORNER, WEIGHTS, gloss, albedo, shade, out, cosines
+        p.cameras, 0, p.pixels, p.depth, p.clipped, X, N, CORNER, WEIGHTS, gloss, albedo, shade, out, cosines
     )
     np.testing.assert_allclose(out[0], (colour - WEIGHTS[0] @ gloss) / shade[0] - albedo[0], atol=1e-4)
     assert cosines[0] == 1
@@ -58,6 +59,49 @@ def test_a_photo_counts_by_the_fourth_power_of_its_resolution() -> None:
     distance, sharp = np.array([1.0, 2.0, 3.0, 1.0]), np.array([1.0, 1.0, 1.0, 0.5])
     weight = looked(photos(np.full((4, 3), 0.3), distance, sharp), 0.3)[1]
     assert weight == pytest.approx(float(((sharp / distance) ** 4).sum()), rel=1e-5)
+
+
+def test_the_photos_of_the_largest_weight_count_whatever_the_order() -> None:
+    """Against all weights sorted: twelve photos, two with one weight, one that does not see the point. The better they
+    are, the brighter, so that a wrong choice shows."""
+    rng = np.random.default_rng(2)
+    distance = rng.uniform(1, 2, 12)
+    distance[7] = distance[2]  # the same weight: the first of them is taken
+    p = photos(np.linspace(0.2, 0.4, 12)[:, None].repeat(3, 1), distance, np.ones(12))
+    best = int(np.argmin(distance))
+    p.depth[best * SIDE * SIDE : (best + 1) * SIDE * SIDE] = 0.0
+    weights = distance**-4
+    wanted = [v for v in np.lexsort((np.arange(12), -weights)) if v != best][: detail_kernels.MAX_PHOTOS]
+    for seed in range(6):
+        order = np.random.default_rng(seed).permutation(12)
+        chosen, places = np.empty(detail_kernels.MAX_PHOTOS), np.empty((detail_kernels.MAX_PHOTOS, 2))
+        views = np.empty(detail_kernels.MAX_PHOTOS, np.int64)
+        count = detail_kernels._best(p.cameras, order, p.depth, p.clipped, X, N, 0, chosen, views, places)
+        assert views[:count].tolist() == sorted(wanted)
+        np.testing.assert_allclose(chosen[:count], weights[sorted(wanted)], rtol=1e-12)
+    low, high = [v for v in range(12) if v != best][:2]
+    asked = np.array([high, best, low])
+    assert detail_kernels._best(p.cameras, asked, p.depth, p.clipped, X, N, 0, chosen, views, places) == 2
+    assert views[:2].tolist() == [low, high]
+
+
+def test_the_detail_does_not_depend_on_the_order_of_the_points() -> None:
+    rng = np.random.default_rng(6)
+    p = photos(rng.uniform(0.25, 0.35, (12, 3)), rng.uniform(1, 2, 12), np.ones(12))
+    x = np.concatenate([rng.uniform(-0.02, 0.02, (300, 2)), np.ones((300, 1))], 1)
+    corner, weights = np.tile(CORNER, (300, 1)), rng.dirichlet(np.ones(3), 300).astype(F32)
+    bands, flat = rng.normal(scale=0.01, size=(3, 12, 6)).astype(F32), np.full((300, 3), 0.3, F32)
+    found = []
+    for order in (np.arange(300), rng.permutation(300)):
+        out, support = np.zeros((300, 3), F32), np.zeros((300, 2), F32)
+        detail_kernels.fine(
+            p.cameras, p.pixels, p.depth, p.clipped, order, x, np.tile(N, (300, 1)), corner, weights, bands,
+            np.zeros((0, 0, 3), F32), flat, np.ones((300, 3), F32), out, support,
+        )  # fmt: skip
+        found.append((out, support))
+    assert (found[0][1][:, 0] > 0).sum() > 200
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_array_equal(found[0][1], found[1][1])
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.01, 0.03])
