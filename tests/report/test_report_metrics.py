@@ -101,6 +101,20 @@ def test_flip_is_zero_for_equal_images_and_grows() -> None:
     assert 0 < small < large <= 1
 
 
+@pytest.mark.parametrize("place", [(60, 70), (0, 0), (150, 0), (150, 200)])
+def test_flip_of_a_part_is_that_of_the_whole_picture(place: tuple[int, int]) -> None:
+    """A subject on black, in the middle and at the borders; and one pixel: the filters reach no further than asked."""
+    evaluate = pytest.importorskip("flip_evaluator").evaluate
+    rng, (row, column) = np.random.default_rng(8), place
+    for height, width in ((40, 30), (1, 1)):
+        images = np.zeros((2, 200, 240, 3), np.float32)
+        images[:, row : row + height, column : column + width] = rng.random((2, height, width, 3))
+        whole = evaluate(*images, "LDR", True, False)[0]
+        assert whole.max() > 0.05
+        assert flip(*images) == pytest.approx(float(whole.mean(dtype=np.float64)), rel=1e-6)
+    assert flip(np.zeros((20, 20, 3), np.float32), np.zeros((20, 20, 3), np.float32)) == 0
+
+
 def test_flip_is_left_out_where_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
