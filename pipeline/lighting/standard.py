@@ -24,7 +24,7 @@ import numpy.typing as npt
 from pipeline.lighting import ggx_kernels as kernels
 from pipeline.lighting.median_cut import Lamps
 from pipeline.maths import microfacet
-from pipeline.ray_casting import RayCaster
+from pipeline.ray_casting import RayCaster, neighbours_first
 from pipeline.thinning import thinned
 
 F32 = npt.NDArray[np.float32]
@@ -75,7 +75,7 @@ def _traced(
     which lamps are traced."""
     n = normals[own]
     caster = RayCaster(vertices, faces)
-    starts = vertices[own] + LIFT * caster.span * n
+    starts, order = vertices[own] + LIFT * caster.span * n, neighbours_first(vertices[own])
     flux = np.zeros((len(n), len(lit.directions), 3), np.float32)
     rows: list[Indices] = []
     lamps: list[Indices] = []
@@ -83,7 +83,7 @@ def _traced(
     for k, w in enumerate(lit.directions):
         if k % 32 == 0:
             check()
-        live = np.flatnonzero(n @ w > lowest)
+        live = order[(n @ w > lowest)[order]]
         face = caster.first_faces(starts[live], np.broadcast_to(w, (len(live), 3)))
         flux[live[face < 0], k] = lit.flux[k]
         rows, lamps, hit = [*rows, live[face >= 0]], [*lamps, np.full((face >= 0).sum(), k)], [*hit, face[face >= 0]]

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.lighting.median_cut import Lamps
-from pipeline.ray_casting import RayCaster
+from pipeline.ray_casting import RayCaster, neighbours_first
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -43,6 +43,7 @@ class Transport:
         self.normals = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
         self._caster = RayCaster(vertices, faces)
         self._starts = vertices + LIFT * self._caster.span * self.normals
+        self._order = neighbours_first(vertices)
         self._rays = rays
         self._reached: I32 | None = None
 
@@ -52,7 +53,7 @@ class Transport:
         for k, w in enumerate(directions):
             if k % 32 == 0:
                 check()
-            live = np.flatnonzero(self.normals @ w > GRAZING)
+            live = self._order[(self.normals @ w > GRAZING)[self._order]]
             out[live, k] = self._caster.first_faces(self._starts[live], np.broadcast_to(w, (len(live), 3))) < 0
         return out
 
@@ -85,7 +86,7 @@ class Transport:
             for j in range(self._rays):
                 x, y = radius[j] * np.cos(turn[j]), radius[j] * np.sin(turn[j])
                 w = x * across + y * along + np.sqrt(1 - radius[j] ** 2) * n
-                out[:, j] = self._caster.first_faces(self._starts, w)
+                out[self._order, j] = self._caster.first_faces(self._starts[self._order], w[self._order])
             self._reached = out
         return self._reached
 

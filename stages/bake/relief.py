@@ -30,6 +30,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.meshes import F32, F64, Mesh, area_vectors
+from pipeline.ray_casting import neighbours_first
 from pipeline.smoothing import Smoother
 from pipeline.tangents import any_across
 from pipeline.visibility import Occluder
@@ -86,6 +87,8 @@ def cavity(fine: F64, coarse: F64) -> F64:
 
 def thickness(points: F64, normals: F64, occluder: Occluder, step: Callable[[int, int], None]) -> F64:
     """(N,) metres, at points (N, 3) with outward unit normals (N, 3)."""
+    order = neighbours_first(points)
+    points, normals = points[order], normals[order]
     across = any_across(normals)
     along = np.cross(normals, across)
     lift = LIFT * occluder.span
@@ -98,4 +101,6 @@ def thickness(points: F64, normals: F64, occluder: Occluder, step: Callable[[int
         down = np.sqrt(1 - radius**2)
         w = radius * np.cos(turn) * across + radius * np.sin(turn) * along - down * normals
         total += np.minimum(occluder.distances(start, w) + lift / down, FAR)
-    return np.asarray(total / RAYS)
+    out = np.empty(len(points))
+    out[order] = total / RAYS
+    return out

@@ -17,7 +17,7 @@ from pipeline.colour import srgb_from_linear
 
 F32 = npt.NDArray[np.float32]
 EQUAL = 100.0  # dB for equal images, in place of infinity
-FLIP_REACH = 16  # pixels: its filters end after 10 at its standard distance of the eye
+FLIP_REACH = 16  # pixels: a difference reaches 5 pixels at its standard distance of the eye
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import pytest
 from support.ball_head import RADIUS, ball_scan
 
 from pipeline import ray_casting
-from pipeline.ray_casting import RayCaster
+from pipeline.ray_casting import RayCaster, neighbours_first
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 1001])
@@ -53,3 +53,15 @@ def test_casters_of_equal_meshes_share_a_scene_and_others_do_not() -> None:
     held = weakref.ref(first._scene)
     del first, again
     assert held() is None  # nothing keeps a scene that no caster uses
+
+
+@pytest.mark.parametrize("count", [0, 1, 700])
+def test_neighbours_come_one_after_the_other(count: int) -> None:
+    """Every point once; and steps along the order are far shorter than those between points as they come."""
+    points = np.random.default_rng(9).normal(size=(count, 3))
+    order = neighbours_first(points)
+    assert np.array_equal(np.sort(order), np.arange(count))
+    if count > 1:
+        step, plain = (np.linalg.norm(np.diff(p, axis=0), axis=1).mean() for p in (points[order], points))
+        assert step < plain / 3
+    assert np.array_equal(neighbours_first(np.zeros((5, 3))), np.arange(5))
