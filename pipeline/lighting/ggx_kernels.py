@@ -30,6 +30,7 @@ ONE, ZERO, HALF, TWO = np.float32(1), np.float32(0), np.float32(0.5), np.float32
 PI = np.float32(np.pi)
 SMOOTH = np.float32(1)
 MOST = np.float32(4)
+BLOCK = 256  # observations of one task of a thread
 LEAST_COSINE = np.float32(1e-3)  # of n.v: the masking's limit at 0 is finite, its terms are not
 
 
@@ -101,34 +102,48 @@ def _totals(plain, rim, light):
 
 
 @njit(parallel=True, error_model="numpy", cache=True)
-def lobes(vertex, normal, wo, arriving, lamp, alphas, share, out):
+def lobes(order, vertex, normal, wo, arriving, lamp, alphas, share, out):
     """Write the specular radiance of each of M observations for K widths, in two parts: out (M, K, 2, 3), such that the
     layer of F0 reflects F0 out[:, :, 0] + out[:, :, 1].
 
-    vertex (M,); normal, wo (M, 3) unit; arriving (V, N, 3) flux of each lamp at the vertices; lamp (5, N): direction,
-    spread, solid angle; alphas (K,); share (2, M, K): a and b. All float32.
+    order (M,): the observations; those of one vertex with one normal, one after the other, share what arrives there.
+    The result does not depend on it. vertex (M,); normal, wo (M, 3) unit; arriving (V, N, 3) flux of each lamp at the
+    vertices; lamp (5, N): direction, spread, solid angle; alphas (K,); share (2, M, K): a and b. All float32.
     """
+    for block in prange((len(order) + BLOCK - 1) // BLOCK):
+        some = order[block * BLOCK : min((block + 1) * BLOCK, len(order))]
+        _lobes(some, vertex, normal, wo, arriving, lamp, alphas, share, out)
+
+
+@njit(error_model="numpy", cache=True)
+def _lobes(some, vertex, normal, wo, arriving, lamp, alphas, share, out):
+    """A block of `lobes`."""
     count = lamp.shape[1]
-    for m in prange(len(vertex)):
-        own = arriving[vertex[m]]
+    room, which = np.empty((11, count + 1), np.float32), np.empty(count + 1, np.int64)
+    cosine, spread, nh, hv, fresnel = room[0], room[1], room[2], room[3], room[4]
+    lx, ly, lz, every = room[5], room[6], room[7], room[8, :count]
+    light = np.empty((count, 4), np.float32)
+    lit, last = 0, -1
+    for at in range(len(some)):
+        m = some[at]
+        nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
+        same = last >= 0 and vertex[m] == vertex[last]
+        if not (same and nx == normal[last, 0] and ny == normal[last, 1] and nz == normal[last, 2]):
+            _cosines(nx, ny, nz, lamp, every)
+            lit = _above(every, which, cosine)
+            v = vertex[m]
+            for j in range(lit):
+                i = which[j]
+                lx[j], ly[j], lz[j], spread[j] = lamp[0, i], lamp[1, i], lamp[2, i], lamp[3, i]
+                for c in range(3):
+                    light[j, c] = arriving[v, i, c]
+                light[j, 3] = lamp[4, i]
+        last = m
         vx, vy, vz = wo[m, 0], wo[m, 1], wo[m, 2]
-        nv = max(normal[m, 0] * vx + normal[m, 1] * vy + normal[m, 2] * vz, LEAST_COSINE)
-        every, which, cosine = (
-            np.empty(count, np.float32),
-            np.empty(count + 1, np.int64),
-            np.empty(count + 1, np.float32),
-        )
-        _cosines(normal[m, 0], normal[m, 1], normal[m, 2], lamp, every)
-        lit = _above(every, which, cosine)
-        nh, hv, fresnel = np.empty(lit, np.float32), np.empty(lit, np.float32), np.empty(lit, np.float32)
-        spread, light = np.empty(lit, np.float32), np.empty((lit, 4), np.float32)
+        nv = max(nx * vx + ny * vy + nz * vz, LEAST_COSINE)
         for j in range(lit):
-            i = which[j]
-            lv = vx * lamp[0, i] + vy * lamp[1, i] + vz * lamp[2, i]
-            nh[j], hv[j], fresnel[j] = _half(cosine[j], nv, lv)
-            spread[j] = lamp[3, i]
-            light[j, 0], light[j, 1], light[j, 2], light[j, 3] = own[i, 0], own[i, 1], own[i, 2], lamp[4, i]
-        plain, rim = np.empty(lit, np.float32), np.empty(lit, np.float32)
+            nh[j], hv[j], fresnel[j] = _half(cosine[j], nv, vx * lx[j] + vy * ly[j] + vz * lz[j])
+        plain, rim = room[9, :lit], room[10, :lit]
         for k in range(len(alphas)):
             _parts(cosine, nv, nh, hv, fresnel, alphas[k] * alphas[k], spread, plain, rim)
             p0, p1, p2, c0, c1, c2, ps, cs = _totals(plain, rim, light)

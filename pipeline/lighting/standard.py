@@ -114,7 +114,8 @@ def lobes(at: Arrivals, vertex: npt.NDArray[np.int64], normal: F64, wo: F64, alp
     """(M, K, 2, 3) specular radiance of M observations at vertices, for K widths: F0 [:, :, 0] + [:, :, 1]."""
     out = np.empty((len(vertex), len(alphas), 2, 3), np.float32)
     share = shares((normal * wo).sum(1)[:, None], np.asarray(alphas)[None])
-    kernels.lobes(vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), _f32(share), out)
+    order = np.argsort(vertex, kind="stable")
+    kernels.lobes(order, vertex, _f32(normal), _f32(wo), at.flux, at.lamp, _f32(alphas), _f32(share), out)
     return out
 
 

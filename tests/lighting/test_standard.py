@@ -215,3 +215,22 @@ def test_blocked_lamps_send_what_leaves_the_wall() -> None:
 
 def test_solid_angles_of_the_lamps_fill_the_sphere() -> None:
     assert lamps(sky(64), 50).solid.sum() == pytest.approx(4 * np.pi, rel=1e-5)
+
+
+def test_observations_of_one_vertex_share_what_arrives_and_nothing_else() -> None:
+    """All at once, in any order, as each alone: vertices that come again with the same normal and with another one."""
+    rng = np.random.default_rng(11)
+    lit, count = lamps(sky(64), 32), 40
+    flux = rng.random((4, len(lit.directions), 3)).astype(np.float32)
+    at = standard.Arrivals(flux, standard.table(lit), np.zeros((4, 3), np.float32))
+    vertex, normals = rng.integers(0, 4, count), rng.normal(size=(2, 4, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normal = normals[rng.integers(0, 2, count), vertex]
+    wo = normal + 0.5 * normals[0, 0]
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    alphas = np.array([0.1, 0.4], np.float32)
+    found = standard.lobes(at, vertex, normal, wo, alphas)
+    for m in range(count):
+        one = slice(m, m + 1)
+        np.testing.assert_array_equal(standard.lobes(at, vertex[one], normal[one], wo[one], alphas)[0], found[m])
+    assert found.min() >= 0 and found.max() > 0
