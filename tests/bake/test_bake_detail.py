@@ -14,7 +14,7 @@ import trimesh
 from pipeline import raster, smoothing
 from pipeline.artifacts import Camera
 from pipeline.fields.protocol import F32, Material
-from pipeline.images import write_exr, write_png
+from pipeline.images import linear_of, write_exr, write_png
 from pipeline.meshes import F64, Charts, Mesh
 from pipeline.transforms import inverse_rigid, matrix, pixel_centres, project, rays, rows
 from pipeline.visibility import FittedPhoto, Occluder
@@ -223,6 +223,19 @@ def test_depth_inside_the_mask_is_that_of_all_rays(scene: Scene) -> None:
     inside = cv2.erode(alpha, np.ones((3, 3), np.uint8)) > detail_views.MIN_ALPHA
     np.testing.assert_array_equal(found, np.where(inside, whole, 0))
     assert not detail_views._depth(view, np.zeros_like(alpha), occluder).any()
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_codes_of_levels_are_those_of_pixels(channels: int) -> None:
+    """8-bit photos are coded level by level; a photo of the same values in 16 bits pixel by pixel."""
+    stored = np.random.default_rng(1).integers(3, 240, (20, 30, channels)).astype(np.uint8)
+    codes, peak, shape = detail_views._coded_photo(stored, 1)
+    wanted, other, again = detail_views._coded_photo(stored.astype(np.uint16) * 257, 1)
+    assert shape == again == (20, 30, 3) and peak == pytest.approx(other, rel=1e-6)
+    assert np.abs(codes.astype(int) - wanted).max() <= 1 and codes.max() == 65535
+    linear = linear_of(stored)
+    np.testing.assert_array_equal(codes, detail_views._coded(linear, float(linear.max())).reshape(-1, 3))
+    assert not detail_views._coded_photo(np.zeros_like(stored), 1)[0].any()
 
 
 def test_smoother_keeps_constants_and_has_its_width(scene: Scene) -> None:
