@@ -16,15 +16,28 @@ from pipeline.transforms import F64, pixel_centres
 from stages.reflectance.field import Field, Lamp, distant_lamp
 
 SAMPLES = 2  # rays along each side of a pixel
+BAND = 1_000_000  # rays that are traced at a time
 QUICK, FULL = 64, 384  # lamps of an environment
 
 
 def look_up(field: Field, camera: PinholeCamera, samples: int = SAMPLES) -> Any:
-    """Sparse (H W, T) matrix from texels to pixels. Its rows sum to the share of a pixel that the mesh covers."""
+    """Sparse (H W, T) matrix from texels to pixels. Its rows sum to the share of a pixel that the mesh covers. Made in
+    bands of rows, because the rays of a large picture would take gigabytes."""
+    from scipy.sparse import vstack
+
+    rows = max(1, BAND // (camera.width * samples**2))
+    bands = [_band(field, camera, samples, first, min(first + rows, camera.height))
+             for first in range(0, camera.height, rows)]  # fmt: skip
+    return bands[0] if len(bands) == 1 else vstack(bands, format="csr")
+
+
+def _band(field: Field, camera: PinholeCamera, samples: int, first: int, last: int) -> Any:
+    """The rows of `look_up` of the pixels in rows first ... last - 1 of the picture."""
     from scipy.sparse import csr_array
 
     fine = camera.scaled(camera.width * samples)
-    origin, rays = fine.rays(pixel_centres(fine.width, fine.height))
+    centres = pixel_centres(fine.width, (last - first) * samples) + (0, first * samples)
+    origin, rays = fine.rays(centres)
     far, face = field.whole.hits(np.broadcast_to(origin, rays.shape), rays)
     hit = np.flatnonzero(face >= 0)
     at, face = origin + far[hit, None] * rays[hit], face[hit]
@@ -43,7 +56,7 @@ def look_up(field: Field, camera: PinholeCamera, samples: int = SAMPLES) -> Any:
             rows.append(pixel)
             columns.append(field.nearest[row * size + column])
             weights.append(share / samples**2)
-    shape = (camera.width * camera.height, len(field.known))
+    shape = (camera.width * (last - first), len(field.known))
     return csr_array((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
 
 

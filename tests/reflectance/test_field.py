@@ -18,7 +18,7 @@ from pipeline.images import read_encoded, read_linear, write_exr
 from pipeline.transforms import rows
 from stages.capture import stage as capture_stage
 from stages.capture.scan import scan_capture
-from stages.reflectance import stage
+from stages.reflectance import relight, stage
 from stages.reflectance.evidence import fewer_lamps
 from stages.reflectance.field import Field, Lamp, centre_of, distant_lamp, load, save
 from stages.reflectance.fill import harmonic
@@ -102,6 +102,17 @@ def test_a_matt_ball_is_lamberts() -> None:
     expected = expected * lamp.strength * (away @ -lamp.axis) / np.linalg.norm(away) / (away @ away)
     np.testing.assert_allclose(made[SIZE // 2, SIZE // 2, :3], expected, rtol=0.02)
     assert made[2, 2].sum() == 0 and made[SIZE // 2, SIZE // 2, 3] == pytest.approx(1)
+
+
+def test_a_picture_in_bands_is_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the last bit; the last band is lower than the others."""
+    field, view = field_of(np.array([0.5, 0.4, 0.3])), camera(20)
+    whole = look_up(field, view)
+    monkeypatch.setattr(relight, "BAND", 4 * SIZE * 7)
+    parts = look_up(field, view)
+    assert SIZE % 7 and whole.shape == parts.shape and whole.nnz == parts.nnz > 1000
+    for one, other in ((whole.data, parts.data), (whole.indices, parts.indices), (whole.indptr, parts.indptr)):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_lamps_add_up_and_far_lamps_are_distant_ones() -> None:
