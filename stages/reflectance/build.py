@@ -39,6 +39,7 @@ from stages.reflectance.reshape import reshaped
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.samples import Step, gather
 from stages.reflectance.score import Score, decibels, score
+from stages.reflectance.sidecar import write_sidecar
 from stages.reflectance.split import Fitted, chosen_widths, split
 from stages.reflectance.texels import Pairs, Points, arriving_of_all, known_surface, pairs_of, points_of
 
@@ -97,7 +98,7 @@ def build(
     )
     motion = {str(f): rows(m.round(9)) for f, m in sorted(at.items())}
     record = {"lights": rig.index, "left_out": [whole.index[i] for i in left_out], "motion": motion}
-    save(field, context.workdir / FOLDER, record)
+    save(field, context.workdir / FOLDER, record | write_sidecar(field, context.workdir / FOLDER))
     write_rest(context.workdir / FOLDER / REST, mesh, charts)
     figures = _figures(field, parts, points, pairs, six) | {"moved_mm": _moved(given, mesh)}
     shots = _pictures(capture, stage, whole)

@@ -159,9 +159,11 @@ def save(field: Field, folder: Path, basis: dict[str, Any]) -> list[str]:
     """Write a field. basis: more entries of basis.json. Returns the files' names."""
     folder.mkdir(parents=True, exist_ok=True)
     near = field.nearest
+    channels_of = dict(basis.get("channels", {}))
     for name, values in field.arrays.items():
         channels = values.shape[1]
         names = None if channels in (1, 3) and name in ("albedo", "coverage") else _names(channels)
+        channels_of[name] = list(names or ("RGB" if channels == 3 else "Y"))
         picture = values.astype(np.float32)[near].reshape(field.points.size, field.points.size, channels)
         write_exr(folder / f"{name}.exr", picture, names, half=True)
     meshes.save(folder / MESH, field.mesh, field.charts)
@@ -169,6 +171,7 @@ def save(field: Field, folder: Path, basis: dict[str, Any]) -> list[str]:
         "size": field.points.size, "alphas": list(field.alphas), "harmonics_order": field.order,
         "kernel_degrees": KERNEL, "unknown": UNKNOWN,
         "centre": field.centre.tolist(), "towards": field.towards.tolist(), **basis,
+        "channels": channels_of,
     }  # fmt: skip
     (folder / BASIS).write_text(json.dumps(content, indent=1) + "\n")
     return [f"{n}.exr" for n in field.arrays] + [MESH, BASIS]

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 RISE = 24.0  # (1 - F0) / F0 of skin's and cornea's F0 of about .04
+LOW = 0.02  # n.l is not taken below in the lobe: its shadowing would divide by it
 FLAT = 0.05  # n.v of a texel is not taken below: there its own normal is not known well enough
 
 
@@ -54,7 +55,7 @@ def specular(weights, alphas, nl, nv, nh, vh):
     """sum_j s_j lobe_j n.l; 0 for n.l <= 0."""
     if nl <= 0:
         return 0.0
-    nl, nv = max(nl, 0.02), max(nv, FLAT)
+    nl, nv = max(nl, LOW), max(nv, FLAT)
     total = 0.0
     for j in range(len(alphas)):
         total += weights[j] * lobe(alphas[j], nl, nv, nh, vh)

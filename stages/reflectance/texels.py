@@ -19,6 +19,7 @@ LIFT = 1e-3  # asset units (metres): rays start this far above the surface
 AROUND = 1.2e-3  # the photos' blur: a texel this near to an edge of the silhouette shows what lies behind
 GRAZING, MARGIN = 0.15, 2.0  # least n.v of a texel; pixels at the frame's border that are not used
 DISC, RAYS = 0.016, 3  # lamps have an extent: shadows are traced to this many points on a ring of that radius
+TURN = 0.4  # radians: the first of them
 BEHIND = -0.1  # least n.l of a texel whose shadow is traced
 
 
@@ -122,7 +123,7 @@ def arriving(points: Points, caster: RayCaster, target: F64, axis: F64 | None, r
     across /= np.linalg.norm(across)
     along = np.cross(axis, across)
     for k in range(rays):
-        turn = 2 * np.pi * k / rays + 0.4
+        turn = 2 * np.pi * k / rays + TURN
         on_disc = target + DISC * (np.cos(turn) * across + np.sin(turn) * along)
         out[live] += (caster.first_faces(start, unit(on_disc - start)) < 0).astype(np.float32) / rays
     return out
