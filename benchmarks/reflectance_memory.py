@@ -1,6 +1,6 @@
 """Peak memory of the reflectance stage on a made-up light stage, by size of its photos.
 
-    python -m benchmarks.reflectance_memory FOLDER --side 2048 --cameras 2 --lights 16 --size 512
+    python -m benchmarks.reflectance_memory FOLDER --side 2048 --cameras 3 --lights 16 --size 512
 
 Photos are those of tests/support/light_stage.py, a ball, enlarged to `side` pixels: what is in them hardly matters for
 the memory. They are made and imported by a process of its own. Prints the peak at the end of each step, and the
@@ -27,7 +27,7 @@ def main() -> None:
     """One case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    for name, value in (("side", 1024), ("cameras", 2), ("lights", 16), ("size", 512)):
+    for name, value in (("side", 1024), ("cameras", 3), ("lights", 16), ("size", 512)):
         parser.add_argument(f"--{name}", type=int, default=value)
     parser.add_argument("--prepare", action="store_true", help="only make and import the photos")
     asked = parser.parse_args()
