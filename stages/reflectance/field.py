@@ -11,7 +11,7 @@
     mesh.npz       the mesh with its charts (the maps' surface, and what throws shadows)
     basis.json     lights, widths of the lobes, order of the harmonics, kernel of the shadows
 
-docs/reflectance.md says how to evaluate it.
+sidecar.py writes more files, for shaders elsewhere; docs/field_look.md says how to evaluate the field.
 """
 
 from __future__ import annotations

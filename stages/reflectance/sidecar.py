@@ -1,4 +1,4 @@
-"""What a shader outside of this project needs beside the field's maps. docs/reflectance.md has such a shader.
+"""What a shader outside of this project needs beside the field's maps. docs/field_look.md has such a shader.
 
 surface.exr    c0 ... c5    position (metres) and normal of the mesh, asset coordinates, 32 bits
 blocker.obj                 the triangles that throw shadows: those that a camera saw

@@ -13,6 +13,7 @@ from pathlib import Path
 from stages.usd.texture_names import DEFAULT, pattern_of, texture_name
 
 TEXTURES, INTERNAL = "textures", "internal"
+FIELD = "reflectance_field"  # of a light stage: measured maps for a shader of its own
 LIGHT = f"{INTERNAL}/light.json"
 OLD_LIGHT = "light.json"  # where it was in assets of older versions
 # Maps of standard shaders, by their name without the asset's.

@@ -24,6 +24,7 @@ from pipeline.artifacts import (
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.head_artifacts import RegisteredHead
+from pipeline.reflectance_artifacts import ReflectanceField
 from stages.usd.config import Config as Config
 
 
@@ -38,6 +39,7 @@ class Inputs:
     inverse_rendering: Located[FittedFace]
     poses: Located[CameraSet]
     capture: Located[Capture]
+    reflectance: Located[ReflectanceField]
     masks: Located[MaskSet]  # for its findings: the verdict is written into the asset
 
 
@@ -62,6 +64,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> UsdAsset:
         inputs.poses,
         inputs.capture,
         inputs.template,
+        inputs.reflectance,
         config,
         context.workdir / "asset",
         context.check,
@@ -138,4 +141,4 @@ def _refs(context: Context, files: list[Path]) -> list[FileRef]:
     return [context.file(f) for f in files]
 
 
-STAGE = Stage(name="usd", version=25, inputs=Inputs, config=Config, output=UsdAsset, run=run)
+STAGE = Stage(name="usd", version=26, inputs=Inputs, config=Config, output=UsdAsset, run=run)

@@ -26,6 +26,7 @@ from pipeline.artifacts import (
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr, write_png, write_png_from_linear
+from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.transforms import rows
 
 RADIUS = 0.12
@@ -44,6 +45,7 @@ class SyntheticInputs:
     poses: Located[CameraSet]
     capture: Located[Capture]
     masks: Located[MaskSet]
+    reflectance: Located[ReflectanceField] = Located(ReflectanceField(present=False), Path())
 
 
 def ball(columns: int = 64, rings: int = 32, height: float = 1.25) -> dict[str, np.ndarray]:

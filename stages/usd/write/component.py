@@ -16,6 +16,8 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdMedia, UsdSkel, Vt
 
 from pipeline.meshes import Mask
 from stages.usd.write.cage import TemplateMesh, write_cage
+from stages.usd.write.field_files import FieldLook
+from stages.usd.write.field_look import write_field_look
 from stages.usd.write.mesh import UvSurface, faces_of, tile_count
 from stages.usd.write.pieces import bind_pieces, grouped, pieces, together
 from stages.usd.write.rig import RIG, MeshRig, bind, with_head, write_skeleton
@@ -103,6 +105,7 @@ def root_layer(
     thumbnail: str | None,
     beside: tuple[str, ...] = (),
     scan: Sequence[TileMaterial] = (),
+    field: FieldLook | None = None,
 ) -> Sdf.Layer:
     """NAME.usd: the file that scenes reference. `extents`: the box of each purpose, shown while it is not loaded.
     high: names of the dense mesh's materials, none without it. beside: names of the meshes beside the template. scan:
@@ -119,6 +122,8 @@ def root_layer(
         previews.SetDefaultThumbnails(UsdMedia.AssetPreviewsAPI.Thumbnails(Sdf.AssetPath(thumbnail)))
     shown = [*materials, *scan]
     write_looks(stage, prim, look, skins(shown), scattering(shown) if look.subsurface else ())
+    if field is not None:
+        write_field_look(stage, prim, skins([m for m in materials if m.tile == 0]), field)
     write_levels(stage, prim, beside=beside, scan=bool(scan), high=high, proxy=proxy)
     if look.displacement:
         without_displacement(stage, prim, look, skins([m for m in materials if m.displaced]))

@@ -19,12 +19,14 @@ from pipeline.fitted_cameras import cameras_of
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr
 from pipeline.lighting.dome import environment, environment_figures, light_json, read_light, read_moving
+from pipeline.reflectance_artifacts import ReflectanceField
 from stages.usd.config import Config
 from stages.usd.layout import LIGHT
 from stages.usd.texture_names import check_apart, keep_pattern
 from stages.usd.write import component
 from stages.usd.write.cage import template_mesh, with_rest
 from stages.usd.write.dense import coarser
+from stages.usd.write.field_files import write_field
 from stages.usd.write.gltf import write_glb
 from stages.usd.write.lookdev import lookdev_layer
 from stages.usd.write.maps import Maps, write_maps
@@ -60,6 +62,7 @@ def export(
     poses: Located[CameraSet],
     capture: Located[Capture],
     template: Located[RegisteredHead],
+    reflectance: Located[ReflectanceField],
     config: Config,
     folder: Path,
     check: Callable[[], None],
@@ -93,6 +96,8 @@ def export(
         scatters=scatters,
     )  # fmt: skip
     written, look = maps.written + names, maps.look
+    sidecar, field = write_field(reflectance, name, folder)
+    written += sidecar
     scan = _scan(uv, bake, light, config, folder, check, scatters=scatters)
     written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
@@ -113,6 +118,7 @@ def export(
                 thumbnail=THUMBNAIL,
                 beside=() if head is None else head.beside(),
                 scan=() if scan is None else tile_materials(scan[0], SCAN_MATERIAL),
+                field=field,
             ),
             "usda",
         ),
