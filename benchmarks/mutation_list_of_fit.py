@@ -187,7 +187,7 @@ OF_FIT = (
              "tests/bake/test_detail_kernels.py"),
     Mutation("stages/bake/detail_kernels.py", "w = cosine * cameras[v, 40] / distance",
              "w = cosine * cameras[v, 40] * distance", "tests/bake/test_detail_kernels.py"),
-    Mutation("stages/bake/detail_views.py", "np.sqrt(photo.clip(0) / peak)", "(photo.clip(0) / peak)",
+    Mutation("stages/bake/detail_views.py", "np.sqrt(linear.clip(0) / peak)", "(linear.clip(0) / peak)",
              "tests/bake/test_bake_detail.py::test_points_are_looked_up_where_the_camera_projects_them"),
     Mutation("stages/bake/detail_views.py", "np.linalg.inv(response).ravel()", "response.ravel()",
              "tests/bake/test_detail_kernels.py"),
