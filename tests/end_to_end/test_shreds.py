@@ -64,7 +64,17 @@ def test_a_shredded_surface_becomes_an_asset(noise: float, tmp_path: Path, monke
         context("bake"),
     )
     asset = usd.run(
-        usd.Inputs(surface, no_head(surface.folder), at_uv, Located(maps, folders["bake"]), face, rig, capture, masks),
+        usd.Inputs(
+            surface,
+            no_head(surface.folder),
+            at_uv,
+            Located(maps, folders["bake"]),
+            face,
+            rig,
+            capture,
+            no_field(surface.folder),
+            masks,
+        ),  # fmt: skip
         usd.Config(preview_size=64, environment_width=64, samples=1),
         context("usd"),
     )
