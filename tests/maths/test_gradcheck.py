@@ -119,7 +119,13 @@ WITHOUT = {
 }
 
 
-NUMPY = {"latlong", "microfacet", "rigid_motion", "studio_lights"}  # beside the fit: nothing is differentiated there
+NUMPY = {  # beside the fit: nothing is differentiated there
+    "latlong",
+    "microfacet",
+    "rigid_motion",
+    "sh_monomials",
+    "studio_lights",
+}
 
 
 @pytest.mark.parametrize("name", CASES)
