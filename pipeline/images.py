@@ -113,11 +113,16 @@ def read_linear(path: Path) -> F32:
 
 def linear_of(stored: npt.NDArray[Any]) -> F32:
     """The same of a file's decoded pixels (H, W, C)."""
-    rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
+    rgb = rgb_of(stored)
     if not np.issubdtype(rgb.dtype, np.integer):
         return rgb.astype(np.float32)
     out: F32 = linear_levels(rgb.dtype)[rgb]
     return out
+
+
+def rgb_of(stored: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(H, W, 3) colours of a picture as it is stored, (H, W, C): grey three times, and without alpha."""
+    return np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
 
 
 def linear_levels(kind: np.dtype[Any]) -> F32:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.images import linear_levels, linear_of, read_alpha, read_encoded, read_linear, shrink_whole
+from pipeline.images import linear_levels, linear_of, read_alpha, read_encoded, read_linear, rgb_of, shrink_whole
 from pipeline.meshes import F32, F64, Mask, Mesh
 from pipeline.threads import side_by_side
 from pipeline.transforms import inverse_rigid, matrix, rays
@@ -120,7 +120,7 @@ def _coded_photo(stored: npt.NDArray[Any], factor: int) -> tuple[U16, float, tup
         photo = shrink_whole(linear_of(stored), factor)
         peak = max(float(photo.max()), 1e-6)
         return _coded(photo, peak).reshape(-1, 3), peak, photo.shape
-    rgb = np.repeat(stored, 3, axis=2) if stored.shape[2] == 1 else stored[..., :3]
+    rgb = rgb_of(stored)
     levels = linear_levels(rgb.dtype)
     peak = max(float(levels[rgb.max()]), 1e-6)
     return _coded(levels, peak)[rgb].reshape(-1, 3), peak, rgb.shape

@@ -123,7 +123,7 @@ def trimap(inside: Bool, opinion: Opinion, *, filled: bool) -> np.typing.NDArray
     # a mask without most of the subject is not used outside of the region of interest either
     lost = (inside & opinion.silhouette).sum() < 0.3 * opinion.silhouette.sum()
     here = np.ones_like(inside) if lost else opinion.here
-    full = opinion.silhouette & (inside if not filled else True)
+    full = opinion.silhouette if filled else opinion.silhouette & inside
     out[here & ~clear & ~empty] = np.where(full, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[here & ~clear & ~empty]
     agreed = here & ~clear & ~empty & near  # undecided by both: the view's own contour is the better start
     out[agreed] = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD)[agreed]

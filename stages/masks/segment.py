@@ -340,7 +340,7 @@ def _dropped(masked: list[Masked], warnings: list[str]) -> list[int]:
             out.append(m.view.index)
             why = "is empty or full" if m.useless else f"has IoU {m.iou:.2f} with the other views' hull"
             warnings.append(f"{name} is not fitted: its mask {why} (median IoU {median:.2f})")
-        elif m.view.holdout and (m.useless or (m.iou is not None and m.iou < MIN_AGREEMENT)):
+        elif (m.view.holdout and m.useless) or _wrong_held_out(m):
             warnings.append(f"{name} is held out and its mask may be wrong: IoU {m.iou or 0:.2f} with the fitted "
                             f"views' hull (median {median:.2f})")  # fmt: skip
     _enough(sum(not m.view.holdout for m in masked) - len(out), len(masked), warnings)

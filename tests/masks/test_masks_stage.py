@@ -324,11 +324,9 @@ def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
     def made(lacks: bool) -> Any:
         def mask(view: PhotoToMask, *_: Any) -> tuple[F32, str]:
             alpha = ball_alpha(scene.cameras[view.index])
-            if view.index not in (2, 7):
-                return alpha, "grabcut"
-            return np.where(
-                lacks & (x > 0), np.float32(0), np.where(chair & (not lacks), np.float32(1), alpha)
-            ), "grabcut"
+            if view.index in (2, 7):
+                alpha = np.where(x > 0, np.float32(0), alpha) if lacks else np.where(chair, np.float32(1), alpha)
+            return alpha, "grabcut"
 
         return mask
 

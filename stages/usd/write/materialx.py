@@ -74,7 +74,7 @@ def materialx_networks(stage: Usd.Stage, material: UsdShade.Material, look: Look
         _surface(stage, f"{path}/openpbr", look, basis=False)
         if look.subsurface:
             made.append(SCATTERS)
-            _scatter(stage, f"{path}/{SCATTERS}", look)
+            _surface(stage, f"{path}/{SCATTERS}", look, basis=False, scatters=True)
     if look.roughness and look.coefficients and look.inv_kappa:
         made.append("neuface_basis")
         _surface(stage, f"{path}/neuface_basis", look, basis=True)
@@ -123,12 +123,13 @@ def _displacement(stage: Usd.Stage, path: str, file: str) -> UsdShade.Shader:
     return out
 
 
-def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
+def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool, scatters: bool = False) -> None:
     nodes = _Nodes(stage, path)
     surface = shader(stage, f"{path}/surface", SURFACE)
     surface.CreateInput("base_weight", T.Float).Set(1.0)
     colour = (look.neuface_albedo, SRGB) if basis and look.neuface_albedo else look.base()
-    connect(surface.CreateInput("base_color", T.Color3f), nodes.image("albedo", "color3", T.Color3f, *colour))
+    albedo = nodes.image("albedo", "color3", T.Color3f, *colour)
+    connect(surface.CreateInput("base_color", T.Color3f), albedo)
     roughness = nodes.image("roughness", "float", T.Float, str(look.roughness), DATA)
     connect(surface.CreateInput("specular_roughness", T.Float), roughness)
     surface.CreateInput("specular_ior", T.Float).Set(REFERENCE_IOR)
@@ -144,16 +145,15 @@ def _surface(stage: Usd.Stage, path: str, look: Look, *, basis: bool) -> None:
             "weight", "ND_multiply_float", T.Float, in1=bounded, in2=(T.Float, round(1 / REFERENCE_F0, 6))
         )
         connect(surface.CreateInput("specular_weight", T.Float), weight)
+    if scatters:
+        _scatter(surface, nodes, look, albedo)
     surface.CreateOutput("out", T.Token)
 
 
-def _scatter(stage: Usd.Stage, path: str, look: Look) -> None:
-    """The network `openpbr` whose base scatters where the map says so."""
-    _surface(stage, path, look, basis=False)
-    surface = UsdShade.Shader.Get(stage, f"{path}/surface")
-    weight = _Nodes(stage, path).image("scatters", "float", T.Float, str(look.subsurface), DATA)
+def _scatter(surface: UsdShade.Shader, nodes: _Nodes, look: Look, albedo: UsdShade.Output) -> None:
+    """Let the base scatter where the map says so."""
+    weight = nodes.image("scatters", "float", T.Float, str(look.subsurface), DATA)
     connect(surface.CreateInput("subsurface_weight", T.Float), weight)
-    albedo = UsdShade.Shader.Get(stage, f"{path}/albedo").GetOutput("out")
     connect(surface.CreateInput("subsurface_color", T.Color3f), albedo)
     radius, scale = radius_and_scale()
     surface.CreateInput("subsurface_radius", T.Float).Set(radius)

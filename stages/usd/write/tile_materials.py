@@ -96,11 +96,11 @@ def write_materials(
 ) -> Made:
     """Author the materials below a scope. hair: the look of HAIR. across: tiles that the texture coordinates have in
     the unit square."""
-    made = {}
+    made, skin = {}, scattering(materials)
     for m in materials:
         own = hair if m.name == HAIR and hair is not None else look if m.displaced else replace(look, displacement=None)
         path, part = f"{scope}/{m.name}", Part(m.tile, across)
-        if m.name not in scattering(materials):
+        if m.name not in skin:
             own = replace(own, subsurface=None)
         if m.eyes:
             made[m] = eye_material(stage, path, own, part)
