@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from pipeline.fields import kernels
+from pipeline.maths import cuda_kernels
 
 nb: Any = kernels.nb
 
@@ -55,7 +56,8 @@ class HashEncoding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Features (N, 2 L) at x (N, 3), differentiable in the table and in x."""
-        out: Tensor = _Hash.apply(x, self.table, self) if kernels.compiled(x) else self.reference(x)  # type: ignore[no-untyped-call]
+        fast = kernels.compiled(x) or cuda_kernels.usable(x, self.table)
+        out: Tensor = _Hash.apply(x, self.table, self) if fast else self.reference(x)  # type: ignore[no-untyped-call]
         return out * self.window
 
     def open_levels(self, share: float) -> None:
@@ -66,29 +68,25 @@ class HashEncoding(nn.Module):
 
     def reference(self, x: Tensor) -> Tensor:
         """The same in plain torch, differentiated by autograd."""
-        columns = []
         mask = 2**self.log2_size - 1
-        for level in range(len(self.offset)):
-            size = self.size[level]
-            u = (x - self.lo.to(x)) * self.inv[level].to(x)
-            node = torch.minimum(torch.floor(u.detach()).long().clamp(min=0), size - 2)
-            f = (u - node).clamp(0, 1)
-            total = x.new_zeros(len(x), FEATURES)
-            for c in range(8):
-                step = torch.tensor([c >> 2, (c >> 1) & 1, c & 1], device=x.device)
-                i, j, k = (node + step).unbind(-1)
-                at = (
-                    ((i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & mask)
-                    if self.hashed[level]
-                    else ((i * size[1] + j) * size[2] + k)
-                )
-                w = torch.where(step.bool(), f, 1 - f).prod(-1, keepdim=True)
-                total = total + w * self.table[self.offset[level] + at].to(x)
-            columns.append(total)
-        return torch.cat(columns, -1)
+        corner = torch.arange(8, device=x.device)
+        step = torch.stack([corner >> 2, (corner >> 1) & 1, corner & 1], -1)  # (8, 3)
+        u = (x - self.lo.to(x))[:, None] * self.inv.to(x)[:, None]  # (N, L, 3)
+        node = torch.minimum(torch.floor(u.detach()).long().clamp(min=0), self.size - 2)
+        f = (u - node).clamp(0, 1)[:, :, None]
+        i, j, k = (node[:, :, None] + step).unbind(-1)  # (N, L, 8) each
+        hashed = (i ^ (j * PRIMES[1]) ^ (k * PRIMES[2])) & mask
+        dense = (i * self.size[:, 1:2] + j) * self.size[:, 2:] + k
+        at = torch.where(self.hashed[:, None], hashed, dense) + self.offset[:, None]
+        w = torch.where(step.bool(), f, 1 - f).prod(-1)
+        return torch.einsum("nlc,nlcf->nlf", w, self.table[at].to(x)).reshape(len(x), -1)
+
+    def grid(self) -> tuple[Tensor | int, ...]:
+        """Input of the GPU's kernels."""
+        return self.offset, self.size, self.hashed, 2**self.log2_size - 1, self.lo, self.inv
 
     def tables(self) -> tuple[Any, ...]:
-        """Input of the compiled kernels."""
+        """Input of the compiled kernels on the CPU."""
         return (
             self.offset.numpy(),
             self.size.numpy(),
@@ -104,6 +102,8 @@ class _Hash(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, table: Tensor, encoding: HashEncoding) -> Tensor:
         ctx.save_for_backward(x, table)
         ctx.encoding = encoding
+        if cuda_kernels.usable(x, table):
+            return cuda_kernels.hash_forward(table, encoding.grid(), x.detach())
         out = torch.empty(len(x), encoding.width)
         nb.hash_forward(table.detach().numpy(), *encoding.tables(), x.detach().contiguous().numpy(), out.numpy())
         return out
@@ -112,6 +112,9 @@ class _Hash(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         x, table = ctx.saved_tensors
         encoding: HashEncoding = ctx.encoding
+        if cuda_kernels.usable(x, table):
+            of_table, of_x = cuda_kernels.hash_backward(table, encoding.grid(), x, grads[0])
+            return of_x if ctx.needs_input_grad[0] else None, of_table, None
         grad_table = torch.zeros_like(table)
         grad_x = torch.empty(len(encoding.offset), len(x), 3)
         nb.hash_backward(

@@ -145,6 +145,12 @@ class GridSdf(nn.Module):
         self.cell *= 0.5
         self._set(finer)
 
+    def on_cpu(self) -> GridSdf:
+        """This surface on the CPU, for code that traces rays from numpy: itself if it is there already."""
+        if self.values.device.type == "cpu":
+            return self
+        return GridSdf(self.values.detach().cpu(), self.lo.cpu(), self.cell)
+
     # ---------------------------------------------------------------- checkpoints
     def to_device(self, device: str) -> None:
         """Move the optimiser's state to the device of the module."""

@@ -1,6 +1,7 @@
-"""Differentiable gathers with two back ends: compiled CPU kernels if numba is installed, else plain torch.
+"""Differentiable gathers with three back ends: compiled CPU kernels if numba is installed, compiled GPU kernels
+(pipeline.maths.cuda_kernels), else plain torch.
 
-The torch path is the reference, and the only one on a GPU. Tests select it by removing `nb`.
+The torch path is the reference. Tests select it by removing `nb`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pipeline.maths import cuda_kernels
 from pipeline.maths.sdf import spline_sdf, spline_stencil
 from pipeline.maths.tracing import MAX_STEPS, REFINE_STEPS, sphere_trace
 
@@ -44,6 +46,8 @@ class SplineSdf(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, values: Tensor, sink: Tensor, lo: Tensor, cell: float) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(x)
         ctx.grid = (values.shape, sink, lo, cell)
+        if cuda_kernels.usable(x, values):
+            return cuda_kernels.spline_forward(values.detach(), lo, cell, x)
         if not compiled(x):
             return spline_sdf(values.detach(), x, lo, cell)
         s, g = torch.empty(len(x)), torch.empty(len(x), 3)
@@ -59,6 +63,8 @@ class SplineSdf(torch.autograd.Function):
             sink[0, 0, 0] = float("nan")
         elif compiled(x):
             nb.spline_backward(sink.numpy(), _np(lo), np.float32(1 / cell), _np(x), _np(gs), _np(gg))
+        elif cuda_kernels.usable(x, sink):
+            cuda_kernels.spline_backward(sink, lo, cell, x, gs, gg)
         else:
             index, w, dw = spline_stencil(x, lo, cell, shape)
             share = gs[:, None] * w + torch.einsum("nc,nkc->nk", gg, dw)
@@ -80,6 +86,9 @@ def trace(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`pipeline.maths.tracing.sphere_trace` on a spline grid: t, hit, sdf there. No gradients."""
     values, o, d = values.detach(), o.detach(), d.detach()
+    if cuda_kernels.usable(values, o, d, t_near, t_far):
+        steps = (MAX_STEPS, REFINE_STEPS)
+        return cuda_kernels.march(values, lo, cell, (o, d, t_near, t_far), factor, min_step, steps)
     if not compiled(o):
         with torch.no_grad():
             return sphere_trace(
@@ -123,6 +132,9 @@ def adam_on_band(
 
     eps is added to the root of the second moment; it is far below any useful gradient, unless it is used for damping.
     """
+    if cuda_kernels.usable(values, grad):
+        cuda_kernels.band_adam(values, grad, m, v, active, lr, betas, eps, step)
+        return
     b1, b2 = betas
     c1, c2 = 1 - b1**step, 1 - b2**step
     if compiled(values):

@@ -10,30 +10,16 @@ threads.
 # ruff: noqa: E741
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from numba import njit, prange
 from torch import Tensor
 
-from pipeline.maths.sh_recurrence import recurrence
+from pipeline.maths.sh_recurrence import tables
 
 LANES = 128
-F32 = npt.NDArray[np.float32]
-
-
-@lru_cache(maxsize=16)
-def tables(order: int) -> tuple[F32, F32, F32]:
-    """Start values Q_m^m (with the sqrt(2) of m > 0) and recurrence factors a[l, m], b[l, m], rounded once."""
-    start, a, b = recurrence(order)
-    q = np.array(start) * np.where(np.arange(order + 1) > 0, np.sqrt(2), 1.0)
-    aa, bb = np.zeros((order + 1, order + 1), np.float32), np.zeros((order + 1, order + 1), np.float32)
-    for l in range(1, order + 1):
-        aa[l, :l], bb[l, :l] = a[l].numpy(), b[l].numpy()
-    return q.astype(np.float32), aa, bb
 
 
 @njit(parallel=True, error_model="numpy", cache=True)

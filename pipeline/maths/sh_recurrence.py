@@ -1,12 +1,16 @@
-"""Factors of the associated Legendre recurrence, shared by pipeline.maths.sh and pipeline.maths.sh_compiled."""
+"""Factors of the associated Legendre recurrence, shared by pipeline.maths.sh and its compiled forms."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
+
+F32 = npt.NDArray[np.float32]
 
 
 @lru_cache(maxsize=32)
@@ -31,3 +35,14 @@ def recurrence(order: int) -> tuple[list[float], list[Tensor], list[Tensor]]:
             )
         )
     return start, a, b
+
+
+@lru_cache(maxsize=16)
+def tables(order: int) -> tuple[F32, F32, F32]:
+    """Start values Q_m^m (with the sqrt(2) of m > 0) and recurrence factors a[l, m], b[l, m], rounded once."""
+    start, a, b = recurrence(order)
+    q = np.array(start) * np.where(np.arange(order + 1) > 0, np.sqrt(2), 1.0)
+    aa, bb = np.zeros((order + 1, order + 1), np.float32), np.zeros((order + 1, order + 1), np.float32)
+    for l in range(1, order + 1):
+        aa[l, :l], bb[l, :l] = a[l].numpy(), b[l].numpy()
+    return q.astype(np.float32), aa, bb

@@ -66,7 +66,7 @@ def set_outline_level(model: FaceModel, views: Sequence[PhotoView]) -> dict[str,
     """Set the model's level; returns the facts for the report. The paper's geometries keep their zero set."""
     if not isinstance(model.geometry, GridSdf):
         return {"level_mm": 0.0, "why": "only for the grid"}
-    found = outline_level(model.geometry, views)
+    found = outline_level(model.geometry.on_cpu(), views)
     model.level.fill_(found.level)
     return found.facts()
 

@@ -33,7 +33,7 @@ from pipeline.fields.shadowing import fibonacci
 from pipeline.images import shrink_whole
 from pipeline.maths import sh
 from stages.inverse_rendering.albedo_level import lobe_std
-from stages.inverse_rendering.observations import surface_hits
+from stages.inverse_rendering.observations import surface_hits, surface_points
 from stages.inverse_rendering.ray_sampling import PhotoView, Rays, factor_for, image_rays
 from stages.inverse_rendering.relight_model import change_light
 
@@ -75,7 +75,7 @@ def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tu
         factor = factor_for(view.size, SIDE)
         skin = (shrink_whole(view.skin.astype(np.float32), factor) == 1).astype(np.uint8)
         pixels = np.flatnonzero(cv2.erode(skin, np.ones((3, 3), np.uint8)))
-        chosen = torch.from_numpy(generator.permutation(pixels)[:each])
+        chosen = torch.from_numpy(generator.permutation(pixels)[:each]).to(device)
         rays = image_rays(view, factor, device)
         x, n, _ = surface_hits(model.geometry, rays[chosen], chosen)
         found.append((x, n))
@@ -157,7 +157,7 @@ def correct_light(
         found = correction(a, e, normals, even)
     if found is None:
         return None
-    x, facing, _ = surface_hits(model.geometry, rays, torch.arange(len(rays.d)))
+    x, facing = surface_points(model.geometry, rays)
     error = change_light(model, spatial, x, facing, lambda: _apply(light, found, n, irradiance))
     return {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
 
