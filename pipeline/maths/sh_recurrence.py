@@ -43,6 +43,6 @@ def tables(order: int) -> tuple[F32, F32, F32]:
     start, a, b = recurrence(order)
     q = np.array(start) * np.where(np.arange(order + 1) > 0, np.sqrt(2), 1.0)
     aa, bb = np.zeros((order + 1, order + 1), np.float32), np.zeros((order + 1, order + 1), np.float32)
-    for l in range(1, order + 1):
+    for l in range(1, order + 1):  # noqa: E741
         aa[l, :l], bb[l, :l] = a[l].numpy(), b[l].numpy()
     return q.astype(np.float32), aa, bb

@@ -2,6 +2,10 @@
 
 The hull is carved by the voting views and tolerates a few wrong views. Where a mask and the hull's silhouette differ by
 more than the hull's resolution, the mask (or the camera) is wrong.
+
+A hull is an upper limit of the subject, so that a mask may rightly lack what the hull has. Not so deep inside: a ray
+through the core of a hull, which views from around the subject carved, meets the subject. The core is carved with more
+tolerance, because the same part often lacks in several masks: where its colour is that of the background.
 """
 
 from __future__ import annotations
@@ -14,14 +18,19 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.artifacts import Camera
-from pipeline.hull import BAND_CELLS, Hull, cloud, render_silhouette, visual_hull
+from pipeline.hull import BAND_CELLS, Cloud, Hull, cloud, render_silhouette, visual_hull
 from pipeline.support import Support
+from pipeline.transforms import matrix
 from stages.masks.region import F32, Bool, dilated, eroded, region
 
 CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
 POSSIBLE = 1.4  # radii within which empty space of the hull is trusted
 MARGIN = 1.0  # cells of tolerance for the hull
 WRONG_SHARE = 0.1  # share of the views of a voxel that may be wrong
+CORE = 0.15  # depth of the core below the hull's surface, radii of the region of interest
+CORE_SHARE, CORE_LEAST = 0.06, 2  # share and least number of the views that may be wrong about a voxel of the core
+KNOWN = 0.5  # share of the views with a voxel of the core in their frame
+AROUND = 0.75  # largest length of the mean of the unit directions to the cameras: 0 all around, 0.64 half a circle
 SPREADS = 6.0  # robust standard deviations below the median for an outlier
 
 
@@ -29,9 +38,9 @@ SPREADS = 6.0  # robust standard deviations below the median for an outlier
 class Opinion:
     """The hull seen from one view, (h, w) at the size of its small alpha.
 
-    silhouette: of the hull. possible: where the subject may be, including space that few views see. here: the region of
-    interest. margin: tolerance in pixels. iou: of the view's mask and the silhouette within the region of interest,
-    None if that is outside of the picture.
+    silhouette: of the hull. core: of its core. possible: where the subject may be, including space that few views see.
+    here: the region of interest. margin: tolerance in pixels. iou: of the view's mask and the silhouette within the
+    region of interest, None if that is outside of the picture.
     """
 
     silhouette: Bool
@@ -39,6 +48,7 @@ class Opinion:
     here: Bool
     margin: int
     iou: float | None
+    core: Bool
 
 
 def tolerated(votes: int) -> int:
@@ -61,21 +71,42 @@ def opinions(
         for least in (min(3, len(voters)), 0)
     ))  # fmt: skip
     hull, may_be = cloud(sure), cloud(possible)
+    inner = _core([c for c, _ in voters], [a for _, a in voters], edge, cell, support, CORE * roi_radius)
     out = []
     for camera, alpha in zip(cameras, alphas, strict=True):
         h, w = alpha.shape
         disc = region(camera, roi_radius)
         if disc is None:
             nowhere = np.zeros((h, w), bool)
-            out.append(Opinion(nowhere, ~nowhere, nowhere, 1, None))
+            out.append(Opinion(nowhere, ~nowhere, nowhere, 1, None, nowhere))
             continue
         disc = disc.scaled(w / camera.width)
         silhouette = render_silhouette(hull, camera, h, w) >= 0.5
         may = (render_silhouette(may_be, camera, h, w) >= 0.5) | ~disc.covers(h, w, POSSIBLE)
         here = disc.covers(h, w)
         margin = max(1, round(MARGIN * disc.radius * cell / roi_radius))
-        out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here)))
+        core = np.zeros((h, w), bool) if inner is None else render_silhouette(inner, camera, h, w) >= 0.5
+        out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here), core & silhouette))
     return out
+
+
+def _core(
+    cameras: Sequence[Camera], alphas: Sequence[F32], edge: float, cell: float, support: Support | None, depth: float
+) -> Cloud | None:
+    """The part of the tolerant hull that is deeper than `depth` (asset units) and in the frame of most views; None if
+    there is none, or if the cameras are on one side: the hull is then deep wherever no camera looks from the side."""
+    centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras])
+    directions = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-9)
+    if float(np.linalg.norm(directions.mean(0))) > AROUND:
+        return None
+    wrong = max(CORE_LEAST, round(CORE_SHARE * len(cameras)))
+    hull = _above(support, visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, cell, max_outside=wrong,
+                                       outside_share=WRONG_SHARE))  # fmt: skip
+    known = hull.seen >= KNOWN * len(cameras)
+    level = (depth - cell * ndimage.distance_transform_edt((hull.level <= 0) & known)).astype(np.float32)
+    if not (level <= 0).any():
+        return None
+    return cloud(replace(hull, level=level.clip(-BAND_CELLS * cell, BAND_CELLS * cell), occupied=level <= 0.5 * cell))
 
 
 def _above(support: Support | None, hull: Hull) -> Hull:
@@ -94,13 +125,22 @@ def _iou(a: Bool, b: Bool, where: Bool) -> float | None:
 
 
 def contradiction(inside: Bool, opinion: Opinion, *, filled: bool) -> float:
-    """Area that the hull contradicts beyond its resolution, as a share of the mask's: what lies in empty space, and, if
-    `filled`, what the mask lacks. A hull is an upper limit of the subject: what few views see, it makes too large, so
-    that only of a mask that is an outlier its missing parts are believed. inside: (h, w)."""
+    """Area that the hull contradicts beyond its resolution, as a share of the mask's: what lies in empty space, what
+    the mask lacks of the core, and, if `filled`, of the hull. A hull is an upper limit of the subject: what few views see,
+    it makes too large, so that only of a mask that is an outlier all missing parts are believed. inside: (h, w)."""
     extra = inside & ~dilated(opinion.possible, opinion.margin)
     extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
-    missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here if filled else np.zeros_like(inside)
+    missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here if filled else _lacks(inside, opinion)
     return float(missing.sum() + extra.sum()) / max(1, int(inside.sum()))
+
+
+def lacking(inside: Bool, opinion: Opinion) -> float:
+    """Area of the core that the mask lacks, as a share of the mask's. inside: (h, w)."""
+    return float(_lacks(inside, opinion).sum()) / max(1, int(inside.sum()))
+
+
+def _lacks(inside: Bool, opinion: Opinion) -> Bool:
+    return np.asarray(eroded(opinion.core, opinion.margin) & ~inside & opinion.here)
 
 
 def hole(inside: Bool, opinion: Opinion) -> float:
@@ -111,14 +151,14 @@ def hole(inside: Bool, opinion: Opinion) -> float:
 
 def trimap(inside: Bool, opinion: Opinion, *, filled: bool) -> np.typing.NDArray[np.uint8]:
     """Trimap (h, w) for GrabCut when a view is segmented again: from the hull where it is clear, else from the mask
-    `inside` (h, w). filled: the hull's inside is the subject's; else only in the mask's holes."""
+    `inside` (h, w). filled: the hull's inside is the subject's; else only its core, and where the mask has holes."""
     out = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     near = dilated(inside, opinion.margin) & ~eroded(inside, opinion.margin)
     out[eroded(inside, opinion.margin)] = cv2.GC_FGD
     out[~inside & ~near] = cv2.GC_BGD
     clear = eroded(opinion.silhouette, opinion.margin)
     if not filled:
-        clear &= ndimage.binary_fill_holes(inside)
+        clear &= ndimage.binary_fill_holes(inside) | opinion.core
     empty = ~dilated(opinion.silhouette, opinion.margin)
     # a mask without most of the subject is not used outside of the region of interest either
     lost = (inside & opinion.silhouette).sum() < 0.3 * opinion.silhouette.sum()

@@ -28,7 +28,7 @@ from stages.masks.config import Config
 from stages.masks.extent import BUST, MAX_OPEN, asked, cut_by_head, outline_points, share_beyond, whole_hull
 from stages.masks.face_labels import labels_with, subjects_face
 from stages.masks.grabcut import cut
-from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, trimap
+from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, trimap
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
@@ -290,10 +290,9 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     inside, filled = made.small >= 0.5, bad and not made.view.holdout
     if made.source in ("given", INVERTED) or (made.source == "key" and made.useless):
         return made  # a photo of background only has no subject to segment
-    doubtful = (
-        not made.view.holdout
-        and made.source in COMPUTED
-        and (contradiction(inside, opinion, filled=filled) > CONTRADICTED or hole(inside, opinion) > HOLE)
+    share = lacking(inside, opinion) if made.view.holdout else contradiction(inside, opinion, filled=filled)
+    doubtful = made.source in COMPUTED and (
+        share > CONTRADICTED or (not made.view.holdout and hole(inside, opinion) > HOLE)
     )
     if not (bad or doubtful):
         return made
@@ -319,7 +318,8 @@ def _at_size(o: Opinion, width: int, height: int) -> Opinion:
     def scaled(a: np.typing.NDArray[np.bool_]) -> np.typing.NDArray[np.bool_]:
         return np.asarray(cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)) >= 0.5
 
-    return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), max(1, round(o.margin * factor)), o.iou)
+    margin = max(1, round(o.margin * factor))
+    return Opinion(scaled(o.silhouette), scaled(o.possible), scaled(o.here), margin, o.iou, scaled(o.core))
 
 
 def _agreement(masked: list[Masked]) -> float:

@@ -6,7 +6,6 @@ import ctypes
 import shutil
 import subprocess
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,11 @@ using std::min;
 struct Index { int x; };
 static Index threadIdx{0}, blockIdx{0}, blockDim{1};
 static float atomicAdd(float* place, float value) { return *place += value; }
-extern "C" void begin(int thread, int block, int threads) { threadIdx.x = thread; blockIdx.x = block; blockDim.x = threads; }
+extern "C" void begin(int thread, int block, int threads) {
+    threadIdx.x = thread;
+    blockIdx.x = block;
+    blockDim.x = threads;
+}
 #include "%s"
 """
 COMPILER = shutil.which("c++")
@@ -227,9 +230,3 @@ def test_a_gpu_whose_kernels_can_not_be_compiled(
     finally:
         cuda_kernels.available.cache_clear()
     assert "no NVRTC" in caplog.text and "slow" in caplog.text
-
-
-def test_the_source_is_beside_its_module() -> None:
-    assert (
-        cuda_kernels.SOURCE == Path(cuda_kernels.__file__).parent / "cuda_kernels.cu" and cuda_kernels.SOURCE.is_file()
-    )

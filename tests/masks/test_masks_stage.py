@@ -18,7 +18,7 @@ from pipeline.images import read_alpha, write_png
 from pipeline.store import Store
 from pipeline.transforms import matrix, pixel_centres, rays, rigid, rows
 from stages.masks import segment
-from stages.masks.hull_consistency import Opinion, contradiction, hole, opinions, outliers, tolerated, trimap
+from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, tolerated, trimap
 from stages.masks.sources import PhotoToMask
 from stages.masks.stage import STAGE, Config, Inputs
 from tests.masks.test_masks_user_model import write_red_detector
@@ -283,7 +283,7 @@ def test_contradiction_and_trimap() -> None:
 
     y, x = np.mgrid[:100, :100]
     body = np.hypot(x - 50, y - 50) < 30
-    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0)
+    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0, np.zeros_like(body))
     assert contradiction(body, opinion, filled=True) == 0
     half = body & (x < 50)
     assert contradiction(half, opinion, filled=True) == pytest.approx(0.9, abs=0.15)
@@ -302,7 +302,7 @@ def test_a_hull_is_an_upper_limit_of_a_mask_that_is_no_outlier() -> None:
 
     y, x = np.mgrid[:100, :100]
     disc = np.hypot(x - 50, y - 50)
-    opinion = Opinion(disc < 30, disc < 30, np.ones_like(disc, bool), 3, 1.0)
+    opinion = Opinion(disc < 30, disc < 30, np.ones_like(disc, bool), 3, 1.0, np.zeros_like(disc, bool))
     small = (disc < 20) & ~(np.hypot(x - 52, y - 52) < 5)
     assert contradiction(small, opinion, filled=False) == 0 < contradiction(small, opinion, filled=True)
     found = trimap(small, opinion, filled=False)
@@ -313,11 +313,41 @@ def test_a_hull_is_an_upper_limit_of_a_mask_that_is_no_outlier() -> None:
     assert (found[disc > 34] == cv2.GC_BGD).all() and (found[disc < 24] == cv2.GC_FGD).all()
 
 
+def test_what_a_mask_lacks_of_the_core_is_the_subject() -> None:
+    """A ray through the core meets the subject; one through the rim need not."""
+    import cv2
+
+    y, x = np.mgrid[:100, :100]
+    disc = np.hypot(x - 50, y - 50)
+    body, core = disc < 30, disc < 20
+    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0, core)
+    notched = body & ~((x > 55) & (abs(y - 50) < 8))
+    assert lacking(notched, opinion) == contradiction(notched, opinion, filled=False) > 0.05
+    found = trimap(notched, opinion, filled=False)
+    assert found[50, 60] == cv2.GC_FGD and found[50, 76] == cv2.GC_PR_BGD and found[50, 95] == cv2.GC_BGD
+    rim = body & ~((x > 72) & (abs(y - 50) < 12))
+    assert lacking(rim, opinion) == lacking(body, opinion) == 0
+    assert lacking(notched, replace(opinion, here=x < 40)) == 0  # outside of the region of interest
+
+
+def test_the_core_is_that_of_views_all_around() -> None:
+    """Two of 24 masks lack the same part, and the core keeps it. Cameras on one side tell no core."""
+    cameras, x = [camera(i, 24) for i in range(24)], np.mgrid[:SIZE, :SIZE][1] - SIZE / 2
+    alphas = [ball_alpha(c) for c in cameras]
+    cut = [np.where(x > 4, np.float32(0), a) if i in (3, 4) else a for i, a in enumerate(alphas)]
+    found = opinions(cameras, cut, [True] * 24, ROI, 64)
+    lacks = [lacking(a >= 0.5, o) for a, o in zip(cut, found, strict=True)]
+    assert min(lacks[3], lacks[4]) > 0.1 and sum(lacks) == lacks[3] + lacks[4]
+    arc = [camera(i, 72) for i in range(9)]
+    one_side = opinions(arc, [ball_alpha(c) for c in arc], [True] * 9, ROI, 64)
+    assert not any(o.core.any() for o in one_side)
+
+
 def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A chair beside the ball in the held-out photo and in a fitted one. The hull is only a limit: a held-out mask of
-    half of the ball stays as it is."""
+    """A chair beside the ball in the held-out photo and in a fitted one. Then masks of half of the ball: they lack a
+    part of the hull's core."""
     y, x = np.mgrid[:SIZE, :SIZE] - SIZE / 2
     chair = (abs(x) < 45) & (y > 0)
 
@@ -337,13 +367,15 @@ def test_a_held_out_mask_ends_where_the_hull_of_the_others_does(
         assert iou(alphas[i], ball_alpha(scene.cameras[i])) > 0.9
     monkeypatch.setattr(segment, "mask", made(lacks=True))
     found, alphas = run(scene, tmp_path / "b", faces=False)
-    assert found.masks[2].source == "grabcut" and found.masks[7].source == "grabcut+hull"  # this one is an outlier
+    for i in (2, 7):
+        assert found.masks[i].source == "grabcut+hull"
+        assert iou(alphas[i], ball_alpha(scene.cameras[i])) > 0.9
 
 
 def test_a_hole_counts_where_the_hull_has_none() -> None:
     y, x = np.mgrid[:100, :100]
     body = np.hypot(x - 50, y - 50) < 30
-    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0)
+    opinion = Opinion(body, body, np.ones_like(body), 3, 1.0, np.zeros_like(body))
     spot = np.hypot(x - 60, y - 50) < 4
     assert hole(body & ~spot, opinion) == pytest.approx(spot.sum() / (body & ~spot).sum())
     assert hole(body & ~spot & ~((y == 50) & (x > 50)), opinion) == 0  # a cut that leads in from outside is none
