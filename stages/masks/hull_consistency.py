@@ -126,8 +126,9 @@ def _iou(a: Bool, b: Bool, where: Bool) -> float | None:
 
 def contradiction(inside: Bool, opinion: Opinion, *, filled: bool) -> float:
     """Area that the hull contradicts beyond its resolution, as a share of the mask's: what lies in empty space, what
-    the mask lacks of the core, and, if `filled`, of the hull. A hull is an upper limit of the subject: what few views see,
-    it makes too large, so that only of a mask that is an outlier all missing parts are believed. inside: (h, w)."""
+    the mask lacks of the core, and, if `filled`, of the hull. A hull is an upper limit of the subject: what few views
+    see, it makes too large, so that only of a mask that is an outlier all missing parts are believed. inside: (h, w).
+    """
     extra = inside & ~dilated(opinion.possible, opinion.margin)
     extra |= inside & ~dilated(opinion.silhouette, opinion.margin) & opinion.here
     missing = eroded(opinion.silhouette, opinion.margin) & ~inside & opinion.here if filled else _lacks(inside, opinion)
