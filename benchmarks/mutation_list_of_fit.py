@@ -243,4 +243,12 @@ OF_FIT = (
              "tests/usd/test_usd_relight.py"),
     Mutation("pipeline/lighting/transport.py", "np.sqrt(i / self._rays)", "i / self._rays",
              "tests/usd/test_usd_relight.py"),
+    Mutation("pipeline/maths/cuda_kernels.cu", "flat * c.w[k] + deep * c.dw[k]", "flat * c.w[k]",
+             "tests/fields/test_cuda_kernels.py"),
+    Mutation("pipeline/maths/cuda_kernels.cu", "found = true;", "found = false;",
+             "tests/fields/test_cuda_kernels.py"),
+    Mutation("pipeline/maths/cuda_kernels.cu", "if (c.f[a] > 0.0f && c.f[a] < 1.0f) atomicAdd", "atomicAdd",
+             "tests/fields/test_cuda_kernels.py"),
+    Mutation("pipeline/maths/cuda_kernels.cu", "(minus * cl - plus * sl)", "(minus * cl + plus * sl)",
+             "tests/fields/test_cuda_kernels.py"),
 )  # fmt: skip
