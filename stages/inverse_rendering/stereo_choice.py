@@ -4,6 +4,8 @@ Photos of the neighbours are projected onto a candidate's surface and from there
 of both are compared by normalised cross-correlation, which does not depend on exposure. A pixel that no neighbour sees
 scores 0, so that a surface cannot win by hiding what it shows wrong. Depth maps are fused without the validation
 views for this comparison.
+
+Depth maps take most of the time, and where the sweep is right they are not used. So small ones are compared first.
 """
 
 from __future__ import annotations
@@ -48,6 +50,9 @@ GAIN = (
 )
 
 
+QUICK, FINER = 0.6, 0.015  # scale of the small depth maps; by how much the whole ones may be better (docs/model.md)
+
+
 def stereo_start(
     hull: Start,
     views: list[PhotoView],
@@ -71,17 +76,28 @@ def stereo_start(
     if kind == "dense":
         return dense_start(depth_maps(hull, views, check), views), {"start": "dense", "why": "setting"}
     waiting = validation_views(len(views))
-    maps = depth_maps(hull, views, check, waiting)
-    swept = start_from_photos(hull, views, device, check, sweeps)
-    dense = dense_start(without(maps, waiting), [v for n, v in enumerate(views) if n not in waiting])
+    seen = [v for n, v in enumerate(views) if n not in waiting]
     known = pictures_of(views, None, SIDE)
     neighbours = neighbours_of(hull, views, waiting)
     poses = np.stack([v.world_from_cam for v in views])
-    scores = [correlation(s, known, poses, waiting, neighbours, check) for s in (swept, dense)]
-    start, name = (dense_start(maps, views), "dense") if scores[1] > scores[0] + GAIN else (swept, "sweep")
-    facts: Facts = {"start": name, "sweep_correlation": round(scores[0], 4), "dense_correlation": round(scores[1], 4)}
+
+    def score(start: Start) -> float:
+        return correlation(start, known, poses, waiting, neighbours, check)
+
+    def dense_score(maps: DepthMaps) -> float:
+        return score(dense_start(without(maps, waiting), seen))
+
+    start = start_from_photos(hull, views, device, check, sweeps)
+    least = (swept := score(start)) + GAIN
+    found, sized, name = dense_score(depth_maps(hull, views, check, waiting, QUICK)), "small ", "sweep"
+    maps = depth_maps(hull, views, check, waiting) if found > least - FINER else None
+    if maps is not None and found <= least:
+        found, sized = dense_score(maps), ""
+    if maps is not None and found > least:
+        start, name = dense_start(maps, views), "dense"
+    facts: Facts = {"start": name, "sweep_correlation": round(swept, 4), "dense_correlation": round(found, 4)}
     log.info("start from stereo: %s", facts)
-    return start, {**facts, "why": "correlation of the photos on validation views"}
+    return start, {**facts, "why": f"correlation of the {sized}photos on validation views"}
 
 
 def validation_views(views: int) -> tuple[int, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy import ndimage
 
 from pipeline import transforms
 from stages.inverse_rendering import dense_stereo as dense
+from stages.inverse_rendering import stereo_choice
 from stages.inverse_rendering import stereo_kernels as kernels
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.depth_fusion import closed, fused
@@ -292,6 +294,40 @@ def test_a_bowl_makes_dense_stereo_win() -> None:
 def test_blank_photos_keep_the_sweep() -> None:
     _, facts = stereo_start(hull(), photos(9, blank=True), "auto", "cpu")
     assert facts["start"] == "sweep"
+
+
+@pytest.mark.parametrize(
+    ("small", "whole", "made", "chosen"),
+    [
+        (0.494, 0.9, [0.6], "sweep"),  # clearly worse: the whole depth maps are not made
+        (0.5, 0.505, [0.6, 1.0], "sweep"),
+        (0.5, 0.52, [0.6, 1.0], "dense"),
+        (0.52, float("nan"), [0.6, 1.0], "dense"),  # clearly better: they are made without another comparison
+    ],
+)
+def test_small_depth_maps_are_compared_first(
+    monkeypatch: pytest.MonkeyPatch, small: float, whole: float, made: list[float], chosen: str
+) -> None:
+    """Starts are named by what they are made of; the sweep's correlation is 0.5."""
+    scales: list[float] = []
+    scores = {"sweep": 0.5, 0.6: small, 1.0: whole}
+    many = photos(9)
+
+    def maps(hull: Any, views: Any, check: Any, alone: Any, scale: float = 1.0) -> float:
+        scales.append(scale)
+        return scale
+
+    monkeypatch.setattr(stereo_choice, "depth_maps", maps)
+    monkeypatch.setattr(stereo_choice, "without", lambda made, waiting: made)
+    monkeypatch.setattr(stereo_choice, "fused", lambda hull, made, check: made)
+    monkeypatch.setattr(
+        stereo_choice, "start_from_photos", lambda base, *_: base if isinstance(base, float) else "sweep"
+    )
+    monkeypatch.setattr(stereo_choice, "correlation", lambda start, *_: scores[start])
+    start, facts = stereo_start(hull(), many, "auto", "cpu")
+    assert scales == made and facts["start"] == chosen
+    assert start == (1.0 if chosen == "dense" else "sweep")
+    assert ("small photos" in str(facts["why"])) == (facts["dense_correlation"] == small and whole != small)
 
 
 def test_few_views_give_no_choice() -> None:
