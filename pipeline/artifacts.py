@@ -219,10 +219,22 @@ class RegisteredView(Artifact):
     exr: FileRef
 
 
+class FittedPhoto(Artifact):
+    """How the fit shows one of its photos. psnr: dB over pixels of the subject that the model covers. weight: mean
+    weight of the photo's pixels in the fit, 1 where photos are not weighed; low_share: share of them with a low
+    weight."""
+
+    index: int
+    psnr: float
+    weight: float = 1.0
+    low_share: float = 0.0
+
+
 class FittedFace(Artifact):
     """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit.
     refined: fitted photos whose cameras the fit moved (pipeline.fitted_cameras). registered: held-out photos, for
-    figures without the error of their cameras; nothing else uses these poses."""
+    figures without the error of their cameras; nothing else uses these poses. photos: the
+    fitted photos, as the finished fit shows them."""
 
     field: FileRef
     light: FileRef
@@ -238,6 +250,7 @@ class FittedFace(Artifact):
     model: dict[str, dict[str, str | float | bool]]
     refined: tuple[RefinedCamera, ...] = ()
     registered: tuple[RegisteredView, ...] = ()
+    photos: tuple[FittedPhoto, ...] = ()
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
 

@@ -145,6 +145,11 @@ class Config(StageConfig):
         "that moves between photos; auto: if the photos show that the cameras are off by more than their noise; on: "
         "without that condition",
     )
+    robust: bool = Field(
+        default=False,
+        description="weigh photos and their parts during the fit by their residuals against those of the other photos "
+        "at the same place of the surface, so that hands, moved shadows and moved photos count less",
+    )
     resolution: Literal["auto", "given"] = Field(
         default=AUTO,
         description="auto: limit grid_cells and hash_fine to the size of a pixel on the surface; given: no limit",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -28,8 +28,9 @@ from stages.inverse_rendering.model_selection import (
     validation_views,
 )
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.ray_sampling import Batch, PixelTable
+from stages.inverse_rendering.ray_sampling import U8, Batch, PixelTable
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
+from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.weakly_seen import SMOOTH_AT, smooth_weakly_seen
@@ -74,11 +75,13 @@ class Trainer(TrainingLoop):
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     validation: tuple[int, ...] = field(init=False)
     poses: PoseHistory = field(init=False)
+    robust: Robust = field(init=False)
 
     def __post_init__(self) -> None:
         TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
         self.validation = validation_views(len(self.views), self.settings)
         self.poses = PoseHistory.of(self.views)
+        self.robust = Robust(self.views, self.settings.robust, self.settings.image_side)
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """The optimiser of all parameters except the SDF grid, which has its own."""
@@ -156,6 +159,7 @@ class Trainer(TrainingLoop):
         rate = self.set_rates()
         self.refine_poses()
         self.smooth()
+        self.weigh_photos()
         due = sum(self.share() >= s for s in SHADOWS_AT)
         if self.shadows_solved < due:
             self.model.solve_shadows()
@@ -184,6 +188,26 @@ class Trainer(TrainingLoop):
             return
         self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)
         self.smoothings = due
+
+    def weigh_photos(self) -> None:
+        """Weigh the photos and their parts by their residuals so far, when it is due."""
+        due = sum(self.share() >= s for s in WEIGH_AT)
+        if self.settings.robust and self.robust.due < due:
+            self.robust.weigh()
+            self.robust.due = due
+
+    def know_labels(self, labels: Sequence[U8 | None], names: Sequence[str]) -> None:
+        """Hair and eyes move between photos: their residuals may lie further from the others."""
+        if self.settings.robust:
+            self.robust.know_labels(labels, names)
+
+    def photo_facts(self) -> dict[str, str | float | bool]:
+        """For the report: how the photos were weighed."""
+        return self.robust.facts()
+
+    def photo_weights(self) -> list[tuple[float, float]]:
+        """Mean weight and share of low weights of each photo; empty if all count alike."""
+        return self.robust.of_photos()
 
     def refined_cameras(self, widths: Mapping[int, int]) -> tuple[RefinedCamera, ...]:
         """The cameras that the fit moved. widths: of the whole photos in pixels, by the views' index."""
@@ -255,7 +279,9 @@ class Trainer(TrainingLoop):
         self.grid.step(rate)
 
     def tend(self) -> None:
-        """Find the narrow band again, every BAND_EVERY steps."""
+        """Keep the residuals of the step, and find the narrow band again every BAND_EVERY steps."""
+        if self.settings.robust and self.share() >= max(OBSERVE_FROM, self.settings.uniform_albedo_until + SETTLING):
+            self.robust.note(self.model)
         if self.step % BAND_EVERY == 0:
             self.grid.find_band()
 
@@ -267,7 +293,9 @@ class Trainer(TrainingLoop):
         """The parts of the loss. bfloat16 affects only the networks' matrix products."""
         kind, short = torch.device(self.device).type, self.settings.precision == "bfloat16"
         with torch.autocast(kind, torch.bfloat16, enabled=short):
-            return terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share())
+            found = terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share(), self.robust.of(batch))
+        self.robust.latest = None if found.seen is None else (batch, found.seen)
+        return found
 
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
@@ -299,6 +327,7 @@ class Trainer(TrainingLoop):
             "choices": self.choices.plain() if self.choices else None,
             "cell": g.cell,
             "poses": self.poses.stored(self.views),
+            "robust": self.robust.stored(),
             "model": self.model.state_dict(),
             "band": g.optimiser_state(),
             "optimiser": self.optimiser.state_dict(),
@@ -310,6 +339,7 @@ class Trainer(TrainingLoop):
         g.cell = float(state["cell"])
         self.level = state["level"]
         self.views = self.poses.restore(self.views, state["poses"])
+        self.robust.restore(state["robust"], self.device)
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
         g.restore(state["model"]["geometry.values"].to(self.device))

@@ -21,15 +21,27 @@ from stages.inverse_rendering.render import sample_shell, shade_shell, solid_beh
 HIDDEN_LIGHT, HIDDEN_DIRECTIONS, BEHIND = 1e-3, 400, 0.3  # weight; directions over the sphere; their least z
 
 
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """K rays of the colour term, detached: rays (K,) indices in the batch; residual (K,) mean absolute difference of
+    the channels, sRGB, without any weight; x, n (K, 3) surface point and normal."""
+
+    rays: Tensor
+    residual: Tensor
+    x: Tensor
+    n: Tensor
+
+
 @dataclass(slots=True)
 class Terms:
     """The terms of the loss. scalars: weighted, by name, in the order of summation. values: detached values of single
     rays with their indices in the batch, for error messages. error: mean squared error (sRGB) over fully covered
-    subject pixels, NaN if the batch has none."""
+    subject pixels, NaN if the batch has none. seen: the rays of the colour term, None if there is none."""
 
     scalars: dict[str, Tensor] = field(default_factory=dict)
     values: dict[str, tuple[Tensor, Tensor]] = field(default_factory=dict)
     error: float = float("nan")
+    seen: Seen | None = None
 
     def add(self, name: str, scalar: Tensor, values: Tensor | None = None, rays: Tensor | None = None) -> None:
         """Add a term of the loss."""
@@ -47,9 +59,16 @@ class Terms:
         return total
 
 
-def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Generator, smooth_scale: float) -> Terms:
+def terms(
+    model: FaceModel,
+    batch: Batch,
+    settings: Config,
+    generator: torch.Generator,
+    smooth_scale: float,
+    weights: Tensor | None = None,
+) -> Terms:
     """All terms of [NeuFace eq. 20]. A batch without rays near the subject gives zeros. smooth_scale: factor of the
-    smoothness term."""
+    smoothness term. weights: (N,) of the rays in the colour term, None: all count alike."""
     device = batch.alpha.device
     jitter = torch.rand(len(batch.alpha), settings.samples, generator=generator).to(device)
     shell = sample_shell(model, batch.rays, settings.samples, jitter, batch.alpha > 0.5)
@@ -72,7 +91,9 @@ def terms(model: FaceModel, batch: Batch, settings: Config, generator: torch.Gen
     if model.spec.calibrated:
         colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
     rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
-    out.add("rgb", settings.rgb * rgb.sum() / n_rays, rgb, rays)
+    counted = rgb if weights is None else rgb * weights[rays]
+    out.add("rgb", settings.rgb * counted.sum() / n_rays, rgb, rays)
+    out.seen = Seen(rays, rgb.detach(), shell.x[pick].detach(), shell.n[pick].detach())
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     if model.ambient is not None:
         out.add("hidden_light", HIDDEN_LIGHT * hidden_light(model.light(), model.spec.light_start))

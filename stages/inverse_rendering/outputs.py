@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from pipeline.artifacts import CameraSet, HeldOutView, Matrix
+from pipeline.artifacts import CameraSet, FittedPhoto, HeldOutView, Matrix
 from pipeline.colour import as_photographed
 from pipeline.contract import Context
 from pipeline.fields.face import FaceModel, FittedField
@@ -17,6 +17,7 @@ from pipeline.images import write_exr, write_png_from_linear
 from stages.inverse_rendering.footprint import Footprint
 from stages.inverse_rendering.load_views import camera_only
 from stages.inverse_rendering.ray_sampling import PhotoView, factor_for, image_rays
+from stages.inverse_rendering.residuals import ViewError
 from stages.inverse_rendering.systems import render_any
 from stages.inverse_rendering.training_loop import TrainingLoop
 
@@ -78,6 +79,19 @@ def predict_view(model: FaceModel, view: PhotoView, factor: int, samples: int, d
     return rgba.reshape(h, w, 4).astype(np.float32)
 
 
+def fitted_photos(
+    errors: Sequence[ViewError], usable: Sequence[int], weights: Sequence[tuple[float, float]]
+) -> tuple[FittedPhoto, ...]:
+    """The fitted photos with their errors and weights. usable: indices of the photos, in the order of weights (mean
+    weight, share of low weights), which may be empty."""
+    of = dict(zip(usable, weights, strict=True)) if weights else {}
+    out = []
+    for e in errors:
+        weight, low = of.get(e.index, (1.0, 0.0))
+        out.append(FittedPhoto(index=e.index, psnr=round(e.psnr, 3), weight=weight, low_share=low))
+    return tuple(out)
+
+
 def model_facts(
     trainer: TrainingLoop, looked: Footprint | None, start: dict[str, dict[str, str | float | bool]]
 ) -> dict[str, dict[str, str | float | bool]]:
@@ -92,6 +106,7 @@ def model_facts(
         "resolution": looked.facts(settings, model) if looked else {"why": "setting"},
         "schedule": _schedule(trainer),
         "cameras": trainer.pose_facts(),
+        "photos": trainer.photo_facts(),
         "density": {"kind": spec.density, "why": "setting"},
         "system": {
             "method": {"grid": "fast", "displaced": "paper"}[spec.geometry],

@@ -89,6 +89,7 @@ class Batch:
     share: (N,) weight of a ray in the mask term, mean 1: inverse to the probability of its pixel. Without it the side
     that is drawn more often would shift the silhouette by beta ln(ratio). bound: (N, 3) int8, 1 where the target is
     only a lower limit, -1 where it is only an upper limit, else 0.
+    xy: (N, 2) position on the z = 1 plane.
     """
 
     rays: Rays
@@ -97,6 +98,7 @@ class Batch:
     view: Tensor
     share: Tensor
     bound: Tensor
+    xy: Tensor
 
 
 def evenly_spaced(count: int, n: int) -> tuple[int, ...]:
@@ -192,7 +194,7 @@ class PixelTable:
         view = self.view[i].long()
         share = torch.ones_like(self.alpha[i]) if share is None else share
         rays, target = self._rays(self.xy[i], view), self.target[i].float()
-        return Batch(rays, target, self.alpha[i], view, share, self.bound[i])
+        return Batch(rays, target, self.alpha[i], view, share, self.bound[i], self.xy[i])
 
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)

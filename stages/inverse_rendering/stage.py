@@ -39,7 +39,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.load_views import read_labels, read_views
     from stages.inverse_rendering.moving_light import light_frame
     from stages.inverse_rendering.outline_level import set_outline_level
-    from stages.inverse_rendering.outputs import model_facts, predict_held_out, write_light
+    from stages.inverse_rendering.outputs import fitted_photos, model_facts, predict_held_out, write_light
     from stages.inverse_rendering.preview import Preview
     from stages.inverse_rendering.registered_views import registered_views
     from stages.inverse_rendering.residuals import view_errors
@@ -91,6 +91,8 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         inputs, usable, config, lambda: exposures_differ(views, start, context.device) if moving is None else moving
     )
     trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, known, lit)
+    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
+    trainer.know_labels(labels, names)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -98,7 +100,6 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     preview = Preview(views, context.show, context.device)
     model = run_fit(trainer, Hooks(context.progress, context.cancelled, context.scratch / "checkpoint.pt", preview))
     views = trainer.views  # with the cameras that the fit moved
-    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
     light = trainer.choices.facts.get("light", {}) if trainer.choices else {}
     wanted = "fitted" if known is not None and known.scaled and config.albedo_level == AUTO else config.albedo_level
     level = set_level(model, trainer.pixels, views, labels, names, wanted, light)
@@ -136,6 +137,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         model=facts,
         refined=trainer.refined_cameras({c.index: c.width for c in cameras}),
         registered=registered,
+        photos=fitted_photos(left, usable, trainer.photo_weights()),
         findings=findings(fitted),
     )
 
@@ -152,7 +154,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=31,
+    version=32,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

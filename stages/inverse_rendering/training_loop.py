@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +24,7 @@ from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.model_selection import Choices
 from stages.inverse_rendering.objective import Terms
-from stages.inverse_rendering.ray_sampling import Batch, PhotoView, PixelTable
+from stages.inverse_rendering.ray_sampling import U8, Batch, PhotoView, PixelTable
 
 OUTSIDE_SHARE = 0.25
 CHECKPOINT_SHARE = 0.02  # largest share of the time for writing checkpoints
@@ -117,6 +117,17 @@ class TrainingLoop(ABC):
     def pose_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the fit moved the cameras."""
         return {"refined": False, "why": "the method has no refinement"}
+
+    def know_labels(self, labels: Sequence[U8 | None], names: Sequence[str]) -> None:  # noqa: B027
+        """Take note of the photos' labels. labels: (H, W) codes of each view, or None; names: of the codes."""
+
+    def photo_facts(self) -> dict[str, str | float | bool]:
+        """For the report: how the photos were weighed."""
+        return {"weighed": False, "why": "the method has no weights"}
+
+    def photo_weights(self) -> list[tuple[float, float]]:
+        """Mean weight and share of low weights of each photo; empty if all count alike."""
+        return []
 
     def surface_facts(self) -> dict[str, str | float | bool]:
         """For the report: what the fit did to the surface beside its steps."""

@@ -171,7 +171,7 @@ def test_an_empty_batch_costs_nothing() -> None:
     t = trainer()
     none = torch.zeros(0, 3)
     index = torch.zeros(0, dtype=torch.int64)
-    batch = Batch(Rays(none, none), none, none[:, 0], index, none[:, 0], none)
+    batch = Batch(Rays(none, none), none, none[:, 0], index, none[:, 0], none, none[:, :2])
     found = objective.terms(t.model, batch, t.settings, torch.Generator(), 1.0)
     assert float(found.total.detach()) == 0 and np.isnan(found.error)
 

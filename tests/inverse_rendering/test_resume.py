@@ -23,6 +23,7 @@ STEPS, BAND_EVERY, TOGETHER = 60, 25, 2
 SMALL = Config(  # what a draft leaves to the evidence is left to it here; steps are few, so that all can be tried
     refine_geometry="on",
     refine_poses="on",
+    robust=True,
     image_side=96,
     steps=STEPS,
     batch=256,
