@@ -147,7 +147,7 @@ def build_page(
             light=_light(r, side),
             scale=data_uri(scale_bar(), 256, lossless=True),
             scale_top=ERROR_RANGE,
-            captured=captured(r, side // 2, outlines),
+            captured=captured(r, side // 2, outlines, r.inverse_rendering.artifact.photos),
             verdict=verdict_shown(verdict, r, side // 2),
             viewer=viewer(r) if view else None,
             field=shown_field(r.reflectance, side),

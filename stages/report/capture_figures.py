@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup, escape
 
-from pipeline.artifacts import Camera, CameraSet, Located
+from pipeline.artifacts import Camera, CameraSet, FittedPhoto, Located
 from pipeline.images import read_alpha, read_encoded
 from pipeline.transforms import F64, matrix
 from stages.report.collect import Started
@@ -33,13 +33,15 @@ KINDS = {"fitted": "#2a9d6f", "held out": "#3f7fd1", "mask dropped": "#d9822b"}
 
 @dataclass(frozen=True, slots=True)
 class CameraRow:
-    """A row of the table of cameras. error_px: mean reprojection error; hull_iou: IoU of mask and others' hull."""
+    """A row of the table of cameras. error_px: mean reprojection error; hull_iou: IoU of mask and others' hull; fit:
+    how the fit shows the photo, and how much the photo counted in it; None if it was not fitted."""
 
     name: str
     kind: str
     error_px: float | None
     hull_iou: float | None
     mask: str
+    fit: FittedPhoto | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +60,10 @@ class Captured:
     more: int
 
 
-def captured(r: Started, side: int, shown: int) -> Captured:
-    """The drawing, the table and the outlines of the `shown` worst masks."""
+def captured(r: Started, side: int, shown: int, fitted: Sequence[FittedPhoto] = ()) -> Captured:
+    """The drawing, the table and the outlines of the `shown` worst masks. fitted: the photos in the finished fit."""
     kinds = camera_kinds(r)
-    rows = sorted(_rows(r, kinds), key=lambda row: -(row.error_px or 0.0))
+    rows = sorted(_rows(r, kinds, fitted), key=lambda row: -(row.error_px or 0.0))
     why = r.poses.artifact.left_out
     lost = [
         f"{n}: no camera pose was found" + (f"; {why[n]}" if n in why else "") for n in r.poses.artifact.unregistered
@@ -81,14 +83,15 @@ def camera_kinds(r: Started) -> dict[int, str]:
             for c in r.poses.artifact.cameras}  # fmt: skip
 
 
-def _rows(r: Started, kinds: dict[int, str]) -> list[CameraRow]:
+def _rows(r: Started, kinds: dict[int, str], fitted: Sequence[FittedPhoto]) -> list[CameraRow]:
     masks = {m.index: m for m in r.masks.artifact.masks}
     errors = r.poses.artifact.view_errors_px
+    fits = {p.index: p for p in fitted}
     out = []
     for c in r.poses.artifact.cameras:
         m = masks.get(c.index)
         out.append(CameraRow(c.name, kinds[c.index], errors.get(c.name), m.hull_iou if m else None,
-                             m.source if m else "none"))  # fmt: skip
+                             m.source if m else "none", fits.get(c.index)))  # fmt: skip
     return out
 
 

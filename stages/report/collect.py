@@ -72,6 +72,7 @@ def figures(r: Results) -> dict[str, Any]:
             "beta": face.beta,
             "cell": face.cell,
         },
+        "photos": {str(p.index): {"psnr": p.psnr, "weight": p.weight, "low_share": p.low_share} for p in face.photos},
         "cameras": {
             "source": cameras.source,
             "metric": cameras.metric,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
-from pipeline.artifacts import FileRef, Located
+from pipeline.artifacts import FileRef, FittedPhoto, Located
 from pipeline.directions import count_seen
-from stages.report.capture_figures import KINDS, _axes, captured, outlined
+from stages.report.capture_figures import KINDS, _axes, camera_kinds, captured, outlined
 
 
 @pytest.fixture(scope="module")
@@ -88,3 +88,12 @@ def test_outline_lies_on_the_mask(kind: type) -> None:
         drawn.shape == (80, 120, 3) and red[20, 30:90].all() and red[20:60, 30].all() and red.sum() == 2 * (40 + 60) - 4
     )
     assert outlined(image, alpha, 60).shape == (40, 60, 3)
+
+
+def test_fitted_photos_have_their_error_and_weight_in_the_table(results: SyntheticResults) -> None:
+    index = next(i for i, kind in camera_kinds(results).items() if kind == "fitted")
+    photo = FittedPhoto(index=index, psnr=31.25, weight=0.625, low_share=0.125)
+    rows = captured(results, 180, 0, [photo]).rows
+    names = {c.index: c.name for c in results.poses.artifact.cameras}
+    assert [row.name for row in rows if row.fit is photo] == [names[index]]
+    assert all(row.fit is None for row in rows if row.name != names[index])

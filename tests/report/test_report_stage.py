@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support.synthetic_results import SyntheticResults, write_results
 
-from pipeline.artifacts import Located
+from pipeline.artifacts import FittedPhoto, Located
 from pipeline.contract import Context
 from pipeline.errors import Cancelled
 from stages.report.page import with_timing
@@ -123,6 +123,18 @@ def test_the_page_says_which_mask_each_score_used(results: SyntheticResults, tmp
     assert metrics["holdout"]["masks"] == {"3": "given", "9": "person"}
     rows = {i: page.split(f"<tr><td>{i}</td>")[1].split("</tr>")[0] for i in ("3", "9")}
     assert rows["3"].endswith("<td>given</td>") and rows["9"].endswith("<td>person</td>")
+
+
+def test_the_page_and_the_metrics_have_the_weight_of_each_fitted_photo(
+    results: SyntheticResults, tmp_path: Path
+) -> None:
+    face = results.inverse_rendering
+    index = face.artifact.fitted_views[0]
+    photo = FittedPhoto(index=index, psnr=31.25, weight=0.625, low_share=0.125)
+    changed = Located(face.artifact.model_copy(update={"photos": (photo,)}), face.folder)
+    metrics, page = run(replace(results, inverse_rendering=changed), tmp_path / "work")
+    assert metrics["photos"] == {str(index): {"psnr": 31.25, "weight": 0.625, "low_share": 0.125}}
+    assert page.count("<td>31.25</td><td>0.625</td><td>0.125</td></tr>") == 1
 
 
 def test_scores_are_right(made: tuple[dict, str]) -> None:
