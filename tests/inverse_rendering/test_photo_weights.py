@@ -83,7 +83,7 @@ def test_what_covers_a_part_of_one_photo_gets_a_low_weight_and_nothing_else() ->
         hits.append(low[OCCLUDED, BLOCK, BLOCK].mean())
         low[OCCLUDED, BLOCK.start - 1 : BLOCK.stop + 1, BLOCK.start - 1 : BLOCK.stop + 1] = False  # smoothed cells
         others.append(low[found.rays > 0].mean())
-    assert min(hits) > 0.95
+    assert min(hits) > 0.9 and np.mean(hits) > 0.98
     assert np.mean(others) < 0.002 and max(others) < 0.005
 
 
@@ -130,7 +130,7 @@ def test_residuals_below_the_noise_are_not_held_against_a_photo() -> None:
 def test_labels_of_what_moves_lower_it_further() -> None:
     seen, _, cells = ball(2)
     there = (seen.view == OCCLUDED) & ((cells >= BLOCK.start) & (cells < BLOCK.stop)).all(1)
-    worse = with_residual(seen, np.where(there, 2.5, 1) * seen.residual)
+    worse = with_residual(seen, np.where(there, 5, 1) * seen.residual)
     inside = OCCLUDED, BLOCK, BLOCK
     plain = weigh(worse, NOISE, STILL).table[inside].mean()
     moves = weigh(worse, NOISE, np.ones_like(STILL)).table[inside].mean()
