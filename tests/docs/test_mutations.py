@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_each_change_can_be_made_and_has_its_tests(mutation: Mutation) -> None:
     text = (ROOT / mutation.file).read_text()
     assert text.count(mutation.before) == 1 and mutation.before != mutation.after
-    compile(text.replace(mutation.before, mutation.after), mutation.file, "exec")
+    if mutation.file.endswith(".py"):  # its own tests compile the other
+        compile(text.replace(mutation.before, mutation.after), mutation.file, "exec")
     file, _, name = mutation.tests.partition("::")
     source = (ROOT / file).read_text()
     assert f"def {name or 'test_'}" in source
