@@ -219,6 +219,11 @@ class Config(StageConfig):
     beta_end: Annotated[float, Unit("finest cells")] = Field(
         default=0.15, gt=0, le=10, description="width of the soft surface at the end of the fit"
     )
+    trials: Literal["on", "off"] = Field(
+        default="off",
+        description="judge the decisions during the fit on pixels that are not fitted, and take back those that make "
+        "it worse; off: take each decision once",
+    )
     # faults
     max_dropped: Steps = Field(
         default=20,
@@ -248,7 +253,7 @@ class Config(StageConfig):
             raise ValueError("a given light stands still: light_frame must be auto or world beside it")
         return self
 
-    @field_validator("specular", "refine_geometry", "refine_poses", mode="before")
+    @field_validator("specular", "refine_geometry", "refine_poses", "trials", mode="before")
     @classmethod
     def _switch(cls, value: Any) -> Any:
         return {"true": "on", "false": "off"}.get(str(value).lower(), value)

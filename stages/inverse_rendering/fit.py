@@ -25,14 +25,17 @@ from stages.inverse_rendering.model_selection import (
     restored,
     select_model,
     take_over,
+    unselected,
     validation_views,
 )
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.ray_sampling import U8, Batch, PixelTable
+from stages.inverse_rendering.ray_sampling import U8, Batch
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
+from stages.inverse_rendering.trial_loop import TrialLoop
+from stages.inverse_rendering.trials import LENGTH, SELECTION, SHADOWS, SKIN, SMOOTHING, Trials
 from stages.inverse_rendering.weakly_seen import SMOOTH_AT, smooth_weakly_seen
 
 LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
@@ -50,7 +53,7 @@ SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
 
 
 @dataclass(slots=True)
-class Trainer(TrainingLoop):
+class Trainer(TrialLoop):
     """The state of a running fit. prior: the surface with which refined geometry is compared. light_given: where the
     light comes from, if it is known before the fit: then it never changes."""
 
@@ -73,7 +76,6 @@ class Trainer(TrainingLoop):
     smoothed: float = 0.0  # share of the surface that the last of them reached
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
-    validation: tuple[int, ...] = field(init=False)
     poses: PoseHistory = field(init=False)
     robust: Robust = field(init=False)
 
@@ -82,6 +84,7 @@ class Trainer(TrainingLoop):
         self.validation = validation_views(len(self.views), self.settings)
         self.poses = PoseHistory.of(self.views)
         self.robust = Robust(self.views, self.settings.robust, self.settings.image_side)
+        self.trials = Trials(self.settings.trials == "on")
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """The optimiser of all parameters except the SDF grid, which has its own."""
@@ -104,8 +107,7 @@ class Trainer(TrainingLoop):
         if self.table is None:
             side = self.settings.image_side
             side = max(side // 2 ** (len(starts) - 1 - self.level), min(side, 256))
-            self.table = PixelTable(self.views, side, self.device)
-            self.table.exclude(() if self.choices else self.validation)
+            self.read_photos(side)
         if self.geometry_frozen:
             self.grid.values.requires_grad_(False)
 
@@ -128,7 +130,9 @@ class Trainer(TrainingLoop):
             self.choices = replace(given, facts=facts_of(given, self.settings, "the light moves with the camera"))
             self.table.exclude(())
             return
-        choices, estimate = select_model(self)
+        settled = self.settings.uniform_albedo_until + SETTLING + LENGTH
+        wanted = self.trials.allows(self, SELECTION, settled, self.validation)
+        choices, estimate = select_model(self) if wanted else (unselected(self), None)
         self.take(choices)
         for parameter in apply_light(self.model, estimate) if estimate is not None else ():
             self.optimiser.state.pop(parameter, None)
@@ -162,12 +166,14 @@ class Trainer(TrainingLoop):
         self.weigh_photos()
         due = sum(self.share() >= s for s in SHADOWS_AT)
         if self.shadows_solved < due:
-            self.model.solve_shadows()
+            if self.model.shadowing is not None and self.trials.allows(self, SHADOWS):
+                self.model.solve_shadows()
             self.shadows_solved = due
         still_light = not self.light_moves and not self.light_given
         asked = self.settings.skin_light and still_light and self.share() >= SKIN_AT
         if asked and self.choices is not None and not self.skin_asked:
-            self.ask_skin(self.choices)
+            if self.trials.allows(self, SKIN):
+                self.ask_skin(self.choices)
             self.skin_asked = True
         return rate
 
@@ -186,7 +192,8 @@ class Trainer(TrainingLoop):
         longest = self.settings.unseen_smoothing
         if longest <= 0 or self.smoothings >= due or self.geometry_frozen:
             return
-        self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)
+        if self.trials.allows(self, SMOOTHING):
+            self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)
         self.smoothings = due
 
     def weigh_photos(self) -> None:
@@ -228,7 +235,9 @@ class Trainer(TrainingLoop):
         rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
         known = None if explained is None else float(explained)
         found = correct_light(self.model, self.views, rays, known, self.device)
-        if found is not None:
+        if found is None:
+            self.trials.withdraw(SKIN)
+        else:
             self.skin_tells = True
             self.choices = replace(choices, facts=choices.facts | {"light": light | found})
             for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
@@ -287,6 +296,8 @@ class Trainer(TrainingLoop):
 
     def finish(self) -> None:
         """Make the SDF a distance again, after the last step."""
+        self.trials.finish(self)
+        self.release()
         self.grid.redistance()
 
     def compute_terms(self, batch: Batch, generator: torch.Generator) -> Terms:
@@ -319,7 +330,7 @@ class Trainer(TrainingLoop):
         """Drop the gradients outside of the optimiser."""
         self.grid.drop_gradient()
 
-    def parts(self) -> dict[str, Any]:
+    def own_parts(self) -> dict[str, Any]:
         """Model, choices and optimisers, for a checkpoint."""
         g = self.grid
         return {
@@ -333,8 +344,8 @@ class Trainer(TrainingLoop):
             "optimiser": self.optimiser.state_dict(),
         }
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Inverse of `parts`."""
+    def restore_own(self, state: dict[str, Any]) -> None:
+        """Inverse of `own_parts`."""
         g = self.grid
         g.cell = float(state["cell"])
         self.level = state["level"]

@@ -47,6 +47,7 @@ SILHOUETTE = 0.01  # share of the validation views' rays: allowed excess of the 
 CROSSED = "cross-polarised photos show no highlights"
 SELECTED = "cross-validation"  # reason of a decision, in the report
 GIVEN = "given"  # the light's: it was measured
+TAKEN_BACK = "a trial took the selection back"
 Facts = dict[str, dict[str, str | float | bool]]
 
 
@@ -158,6 +159,13 @@ def _with_given_light(c: Choices, source: str) -> Choices:
     """The choices with the light that was given."""
     light: dict[str, str | float | bool] = {**c.facts["light"], "from": source, "why": GIVEN}
     return replace(c, light_known=True, facts={**c.facts, "light": light})
+
+
+def unselected(fit: Fit) -> Choices:
+    """The whole model, after a trial took its selection back (trials.py)."""
+    given = given_model(fit.settings, calibrated=fit.model.spec.calibrated)
+    out = replace(given, facts=facts_of(given, fit.settings, TAKEN_BACK))
+    return _with_given_light(out, fit.light_given) if fit.light_given else _with_light_source(out, None)
 
 
 def polarised(views: list[PhotoView]) -> bool:

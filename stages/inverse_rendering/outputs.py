@@ -99,6 +99,9 @@ def model_facts(
     settings, model, guard, choices = trainer.settings, trainer.model, trainer.guard, trainer.choices
     spec = model.spec
     decided: dict[str, dict[str, str | float | bool]] = dict(choices.facts) if choices else {}
+    tried = trainer.trial_facts()
+    if tried:
+        decided["trials"] = tried
     return {
         **decided,
         **start,

@@ -146,7 +146,7 @@ class PixelTable:
         self.alpha, self.view = torch.from_numpy(alpha).to(device), torch.from_numpy(which).to(device)
         self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
         self.outside = torch.from_numpy(np.flatnonzero(kind == 0)).to(device)
-        self._pools = self.inside, self.outside
+        self._all = self._pools = self.inside, self.outside
         self.place(views)
 
     def place(self, views: list[PhotoView]) -> None:
@@ -154,6 +154,12 @@ class PixelTable:
         poses, device = np.stack([v.world_from_cam for v in views]).astype(np.float32), self.xy.device
         self.R = torch.from_numpy(np.ascontiguousarray(poses[:, :3, :3])).to(device)
         self.centre = torch.from_numpy(np.ascontiguousarray(poses[:, :3, 3])).to(device)
+
+    def withhold(self, pixels: Tensor | None) -> None:
+        """Never draw these pixels (N,) of the table, bool, from now on; None: all may be drawn again. `exclude` comes
+        after it."""
+        a, b = self._all
+        self._pools = self._all if pixels is None else (a[~pixels[a]], b[~pixels[b]])
 
     def exclude(self, views: tuple[int, ...]) -> None:
         """Draw from all views except these (positions in the fit) from now on."""

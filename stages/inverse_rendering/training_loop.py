@@ -133,6 +133,10 @@ class TrainingLoop(ABC):
         """For the report: what the fit did to the surface beside its steps."""
         return {}
 
+    def trial_facts(self) -> dict[str, str | float | bool]:
+        """For the report: decisions that were tried, if any may be."""
+        return {}
+
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""
         return True
