@@ -69,6 +69,9 @@ def test_auto_asks_torch_unless_it_is_a_build_for_the_cpu(torch: str | None, mon
 
     monkeypatch.setattr(plan, "version", version)
     monkeypatch.setitem(sys.modules, "torch", type("Torch", (), {"cuda": Cuda, "__version__": torch}))
+    monkeypatch.setattr(plan, "_has_kernels", lambda: False)
+    assert plan.device_for("auto") == "cpu"  # the processor is faster than a GPU in plain torch
+    monkeypatch.setattr(plan, "_has_kernels", lambda: True)
     assert plan.device_for("auto") == ("cpu" if torch == "2.13.0+cpu" else "cuda")
     assert plan.device_for("cuda") == "cuda"
     assert plan.device_for("cpu") == "cpu"

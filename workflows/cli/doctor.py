@@ -132,7 +132,14 @@ def _device() -> Finding:
     except (ImportError, OSError):
         return Finding("fault", "device", "torch can't be loaded", "make setup")
     if torch.cuda.is_available():
-        return Finding("ok", "device", f"cuda, {torch.cuda.get_device_name(0)}")
+        from pipeline.maths import cuda_kernels
+
+        name = f"cuda, {torch.cuda.get_device_name(0)}"
+        if cuda_kernels.available():
+            return Finding("ok", "device", name)
+        return Finding(
+            "note", "device", f"{name}: the fit's kernels can't be compiled", "the fit runs on the processor"
+        )
     return Finding("note", "device", "cpu", "where there is a CUDA device, the fit runs on it")
 
 

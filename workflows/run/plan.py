@@ -179,7 +179,7 @@ def device_for(wanted: str) -> str:
     import torch
 
     if torch.cuda.is_available():
-        return "cuda"
+        return "cuda" if wanted == "cuda" or _has_kernels() else "cpu"
     if wanted == "cuda":
         raise StageError(
             "there is no CUDA device that torch can use",
@@ -197,6 +197,13 @@ def _without_cuda() -> bool:
         return version("torch").endswith("+cpu")
     except PackageNotFoundError:  # a torch that no package manager knows of
         return False
+
+
+def _has_kernels() -> bool:
+    """Whether the fit's GPU kernels can be compiled here: without them the processor is faster."""
+    from pipeline.maths import cuda_kernels
+
+    return cuda_kernels.available()
 
 
 @dataclass(frozen=True, slots=True)
