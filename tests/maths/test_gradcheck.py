@@ -119,7 +119,7 @@ WITHOUT = {
 
 
 NUMPY = {  # nothing is differentiated there by torch
-    "cuda_kernels",  # float32 alone; its gradients are held to those of plain torch in tests/fields/test_cuda_kernels.py
+    "cuda_kernels",  # float32 alone; held to plain torch in tests/fields/test_cuda_kernels.py
     "latlong",
     "microfacet",
     "rigid_motion",
