@@ -145,7 +145,7 @@ class Config(StageConfig):
         "that moves between photos; auto: if the photos show that the cameras are off by more than their noise; on: "
         "without that condition",
     )
-    robust: bool = Field(
+    weigh_photos: bool = Field(
         default=False,
         description="weigh photos and their parts during the fit by their residuals against those of the other photos "
         "at the same place of the surface, so that hands, moved shadows and moved photos count less",

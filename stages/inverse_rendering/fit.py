@@ -83,7 +83,7 @@ class Trainer(TrialLoop):
         TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
         self.validation = validation_views(len(self.views), self.settings)
         self.poses = PoseHistory.of(self.views)
-        self.robust = Robust(self.views, self.settings.robust, self.settings.image_side)
+        self.robust = Robust(self.views, self.settings.weigh_photos, self.settings.image_side)
         self.trials = Trials(self.settings.trials == "on")
 
     def make_optimiser(self) -> torch.optim.Optimizer:
@@ -199,13 +199,13 @@ class Trainer(TrialLoop):
     def weigh_photos(self) -> None:
         """Weigh the photos and their parts by their residuals so far, when it is due."""
         due = sum(self.share() >= s for s in WEIGH_AT)
-        if self.settings.robust and self.robust.due < due:
+        if self.settings.weigh_photos and self.robust.due < due:
             self.robust.weigh()
             self.robust.due = due
 
     def know_labels(self, labels: Sequence[U8 | None], names: Sequence[str]) -> None:
         """Hair and eyes move between photos: their residuals may lie further from the others."""
-        if self.settings.robust:
+        if self.settings.weigh_photos:
             self.robust.know_labels(labels, names)
 
     def photo_facts(self) -> dict[str, str | float | bool]:
@@ -289,7 +289,9 @@ class Trainer(TrialLoop):
 
     def tend(self) -> None:
         """Keep the residuals of the step, and find the narrow band again every BAND_EVERY steps."""
-        if self.settings.robust and self.share() >= max(OBSERVE_FROM, self.settings.uniform_albedo_until + SETTLING):
+        if self.settings.weigh_photos and self.share() >= max(
+            OBSERVE_FROM, self.settings.uniform_albedo_until + SETTLING
+        ):
             self.robust.note(self.model)
         if self.step % BAND_EVERY == 0:
             self.grid.find_band()

@@ -21,7 +21,7 @@ from stages.inverse_rendering.robust import Robust, _cell_from_plane, cells_of
 from stages.inverse_rendering.training_loop import run_fit
 from tests.support.small_ball import SIDE, SMALL, ball_start, ball_view, hooks
 
-ROBUST = SMALL.changed(robust=True, specular="off", calibration="off", refine_geometry="on", light_order=2)
+ROBUST = SMALL.changed(weigh_photos=True, specular="off", calibration="off", refine_geometry="on", light_order=2)
 COVERED, TOP, LEFT, SIZE = 4, 26, 26, 10  # photo, and a square of its pixels on the ball
 
 
@@ -37,7 +37,7 @@ def photos(covered: bool) -> list[PhotoView]:
 
 @cache
 def fitted(covered: bool, robust: bool = True) -> Trainer:
-    t = new_trainer(photos(covered), ball_start(), ROBUST.changed(robust=robust), False, "cpu")
+    t = new_trainer(photos(covered), ball_start(), ROBUST.changed(weigh_photos=robust), False, "cpu")
     run_fit(t, hooks())
     return t
 
@@ -90,7 +90,7 @@ def test_what_is_behind_it_is_fitted_better() -> None:
 
 
 def test_off_keeps_nothing_and_weighs_nothing() -> None:
-    t = new_trainer(photos(covered=True)[:6], ball_start(), ROBUST.changed(robust=False, steps=10), False, "cpu")
+    t = new_trainer(photos(covered=True)[:6], ball_start(), ROBUST.changed(weigh_photos=False, steps=10), False, "cpu")
     while t.step < 10:
         t.advance()
     assert t.robust.weights is None and not t.robust.steps and t.photo_weights() == []
