@@ -233,8 +233,8 @@ class FittedPhoto(Artifact):
 class FittedFace(Artifact):
     """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit.
     refined: fitted photos whose cameras the fit moved (pipeline.fitted_cameras). registered: held-out photos, for
-    figures without the error of their cameras; nothing else uses these poses. photos: the
-    fitted photos, as the finished fit shows them."""
+    figures without the error of their cameras; nothing else uses these poses. photos: the fitted
+    photos, as the finished fit shows them."""
 
     field: FileRef
     light: FileRef

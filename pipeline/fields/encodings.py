@@ -81,7 +81,7 @@ class HashEncoding(nn.Module):
         w = torch.where(step.bool(), f, 1 - f).prod(-1)
         return torch.einsum("nlc,nlcf->nlf", w, self.table[at].to(x)).reshape(len(x), -1)
 
-    def grid(self) -> tuple[Tensor | int, ...]:
+    def grid(self) -> cuda_kernels.HashGrid:
         """Input of the GPU's kernels."""
         return self.offset, self.size, self.hashed, 2**self.log2_size - 1, self.lo, self.inv
 

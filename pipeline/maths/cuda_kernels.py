@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 SOURCE = Path(__file__).with_suffix(".cu")
 THREADS = 128  # of a block
 MOST = 2**31 - THREADS  # elements of one launch: they are counted in 32 bits
+HashGrid = tuple[Tensor, Tensor, Tensor, int, Tensor, Tensor]  # offset, size, hashed, mask, lo, inverse cells
 
 
 def usable(*tensors: Tensor) -> bool:
@@ -94,17 +95,17 @@ def band_adam(
     launch("band_adam", len(active), values.detach(), grad, m, v, active, *scalars)
 
 
-def hash_forward(table: Tensor, grid: tuple[Tensor | int, ...], x: Tensor) -> Tensor:
-    """Features (N, 2 L) at x (N, 3). grid: offset, size, hashed, mask, lo, inverse cells of the encoding."""
-    levels = len(grid[0]) if isinstance(grid[0], Tensor) else 0
+def hash_forward(table: Tensor, grid: HashGrid, x: Tensor) -> Tensor:
+    """Features (N, 2 L) at x (N, 3)."""
+    levels = len(grid[0])
     out = x.new_empty(len(x), 2 * levels)
     launch("hash_forward", len(x) * levels, levels, table.detach(), *grid, x.contiguous(), out)
     return out
 
 
-def hash_backward(table: Tensor, grid: tuple[Tensor | int, ...], x: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+def hash_backward(table: Tensor, grid: HashGrid, x: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of the table and of x (N, 3), from that of the features (N, 2 L)."""
-    levels = len(grid[0]) if isinstance(grid[0], Tensor) else 0
+    levels = len(grid[0])
     of_table, of_x = torch.zeros_like(table), torch.zeros_like(x)
     x, grad = x.contiguous(), grad.contiguous()
     launch("hash_backward", len(x) * levels, levels, table.detach(), *grid, x, grad, of_table, of_x)

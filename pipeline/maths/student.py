@@ -14,8 +14,8 @@ def student_weight(r: F64, nu: F64 | float) -> F64:
     0 -> (N,) in [0, 1].
 
     The score of the distribution over that of a Gaussian, -(d/dr ln p(r)) / r: with it, weighted least squares is the
-    maximum likelihood estimate. Residuals below their scale have weight 1. Of an infinite residual
-    nothing is left (1e-299).
+    maximum likelihood estimate. Residuals below their scale have weight 1. That of
+    an infinite residual is almost 0 (1e-299).
 
     Source: Lange, Little and Taylor, Robust statistical modeling using the t distribution (1989).
     """

@@ -307,7 +307,8 @@ class Trainer(TrialLoop):
         kind, short = torch.device(self.device).type, self.settings.precision == "bfloat16"
         with torch.autocast(kind, torch.bfloat16, enabled=short):
             found = terms(self.model, batch, self.weights(), generator, 1.0 - 0.8 * self.share(), self.robust.of(batch))
-        self.robust.latest = None if found.seen is None else (batch, found.seen)
+        if self.settings.weigh_photos:
+            self.robust.latest = None if found.seen is None else (batch, found.seen)
         return found
 
     def weights(self) -> Config:

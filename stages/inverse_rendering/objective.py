@@ -93,7 +93,8 @@ def terms(
     rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
     counted = rgb if weights is None else rgb * weights[rays]
     out.add("rgb", settings.rgb * counted.sum() / n_rays, rgb, rays)
-    out.seen = Seen(rays, rgb.detach(), shell.x[pick].detach(), shell.n[pick].detach())
+    x = shell.x[pick].detach()
+    out.seen = Seen(rays, rgb.detach(), x, shell.n[pick].detach())
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     if model.ambient is not None:
         out.add("hidden_light", HIDDEN_LIGHT * hidden_light(model.light(), model.spec.light_start))
@@ -108,7 +109,7 @@ def terms(
             high = losses.above(f0_of(shaded.along_normal, shaded.inv_kappa), settings.f0_limit)
             out.add("f0_excess", settings.f0_excess * high.mean(), high, rays)
     if grid_of(model.geometry).values.requires_grad:  # not for a frozen surface
-        out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, shell.x[pick].detach(), generator))
+        out.add("smooth", settings.smooth * smooth_scale * _smoothness(model, x, generator))
     with torch.no_grad():
         exact = batch.bound[rays] == 0
         square = (srgb_from_linear(colour.clamp(0, 1)) - target) ** 2

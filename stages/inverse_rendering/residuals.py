@@ -16,10 +16,9 @@ from torch import Tensor
 
 from pipeline.colour import linear_from_srgb, srgb_from_linear
 from pipeline.fields.face import FaceModel
-from pipeline.images import shrink_whole
 from stages.inverse_rendering.objective import calibrated_colours
-from stages.inverse_rendering.ray_sampling import U8, WHOLE, Batch, PhotoView, PixelTable, codes_at, factor_for
-from stages.inverse_rendering.stereo import noise_of
+from stages.inverse_rendering.ray_sampling import U8, WHOLE, Batch, PhotoView, PixelTable, codes_at
+from stages.inverse_rendering.stereo import photo_noise
 from stages.inverse_rendering.systems import render_any
 
 PIXELS = 60_000  # of all photos' subjects together: about a second on two cores
@@ -113,13 +112,6 @@ def view_errors(
             )
         )
     return tuple(out)
-
-
-def photo_noise(view: PhotoView, side: int) -> float:
-    """Standard deviation of the noise of a photo's green channel within its subject, sRGB, at the size of the fit."""
-    f = factor_for(view.size, side)
-    green = srgb_from_linear(shrink_whole(np.ascontiguousarray(view.rgb[..., 1]), f)).astype(np.float32)
-    return noise_of(green, shrink_whole(view.alpha, f) > WHOLE)
 
 
 def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Tensor]:

@@ -18,7 +18,7 @@ from pipeline.fields.face import FaceModel
 from stages.inverse_rendering.objective import Seen
 from stages.inverse_rendering.photo_weights import CELLS, FACINGS, LOW, Residuals, Weights, weigh
 from stages.inverse_rendering.ray_sampling import U8, Batch, PhotoView, codes_at, factor_for, normalised_positions
-from stages.inverse_rendering.residuals import photo_noise
+from stages.inverse_rendering.stereo import photo_noise
 
 F64 = npt.NDArray[np.float64]
 OBSERVE_FROM = 0.4  # share of the fit: model and light are selected, and the reflectance has adapted to them

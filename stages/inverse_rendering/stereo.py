@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from pipeline import transforms
+from pipeline.colour import srgb_from_linear
 from pipeline.fields.geometry import GridSdf
 from pipeline.fields.kernels import look_up
 from pipeline.images import shrink_whole
@@ -29,7 +30,7 @@ from pipeline.maths.correlation import FLOOR, agreement
 from pipeline.maths.tracing import box_interval
 from pipeline.pieces import filled, subject_pieces
 from stages.inverse_rendering.initial_geometry import Start
-from stages.inverse_rendering.ray_sampling import PhotoView, factor_for
+from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, factor_for
 
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
@@ -156,6 +157,13 @@ def noise_of(image: F32, inside: npt.NDArray[np.bool_]) -> float:
         return 0.0
     answer = cv2.filter2D(image, -1, LAPLACIAN)[inner]
     return float(1.4826 * np.median(np.abs(answer)) / np.sqrt((LAPLACIAN**2).sum()))
+
+
+def photo_noise(view: PhotoView, side: int) -> float:
+    """Standard deviation of the noise of a photo's green channel within its subject, sRGB, at the size of the fit."""
+    f = factor_for(view.size, side)
+    green = srgb_from_linear(shrink_whole(np.ascontiguousarray(view.rgb[..., 1]), f)).astype(np.float32)
+    return noise_of(green, shrink_whole(view.alpha, f) > WHOLE)
 
 
 def without_distortion(image: F32, K: F64, distortion: F64) -> F32:

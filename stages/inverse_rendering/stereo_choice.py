@@ -88,7 +88,8 @@ def stereo_start(
         return score(dense_start(without(maps, waiting), seen))
 
     start = start_from_photos(hull, views, device, check, sweeps)
-    least = (swept := score(start)) + GAIN
+    swept = score(start)
+    least = swept + GAIN
     found, sized, name = dense_score(depth_maps(hull, views, check, waiting, QUICK)), "small ", "sweep"
     maps = depth_maps(hull, views, check, waiting) if found > least - FINER else None
     if maps is not None and found <= least:

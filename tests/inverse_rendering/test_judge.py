@@ -20,7 +20,8 @@ from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.judge import Fitted, findings
 from stages.inverse_rendering.outputs import predict_view
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.residuals import LabelError, ViewError, photo_noise, view_errors
+from stages.inverse_rendering.residuals import LabelError, ViewError, view_errors
+from stages.inverse_rendering.stereo import photo_noise
 from stages.inverse_rendering.training_loop import run_fit
 from tests.support.small_ball import SMALL, ball_start, ball_view, fit_of_the_ball, hooks, trainer
 from tests.support.spread import made_once
