@@ -102,7 +102,7 @@ class Config(StageConfig):
         default=AUTO,
         description="source of the light; lobe: estimated from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo; stage: the lamps of a light stage, as distant lights; "
-        "auto: light_file if it is given, else lobe",
+        "auto: light_file if it is given, else the lamps of a light stage that account for most of its light, else lobe",
     )
     light_file: str = Field(
         default="",
@@ -220,7 +220,7 @@ class Config(StageConfig):
         default=0.15, gt=0, le=10, description="width of the soft surface at the end of the fit"
     )
     trials: Literal["on", "off"] = Field(
-        default="off",
+        default="on",
         description="judge the decisions during the fit on pixels that are not fitted, and take back those that make "
         "it worse; off: take each decision once",
     )

@@ -48,7 +48,9 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.training_loop import Hooks, run_fit
 
     clock, settings = Clock(context.waited), config
-    known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
+    known = None
+    if settings.preset not in COMPARED:  # which estimate their light
+        known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
     if known is not None and settings.light_order == AUTO:
         settings = settings.changed(light_order=MAX_ORDER)
     dropped = set(inputs.masks.artifact.dropped)
@@ -154,7 +156,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=32,
+    version=33,
     inputs=Inputs,
     config=Config,
     output=FittedFace,
