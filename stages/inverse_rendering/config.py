@@ -15,6 +15,7 @@ from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
 from pipeline.units import Cells, ContentHash, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
 
+GPU_BATCH = 16_384  # rays of a step on a GPU, where it takes as long as one of 4,096
 AUTO: Final = "auto"  # decided by cross-validation during the fit (stages.inverse_rendering.cross_validation)
 MAX_RANK, MAX_ORDER = 3, 10  # values until the model selection: the paper's
 
