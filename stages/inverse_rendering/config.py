@@ -103,7 +103,7 @@ class Config(StageConfig):
         default=AUTO,
         description="source of the light; lobe: estimated from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo; stage: the lamps of a light stage, as distant lights; "
-        "auto: light_file if it is given, else the lamps of a light stage that account for most of its light, else lobe",
+        "auto: light_file if it is given, else the lamps of a light stage that are most of its light, else lobe",
     )
     light_file: str = Field(
         default="",
