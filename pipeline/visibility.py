@@ -163,3 +163,8 @@ class _Masks:
 
 
 _MASKS = _Masks(KEPT)
+
+
+def mask_of(path: Path) -> Mask:
+    """(H, W) what a mask covers."""
+    return _MASKS.inside(path)
