@@ -62,9 +62,9 @@ def with_hair(region: Indices, hair: Mask) -> Indices:
 
 
 def region_colours(albedo: F64, region: Indices, cosine: F64, depth: F64) -> F64:
-    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): the upper BEST of all
-    that are seen well by the cosine (V,), or of LOOSE regions by the depth (V,) inside of the silhouettes. A band that is not seen takes the nearest band's
-    colour, other regions that of the whole head."""
+    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): the upper BEST of
+    all that are seen well by the cosine (V,), or of LOOSE regions by the depth (V,) inside of the silhouettes. A band
+    that is not seen takes the nearest band's colour, other regions that of the whole head."""
     seen, known = cosine >= CLEAR, {}
     for code in np.unique(region):
         mine = region == code

@@ -63,7 +63,7 @@ def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
     albedo = np.where((region == 0)[:, None], 0.02, 0.6) * np.ones((450, 3))
     albedo[~seen] = 9.0  # means nothing
     cosine, depth = np.where(seen, 0.9, 0.0), np.where(seen, 0.2, 0.0)
-    # at the outline the wall shines through, on more than half of what is seen, some of it straight in front of a camera
+    # at the outline the wall shines through, on more than half of what is seen, and straight before a camera
     cosine[:18], depth[:18], albedo[:18] = 0.95, 0.01, 0.8
     found = region_colours(albedo, region, cosine, depth)
     np.testing.assert_allclose(found[region == 0], 0.02)
