@@ -47,4 +47,5 @@ def _distance(view: FittedPhoto) -> F64:
     scale = SIDE / max(inside.shape)
     size = (max(1, round(inside.shape[1] * scale)), max(1, round(inside.shape[0] * scale)))
     small = cv2.resize(inside.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(cv2.distanceTransform(small, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float64) / max(small.shape)
+    pixels = np.asarray(cv2.distanceTransform(small, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float64)
+    return np.asarray(pixels / max(small.shape), np.float64)
