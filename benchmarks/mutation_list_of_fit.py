@@ -169,7 +169,7 @@ OF_FIT = (
     Mutation("stages/bake/unseen.py", "depth if code in LOOSE else cosine", "cosine",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "cosine >= least_cosine", "cosine >= 0", "tests/bake/test_bake_unseen.py"),
-    Mutation("stages/bake/outline_depth.py", "/ max(small.shape)", "", "tests/bake/test_bake_unseen.py"),
+    Mutation("stages/bake/outline_depth.py", "pixels / max(small.shape)", "pixels", "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", "[names[nearest]] * head.scale", "[names[nearest]]",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", 'REGIONS.index("face"), region)', 'REGIONS.index("neck"), region)',
