@@ -1,0 +1,179 @@
+"""Processor time and peak memory of the stages against one thing that grows by a factor of eight.
+
+    python -m benchmarks.scaling FOLDER --capture ../shared/captures/head_a --run runs/a [--only photos]
+
+    photos   capture, poses, masks    of made-up captures (benchmarks/many_photos.py) of small photos
+    pixels   capture, poses, masks    the same, of few photos
+    texels   bake                     of the run's fit, on its mesh
+    faces    surface, uv              of the run's fit, at other lattices; charts of the scan's own mesh
+
+Each point is a process of its own, so that its peak memory is its own: memory before is of the start and of what was
+loaded. y = a x^b is fitted to each stage's seconds of processor time, and to its memory over that of the start. Prints
+tables, and writes FOLDER/scaling.json after every point; a point that is in it is not measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.many_photos import enlarge
+from pipeline.contract import peak_memory_mb
+from workflows.run import host_info
+
+FEW, SMALL = 27, 512  # photos where their pixels grow; pixels along a side where their number grows
+AXES: dict[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
+    "photos": ((27, 54, 108, 216), ("capture", "poses", "masks")),
+    "pixels": ((724, 1024, 1448, 2048), ("capture", "poses", "masks")),  # a side: their squares grow by 8
+    "texels": ((512, 724, 1024, 1448), ("bake",)),  # a side
+    "faces": ((181, 256, 362, 512), ("surface", "uv")),  # cells along the lattice: faces are their squares
+}
+BEFORE = ("capture", "poses", "masks", "inverse_rendering", "surface", "template", "uv", "reflectance")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One measurement. x: photos, pixels of one, texels, or faces. cpu: seconds of processor time of each stage; peak:
+    MB of the process at its end; start: MB before the first stage."""
+
+    axis: str
+    value: int
+    x: float
+    cpu: dict[str, float]
+    peak: dict[str, float]
+    start: float
+
+
+# ------------------------------------------------------------------ one point, in a process of its own
+def measure(axis: str, value: int, folder: Path, capture: Path, finished: Path) -> Point:
+    """Make what the point needs, and run its stages."""
+    if axis in ("photos", "pixels"):
+        return _of_photos(axis, value, folder, capture)
+    return _of_fit(axis, value, folder, finished)
+
+
+def _of_photos(axis: str, value: int, folder: Path, capture: Path) -> Point:
+    photos, side = (value, SMALL) if axis == "photos" else (FEW, value)
+    made = folder / f"{axis}_{value}"
+    if not made.exists():
+        enlarge(capture, made, photos, side, side)
+    stages = AXES[axis][1]
+    found = run({"capture": str(made), "out": str(folder / "out"), "store": str(folder / "store"),
+                 "until": stages[-1], "force": True}, stages)  # fmt: skip
+    shutil.rmtree(made)
+    return Point(axis, value, float(photos if axis == "photos" else side * side), *found[:3])
+
+
+def _of_fit(axis: str, value: int, folder: Path, finished: Path) -> Point:
+    from pipeline.store import link_or_copy
+
+    record = json.loads((finished / "run.json").read_text())
+    store = folder / "store"
+    for stage in BEFORE:
+        if stage in record["stages"]:
+            part = Path(stage) / record["stages"][stage]["key"]
+            shutil.copytree(Path(record["store"]) / part, store / part, copy_function=link_or_copy)
+    sets = [f"bake.size={value}"] if axis == "texels" else [f"surface.resolution={value}", "uv.mesh=scan"]
+    stages = AXES[axis][1]
+    changed = {"out": str(folder / "out"), "store": str(store), "until": stages[-1], "from_stage": stages[0]}
+    request = record["request"] | changed | {"sets": record["request"]["sets"] + sets, "pack": None}
+    cpu, peak, start, done = run(request, stages)
+    x = float(value * value) if axis == "texels" else float(done["surface"].located.artifact.faces)
+    return Point(axis, value, x, cpu, peak, start)
+
+
+def run(
+    request: dict[str, Any], stages: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float], float, dict[str, Any]]:
+    """Processor seconds and peak of each of the stages, the memory before, and what was done."""
+    import pipeline.threads  # noqa: F401
+    from pipeline.contract import execute
+    from workflows.run.plan import make_plan
+    from workflows.run.request import RunRequest
+    from workflows.run.runner import run_stages
+
+    cpu: dict[str, float] = {}
+    peak: dict[str, float] = {}
+
+    def timed(stage: Any, *given: Any, **more: Any) -> Any:
+        before = processor_seconds()
+        done = execute(stage, *given, **more)
+        if stage.name in stages:
+            assert not done.reused, stage.name
+            cpu[stage.name], peak[stage.name] = processor_seconds() - before, peak_memory_mb()
+        return done
+
+    plan = make_plan(RunRequest(**request))
+    start = peak_memory_mb()
+    done = {d.stage: d for d in run_stages(plan, execute_stage=timed)}
+    return {k: round(v, 2) for k, v in cpu.items()}, peak, start, done
+
+
+def processor_seconds() -> float:
+    """Of this process and its finished children."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(u.ru_utime + u.ru_stime for u in used)
+
+
+# ------------------------------------------------------------------ laws
+def laws(points: Sequence[Point]) -> list[list[str]]:
+    """Rows: axis, stage, from .. to, seconds there, b of the seconds, MB there, b of the memory."""
+    rows = []
+    for axis, (_, stages) in AXES.items():
+        line = sorted((p for p in points if p.axis == axis), key=lambda p: p.x)
+        for stage in stages if len(line) > 1 else ():
+            x, cpu = [p.x for p in line], [p.cpu[stage] for p in line]
+            memory = [p.peak[stage] for p in line]
+            rows.append([axis, stage, f"{short(x[0])} to {short(x[-1])}", f"{cpu[0]:.1f} to {cpu[-1]:.1f}", law(x, cpu),
+                         f"{memory[0]:.0f} to {memory[-1]:.0f}", law(x, memory)])  # fmt: skip
+    return rows
+
+
+def law(x: list[float], y: list[float]) -> str:
+    """The exponent with its standard error."""
+    _, b, error = host_info.power_law(x, y)
+    return f"{b:.2f} +- {error:.2f}"
+
+
+def short(x: float) -> str:
+    """A number of photos, pixels, texels or faces."""
+    return f"{x / 1e6:.2g} million" if x >= 1e6 else f"{x:,.0f}"
+
+
+HEAD = ["against", "stage", "from .. to", "processor s", "exponent", "peak MB", "exponent"]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="for what is made, and scaling.json")
+    parser.add_argument("--capture", type=Path, required=True, help="a FaceScape folder with photos")
+    parser.add_argument("--run", dest="finished", type=Path, required=True, help="a finished run, for texels and faces")
+    parser.add_argument("--only", choices=list(AXES), help="one axis")
+    given = parser.parse_args(arguments)
+    given.folder.mkdir(parents=True, exist_ok=True)
+    path = given.folder / "scaling.json"
+    points = [Point(**p) for p in json.loads(path.read_text())["points"]] if path.is_file() else []
+    for axis in [given.only] if given.only else AXES:
+        for value in AXES[axis][0]:
+            if any((p.axis, p.value) == (axis, value) for p in points):
+                continue
+            work = given.folder / "work"
+            shutil.rmtree(work, ignore_errors=True)
+            points.append(host_info.apart(measure, axis, value, work, given.capture, given.finished))
+            shutil.rmtree(work, ignore_errors=True)
+            found = {"machine": host_info.machine(), "points": [asdict(p) for p in points]}
+            path.write_text(json.dumps(found, indent=1) + "\n")
+            print(points[-1], flush=True)
+    for row in [HEAD, ["---"] * len(HEAD), *laws(points)]:
+        print("| " + " | ".join(row) + " |")
+
+
+if __name__ == "__main__":
+    main()
