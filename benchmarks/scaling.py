@@ -1,10 +1,10 @@
 """Processor time and peak memory of the stages against one thing that grows by a factor of eight.
 
-    python -m benchmarks.scaling FOLDER --capture ../shared/captures/head_a --run runs/a [--only photos]
+    python -m benchmarks.scaling FOLDER --capture ../shared/captures/head_a --run runs/a [--only photos] [--most 1]
 
     photos   capture, poses, masks    of made-up captures (benchmarks/many_photos.py) of small photos
     pixels   capture, poses, masks    the same, of few photos
-    texels   bake                     of the run's fit, on its mesh
+    texels   bake                     of the run's fit, on its mesh, without the fit of a standard material
     faces    surface, uv              of the run's fit, at other lattices; charts of the scan's own mesh
 
 Each point is a process of its own, so that its peak memory is its own: memory before is of the start and of what was
@@ -27,12 +27,18 @@ from benchmarks.many_photos import enlarge
 from pipeline.contract import peak_memory_mb
 from workflows.run import host_info
 
-FEW, SMALL = 27, 512  # photos where their pixels grow; pixels along a side where their number grows
+FEW, SMALL = 8, 512  # photos where their pixels grow; pixels along a side where their number grows
 AXES: dict[str, tuple[tuple[int, ...], tuple[str, ...]]] = {
-    "photos": ((27, 54, 108, 216), ("capture", "poses", "masks")),
+    "photos": ((4, 8, 16, 32), ("capture", "poses", "masks")),
     "pixels": ((724, 1024, 1448, 2048), ("capture", "poses", "masks")),  # a side: their squares grow by 8
-    "texels": ((512, 724, 1024, 1448), ("bake",)),  # a side
-    "faces": ((181, 256, 362, 512), ("surface", "uv")),  # cells along the lattice: faces are their squares
+    "texels": ((362, 512, 724, 1024), ("bake",)),  # a side
+    "faces": ((91, 128, 181, 256), ("surface", "uv")),  # cells along the lattice: faces are their squares
+}
+SETTING = {"bake": "size", "surface": "resolution"}
+CHANGED: dict[str, dict[str, Any]] = {  # charts of the scan; maps and detail without the fit of a standard material
+    "surface": {},
+    "uv": {"mesh": "scan"},
+    "bake": {"fit_standard": False},
 }
 BEFORE = ("capture", "poses", "masks", "inverse_rendering", "surface", "template", "uv", "reflectance")
 
@@ -63,56 +69,65 @@ def _of_photos(axis: str, value: int, folder: Path, capture: Path) -> Point:
     made = folder / f"{axis}_{value}"
     if not made.exists():
         enlarge(capture, made, photos, side, side)
-    stages = AXES[axis][1]
-    found = run({"capture": str(made), "out": str(folder / "out"), "store": str(folder / "store"),
-                 "until": stages[-1], "force": True}, stages)  # fmt: skip
+    used, start, _ = run({"capture": str(made), "out": str(folder / "out"), "store": str(folder / "store"),
+                          "until": AXES[axis][1][-1], "force": True})  # fmt: skip
     shutil.rmtree(made)
-    return Point(axis, value, float(photos if axis == "photos" else side * side), *found[:3])
+    return Point(axis, value, float(photos if axis == "photos" else side * side), used.cpu, used.peak, start)
 
 
 def _of_fit(axis: str, value: int, folder: Path, finished: Path) -> Point:
-    from pipeline.store import link_or_copy
-
-    record = json.loads((finished / "run.json").read_text())
-    store = folder / "store"
-    for stage in BEFORE:
-        if stage in record["stages"]:
-            part = Path(stage) / record["stages"][stage]["key"]
-            shutil.copytree(Path(record["store"]) / part, store / part, copy_function=link_or_copy)
-    sets = [f"bake.size={value}"] if axis == "texels" else [f"surface.resolution={value}", "uv.mesh=scan"]
-    stages = AXES[axis][1]
-    changed = {"out": str(folder / "out"), "store": str(store), "until": stages[-1], "from_stage": stages[0]}
-    request = record["request"] | changed | {"sets": record["request"]["sets"] + sets, "pack": None}
-    cpu, peak, start, done = run(request, stages)
-    x = float(value * value) if axis == "texels" else float(done["surface"].located.artifact.faces)
-    return Point(axis, value, x, cpu, peak, start)
-
-
-def run(
-    request: dict[str, Any], stages: Sequence[str]
-) -> tuple[dict[str, float], dict[str, float], float, dict[str, Any]]:
-    """Processor seconds and peak of each of the stages, the memory before, and what was done."""
+    """The stages on what the run's store has, with the settings of that run but one."""
     import pipeline.threads  # noqa: F401
-    from pipeline.contract import execute
+    from pipeline.contract import inputs_from
+    from pipeline.store import Store
+    from stages.registry import REGISTRY
+
+    record, made = json.loads((finished / "run.json").read_text()), Store(folder / "store")
+    store, known = Store(Path(record["store"])), {s.name: s for s in REGISTRY}
+    keys = {name: s["key"] for name, s in record["stages"].items()}
+    finished_parts = {n: store.load(n, keys[n], known[n].output) for n in BEFORE}
+    assert all(finished_parts.values()), "the run's store is not complete"
+    stages, used = AXES[axis][1], Used()
+    start, x = peak_memory_mb(), float(value * value)
+    for name in stages:
+        settings = store.load_run(name, keys[name]).get("config", {})
+        assert isinstance(settings, dict)
+        config = known[name].config(**settings | CHANGED[name] | ({} if name == "uv" else {SETTING[name]: value}))
+        done = used.execute(known[name], inputs_from(known[name], finished_parts), config, made)
+        finished_parts[name] = done.located
+        x = float(done.located.artifact.faces) if name == "surface" else x
+    return Point(axis, value, x, used.cpu, used.peak, start)
+
+
+class Used:
+    """What stages took. cpu: processor seconds of each; peak: MB of the process at its end."""
+
+    def __init__(self) -> None:
+        self.cpu: dict[str, float] = {}
+        self.peak: dict[str, float] = {}
+
+    def execute(self, stage: Any, *given: Any, **more: Any) -> Any:
+        """As pipeline.contract.execute."""
+        from pipeline.contract import execute
+
+        before = processor_seconds()
+        done = execute(stage, *given, **more)
+        assert not done.reused, stage.name
+        self.cpu[stage.name] = round(processor_seconds() - before, 2)
+        self.peak[stage.name] = peak_memory_mb()
+        return done
+
+
+def run(request: dict[str, Any]) -> tuple[Used, float, dict[str, Any]]:
+    """What the stages of a run took, the MB before, and what was done."""
+    import pipeline.threads  # noqa: F401
     from workflows.run.plan import make_plan
     from workflows.run.request import RunRequest
     from workflows.run.runner import run_stages
 
-    cpu: dict[str, float] = {}
-    peak: dict[str, float] = {}
-
-    def timed(stage: Any, *given: Any, **more: Any) -> Any:
-        before = processor_seconds()
-        done = execute(stage, *given, **more)
-        if stage.name in stages:
-            assert not done.reused, stage.name
-            cpu[stage.name], peak[stage.name] = processor_seconds() - before, peak_memory_mb()
-        return done
-
-    plan = make_plan(RunRequest(**request))
+    plan, used = make_plan(RunRequest(**request)), Used()
     start = peak_memory_mb()
-    done = {d.stage: d for d in run_stages(plan, execute_stage=timed)}
-    return {k: round(v, 2) for k, v in cpu.items()}, peak, start, done
+    return used, start, {d.stage: d for d in run_stages(plan, execute_stage=used.execute)}
 
 
 def processor_seconds() -> float:
@@ -156,21 +171,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--capture", type=Path, required=True, help="a FaceScape folder with photos")
     parser.add_argument("--run", dest="finished", type=Path, required=True, help="a finished run, for texels and faces")
     parser.add_argument("--only", choices=list(AXES), help="one axis")
+    parser.add_argument("--most", type=int, default=100, help="end after so many new points; the next call goes on")
     given = parser.parse_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
     path = given.folder / "scaling.json"
     points = [Point(**p) for p in json.loads(path.read_text())["points"]] if path.is_file() else []
-    for axis in [given.only] if given.only else AXES:
-        for value in AXES[axis][0]:
-            if any((p.axis, p.value) == (axis, value) for p in points):
-                continue
-            work = given.folder / "work"
-            shutil.rmtree(work, ignore_errors=True)
-            points.append(host_info.apart(measure, axis, value, work, given.capture, given.finished))
-            shutil.rmtree(work, ignore_errors=True)
-            found = {"machine": host_info.machine(), "points": [asdict(p) for p in points]}
-            path.write_text(json.dumps(found, indent=1) + "\n")
-            print(points[-1], flush=True)
+    axes, known = [given.only] if given.only else list(AXES), {(p.axis, p.value) for p in points}
+    for axis, value in [(a, v) for a in axes for v in AXES[a][0] if (a, v) not in known][: given.most]:
+        work = given.folder / "work"
+        shutil.rmtree(work, ignore_errors=True)
+        points.append(host_info.apart(measure, axis, value, work, given.capture, given.finished))
+        shutil.rmtree(work, ignore_errors=True)
+        found = {"machine": host_info.machine(), "points": [asdict(p) for p in points]}
+        path.write_text(json.dumps(found, indent=1) + "\n")
+        print(points[-1], flush=True)
     for row in [HEAD, ["---"] * len(HEAD), *laws(points)]:
         print("| " + " | ".join(row) + " |")
 

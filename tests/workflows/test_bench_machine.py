@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -118,11 +119,21 @@ def test_the_ball_is_closed_and_round() -> None:
 
 
 def test_a_rate_is_the_median(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One slow call of five, and the first one, which warms up, do not count."""
-    times = iter([0.0, 2.0, 2.0, 4.0, 4.0, 54.0, 54.0, 56.0, 56.0, 57.0])
-    monkeypatch.setattr(machine_rates.time, "perf_counter", lambda: next(times))
+    """One slow call of five, and the first one, which warms up, do not count. Processor time counts for each core."""
+    times = [0.0, 2.0, 2.0, 4.0, 4.0, 54.0, 54.0, 56.0, 56.0, 57.0]
     calls: list[int] = []
-    assert machine_rates.rate(8.0, lambda: calls.append(1)) == 4.0 and len(calls) == 6
+    for clock, of, cores in (("perf_counter", machine_rates.wall_rate, 1), ("process_time", machine_rates.rate, 3)):
+        left = iter(times)
+        monkeypatch.setattr(machine_rates.time, clock, lambda left=left: next(left))
+        monkeypatch.setattr(machine_rates, "_cores", lambda: 3)
+        assert of(8.0, lambda: calls.append(1)) == 4.0 * cores
+    assert len(calls) == 12
+
+
+def test_waiting_is_no_work_of_the_processor() -> None:
+    assert machine_rates.rate(1.0, lambda: time.sleep(0.05)) > 5 * machine_rates.wall_rate(
+        1.0, lambda: time.sleep(0.05)
+    )
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 
 from benchmarks import many_photos, scaling
 from benchmarks.scaling import AXES, Point
-from stages.registry import REGISTRY
+from stages.registry import REGISTRY, SOURCE
 
 SIZE, FRAME = 64, (384, 256)
 POINTS = np.array([[0.05, -0.03, 1.0], [-0.08, 0.02, 1.1]])
@@ -75,6 +76,16 @@ def test_a_folder_without_photos_is_refused(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     with pytest.raises(SystemExit, match="exists"):
         many_photos.main([str(source), str(tmp_path / "there")])
+
+
+# ------------------------------------------------------------------ stages side by side
+def test_the_stages_are_a_chain() -> None:
+    """Each stage needs what the one before it made, so that no two stages of one run can overlap (docs/benchmarks.md).
+    Without a light stage `reflectance` is over at once: bake waits for it nevertheless, in no time."""
+    ready = {SOURCE: 0}
+    for number, stage in enumerate(REGISTRY, 1):
+        ready[stage.name] = 1 + max(ready[f.name] for f in dataclasses.fields(stage.inputs))
+        assert ready[stage.name] == number, stage.name
 
 
 # ------------------------------------------------------------------ laws

@@ -35,18 +35,18 @@ SHOWN: dict[str, tuple[str, float, str]] = {  # what a rate is, its unit, the un
     "exr_written": ("EXR of 16-bit floats written", 1e6, "MP/s"),
     "rays": ("Embree, 80,000 triangles", 1e6, "million rays/s"),
 }
-WHY: dict[str, str] = {
-    "capture": "photos are checked one after the other on one core, in some twenty passes of numpy over each",
-    "poses": "features and matches run photo after photo in OpenCV; solved cameras wait for COLMAP's mapper",
-    "masks": "photos are decoded again for labels and extent; passes of numpy at full size; of people, GrabCut",
-    "inverse_rendering": "hundreds of small torch operations a step, and passes over memory in stereo and smoothing "
-    "before and between steps",
-    "surface": "the field is loaded and called in blocks; components, handles and normals by numpy on one core",
-    "template": "a sparse system is factorised for each of the sweeps, and Python loops over the mesh's repairs",
-    "uv": "heap, cuts and packing in Python on one core",
-    "bake": "factors of sparse systems (SuperLU, one core) for smoothing and for how gloss varies",
-    "usd": "pictures are rendered by passes of numpy, and writers of USD, glTF and OBJ run on one core",
-    "report": "FLIP and SSIM by passes of numpy, pictures and meshes packed into one page on one core",
+WHY: dict[str, str] = {  # by profiles in docs/benchmarks.md and by the code
+    "capture": "one photo after the other on one core: some twenty passes of numpy and two networks over each",
+    "poses": "photos are decoded again, features and matches go photo after photo; solved cameras wait for the mapper",
+    "masks": "photos are decoded twice; components and matting by passes at full size; of people, GrabCut",
+    "inverse_rendering": "hundreds of small torch operations a step; smoothing and stereo pass over memory beside the "
+    "steps. Depth maps alone are near their floor",
+    "surface": "marching cubes block after block; components, handles and normals by numpy on one core",
+    "template": "rounds of nearest places, solver and repairs of folds, with numpy on one core between them",
+    "uv": "decimation, subdivision by sparse products, charts and packing on one core",
+    "bake": "sparse systems are factorised on one core (SuperLU) for smoothing and for how gloss varies",
+    "usd": "texture coordinates of the dense mesh, writers of USD, glTF and OBJ, and PNG, on one core",
+    "report": "FLIP by passes of numpy over each view, and a page of some 18 MB, on one core",
 }
 
 

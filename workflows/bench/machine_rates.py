@@ -1,7 +1,8 @@
 """What a machine can do: rates of the few kinds of work of which all stages consist.
 
-Each rate is the median of REPEATS measurements with all cores, in a few seconds together. Work of other programs makes
-them smaller; they are no fixed property of the machine.
+Each rate is the median of REPEATS measurements, in a few seconds together. What is the processor's work is measured in
+processor time and told for all cores, so that other programs hardly matter; memory and disk are measured by the clock,
+and other programs take their share of them.
 """
 
 from __future__ import annotations
@@ -75,26 +76,24 @@ def measured(folder: Path) -> Rates:
 
 
 def rate(amount: float, work: Callable[[], object]) -> float:
-    """Amount a second: the median of REPEATS calls, after one that compiles and warms up."""
+    """Amount that all cores do in a second: by the processor time of the work, whatever else the machine does. The
+    median of REPEATS calls, after one that compiles and warms up."""
+    return _cores() * _rate(amount, work, time.process_time)
+
+
+def wall_rate(amount: float, work: Callable[[], object]) -> float:
+    """Amount a second by the clock, for what is not the processor's work. The median as before."""
+    return _rate(amount, work, time.perf_counter)
+
+
+def _rate(amount: float, work: Callable[[], object], clock: Callable[[], float]) -> float:
     work()
     taken = []
     for _ in range(REPEATS):
-        begun = time.perf_counter()
+        begun = clock()
         work()
-        taken.append(time.perf_counter() - begun)
+        taken.append(clock() - begun)
     return amount / max(statistics.median(taken), 1e-9)
-
-
-def beside(work: Callable[[], object]) -> Callable[[], None]:
-    """The same work in one thread of each core at once."""
-    threads = _cores()
-
-    def all_of_it() -> None:
-        with ThreadPoolExecutor(threads) as pool:
-            for done in [pool.submit(work) for _ in range(threads)]:
-                done.result()
-
-    return all_of_it
 
 
 def _cores() -> int:
@@ -134,7 +133,7 @@ def _memory() -> float:
         with ThreadPoolExecutor(len(parts)) as pool:
             list(pool.map(np.copyto, copies, parts))
 
-    return rate(2.0 * sum(p.nbytes for p in parts), copy)
+    return wall_rate(2.0 * sum(p.nbytes for p in parts), copy)
 
 
 def _disk(path: Path) -> tuple[float, float]:
@@ -153,13 +152,13 @@ def _disk(path: Path) -> tuple[float, float]:
             while f.read(1 << 22):
                 pass
 
-    written = rate(FILE, write)
-    return rate(FILE, read), written
+    written = wall_rate(FILE, write)
+    return wall_rate(FILE, read), written
 
 
 def _hashed() -> float:
     data = bytes(1 << 25)
-    return rate(float(_cores() << 25), beside(lambda: hashlib.sha256(data).digest()))
+    return rate(float(len(data)), lambda: hashlib.sha256(data).digest())
 
 
 def _pictures(folder: Path) -> tuple[float, float, float, float, float]:
@@ -175,15 +174,14 @@ def _pictures(folder: Path) -> tuple[float, float, float, float, float]:
     write_png(png, picture)
     write_exr(exr, picture, half=True)
     each = float(PICTURE * PICTURE)
-    all_cores = each * _cores()
-    work: list[tuple[float, Callable[[], Any]]] = [
-        (all_cores, beside(lambda: read_encoded(jpeg))),
-        (all_cores, beside(lambda: read_encoded(png))),
-        (each, lambda: read_exr(exr)),
-        (all_cores, beside(lambda: write_png(png, smooth))),
-        (each, lambda: write_exr(exr, smooth, half=True)),
+    work: list[Callable[[], Any]] = [
+        lambda: read_encoded(jpeg),
+        lambda: read_encoded(png),
+        lambda: read_exr(exr),
+        lambda: write_png(png, smooth),
+        lambda: write_exr(exr, smooth, half=True),
     ]
-    found = [rate(amount, one) for amount, one in work]
+    found = [rate(each, one) for one in work]
     return found[0], found[1], found[2], found[3], found[4]
 
 
