@@ -93,7 +93,7 @@ def test_axes_grow_by_a_factor_of_eight() -> None:
     names = {s.name for s in REGISTRY}
     for axis, (values, stages) in AXES.items():
         factor = values[-1] / values[0]
-        assert (factor if axis == "photos" else factor**2) == pytest.approx(8, rel=0.01) and set(stages) <= names
+        assert (factor if axis == "photos" else factor**2) == pytest.approx(8, rel=0.02) and set(stages) <= names
 
 
 def test_a_law_has_its_exponent_and_error() -> None:
@@ -104,7 +104,7 @@ def test_a_law_has_its_exponent_and_error() -> None:
         for n in AXES["photos"][0]
     ]  # fmt: skip
     rows = scaling.laws(points[::-1])
-    assert [r[:3] for r in rows] == [["photos", s, "27 to 216"] for s in AXES["photos"][1]]
+    assert [r[:3] for r in rows] == [["photos", s, "4 to 32"] for s in AXES["photos"][1]]
     for row in rows:
         b, error = map(float, row[4].split(" +- "))
         assert abs(b - 0.9) < 4 * error + 0.01 and 0 < error < 0.1 and row[6] == "0.00 +- 0.00"
