@@ -7,8 +7,8 @@
     texels   bake                     of the run's fit, on its mesh, without the fit of a standard material
     faces    surface, uv              of the run's fit, at other lattices; charts of the scan's own mesh
 
-Each point is a process of its own, so that its peak memory is its own: memory before is of the start and of what was
-loaded. y = a x^b is fitted to each stage's seconds of processor time, and to its memory over that of the start. Prints
+Each point is a process of its own, so that its peak memory is its own. y = a x^b is fitted to each stage's seconds of
+processor time, and to the process's peak at the stage's end: memory of the stages before it in the row is in it. Prints
 tables, and writes FOLDER/scaling.json after every point; a point that is in it is not measured again.
 """
 
@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         shutil.rmtree(work, ignore_errors=True)
         points.append(host_info.apart(measure, axis, value, work, given.capture, given.finished))
         shutil.rmtree(work, ignore_errors=True)
-        found = {"machine": host_info.machine(), "points": [asdict(p) for p in points]}
+        found = {"machine": host_info.apart(host_info.machine), "points": [asdict(p) for p in points]}
         path.write_text(json.dumps(found, indent=1) + "\n")
         print(points[-1], flush=True)
     for row in [HEAD, ["---"] * len(HEAD), *laws(points)]:
