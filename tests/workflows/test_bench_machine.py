@@ -297,4 +297,5 @@ def test_figures_have_two_digits_and_no_exponent() -> None:
     assert [machine.amount(v) for v in (0, 0.004, 0.043, 1.26, 12.6, 126.4, 98765.0)] == [
         "0", "0", "0.043", "1.3", "13", "126", "98765"
     ]  # fmt: skip
+    assert [machine.speed(v) for v in (2897.3, 133.4, 5.339)] == ["2,897", "133", "5.34"]
     assert machine.ratio(10, 4) == "2.5" and machine.ratio(10, 0) == "-"

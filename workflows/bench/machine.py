@@ -113,7 +113,14 @@ def report(found: dict[str, Any]) -> list[str]:
     """The machine, Markdown."""
     lines = [f"`neuface bench machine`. Machine: {host_info.describe(found['machine'])}.", ""]
     lines += ["| work, all cores | rate |", "|---|---|"]
-    return lines + [f"| {what} | {found['rates'][name] / unit:,.3g} {of} |" for name, (what, unit, of) in SHOWN.items()]
+    return lines + [
+        f"| {what} | {speed(found['rates'][name] / unit)} {of} |" for name, (what, unit, of) in SHOWN.items()
+    ]
+
+
+def speed(value: float) -> str:
+    """In three digits, without an exponent."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def table(work: Mapping[str, Work], seconds: Mapping[str, float], rates: Rates) -> list[str]:
