@@ -221,7 +221,7 @@ class Config(StageConfig):
         default=0.15, gt=0, le=10, description="width of the soft surface at the end of the fit"
     )
     trials: Literal["on", "off"] = Field(
-        default="on",
+        default="off",
         description="judge the decisions during the fit on pixels that are not fitted, and take back those that make "
         "it worse; off: take each decision once",
     )
