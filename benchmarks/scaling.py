@@ -40,7 +40,6 @@ CHANGED: dict[str, dict[str, Any]] = {  # charts of the scan; maps and detail wi
     "uv": {"mesh": "scan"},
     "bake": {"fit_standard": False},
 }
-BEFORE = ("capture", "poses", "masks", "inverse_rendering", "surface", "template", "uv", "reflectance")
 
 
 @dataclass(frozen=True)
@@ -80,12 +79,13 @@ def _of_fit(axis: str, value: int, folder: Path, finished: Path) -> Point:
     import pipeline.threads  # noqa: F401
     from pipeline.contract import inputs_from
     from pipeline.store import Store
+    from stages.__main__ import before
     from stages.registry import REGISTRY
 
     record, made = json.loads((finished / "run.json").read_text()), Store(folder / "store")
     store, known = Store(Path(record["store"])), {s.name: s for s in REGISTRY}
     keys = {name: s["key"] for name, s in record["stages"].items()}
-    finished_parts = {n: store.load(n, keys[n], known[n].output) for n in BEFORE}
+    finished_parts = {s.name: store.load(s.name, keys[s.name], s.output) for s in before("bake")}
     assert all(finished_parts.values()), "the run's store is not complete"
     stages, used = AXES[axis][1], Used()
     start, x = peak_memory_mb(), float(value * value)
