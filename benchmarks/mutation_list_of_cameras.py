@@ -9,9 +9,25 @@ WEAK, KEPT = "tests/inverse_rendering/test_weakly_seen.py", "tests/inverse_rende
 ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/test_steering.py"
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
+NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
 OF_CAMERAS = (
+    # ---------------------------------------------------------------- what a mask lacks of the hull
+    Mutation("pipeline/hull_needs.py", "known = float(np.median(hull.seen[part])) >= KNOWN * len(cameras)",
+             "known = True", f"{NEEDS}::test_a_part_that_most_frames_lack_must_be_needed"),
+    Mutation("pipeline/hull_needs.py", "return known or len(", "return known and len(",
+             f"{NEEDS}::test_a_part_that_most_frames_lack_must_be_needed"),
+    Mutation("pipeline/hull_needs.py", "if regions(covered & inside,", "if regions(covered,",
+             f"{NEEDS}::test_a_mask_that_lacks_the_part_does_not_need_it"),
+    Mutation("pipeline/hull_needs.py", "(w / camera.width, h / camera.height))", "(1, 1))",
+             f"{NEEDS}::test_voxels_at_pixels_by_the_camera_matrix"),
+    Mutation("stages/masks/extent.py", "roi_radius) > SLIVER", "roi_radius) > 0",
+             f"{EXTENT}::test_a_bust_is_kept_whole_and_a_tail_of_the_hull_is_no_bust"),
+    Mutation("stages/inverse_rendering/initial_geometry.py", "if is_subject(", "if not is_subject(",
+             "tests/inverse_rendering/test_initial_geometry.py::test_a_mask_carves_what_few_frames_show"),
+    Mutation("stages/masks/hull_consistency.py", "if not is_subject(", "if is_subject(",
+             "tests/masks/test_hull_consistency.py::test_the_core_of_a_hull_is_empty_where_few_frames_show_it"),
     # ---------------------------------------------------------------- held-out photos
     Mutation("stages/poses/held_out.py", "if j != fitted + number:", "if j != number:",
              f"{HELD_OUT}::test_matches_with_observations_of_points_are_sightings"),

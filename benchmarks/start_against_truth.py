@@ -33,12 +33,12 @@ FAR = 3.0  # mm
 F64 = npt.NDArray[np.float64]
 
 
-def found_in(run: Path) -> tuple[dict[str, Located[Any]], F64]:
-    """Artifacts of the run's first stages, and its capture_from_asset."""
+def found_in(run: Path, names: tuple[str, ...] = ("capture", "poses", "masks")) -> tuple[dict[str, Located[Any]], F64]:
+    """Artifacts of some stages of the run, and its capture_from_asset."""
     record = json.loads((run / "run.json").read_text())
     store, by_name = Store(Path(record["store"])), {s.name: s for s in REGISTRY}
     loaded = {}
-    for name in ("capture", "poses", "masks"):
+    for name in names:
         artifact = store.load(name, record["stages"][name]["key"], by_name[name].output)
         if artifact is None:
             raise SystemExit(f"{run}: its {name} are no longer in the store {store.root}; run it again")

@@ -1,8 +1,8 @@
 """Initial geometry: the visual hull of the masks as a signed distance on the coarsest grid.
 
 In a plain hull one wrong mask is enough: if it lacks the shirt, the body ends at the collar. So first a lenient hull is
-carved, which tolerates a few wrong views. Where it clearly shows the subject and a mask does not, that mask is ignored.
-Everywhere else all masks carve, because a lenient hull is too thick.
+carved, which tolerates a few wrong views. Where a mask clearly lacks what it shows, and that part is the subject
+(pipeline.hull_needs), the mask is ignored. Everywhere else all masks carve, because a lenient hull is too thick.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pipeline.errors import StageError
 from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, visual_hull
-from pipeline.transforms import inverse_rigid, matrix
+from pipeline.hull_needs import grown, is_subject, margin_of, regions, voxels_at
 
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
@@ -58,7 +58,7 @@ class Agreed:
 
 
 def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agreed:
-    """Masks that do not carve where almost all other views show a part of the subject that they lack.
+    """Masks that do not carve where they lack a part of the subject.
 
     alphas: (H, W) each, in [0, 1]. roi_radius: asset units. Doubtful pixels have the size of the view's alpha.
     """
@@ -69,10 +69,12 @@ def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agree
     points = cloud(lenient)
     out, doubtful = list(alphas), {}
     for i, (camera, alpha) in enumerate(zip(cameras, small, strict=True)):
-        lacks = _lacks(points, camera, alpha, cell)
-        if lacks is not None:
+        lacks = [r for r in _lacks(points, camera, alpha, cell)
+                 if is_subject(lenient, voxels_at(lenient, camera, r), cameras, small)]  # fmt: skip
+        if lacks:
             h, w = alphas[i].shape
-            where = cv2.resize(lacks.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST) > 0
+            wrong = np.logical_or.reduce(lacks).astype(np.uint8)
+            where = cv2.resize(wrong, (w, h), interpolation=cv2.INTER_NEAREST) > 0
             doubtful[i] = where
             out[i] = np.where(where, np.float32(1), alphas[i])
     return Agreed(out, doubtful)
@@ -86,30 +88,14 @@ def _shrunk(alpha: F32) -> F32:
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _lacks(lenient: Cloud, camera: Camera, alpha: F32, cell: float) -> Bool | None:
-    """(h, w) where a mask clearly lacks what the lenient hull shows; None if it lacks nothing significant."""
+def _lacks(lenient: Cloud, camera: Camera, alpha: F32, cell: float) -> list[Bool]:
+    """The regions (h, w) that the lenient hull clearly shows and a mask clearly lacks."""
     h, w = alpha.shape
     shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5
-    margin = max(1, round(MARGIN * _pixels_a_unit(camera) * cell * w / camera.width))
-    clear = ~_grown(~shown, margin) & ~_grown(inside, margin)
-    count, label, facts, _ = cv2.connectedComponentsWithStats(clear.astype(np.uint8), connectivity=4)
-    large = [k for k in range(1, count) if facts[k, cv2.CC_STAT_AREA] > MISSING * max(int(shown.sum()), 1)]
-    if not large:
-        return None
-    return np.asarray(_grown(np.isin(label, large), 2 * margin) & shown & ~inside)
-
-
-def _pixels_a_unit(camera: Camera) -> float:
-    """Pixels of the photo per asset unit at the origin."""
-    depth = abs(float(inverse_rigid(matrix(camera.world_from_cam))[2, 3]))
-    K = matrix(camera.K)
-    return float(np.sqrt(K[0, 0] * K[1, 1])) / max(depth, 1e-9)
-
-
-def _grown(mask: Bool, radius: int) -> Bool:
-    """(h, w) dilation of a mask by `radius` pixels; there is no mask beyond the frame."""
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), disc)) > 0
+    margin = margin_of(camera, w, cell, MARGIN)
+    clear = ~grown(~shown, margin) & ~grown(inside, margin)
+    large = regions(clear, MISSING * max(int(shown.sum()), 1))
+    return [np.asarray(grown(region, 2 * margin) & shown & ~inside) for region in large]
 
 
 def hull_start(

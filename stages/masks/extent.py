@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 
 from pipeline.artifacts import Camera, Extent
-from pipeline.extent import ASKED, BELOW, bounds, core, signed
+from pipeline.extent import ASKED, BELOW, HEAD_BELOW, HEAD_RADIUS, bounds, core, head_extent, signed
+from pipeline.faces.landmarks3d import HeadFrame
 from pipeline.hull import Hull, surface_points, visual_hull
 from pipeline.transforms import F64, inverse_rigid, matrix, pixel_centres, project, rays
 from stages.masks.hull_consistency import CUBE, WRONG_SHARE, tolerated
@@ -29,6 +30,9 @@ THICK = 0.2  # h, the head's size: excess thickness of a hull where few photos s
 COARSE = 48  # cells along the cube in which the volumes inside and beyond the extent are compared
 BUST = (
     1.25  # largest volume beyond over volume inside of a subject that is kept whole (head scans .9, a seated man 1.8)
+)
+SLIVER = (
+    0.05  # of the volume inside: shoulders beyond a person's extent are .5 of it, a tail of a hull behind a neck .01
 )
 MAX_OPEN = 0.2  # of the edge of the region of interest, above the neck, inside the hull: 0 to .02 all around
 NEAR = 0.15  # h: largest distance beside the hull at which its nearest point decides
@@ -58,6 +62,14 @@ def cut_by_head(hull: Hull, cameras: Sequence[Camera], face: F64) -> Hull:
     head = placed_on_face(template, face)
     centres = np.stack([matrix(c.world_from_cam)[:3, 3] for c in cameras])
     return hull if head is None else carved_hull(hull, template, head, centres)
+
+
+def kept_whole(cameras: Sequence[Camera], alphas: Sequence[F32], frame: HeadFrame, roi_radius: float) -> bool:
+    """Whether the subject is a bust, which is kept whole: a head scan that ends in its shoulders. If next to nothing is
+    beyond a person's extent, that is no shoulder but empty space that no frame carves, and the extent cuts it off."""
+    if share_beyond(cameras, alphas, head_extent(frame, HEAD_BELOW, HEAD_RADIUS), roi_radius) > BUST:
+        return False
+    return share_beyond(cameras, alphas, head_extent(frame), roi_radius) > SLIVER
 
 
 def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent, roi_radius: float) -> float:

@@ -5,7 +5,9 @@ more than the hull's resolution, the mask (or the camera) is wrong.
 
 A hull is an upper limit of the subject, so that a mask may rightly lack what the hull has. Not so deep inside: a ray
 through the core of a hull, which views from around the subject carved, meets the subject. The core is carved with more
-tolerance, because the same part often lacks in several masks: where its colour is that of the background.
+tolerance, because the same part often lacks in several masks: where its colour is that of the background. What a mask
+lacks of it is the subject's only if the other views say so (pipeline.hull_needs): beside shoulders that leave most
+frames a hull is deep where there is nothing.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from scipy import ndimage
 
 from pipeline.artifacts import Camera
 from pipeline.hull import BAND_CELLS, Cloud, Hull, cloud, render_silhouette, visual_hull
+from pipeline.hull_needs import is_subject, regions, voxels_at
 from pipeline.support import Support
 from pipeline.transforms import matrix
 from stages.masks.region import F32, Bool, dilated, eroded, region
@@ -30,6 +33,7 @@ WRONG_SHARE = 0.1  # share of the views of a voxel that may be wrong
 CORE = 0.15  # depth of the core below the hull's surface, radii of the region of interest
 CORE_SHARE, CORE_LEAST = 0.06, 2  # share and least number of the views that may be wrong about a voxel of the core
 KNOWN = 0.5  # share of the views with a voxel of the core in their frame
+NEED = 0.002  # of a mask: smallest region that it lacks of which is asked whether it is the subject
 AROUND = 0.75  # largest length of the mean of the unit directions to the cameras: 0 all around, 0.64 half a circle
 SPREADS = 6.0  # robust standard deviations below the median for an outlier
 
@@ -86,8 +90,21 @@ def opinions(
         here = disc.covers(h, w)
         margin = max(1, round(MARGIN * disc.radius * cell / roi_radius))
         core = np.zeros((h, w), bool) if inner is None else render_silhouette(inner, camera, h, w) >= 0.5
-        out.append(Opinion(silhouette, may, here, margin, _iou(alpha >= 0.5, silhouette, here), core & silhouette))
+        inside = alpha >= 0.5
+        found = Opinion(silhouette, may, here, margin, _iou(inside, silhouette, here), core & silhouette)
+        out.append(_without_empty(found, inside, camera, sure, voters))
     return out
+
+
+def _without_empty(
+    opinion: Opinion, inside: Bool, camera: Camera, hull: Hull, voters: Sequence[tuple[Camera, F32]]
+) -> Opinion:
+    """The opinion with a core that does not have what the mask lacks and the other views do not show."""
+    core, carving = opinion.core, list(zip(*voters, strict=True))
+    for region_ in regions(_lacks(inside, opinion), NEED * inside.sum()):
+        if not is_subject(hull, voxels_at(hull, camera, region_), *carving):
+            core = core & ~dilated(region_, opinion.margin)
+    return opinion if core is opinion.core else replace(opinion, core=core)
 
 
 def _core(

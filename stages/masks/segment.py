@@ -17,15 +17,15 @@ from pipeline.artifacts import Camera, CameraSet, Extent, FileRef, Located, Mask
 from pipeline.capture_artifacts import Capture, CaptureView
 from pipeline.contract import Context
 from pipeline.errors import StageError
-from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
+from pipeline.extent import head_extent
 from pipeline.faces.find import Face
 from pipeline.faces.labels import LABELS
-from pipeline.faces.landmarks3d import HeadFrame, head_frame
+from pipeline.faces.landmarks3d import head_frame
 from pipeline.images import read_alpha, read_encoded, write_png
 from pipeline.meshes import F64
 from pipeline.support import Support
 from stages.masks.config import Config
-from stages.masks.extent import BUST, MAX_OPEN, asked, cut_by_head, outline_points, share_beyond, whole_hull
+from stages.masks.extent import MAX_OPEN, asked, cut_by_head, kept_whole, outline_points, whole_hull
 from stages.masks.face_labels import labels_with, subjects_face
 from stages.masks.grabcut import cut
 from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, trimap
@@ -120,7 +120,8 @@ def segment(
     people = found_face is not None and how.method != "object"
     frame = head_frame(found_face.face.xyz) if found_face is not None and people else None
     votes = [m for m in masked if not m.view.holdout and not m.useless and m.view.index not in set(dropped)]
-    extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
+    whole = frame is None or kept_whole([m.camera for m in votes], [m.small for m in votes], frame, poses.roi_radius)
+    extent = None if frame is None or whole else head_extent(frame)
     face = None if found_face is None else found_face.face.xyz
     showing = {m.view.index for m, x in zip(masked, faces, strict=True) if x.face is not None}
     parts = _asked(masked, votes, extent, face, showing, poses.roi_radius, threads, context)
@@ -139,13 +140,6 @@ def _seen(masked: list[Masked], dropped: list[int]) -> list[Seen]:
     """The masks as input of the checks."""
     return [Seen(m.view.name, m.camera, m.small, m.source, m.coverage, None if m.useless else m.iou, m.view.holdout,
                  m.view.index in dropped) for m in masked]  # fmt: skip
-
-
-def _is_bust(votes: list[Masked], frame: HeadFrame, roi_radius: float) -> bool:
-    """Whether the subject is a bust, which is kept whole: a head scan that ends in its shoulders."""
-    head = head_extent(frame, HEAD_BELOW, HEAD_RADIUS)
-    beyond = share_beyond([m.camera for m in votes], [m.small for m in votes], head, roi_radius)
-    return beyond <= BUST
 
 
 def _asked(

@@ -13,7 +13,7 @@ from pipeline.verdict import Finding, Limits, judged
 
 UNSHOWN = Limits(0.01, 0.1, lower=False)  # of the visible surface: 0.01 is a collar's edge, 0.1 a shoulder
 CUT_HANDLES = Limits(10, 100, lower=False)  # ears and hair of a head cause a few, a broken surface dozens
-LEFT_HANDLES = Limits(0, 4, lower=False)  # each needs a seam around it
+LEFT_HANDLES = Limits(0, 20, lower=False)  # each needs a seam around it; a skull has arches of its own (found: 5)
 CAPPED = Limits(0.25, 0.5, lower=False)  # of the area: the cut of a neck is a tenth
 TRIMMED = Limits(0.6, 0.9, lower=False)  # of the area: the user chose trimming; the back of the head is a half
 THIN = Limits(0.015, 0.1, lower=False)  # of the area; see above
@@ -73,7 +73,7 @@ def judge(found: Measured) -> tuple[Finding, ...]:
             left,
             LEFT_HANDLES,
             f"{left} handles (tunnels) are wider than surface.handle and were kept",
-            "raise surface.handle, or check the masks: an arm or a strap that touches the head makes a handle",
+            "where the subject has none: raise surface.handle, or check the masks (an arm that touches the head)",
         ),
         judged(
             "thin",

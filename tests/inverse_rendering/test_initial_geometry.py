@@ -9,48 +9,16 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from pipeline.artifacts import Camera, Cut, Extent
+from pipeline.artifacts import Cut, Extent
 from pipeline.extent import GROWN
 from stages.inverse_rendering.initial_geometry import agreed, hull_start
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+from tests.support.two_balls import BOTTOM, FOCAL, HEAD, TORSO, WIDTH, bust_alpha, cropped_bust, ring_camera
 
 F32 = npt.NDArray[np.float32]
-HEAD, TORSO = ((0.0, 0.02, 0.0), 0.09), ((0.0, -0.14, 0.0), 0.12)
-RADIUS, WIDTH, FOCAL, AWAY = 0.18, 160, 400.0, 1.0
-BOTTOM = 100  # rows from here on show the torso alone
-
-
-def camera(index: int, count: int) -> Camera:
-    """One of a ring of cameras that look at the origin from a little above."""
-    angle, up = 2 * np.pi * index / count, 0.15 * (-1) ** index
-    centre = AWAY * np.array([np.cos(up) * np.sin(angle), np.sin(up), np.cos(up) * np.cos(angle)])
-    z = -centre / AWAY
-    x = np.cross(z, [0, 1, 0])
-    x /= np.linalg.norm(x)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, np.cross(z, x), z], 1), centre
-    K = ((FOCAL, 0.0, WIDTH / 2), (0.0, FOCAL, WIDTH / 2), (0.0, 0.0, 1.0))
-    rows = tuple(tuple(float(v) for v in r) for r in pose)
-    return Camera(index=index, name=f"{index}.png", width=WIDTH, height=WIDTH, K=K, world_from_cam=rows,
-                  distortion=(0.0,) * 5)  # fmt: skip
-
-
-def shown(c: Camera) -> F32:
-    """Alpha of two balls, by the angle between a pixel's ray and the way to a ball's centre."""
-    pose = np.array(c.world_from_cam)
-    v, u = np.mgrid[:WIDTH, :WIDTH] + 0.5
-    ray = np.stack([(u - WIDTH / 2) / FOCAL, (v - WIDTH / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
-    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
-    out = np.zeros((WIDTH, WIDTH), bool)
-    for middle, radius in (HEAD, TORSO):
-        way = np.array(middle) - pose[:3, 3]
-        along = ray @ way
-        out |= way @ way - along**2 < radius**2
-    return out.astype(np.float32)
-
-
-CAMERAS = [camera(i, 24) for i in range(24)]
-ALPHAS = [shown(c) for c in CAMERAS]
+RADIUS = 0.18
+CAMERAS = [ring_camera(i, 24) for i in range(24)]
+ALPHAS = [bust_alpha(c) for c in CAMERAS]
 
 
 def solid(alphas: list[F32]) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.float64]]:
@@ -99,6 +67,20 @@ def test_what_many_masks_call_background_is_background() -> None:
     for i in range(0, 24, 4):
         alphas[i][BOTTOM:] = 0
     assert not agreed(CAMERAS, alphas, RADIUS).doubtful
+
+
+def test_a_mask_carves_what_few_frames_show() -> None:
+    """The torso leaves most frames. One view from the side shows how deep it is, and the others lose nothing by it."""
+    cameras, alphas = cropped_bust()
+    assert not agreed(cameras, alphas, RADIUS).doubtful
+    behind = []
+    for n in (len(cameras), len(cameras) - 1):
+        start = hull_start(cameras[:n], agreed(cameras[:n], alphas[:n], RADIUS).alphas, RADIUS, 40, 1)
+        points = start.lo + start.cell * np.argwhere(start.values < 0)
+        at_its_middle = np.abs(points[:, 1] - TORSO[0][1]) < 0.03
+        depth = np.abs(points[at_its_middle, 2]) - TORSO[1]
+        behind.append(int(((depth > 0.02) & (depth < 0.07)).sum()))  # in the frame of the view from the side
+    assert behind[0] < 0.05 * behind[1] and behind[1] > 200
 
 
 def test_a_narrow_strip_is_left_to_the_mask() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, tolerated, trimap
 from tests.masks.test_masks_stage import RADIUS, ROI, SIZE, ball_alpha, camera
+from tests.support.two_balls import cropped_bust
 
 
 # ------------------------------------------------------------------ agreement
@@ -91,6 +92,14 @@ def test_the_core_is_that_of_views_all_around() -> None:
     arc = [camera(i, 72) for i in range(9)]
     one_side = opinions(arc, [ball_alpha(c) for c in arc], [True] * 9, ROI, 64)
     assert not any(o.core.any() for o in one_side)
+
+
+def test_the_core_of_a_hull_is_empty_where_few_frames_show_it() -> None:
+    """A torso that leaves half of the frames: the hull is deep, the view from the side is right."""
+    cameras, alphas = cropped_bust()
+    found = opinions(cameras, alphas, [True] * len(cameras), 0.18, 64)
+    assert lacking(alphas[-1] >= 0.5, found[-1]) == 0
+    assert found[0].core.any()  # that of the head
 
 
 def test_a_hole_counts_where_the_hull_has_none() -> None:

@@ -18,7 +18,7 @@ from pipeline.images import read_alpha
 from pipeline.store import Store
 from pipeline.transforms import inverse_rigid, matrix, project
 from stages.masks import segment
-from stages.masks.extent import BUST, asked, share_beyond
+from stages.masks.extent import BUST, SLIVER, asked, kept_whole, share_beyond
 from stages.masks.judge import extent_finding
 from stages.masks.segment import FaceResult, Masked
 from stages.masks.stage import STAGE, Config
@@ -154,22 +154,39 @@ def test_what_a_thick_hull_puts_just_above_the_cut_is_not_asked() -> None:
         assert found is not None and found[pixels(c, at)] == pytest.approx(wanted, abs=0.3)
 
 
+AROUND = [camera(i, 30 * i, 5, 2.4) for i in range(12)]
+
+
+def outlines(points: F64) -> list[np.typing.NDArray[np.float32]]:
+    """Masks of convex parts of 40,000 points each, seen by AROUND."""
+    alphas = []
+    for c in AROUND:
+        uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), points)
+        alpha = np.zeros((c.height, c.width), np.uint8)
+        for part in np.split(uv.astype(np.int32), len(uv) // 40_000):
+            cv2.fillConvexPoly(alpha, cv2.convexHull(part), 1)
+        alphas.append(alpha.astype(np.float32))
+    return alphas
+
+
 def test_how_much_goes_on_beyond_the_extent() -> None:
     """A head alone has nothing beyond it; with a chest as large as a person's more is beyond than inside."""
-    cameras = [camera(i, 30 * i, 5, 2.4) for i in range(12)]
+    assert share_beyond(AROUND, outlines(HEAD), EXTENT, 0.28) < 0.05
+    assert share_beyond(AROUND, outlines(np.concatenate([HEAD, CHEST])), EXTENT, 0.28) > 1.3 > BUST
 
-    def share(points: F64) -> float:
-        alphas = []
-        for c in cameras:
-            uv, _ = project(matrix(c.K), inverse_rigid(matrix(c.world_from_cam)), np.array(c.distortion), points)
-            alpha = np.zeros((c.height, c.width), np.uint8)
-            for part in np.split(uv.astype(np.int32), len(uv) // 40_000):
-                cv2.fillConvexPoly(alpha, cv2.convexHull(part), 1)
-            alphas.append(alpha.astype(np.float32))
-        return share_beyond(cameras, alphas, EXTENT, 0.28)
 
-    assert share(HEAD) < 0.05
-    assert share(np.concatenate([HEAD, CHEST])) > 1.3 > BUST
+def test_a_bust_is_kept_whole_and_a_tail_of_the_hull_is_no_bust() -> None:
+    """Shoulders of a scan, beyond a person's extent; a rod that goes on behind the neck; a seated person's chest."""
+    frame = head_frame(face())
+    whole = {
+        "scan": shell((0, -0.24, -0.03), (0.21, 0.09, 0.09)),
+        "tail": shell((0, -0.1, -0.2), (0.03, 0.02, 0.12)),
+        "person": CHEST,
+    }
+    found = {k: kept_whole(AROUND, outlines(np.concatenate([HEAD, v])), frame, 0.28) for k, v in whole.items()}
+    assert found == {"scan": True, "tail": False, "person": False}
+    beyond = share_beyond(AROUND, outlines(np.concatenate([HEAD, whole["tail"]])), head_extent(frame), 0.28)
+    assert 0.001 < beyond < SLIVER
 
 
 def test_a_gap_in_the_hull_does_not_take_a_piece_of_the_face() -> None:
