@@ -13,6 +13,7 @@ from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
 from stages.inverse_rendering.config import AUTO, PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.keep_silhouettes import start_with_silhouettes
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.stereo import SWEEPS, Sweep
 from stages.inverse_rendering.stereo_choice import Facts, stereo_start
@@ -89,7 +90,8 @@ def _after_stereo(
 ) -> tuple[Start, Facts]:
     if settings.stereo == "off":
         return hull, {"start": "visual hull", "why": "setting"}
-    return stereo_start(hull, views, settings.stereo, device, check, sweeps)
+    start, facts = stereo_start(hull, views, settings.stereo, device, check, sweeps)
+    return start_with_silhouettes(hull, start, views, check), facts
 
 
 def _facts(prior: str, why: str, more: Facts | None = None, stereo: Facts | None = None) -> dict[str, Facts]:

@@ -1,17 +1,22 @@
-"""Long hair, a hat, headphones: what stands further out of the template than is allowed, where silhouettes show it.
+"""What a start must not lose, because silhouettes show it: hair beyond the template's space, the tip of a nose.
 
-The space that a person with a placed head can fill (pipeline.registration.carve) is a guess. Where it leaves a ray of a
-silhouette empty although the hull does not, the guess is wrong, and one place on that ray is kept: within the hull,
-near the template, rather beside or behind it than in front, because hair hangs there. Stereo and the fit move it.
+Depth maps, fused on a coarse grid, end short of what is thin and pointed. Where they leave a ray of a silhouette empty
+although the hull does not, the place on that ray that is nearest to their surface is kept (`start_with_silhouettes`).
+
+Long hair, a hat or headphones stand further out of the template than is allowed. The space that a person with a placed
+head can fill (pipeline.registration.carve) is a guess. Where it leaves a ray of a silhouette empty although the hull
+does not, the guess is wrong, and one place on that ray is kept: within the hull, near the template, rather beside or
+behind it than in front, because hair hangs there. Stereo and the fit move it.
 
 Symbols: S the signed bound of the possible space, negative inside; u metres ahead of the head, along the direction that
 the face looks to; p the point of a lost ray within the hull at which S + BEHIND u is least. The bound becomes
-min(S, |x - p| - RADIUS) over all p, smoothed.
+min(S, |x - p| - radius) over all p, smoothed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -28,35 +33,63 @@ from stages.inverse_rendering.stereo import distances, reduced
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
-SIDE, VIEWS = 160, 32  # pixels of a silhouette's longest side; silhouettes, evenly spaced over the views
 BEHIND = 0.5  # metres from the template that count like a metre further to the front
-RADIUS, BLUR = 1.5, 0.7  # cells that are kept around p; smoothing of that, because every view has its own p
-BORDER = 2  # pixels of the silhouette's border that need not be kept: there the hull itself is uncertain
+BLUR = 0.7  # cells; smoothing of what is kept, because every view has its own p
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """views: silhouettes, evenly spaced over all; side: pixels of their longest side; border: pixels inside of their
+    outlines that need not be kept, because the hull itself is uncertain there; radius: cells that are kept around p."""
+
+    views: int
+    side: int
+    border: int
+    radius: float
+
+
+HAIR = Detail(32, 160, 2, 1.5)
+POINTED = Detail(48, 320, 0, 1.25)
 
 
 def bound_with_silhouettes(
-    hull: Start, bound: F32, front: F64, views: list[PhotoView], check: Callable[[], None] = lambda: None
+    hull: Start,
+    bound: F32,
+    front: F64,
+    views: list[PhotoView],
+    check: Callable[[], None] = lambda: None,
+    detail: Detail = HAIR,
 ) -> F32:
     """The bound S (X, Y, Z) on the hull's grid, widened where it would empty rays of the silhouettes. front (3,): unit
-    direction that the face looks to."""
+    direction that the face looks to; zero where no direction is better."""
     cut = Start(distances(np.maximum(hull.values, bound), hull.lo, hull.cell), hull.lo, hull.cell)
     whole, left = hull.surface("cpu"), cut.surface("cpu")
     free = np.ones(bound.shape, bool)
     axes = [BEHIND * hull.cell * f * np.arange(n) for f, n in zip(front, bound.shape, strict=True)]
     cost = bound + axes[0][:, None, None] + axes[1][None, :, None] + axes[2][None, None, :]
-    for i in evenly_spaced(len(views), min(VIEWS, len(views))):
+    for i in evenly_spaced(len(views), min(detail.views, len(views))):
         check()
-        points = _lost(whole, left, hull, cost, views[i])
+        points = _lost(whole, left, hull, cost, views[i], detail)
         free[tuple(np.rint((points - hull.lo) / hull.cell).astype(np.intp).T)] = False
     if free.all():
         return bound
-    near = ndimage.gaussian_filter(ndimage.distance_transform_edt(free), BLUR) - RADIUS
+    near = ndimage.gaussian_filter(ndimage.distance_transform_edt(free), BLUR) - detail.radius
     return np.asarray(np.minimum(bound, near * hull.cell), np.float32)
 
 
-def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView) -> F64:
+def start_with_silhouettes(
+    hull: Start, start: Start, views: list[PhotoView], check: Callable[[], None] = lambda: None
+) -> Start:
+    """A start on the hull's grid, with the places that it must have to fill the silhouettes that the hull fills."""
+    kept = bound_with_silhouettes(hull, start.values, np.zeros(3), views, check, POINTED)
+    if kept is start.values:
+        return start
+    return Start(distances(np.maximum(kept, hull.values), hull.lo, hull.cell), hull.lo, hull.cell)
+
+
+def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView, detail: Detail) -> F64:
     """Points (N, 3) in the hull, on the rays of a view that meet `whole` but not `left`, at which `cost` is least."""
-    K, shown = _silhouette(view)
+    K, shown = _silhouette(view, detail)
     rows, columns = np.nonzero(shown)
     o, d, _ = pixel_rays(K, view.world_from_cam, rows, columns)
     near, far = box_interval(o, d, *left.box())
@@ -75,14 +108,14 @@ def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView
     return np.asarray(place[np.isfinite(least)], np.float64)
 
 
-def _silhouette(view: PhotoView) -> tuple[F64, Bool]:
+def _silhouette(view: PhotoView, detail: Detail) -> tuple[F64, Bool]:
     """K and (h, w) certain pixels of the subject within its extent, without distortion."""
-    K, small = reduced(view, SIDE)
+    K, small = reduced(view, detail.side)
     certain = view.alpha.astype(np.float32)
     if view.asked is not None:
         certain = certain * (view.asked > WHOLE)
     if view.doubtful is not None:
         certain = certain * ~view.doubtful
     full = (small(certain) > WHOLE).astype(np.uint8)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * BORDER + 1, 2 * BORDER + 1))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * detail.border + 1,) * 2)
     return K, np.asarray(cv2.erode(full, disc, borderValue=1)) > 0

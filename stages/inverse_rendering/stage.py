@@ -156,7 +156,7 @@ def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_diff
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=35,
+    version=36,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -31,9 +31,6 @@ COARSE = 48  # cells along the cube in which the volumes inside and beyond the e
 BUST = (
     1.25  # largest volume beyond over volume inside of a subject that is kept whole (head scans .9, a seated man 1.8)
 )
-SLIVER = (
-    0.05  # of the volume inside: shoulders beyond a person's extent are .5 of it, a tail of a hull behind a neck .01
-)
 MAX_OPEN = 0.2  # of the edge of the region of interest, above the neck, inside the hull: 0 to .02 all around
 NEAR = 0.15  # h: largest distance beside the hull at which its nearest point decides
 MIN_ALPHA = 0.01  # alpha of background is below
@@ -65,11 +62,8 @@ def cut_by_head(hull: Hull, cameras: Sequence[Camera], face: F64) -> Hull:
 
 
 def kept_whole(cameras: Sequence[Camera], alphas: Sequence[F32], frame: HeadFrame, roi_radius: float) -> bool:
-    """Whether the subject is a bust, which is kept whole: a head scan that ends in its shoulders. If next to nothing is
-    beyond a person's extent, that is no shoulder but empty space that no frame carves, and the extent cuts it off."""
-    if share_beyond(cameras, alphas, head_extent(frame, HEAD_BELOW, HEAD_RADIUS), roi_radius) > BUST:
-        return False
-    return share_beyond(cameras, alphas, head_extent(frame), roi_radius) > SLIVER
+    """Whether the subject is a bust, which is kept whole: a head scan that ends in its shoulders."""
+    return share_beyond(cameras, alphas, head_extent(frame, HEAD_BELOW, HEAD_RADIUS), roi_radius) <= BUST
 
 
 def share_beyond(cameras: Sequence[Camera], alphas: Sequence[F32], extent: Extent, roi_radius: float) -> float:

@@ -7,9 +7,12 @@ import pytest
 
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths.tracing import box_interval
+from stages.inverse_rendering import choose_start
+from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
-from stages.inverse_rendering.keep_silhouettes import BORDER, F32, F64, Bool, bound_with_silhouettes
+from stages.inverse_rendering.keep_silhouettes import F32, F64, Bool, bound_with_silhouettes, start_with_silhouettes
+from stages.inverse_rendering.keep_silhouettes import HAIR as DETAIL
 from stages.inverse_rendering.ray_sampling import PhotoView
 
 CELL, COUNT, SIDE = 0.01, 64, 120
@@ -77,7 +80,7 @@ def test_a_strand_that_silhouettes_show_is_kept() -> None:
     for view in VIEWS:
         shown = met(left, view.K, view.world_from_cam, SIDE)
         inner = view.alpha > 0
-        for _ in range(BORDER + 1):
+        for _ in range(DETAIL.border + 1):
             inner[1:-1, 1:-1] &= inner[2:, 1:-1] & inner[:-2, 1:-1] & inner[1:-1, 2:] & inner[1:-1, :-2]
         assert shown[inner].mean() > 0.98
         assert met(before, view.K, view.world_from_cam, SIDE)[inner].mean() < 0.96
@@ -115,3 +118,43 @@ def test_it_can_be_stopped() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         bound_with_silhouettes(BOTH, BOUND, FRONT, VIEWS, stop)
+
+
+# ------------------------------------------------------------------ after stereo
+NOSE = visual_hull([0.085, 0, 0], 0.02)  # beside the head, joined to it
+POINTED = start(np.minimum(HEAD, NOSE))
+SHORT = start((np.linalg.norm(NODE, axis=-1) - 0.078).astype(np.float32))  # depth maps that lost the nose
+
+
+def test_a_start_fills_the_silhouettes_that_the_hull_fills() -> None:
+    photos = views(POINTED)
+    found = start_with_silhouettes(POINTED, SHORT, photos)
+    beyond = (found.values < 0) & (POINTED.values > CELL)
+    assert beyond.sum() == 0
+    for view in photos:
+        missing = [
+            int(((view.alpha > 0) & ~met(s.surface("cpu"), view.K, view.world_from_cam, SIDE)).sum())
+            for s in (SHORT, found)
+        ]
+        assert missing[0] > 30 and missing[1] < 0.25 * missing[0]
+
+
+def test_what_is_kept_lies_nearest_to_the_start() -> None:
+    """A hull is deep along the rays from the front; the nose is kept beside the head, not at the hull's ends."""
+    found = start_with_silhouettes(POINTED, SHORT, views(POINTED))
+    depth = NODE[(found.values < 0) & (NODE[..., 0] > 0.085)][:, 2]
+    assert len(depth) > 5 and np.abs(depth).max() < 0.04
+    assert np.abs(NODE[(POINTED.values < 0) & (NODE[..., 0] > 0.085)][:, 2]).max() > 0.2
+
+
+def test_a_start_that_fills_all_silhouettes_stays_the_same_object() -> None:
+    assert start_with_silhouettes(POINTED, POINTED, views(POINTED)) is POINTED
+    assert start_with_silhouettes(POINTED, SHORT, []) is SHORT
+
+
+def test_the_chosen_start_has_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choose_start, "stereo_start", lambda *_: (SHORT, {"start": "depth maps"}))
+    photos = views(POINTED)
+    found = choose_start.choose_start(POINTED, photos, None, Config(), "cpu")
+    assert np.array_equal(found.start.values, start_with_silhouettes(POINTED, SHORT, photos).values)
+    assert found.prior is POINTED and found.facts["stereo"] == {"start": "depth maps"}
