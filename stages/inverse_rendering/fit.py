@@ -21,6 +21,7 @@ from stages.inverse_rendering.model_selection import (
     apply_light,
     facts_of,
     given_model,
+    own_lights,
     prior_surface,
     restored,
     select_model,
@@ -29,9 +30,18 @@ from stages.inverse_rendering.model_selection import (
     validation_views,
 )
 from stages.inverse_rendering.objective import Terms, terms
+from stages.inverse_rendering.observations import surface_points
 from stages.inverse_rendering.ray_sampling import U8, Batch
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
+from stages.inverse_rendering.relight_model import change_light
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
+from stages.inverse_rendering.second_capture import (
+    agreed_lights,
+    first_capture,
+    light_from_first,
+    of_first,
+    set_lights,
+)
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
@@ -76,12 +86,13 @@ class Trainer(TrialLoop):
     smoothed: float = 0.0  # share of the surface that the last of them reached
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
+    known_of_second: dict[str, str | float | bool] = field(default_factory=dict)  # of the second capture's light
     poses: PoseHistory = field(init=False)
     robust: Robust = field(init=False)
 
     def __post_init__(self) -> None:
         TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
-        self.validation = validation_views(len(self.views), self.settings)
+        self.validation = validation_views(len(of_first(self.views)), self.settings)
         self.poses = PoseHistory.of(self.views)
         self.robust = Robust(self.views, self.settings.weigh_photos, self.settings.image_side)
         self.trials = Trials(self.settings.trials == "on")
@@ -132,10 +143,14 @@ class Trainer(TrialLoop):
             return
         settled = self.settings.uniform_albedo_until + SETTLING + LENGTH
         wanted = self.trials.allows(self, SELECTION, settled, self.validation)
-        choices, estimate = select_model(self) if wanted else (unselected(self), None)
+        first = first_capture(self)
+        choices, estimate = select_model(first) if wanted else (unselected(first), None)
         self.take(choices)
         for parameter in apply_light(self.model, estimate) if estimate is not None else ():
             self.optimiser.state.pop(parameter, None)
+        if self.model.second is not None and choices.light_known:
+            self.known_of_second = light_from_first(self)
+            self.restart_second()
         self.table.exclude(())
 
     def take(self, choices: Choices) -> None:
@@ -170,6 +185,10 @@ class Trainer(TrialLoop):
                 self.model.solve_shadows()
             self.shadows_solved = due
         still_light = not self.light_moves and not self.light_given
+        if self.model.second is not None and self.choices is not None and self.share() >= SKIN_AT:
+            if not self.skin_asked:
+                self.ask_second()
+            self.skin_asked = True
         asked = self.settings.skin_light and still_light and self.share() >= SKIN_AT
         if asked and self.choices is not None and not self.skin_asked:
             if self.trials.allows(self, SKIN):
@@ -243,6 +262,32 @@ class Trainer(TrialLoop):
             for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
                 self.optimiser.state.pop(parameter, None)
 
+    def ask_second(self) -> None:
+        """Correct both lights so that the two captures show one albedo, and learn the reflectance anew."""
+        found = agreed_lights(self)
+        if found is None:
+            return
+        rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
+        x, n = surface_points(self.model.geometry, rays)
+        change_light(self.model, _hashed(self.model), x, n, lambda: set_lights(self.model, found))
+        differ: dict[str, str | float | bool] = {
+            "albedos_differ_before": round(found.before, 5),
+            "albedos_differ": round(found.after, 5),
+        }
+        self.known_of_second = self.known_of_second | differ
+        for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
+            self.optimiser.state.pop(parameter, None)
+        self.restart_second()
+
+    def second_facts(self) -> dict[str, str | float | bool]:
+        """For the report: where the light of the second capture comes from."""
+        return self.known_of_second
+
+    def restart_second(self) -> None:
+        """Forget the momentum of the second capture's light, which was set."""
+        for parameter in self.model.second.parameters() if self.model.second is not None else ():
+            self.optimiser.state.pop(parameter, None)
+
     def set_rates(self) -> float:
         """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
 
@@ -261,13 +306,16 @@ class Trainer(TrialLoop):
         interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not self.light_moves
         light_known = self.light_given != "" or (self.choices is not None and self.choices.light_known)
         self.model.uniform_albedo = interlude and not light_known
+        second = None if self.model.second is None else next(self.model.second.light.parameters())
         for group in self.optimiser.param_groups:
-            light = group["params"][0] is next(self.model.light.parameters())
+            other = group["params"][0] is second
+            light = other or group["params"][0] is next(self.model.light.parameters())
             group["lr"] = group["start"] * decay * warm
             if interlude and not light_known:
                 group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
             elif light and (light_known or self.skin_tells):
-                group["lr"] *= 0.0 if interlude or self.light_given else KNOWN_LIGHT_RATE
+                frozen = interlude or (self.light_given and not other)
+                group["lr"] *= 0.0 if frozen else KNOWN_LIGHT_RATE
         finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
         start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
         self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
@@ -283,7 +331,8 @@ class Trainer(TrialLoop):
     def move(self, rate: float) -> None:
         """Update the parameters. rate: of the SDF, asset units."""
         if self.model.uniform_albedo:
-            self.model.light.uniform_gradient(UNIFORM_LIGHT_ORDER)
+            for light in own_lights(self.model):
+                light.uniform_gradient(UNIFORM_LIGHT_ORDER)
         self.optimiser.step()
         self.grid.step(rate)
 
@@ -341,6 +390,7 @@ class Trainer(TrialLoop):
             "choices": self.choices.plain() if self.choices else None,
             "cell": g.cell,
             "poses": self.poses.stored(self.views),
+            "known_of_second": self.known_of_second,
             "robust": self.robust.stored(),
             "model": self.model.state_dict(),
             "band": g.optimiser_state(),
@@ -354,6 +404,7 @@ class Trainer(TrialLoop):
         self.level = state["level"]
         self.views = self.poses.restore(self.views, state["poses"])
         self.robust.restore(state["robust"], self.device)
+        self.known_of_second = state["known_of_second"]
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
         g.restore(state["model"]["geometry.values"].to(self.device))
@@ -375,6 +426,8 @@ def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
     ]
     if model.ambient is not None:
         groups.append({"params": list(model.ambient.parameters()), "start": settings.lr_light})
+    if model.second is not None:
+        groups.append({"params": list(model.second.light.parameters()), "start": settings.lr_light})
     return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
