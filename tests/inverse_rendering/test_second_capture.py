@@ -105,6 +105,21 @@ def test_the_selection_sees_the_first_capture_alone() -> None:
     assert first_capture(alone) is alone and alone.pixels.draw(10, 0.2, 0).rays.second is None
 
 
+def test_a_decision_that_is_taken_back_leaves_both_lights_as_they_were() -> None:
+    t = trainer(SETTINGS.changed(steps=20, batch=128), calibrated=True)
+    for _ in range(3):
+        t.advance()
+    state, before = t.kept(), {k: v.clone() for k, v in t.model.state_dict().items()}
+    while t.choices is None:
+        t.advance()
+    assert t.model.second is not None and t.model.second.light().shape != before["second.light.coefficients"].shape
+    t.recall(state)
+    for name, value in t.model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    t.advance()
+    assert t.model.calibration.own == (False, True)
+
+
 def test_only_the_second_capture_has_colour_matrices_where_only_it_needs_them() -> None:
     t = trainer(calibrated=True)
     with torch.no_grad():
