@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from pipeline.artifacts import FileRef, HeldOutView, Located, SecondFitted
 from pipeline.errors import UsageError
 from stages import registry
 from tests.support.textured_ball import camera_on_orbit, write_facescape
 from workflows.cli.main import main
 from workflows.run.plan import check_settings, make_plan, preview
+from workflows.run.publish import report_files
 from workflows.run.request import RunRequest
 from workflows.server.access import ROOTS, check_folders
 
@@ -86,6 +89,17 @@ def test_dry_run_shows_both_captures(two: Any, tmp_path: Path, capsys: pytest.Ca
 def test_a_missing_folder_is_named(two: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["run", str(tmp_path / "a"), "--out", str(tmp_path / "out"), "--also", str(tmp_path / "no")])
     assert code in (1, 2) and str(tmp_path / "no") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("exr", [True, False])
+def test_what_is_known_of_the_second_capture_is_published(exr: bool, tmp_path: Path) -> None:
+    file = FileRef(path="second/x", sha256="", size=0)
+    view = HeldOutView(index=4, exr=file, png=file, scale=1)
+    for second in (None, SecondFitted(light=file, held_out=(view,))):
+        face = SimpleNamespace(held_out=(), second=second)
+        done: Any = SimpleNamespace(located=Located(face, tmp_path))  # type: ignore[type-var, arg-type]
+        wanted = {"second/light.json", "second/views/4.png"} | ({"second/views/4.exr"} if exr else set())
+        assert set(report_files({"inverse_rendering": done}, exr=exr)) == (wanted if second else set())
 
 
 def test_a_server_guards_its_folder_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
