@@ -12,6 +12,7 @@ from pipeline.artifacts import RefinedCamera
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
+from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.initial_geometry import Start
@@ -30,18 +31,10 @@ from stages.inverse_rendering.model_selection import (
     validation_views,
 )
 from stages.inverse_rendering.objective import Terms, terms
-from stages.inverse_rendering.observations import surface_points
 from stages.inverse_rendering.ray_sampling import U8, Batch
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
-from stages.inverse_rendering.relight_model import change_light
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
-from stages.inverse_rendering.second_capture import (
-    agreed_lights,
-    first_capture,
-    light_from_first,
-    of_first,
-    set_lights,
-)
+from stages.inverse_rendering.second_capture import correct_lights, first_capture, light_from_first, of_first
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
@@ -150,7 +143,7 @@ class Trainer(TrialLoop):
             self.optimiser.state.pop(parameter, None)
         if self.model.second is not None and choices.light_known:
             self.known_of_second = light_from_first(self)
-            self.restart_second()
+            self.restart(*own_lights(self.model))
         self.table.exclude(())
 
     def take(self, choices: Choices) -> None:
@@ -259,33 +252,22 @@ class Trainer(TrialLoop):
         else:
             self.skin_tells = True
             self.choices = replace(choices, facts=choices.facts | {"light": light | found})
-            for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
-                self.optimiser.state.pop(parameter, None)
+            self.restart(self.model.light, self.model.spatial)
 
     def ask_second(self) -> None:
-        """Correct both lights so that the two captures show one albedo, and learn the reflectance anew."""
-        found = agreed_lights(self)
-        if found is None:
-            return
-        rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
-        x, n = surface_points(self.model.geometry, rays)
-        change_light(self.model, _hashed(self.model), x, n, lambda: set_lights(self.model, found))
-        differ: dict[str, str | float | bool] = {
-            "albedos_differ_before": round(found.before, 5),
-            "albedos_differ": round(found.after, 5),
-        }
-        self.known_of_second = self.known_of_second | differ
-        for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
-            self.optimiser.state.pop(parameter, None)
-        self.restart_second()
+        """Correct both lights so that the two captures show one albedo."""
+        found = correct_lights(self, _hashed(self.model))
+        self.known_of_second = self.known_of_second | found
+        if found:
+            self.restart(*own_lights(self.model), self.model.spatial)
 
     def second_facts(self) -> dict[str, str | float | bool]:
         """For the report: where the light of the second capture comes from."""
         return self.known_of_second
 
-    def restart_second(self) -> None:
-        """Forget the momentum of the second capture's light, which was set."""
-        for parameter in self.model.second.parameters() if self.model.second is not None else ():
+    def restart(self, *parts: Part) -> None:
+        """Forget the momentum of parts that were set."""
+        for parameter in (p for part in parts for p in part.parameters()):
             self.optimiser.state.pop(parameter, None)
 
     def set_rates(self) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from pipeline.fields.appearance import TYPICAL_INV_KAPPA
+from pipeline.fields.appearance import TYPICAL_INV_KAPPA, SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from pipeline.maths import sh
@@ -38,11 +38,13 @@ from stages.inverse_rendering.observations import (
     surface_points,
 )
 from stages.inverse_rendering.ray_sampling import U8, PhotoView, PixelTable
+from stages.inverse_rendering.relight_model import change_light
 from stages.inverse_rendering.two_lights import Agreed, Shown, agree, irradiance_rows
 
 F64 = npt.NDArray[np.float64]
 Fact = dict[str, str | float | bool]
 RAYS, SEED = 6000, 90_863
+LEARNED = 40_000  # places at which the reflectance is learned anew
 ROUNDS, HUBER, LEAST_NOISE = 8, 1.5, 1e-6
 MIN_POINTS = 200
 
@@ -215,13 +217,19 @@ def light_from_first(fit: Running) -> Fact:
     return facts
 
 
-def agreed_lights(fit: Running) -> Agreed | None:
-    """The two lights under which the photos of both captures show one albedo, with the usual lobe and the shadows so
-    far; None if too few places tell it, or the first light was given."""
+def correct_lights(fit: Running, spatial: SpatialField) -> Fact:
+    """Set the two lights under which the photos of both captures show one albedo, with the usual lobe and the shadows
+    so far, and learn the reflectance anew; the facts for the report, empty if too few places tell it or the first light
+    was given."""
     if fit.light_given:
-        return None
+        return {}
     model, pair = fit.model, places(fit)
-    return agree(pair.normal, *_shown(model, pair, [_usual_lobe(model, s) for s in (pair.first, pair.second)]))
+    found = agree(pair.normal, *_shown(model, pair, [_usual_lobe(model, s) for s in (pair.first, pair.second)]))
+    if found is None:
+        return {}
+    x, n = surface_points(model.geometry, fit.pixels.draw(LEARNED, 0.0, fit.settings.seed).rays)
+    change_light(model, spatial, x, n, lambda: set_lights(model, found))
+    return {"albedos_differ_before": round(found.before, 5), "albedos_differ": round(found.after, 5)}
 
 
 def set_lights(model: FaceModel, found: Agreed) -> None:

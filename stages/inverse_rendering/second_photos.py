@@ -20,8 +20,10 @@ from pipeline.colour import srgb_from_linear
 from pipeline.contract import Context
 from pipeline.errors import StageError, UsageError
 from pipeline.fields.face import FaceModel
+from pipeline.fields.geometry import GridSdf
 from pipeline.images import read_alpha, read_exr, read_linear, shrink_whole
 from pipeline.maths.light_frame import WORLD
+from pipeline.maths.tracing import box_interval
 from pipeline.together_artifacts import Together
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.held_out_colour import held_out_colours
@@ -156,12 +158,8 @@ def refuse_moving(frame: str, which: str) -> None:
         )
 
 
-def limited(view: PhotoView, surface: object, device: str) -> PhotoView:
+def limited(view: PhotoView, surface: GridSdf, device: str) -> PhotoView:
     """The view, without the pixels that show the subject where nothing is fitted. surface: the initial one."""
-    from pipeline.fields.geometry import GridSdf
-    from pipeline.maths.tracing import box_interval
-
-    assert isinstance(surface, GridSdf)
     factor = factor_for(view.size, REGION_SIDE)
     rays = image_rays(view, factor, device)
     near, far = box_interval(rays.o, rays.d, *surface.box())
