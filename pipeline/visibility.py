@@ -108,9 +108,9 @@ def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occlude
     facing(_row(camera), np.ascontiguousarray(points), np.ascontiguousarray(normals), cosine, uv)
     live = np.flatnonzero(cosine)
     if view.mask is not None:
-        live = live[picked(_MASKS.inside(view.mask), camera, uv[live])]
+        live = live[picked(mask_of(view.mask), camera, uv[live])]
     if view.asked is not None:  # elsewhere the subject is not fitted, so that its colours there mean nothing
-        live = live[picked(_MASKS.inside(view.asked), camera, uv[live])]
+        live = live[picked(mask_of(view.asked), camera, uv[live])]
     out = np.zeros(len(points))
     if len(live):
         away = matrix(camera.world_from_cam)[:3, 3] - points[live]
@@ -163,3 +163,8 @@ class _Masks:
 
 
 _MASKS = _Masks(KEPT)
+
+
+def mask_of(path: Path) -> Mask:
+    """(H, W) what a mask covers."""
+    return _MASKS.inside(path)

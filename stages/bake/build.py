@@ -26,13 +26,14 @@ from stages.bake.lit import Measured
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.mouth import Inside
+from stages.bake.outline_depth import outline_depth
 from stages.bake.regions import Votes, areas, unanimous
 from stages.bake.relief import relief
 from stages.bake.sources import sources
 from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
-from stages.bake.unseen import CLEAR, LENGTH, region_colours, replaced_share
+from stages.bake.unseen import CLEAR, LENGTH, LOOSE, region_colours, replaced_share
 
 log = logging.getLogger("neuface.bake")
 
@@ -211,7 +212,8 @@ def _known(
     albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), cosine >= CLEAR
     if well.any():
         region = np.zeros(len(well), np.int64) if region is None else region
-        albedo = continued(mesh, albedo, well, region_colours(albedo, region, cosine), LENGTH)
+        depth = outline_depth(mesh, np.flatnonzero(np.isin(region, LOOSE)), views, occluder, CLEAR)
+        albedo = continued(mesh, albedo, well, region_colours(albedo, region, cosine, depth), LENGTH)
     if mouth is not None:
         albedo = mouth.in_place_of(albedo, cosine == 0)
     unseen = (cosine == 0).astype(np.float32)

@@ -4,7 +4,8 @@ A photo that sees the surface at a grazing angle mixes it with what lies behind,
 colours, and continuing them gives smears; and a mean over the whole head makes the back of a dark-haired head bald.
 Hence only well seen vertices are kept, and others are drawn, over the length L, to the median of the seen albedo of
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
-divided by height, because a collar or long hair ends at about one height all around it.
+divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
+count that photos show farthest inside of the silhouette: at the outline the wall shines through loose hair.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
@@ -20,7 +21,7 @@ from pipeline.template.model import Template
 
 GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, from the second on it is kept
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
-BEST = 1 / 3  # of the well seen vertices: at the hair's outline the wall shines through
+BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
 # Metres from the head template within which a vertex belongs to its region: hair is thick; so is a collar.
 NEAR = {"scalp": 0.04, "neck": 0.06, "ears": 0.02, "face": 0.02}
@@ -28,6 +29,7 @@ REGIONS = tuple(NEAR)
 NECK = REGIONS.index("neck")
 REST = len(REGIONS)
 HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
+LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 FIRST_BAND, BANDS, BAND_HEIGHT = HAIR + 1, 32, 0.012  # codes of the neck's bands, the lowest first; metres of each
 
 
@@ -59,15 +61,15 @@ def with_hair(region: Indices, hair: Mask) -> Indices:
     return np.where(hair, HAIR, bare)
 
 
-def region_colours(albedo: F64, region: Indices, cosine: F64) -> F64:
-    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): those with the
-    largest cosines (V,), the upper BEST of all that are seen well. A band that is not seen takes the nearest band's
-    colour, other regions that of the whole head."""
+def region_colours(albedo: F64, region: Indices, cosine: F64, depth: F64) -> F64:
+    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): the upper BEST of
+    all that are seen well by the cosine (V,), or of LOOSE regions by the depth (V,) inside of the silhouettes. A band
+    that is not seen takes the nearest band's colour, other regions that of the whole head."""
     seen, known = cosine >= CLEAR, {}
     for code in np.unique(region):
         mine = region == code
         if (mine & seen).sum() >= max(MIN_SHARE * mine.sum(), 1):
-            known[int(code)] = _median(albedo, cosine, mine & seen)
+            known[int(code)] = _median(albedo, depth if code in LOOSE else cosine, mine & seen)
     whole, bands = _median(albedo, cosine, seen), [c for c in known if c >= FIRST_BAND]
     out = np.broadcast_to(whole, albedo.shape).copy()
     for code in map(int, np.unique(region)):
@@ -78,6 +80,6 @@ def region_colours(albedo: F64, region: Indices, cosine: F64) -> F64:
     return out
 
 
-def _median(albedo: F64, cosine: F64, of: Mask) -> F64:
-    best = of & (cosine >= np.quantile(cosine[of], 1 - BEST))
+def _median(albedo: F64, rank: F64, of: Mask) -> F64:
+    best = of & (rank >= np.quantile(rank[of], 1 - BEST))
     return np.asarray(np.median(albedo[best], axis=0), np.float64)

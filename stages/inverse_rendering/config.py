@@ -15,6 +15,7 @@ from pipeline.artifacts import sha256_of
 from pipeline.contract import StageConfig
 from pipeline.units import Cells, ContentHash, Metres, Pixels, Rays, Seconds, Share, Steps, Unit
 
+GPU_BATCH = 16_384  # rays of a step on a GPU, where it takes as long as one of 4,096
 AUTO: Final = "auto"  # decided by cross-validation during the fit (stages.inverse_rendering.cross_validation)
 MAX_RANK, MAX_ORDER = 3, 10  # values until the model selection: the paper's
 
@@ -102,7 +103,7 @@ class Config(StageConfig):
         default=AUTO,
         description="source of the light; lobe: estimated from view-dependent residuals, in closed form; "
         "uniform_albedo: by optimisation with a uniform albedo; stage: the lamps of a light stage, as distant lights; "
-        "auto: light_file if it is given, else lobe",
+        "auto: light_file if it is given, else the lamps of a light stage that are most of its light, else lobe",
     )
     light_file: str = Field(
         default="",

@@ -27,6 +27,7 @@ from pipeline.transforms import F64, matrix, scale_of
 from stages.inverse_rendering.config import AUTO, Config
 
 STAGE = "the light stage's lamps"
+LEAST_SHARE = 0.7  # of the light that calibrated lamps account for: the rest is taken to be spread as they are
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +63,18 @@ def given_light(capture: Capture, poses: CameraSet, config: Config) -> GivenLigh
             limit="the capture of a light stage",
             remedy="use inverse_rendering.light_from=auto, or --light with a file",
         )
-    if config.light_from != "stage" or capture.stage is None:
+    if capture.stage is None or not takes_lamps(capture.stage, config):
         return None
     return GivenLight(of_stage(capture.stage, capture_from_asset, config.first_order), STAGE, scaled=True)
+
+
+def takes_lamps(stage: LightStage, config: Config) -> bool:
+    """Whether the lamps of a stage are the light of its pictures: where the setting says so, or leaves it open and the
+    lamps account for most of the light. The maps of its single lights have the level of the lamps, so that an
+    environment with a level of its own would show them too bright or too dark."""
+    if config.light_from != AUTO:
+        return config.light_from == "stage"
+    return stage.share >= LEAST_SHARE and config.light_frame in (AUTO, "world")
 
 
 def of_stage(stage: LightStage, capture_from_asset: F64, order: int) -> F64:

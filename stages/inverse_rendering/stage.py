@@ -85,7 +85,9 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     from stages.inverse_rendering.training_loop import Hooks, run_fit
 
     clock, settings = Clock(context.waited), config
-    known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
+    known = None
+    if settings.preset not in COMPARED:  # which estimate their light
+        known = given_light(inputs.capture.artifact, inputs.poses.artifact, config)
     if known is not None and settings.light_order == AUTO:
         settings = settings.changed(light_order=MAX_ORDER)
     dropped = set(inputs.masks.artifact.dropped)
@@ -210,7 +212,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=32,
+    version=34,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

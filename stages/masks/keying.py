@@ -6,7 +6,7 @@ to the frame's border.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -66,8 +66,7 @@ def find_background(borders: Sequence[U8]) -> Background | None:
 
 def key_out(image: U8, background: Background) -> F32:
     """Alpha (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
-    apart = [np.abs(image[..., k].astype(np.float32) - np.float32(background.colour[k])) for k in range(3)]
-    away = np.maximum(np.maximum(apart[0], apart[1]), apart[2])
+    away = _farthest(image, lambda k: np.float32(background.colour[k]))
     return soft_edge(image, _inside(away, background.tolerance), EDGE)
 
 
@@ -76,14 +75,24 @@ def key_out_plate(image: U8, plate: U8) -> F32:
 
     Exposure may have changed: the plate is scaled to the photo by one gain, over the pixels that differ least.
     """
-    photo, empty = image.astype(np.float32), plate.astype(np.float32)
-    like = np.abs(photo - empty).max(2)
+    like = _farthest(image, lambda k: plate[..., k].astype(np.float32))
     same = like <= np.quantile(like, UNCHANGED)
-    gain = float(np.median((photo[same] + 1) / (empty[same] + 1)))
-    away = np.abs(photo - empty * np.float32(gain)).max(2)
+    gain = float(np.median((image[same].astype(np.float32) + 1) / (plate[same].astype(np.float32) + 1)))
+    away = _farthest(image, lambda k: plate[..., k].astype(np.float32) * np.float32(gain))
     away = np.asarray(cv2.GaussianBlur(away, (0, 0), 1.0), np.float32)  # reduces noise
     tolerance = float(np.clip(PLATE_NOISE * np.median(away[same]), *PLATE_LEVELS))
     return soft_edge(image, _inside(away, tolerance), EDGE)
+
+
+def _farthest(image: U8, other: Callable[[int], F32 | np.float32]) -> F32:
+    """(H, W) difference of a photo (H, W, 3) from what `other` gives for a channel, levels of the channel in which it
+    is largest. One channel at a time: a large photo in floats takes 12 bytes a pixel."""
+    away = np.zeros(image.shape[:2], np.float32)
+    for k in range(3):
+        plane = image[..., k].astype(np.float32)
+        plane -= other(k)
+        np.maximum(away, np.abs(plane, out=plane), out=away)
+    return away
 
 
 def _inside(away: F32, tolerance: float) -> Bool:

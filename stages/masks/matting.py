@@ -9,6 +9,8 @@ takes it in, B is the background continued from outside, and F the mean colour o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
@@ -21,6 +23,7 @@ NEITHER = 16.0  # weight of what no mixture of both explains: a highlight at the
 SNAP = 0.04  # alphas this close to 0 or 1 are noise
 MARGIN = 2  # pixels beyond both contours that are matted with what is between them
 NEARBY = 9  # pixels: half-edge of the window of F; twice that where it holds nothing of the subject
+STRIP = 1 << 20  # pixels of an edge's box that are matted at once: a hundred bytes each
 BEHIND = 8.5  # pixels: width of the window that continues the background
 
 
@@ -33,10 +36,21 @@ def soft_edge(image: U8, inside: Bool, radius: int) -> F32:
         return alpha
     rows, columns = np.flatnonzero(band.any(1)), np.flatnonzero(band.any(0))
     room = 3 * radius + 2
-    window = (slice(max(rows[0] - room, 0), rows[-1] + room + 1),
-              slice(max(columns[0] - room, 0), columns[-1] + room + 1))  # fmt: skip
-    alpha[window] = _solve(LINEAR[image[window]], inside[window], inner[window], outer[window], radius)
+    window = (slice(max(rows[0] - room, 0), min(rows[-1] + room + 1, len(inside))),
+              slice(max(columns[0] - room, 0), min(columns[-1] + room + 1, inside.shape[1])))  # fmt: skip
+    for wide, kept in _strips(window[0], STRIP // (window[1].stop - window[1].start), room):
+        place = (wide, window[1])
+        found = _solve(LINEAR[image[place]], inside[place], inner[place], outer[place], radius)
+        alpha[kept, window[1]] = found[kept.start - wide.start : kept.stop - wide.start]
     return alpha
+
+
+def _strips(rows: slice, step: int, room: int) -> Iterator[tuple[slice, slice]]:
+    """Rows in strips of at least `room` rows: those that a strip needs, `room` more to either side, and those that it
+    gives."""
+    for first in range(rows.start, rows.stop, max(step, room, 1)):
+        end = min(first + max(step, room, 1), rows.stop)
+        yield slice(max(first - room, rows.start), min(end + room, rows.stop)), slice(first, end)
 
 
 def between(image: U8, narrow: Bool, wide: Bool) -> F32:

@@ -4,7 +4,7 @@ masks."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,6 +45,8 @@ SMALL = 512  # pixels, longest edge of the masks for the consistency check
 CONTRADICTED = 0.007  # share of a mask's area from which the view is segmented again
 HOLE = 0.001  # the same for a hole: one in a single mask makes a tunnel through the subject
 FEWEST = 3  # views that must remain
+ROOM, PIXEL_BYTES = 3 << 30, 40  # memory for the photos at work at once; bytes that a pixel of them takes at most
+MOST_AT_ONCE = 8
 INVERTED = "given, inverted"
 LEARNED = ("model", "person")  # methods with a network's contour
 COMPUTED = ("plate", "model", "person", "object", "grabcut")  # methods whose masks the hull may contradict
@@ -83,11 +85,11 @@ def segment(
 ) -> MaskSet:  # fmt: skip
     """Masks of all registered views: the whole stage. See stages.masks.stage.run."""
     poses = located.artifact
-    pairs = _views(capture, poses)
+    pairs, threads = _views(capture, poses), at_once(capture.artifact.views, os.cpu_count() or 1)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
                lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
-    masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, context, "masking")
+    masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, threads, context, "masking")
     warnings = [f"view {m.view.index} ({m.view.name}): its mask is black on the subject and was inverted; save it "
                 "white on the subject" for m in masked if m.source == INVERTED]  # fmt: skip
     voting = [not m.view.holdout and not m.useless for m in masked]
@@ -99,7 +101,7 @@ def segment(
     if config.resegment and _agreement(masked) >= MIN_AGREEMENT:  # else the hull knows no better than the masks
         bad = [a or _wrong_held_out(m) for a, m in zip(_outliers(masked), masked, strict=True)]
         corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
-                          list(zip(masked, found, bad, strict=True)), context, "checking masks")  # fmt: skip
+                          list(zip(masked, found, bad, strict=True)), threads, context, "checking masks")  # fmt: skip
         if any(a is not b for a, b in zip(corrected, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in corrected]
             found = _opinions(corrected, voting, poses, config, support)
@@ -109,7 +111,7 @@ def segment(
     faces = [FaceResult()] * len(masked)
     if config.faces:
         hair = hair_model(config)
-        faces = _each(lambda m: _find_face(m, hair, context), masked, context, "detecting faces")
+        faces = _each(lambda m: _find_face(m, hair, context), masked, threads, context, "detecting faces")
     fitted = [(m.camera, x.face) for m, x in zip(masked, faces, strict=True)
               if x.face is not None and not m.view.holdout and m.view.index not in dropped]  # fmt: skip
     found_face = agreed(fitted)
@@ -121,7 +123,7 @@ def segment(
     extent = None if frame is None or _is_bust(votes, frame, poses.roi_radius) else head_extent(frame)
     face = None if found_face is None else found_face.face.xyz
     showing = {m.view.index for m, x in zip(masked, faces, strict=True) if x.face is not None}
-    parts = _asked(masked, votes, extent, face, showing, poses.roi_radius, context)
+    parts = _asked(masked, votes, extent, face, showing, poses.roi_radius, threads, context)
     masks = tuple(_manifest(m, x.labels, parts.get(m.view.index), context) for m, x in zip(masked, faces, strict=True))
     findings = judge(_seen(masked, dropped), first, poses.roi_radius, poses.metric,
                      sum("face" in m.labelled for m in masks))  # fmt: skip
@@ -153,6 +155,7 @@ def _asked(
     face: F64 | None,
     showing: set[int],
     roi_radius: float,
+    threads: int,
     context: Context,
 ) -> dict[int, Path]:
     """Files of the pixels that count, by view index; only for views in which not all pixels count. face (468, 3):
@@ -173,7 +176,7 @@ def _asked(
             write_png(path, part)
         return m.view.index, None if part is None else path
 
-    found = _each(one, masked, context, "computing the extent")
+    found = _each(one, masked, threads, context, "computing the extent")
     return {index: path for index, path in found if path is not None}
 
 
@@ -221,10 +224,16 @@ def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F
     return read
 
 
-def _each(work: Callable[[T], R], items: list[T], context: Context, message: str) -> list[R]:
+def at_once(views: Sequence[CaptureView], cores: int) -> int:
+    """How many photos are worked on at once: one a core, but no more than memory has room for."""
+    largest = max((v.width * v.height for v in views), default=1)
+    return max(1, min(MOST_AT_ONCE, cores, ROOM // (PIXEL_BYTES * largest)))
+
+
+def _each(work: Callable[[T], R], items: list[T], threads: int, context: Context, message: str) -> list[R]:
     """`work` on every item in a thread pool, results in order; OpenCV releases Python's lock."""
     out: list[R] = []
-    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+    pool = ThreadPoolExecutor(threads)
     try:
         for done, result in enumerate(pool.map(work, items)):
             context.check()

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pipeline.images import write_png
 from pipeline.meshes import Mesh
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.smoothing import continued
 from pipeline.template.load import load_template
+from pipeline.visibility import FittedPhoto, Occluder, view_cosines
+from stages.bake.outline_depth import outline_depth
 from stages.bake.unseen import (
     BAND_HEIGHT,
     CLEAR,
@@ -23,6 +29,7 @@ from stages.bake.unseen import (
     replaced_share,
     with_hair,
 )
+from tests.support.field_artifacts import camera
 
 TEMPLATE = load_template()
 
@@ -55,9 +62,10 @@ def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
     seen = np.concatenate([np.arange(100) < 30, np.ones(300, bool), np.zeros(50, bool)])
     albedo = np.where((region == 0)[:, None], 0.02, 0.6) * np.ones((450, 3))
     albedo[~seen] = 9.0  # means nothing
-    cosine = np.where(seen, 0.9, 0.0)
-    cosine[:18], albedo[:18] = 0.5, 0.8  # at the outline the wall shines through, on more than half of what is seen
-    found = region_colours(albedo, region, cosine)
+    cosine, depth = np.where(seen, 0.9, 0.0), np.where(seen, 0.2, 0.0)
+    # at the outline the wall shines through, on more than half of what is seen, and straight before a camera
+    cosine[:18], depth[:18], albedo[:18] = 0.95, 0.01, 0.8
+    found = region_colours(albedo, region, cosine, depth)
     np.testing.assert_allclose(found[region == 0], 0.02)
     np.testing.assert_allclose(found[region != 0], 0.6)
 
@@ -94,8 +102,38 @@ def test_a_band_that_is_not_seen_takes_the_nearest_bands_colour() -> None:
     cosine = np.where(np.isin(region - FIRST_BAND, [0, 3]), 0.9, 0.0)
     albedo = np.where((region == FIRST_BAND)[:, None], 0.1, 0.6) * np.ones((200, 3))
     albedo[cosine == 0] = 9.0
-    found = region_colours(albedo, region, cosine)[:, 0]
+    found = region_colours(albedo, region, cosine, cosine)[:, 0]
     np.testing.assert_allclose(found, np.repeat([0.1, 0.6, 0.6, 0.6], 50))
+
+
+def test_depth_is_the_distance_from_the_outline_of_the_best_photo(tmp_path: Path) -> None:
+    """Oracle: a wall before two cameras whose masks are a square and the whole photo; distances by hand."""
+    side = np.linspace(-0.05, 0.05, 41)
+    x, y = (a.ravel() for a in np.meshgrid(side, side))
+    vertices = np.stack([x, y, np.zeros_like(x)], 1).astype(np.float32)
+    i = np.arange(40 * 41).reshape(40, 41)[:, :40].ravel()
+    faces = np.concatenate([np.stack([i, i + 1, i + 42], 1), np.stack([i, i + 42, i + 41], 1)]).astype(np.int32)
+    wall = Mesh(vertices, np.tile(np.float32([0, 0, 1]), (len(vertices), 1)), faces)
+    front = camera(0, 0.0)  # 0.6 m in front
+    square = np.zeros((front.height, front.width), np.uint8)
+    margin = 7 * front.width // 16
+    square[margin:-margin, margin:-margin] = 255
+    write_png(tmp_path / "square.png", square)
+    view = FittedPhoto(front, tmp_path / "square.png")
+    every = np.arange(len(vertices))
+    found = outline_depth(wall, every, [view], Occluder(wall), CLEAR)
+    _, at = view_cosines(view, vertices.astype(np.float64), wall.normals.astype(np.float64), Occluder(wall))
+    inside = front.width / 2 - margin - np.abs(at - front.width / 2).max(1)  # pixels to the square's side
+    seen = inside > 1
+    assert seen.any() and not seen.all()
+    np.testing.assert_allclose(found[seen] * front.width, inside[seen], atol=1.5)
+    assert (found[inside < -1] == 0).all()
+    some = outline_depth(wall, every[:7], [view, replace(view, mask=None)], Occluder(wall), CLEAR)
+    np.testing.assert_array_equal(some[:7], found[:7])
+    assert (some[7:] == 0).all()
+    grazing = replace(wall, normals=np.tile(np.float32([0.98, 0, 0.19]), (len(vertices), 1)))
+    assert not outline_depth(grazing, every[820:860], [view], Occluder(wall), CLEAR).any()
+    assert not outline_depth(wall, every, [replace(view, mask=None)], Occluder(wall), CLEAR).any()
 
 
 def test_the_seen_rim_fades_over_the_length() -> None:
@@ -124,6 +162,6 @@ def test_the_scalp_under_hair_goes_on_in_the_colour_of_the_face() -> None:
     cosine = np.where(region == scalp, 0.0, 0.9)
     cosine[300:350] = 0.9
     albedo = np.where(hair, 0.02, 0.6)[:, None] * np.ones((400, 3))
-    colours = region_colours(albedo, found, cosine)
+    colours = region_colours(albedo, found, cosine, cosine)
     np.testing.assert_allclose(colours[:200], 0.6)
     np.testing.assert_allclose(colours[300:], 0.02)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from pipeline.maths.sh import irradiance
 from pipeline.transforms import rows
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
-from stages.inverse_rendering.given_light import STAGE, GivenLight, given_light
+from stages.inverse_rendering.given_light import LEAST_SHARE, STAGE, GivenLight, given_light
 from stages.inverse_rendering.initialise import new_trainer, put
 from stages.inverse_rendering.judge import Fitted, choices
 from stages.inverse_rendering.model_selection import given_model, select_model
@@ -91,6 +92,20 @@ def test_a_stages_lamps_give_the_irradiance_at_its_centre() -> None:
         expected += 0.25 / 0.8 * cosine[:, None] * np.array(light.intensity) / distance**2
     made = irradiance(torch.from_numpy(found.coefficients), torch.from_numpy(n)).numpy()
     np.testing.assert_allclose(made, expected, rtol=0.02)  # SH of order 10 of a cosine
+
+
+def test_a_stages_lamps_are_its_light_unless_they_are_too_few_or_it_is_said_otherwise() -> None:
+    """The maps of the single lights have the level of the lamps: an estimated environment would have another one."""
+
+    def found(share: float, **settings: Any) -> GivenLight | None:
+        stage = stage_of(np.zeros(3)).model_copy(update={"share": share})
+        return given_light(Capture(kind="olat", views=(), stage=stage), poses(), Config(**settings))
+
+    assert (lamps := found(LEAST_SHARE)) is not None and lamps.source == STAGE and lamps.scaled
+    assert found(LEAST_SHARE - 0.01) is None
+    assert found(LEAST_SHARE - 0.01, light_from="stage") is not None
+    assert found(1.0, light_from="lobe") is None
+    assert found(1.0, light_frame="camera") is None
 
 
 def test_where_there_is_nothing_to_take(tmp_path: Path) -> None:

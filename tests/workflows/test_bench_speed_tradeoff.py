@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from scipy.stats import linregress
 
 from pipeline.errors import UsageError
 from stages.inverse_rendering.stage import STAGE
@@ -39,6 +40,18 @@ def test_growth_finds_a_power_law() -> None:
     a, b = host_info.growth(x, [3 * v**1.7 for v in x])
     assert (a, b) == pytest.approx((3, 1.7))
     assert np.isnan(host_info.growth([1, 1], [2, 3])).all() and np.isnan(host_info.growth([1, 2], [0, 3])).all()
+
+
+def test_the_error_of_a_power_law_is_that_of_its_residuals() -> None:
+    """Against scipy's regression of the logarithms; exact points have none, and two points tell none."""
+    rng = np.random.default_rng(0)
+    x = [1.0, 2.0, 4.0, 8.0, 16.0]
+    y = [float(2 * v**0.8 * np.exp(e)) for v, e in zip(x, rng.normal(0, 0.1, 5), strict=True)]
+    told = linregress(np.log(x), np.log(y))
+    a, b, error = host_info.power_law(x, y)
+    assert (a, b, error) == pytest.approx((np.exp(told.intercept), told.slope, told.stderr))
+    assert host_info.power_law(x, [3 * v for v in x])[2] == pytest.approx(0, abs=1e-12)
+    assert np.isnan(host_info.power_law([1.0, 2.0], [1.0, 2.0])[2])
 
 
 def test_the_machine_is_told() -> None:

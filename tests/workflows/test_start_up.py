@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -75,3 +76,21 @@ def test_auto_asks_torch_unless_it_is_a_build_for_the_cpu(torch: str | None, mon
     assert plan.device_for("auto") == ("cpu" if torch == "2.13.0+cpu" else "cuda")
     assert plan.device_for("cuda") == "cuda"
     assert plan.device_for("cpu") == "cpu"
+
+
+def test_a_gpu_has_a_batch_of_its_own_unless_one_is_given() -> None:
+    """Whoever runs on a GPU gets the accuracy that it gives for nothing; the paper's systems keep the paper's batch."""
+
+    from stages.inverse_rendering.config import GPU_BATCH
+    from workflows.run.plan import check_settings, of_gpu
+    from workflows.run.request import RunRequest
+
+    def batch(**changes: Any) -> Any:
+        asked = RunRequest(capture="photos", out="out", **changes)
+        return of_gpu(asked, check_settings(asked))["inverse_rendering"].model_dump()["batch"]
+
+    assert batch() == batch(preset="film") == GPU_BATCH
+    assert batch(sets=("inverse_rendering.batch=512",)) == 512
+    assert batch(sets=("inverse_rendering.batch=32768",)) == 32768
+    assert batch(config={"inverse_rendering": {"batch": 1024}}) == 1024
+    assert batch(sets=("inverse_rendering.preset=paper",)) == 2048

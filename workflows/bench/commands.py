@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from workflows.bench import ablations, captures, speed, tradeoff
+from workflows.bench import ablations, captures, machine, speed, tradeoff
 from workflows.cli.console import Console
 
 
@@ -36,6 +36,11 @@ BENCHES: dict[str, Bench] = {
         tradeoff.run,
     ),
     "speed": Bench("rays, pictures and SH evaluations a second; how time and memory grow", speed.options, speed.run),
+    "machine": Bench(
+        "what this machine can do, and how far each stage of a run is from the least time there",
+        machine.options,
+        machine.run,
+    ),
 }
 
 

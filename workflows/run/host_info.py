@@ -78,9 +78,16 @@ def seconds_each(work: Callable[[], object], least: float = 1.0, rounds: int = 3
 
 def growth(x: list[float], y: list[float]) -> tuple[float, float]:
     """(a, b) of y = a x^b, by least squares of the logarithms; NaN where fewer than two points are positive."""
+    return power_law(x, y)[:2]
+
+
+def power_law(x: list[float], y: list[float]) -> tuple[float, float, float]:
+    """(a, b, s) of y = a x^b, and s the standard error of b from the residuals; s is NaN with two points or fewer."""
     points = [(u, v) for u, v in zip(x, y, strict=True) if u > 0 and v > 0]
     if len({u for u, _ in points}) < 2:
-        return float("nan"), float("nan")
+        return float("nan"), float("nan"), float("nan")
     u, v = np.log(np.array(points)).T
     b, a = np.polyfit(u, v, 1)
-    return float(np.exp(a)), float(b)
+    free, rest = len(points) - 2, v - a - b * u
+    error = np.sqrt((rest**2).sum() / free / ((u - u.mean()) ** 2).sum()) if free else np.nan
+    return float(np.exp(a)), float(b), float(error)
