@@ -1,5 +1,5 @@
 """The artifacts that stages exchange: frozen manifests that refer to files by content. Those of the capture are in
-pipeline/capture_artifacts.py.
+pipeline/capture_artifacts.py, those of the asset in pipeline/asset_artifacts.py.
 
 An artifact is a pydantic model saved as `manifest.json` beside its files. It contains figures and `FileRef`s, but no
 arrays and no absolute paths, so that two runs with the same content have the same manifest in any folder.
@@ -379,29 +379,3 @@ class TextureSet(Artifact):
     def side(self, tile: int) -> int:
         """Width and height of a tile's maps in texels."""
         return self.sides[tile] if self.sides else self.size
-
-
-# ------------------------------------------------------------------ asset and report
-class UsdAsset(Artifact):
-    """The exported component. `root`: the file to open; `files`: all files, with relative paths.
-
-    figures: measurements of the export, by name. stated: author, licence and consent, as given by the user.
-    """
-
-    name: str
-    root: RelativePath
-    files: tuple[FileRef, ...]
-    views: tuple[HeldOutView, ...] = ()
-    figures: dict[str, float] = {}
-    stated: dict[str, str] = {}
-    checks: int
-    warnings: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-
-
-class Report(Artifact):
-    """One self-contained page and its figures."""
-
-    files: tuple[FileRef, ...]
-    warnings: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
