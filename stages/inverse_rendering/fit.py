@@ -9,8 +9,6 @@ from typing import Any, ClassVar
 import torch
 
 from pipeline.artifacts import RefinedCamera
-from pipeline.fields.appearance import SpatialField
-from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
@@ -34,6 +32,16 @@ from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import U8, Batch
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
+from stages.inverse_rendering.schedule import (
+    LEVEL_STARTS,
+    SETTLING,
+    SHADOWS_AT,
+    SKIN_AT,
+    UNIFORM_LIGHT_ORDER,
+    hashed,
+    make_optimiser,
+    set_rates,
+)
 from stages.inverse_rendering.second_capture import correct_lights, first_capture, light_from_first, of_first
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
@@ -41,17 +49,7 @@ from stages.inverse_rendering.trial_loop import TrialLoop
 from stages.inverse_rendering.trials import LENGTH, SELECTION, SHADOWS, SKIN, SMOOTHING, Trials
 from stages.inverse_rendering.weakly_seen import SMOOTH_AT, smooth_weakly_seen
 
-LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
-BAND_EVERY = 250
-UNIFORM_FROM = 0.3  # share of the fit at which the light-only phase with uniform albedo begins
-OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are active at the start
-OPEN_UNTIL = 0.5  # share of the fit after which all levels are active
-UNIFORM_LIGHT_ORDER = 3  # diffuse skin determines hardly more of a light
-UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
-KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
-SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
-SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
-SKIN_AT = 0.8  # share of the fit at which the light is corrected by the skin: the albedo is that of the light before
+BAND_EVERY = 250  # steps after which the narrow band is found again
 SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
 
 
@@ -256,7 +254,7 @@ class Trainer(TrialLoop):
 
     def ask_second(self) -> None:
         """Correct both lights so that the two captures show one albedo."""
-        found = correct_lights(self, _hashed(self.model))
+        found = correct_lights(self, hashed(self.model))
         self.known_of_second = self.known_of_second | found
         if found:
             self.restart(*own_lights(self.model), self.model.spatial)
@@ -271,43 +269,8 @@ class Trainer(TrialLoop):
             self.optimiser.state.pop(parameter, None)
 
     def set_rates(self) -> float:
-        """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
-
-        Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
-        learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
-
-        Between UNIFORM_FROM and `uniform_albedo_until`, a light that is known from the lobe (light_estimate.py) is
-        frozen together with the surface, and the reflectance adapts to it; later it has a low rate. A given light is
-        frozen throughout. If the lobe does not determine the light, everything except the light is frozen, and the
-        albedo is uniform: the light, which was uniform at the start, explains the shading that was in the albedo
-        before. Earlier, the surface is still wrong.
-        """
-        s, p = self.settings, self.share()
-        decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
-        warm = min((self.step + 1) / 50, 1.0)
-        interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not self.light_moves
-        light_known = self.light_given != "" or (self.choices is not None and self.choices.light_known)
-        self.model.uniform_albedo = interlude and not light_known
-        second = None if self.model.second is None else next(self.model.second.light.parameters())
-        for group in self.optimiser.param_groups:
-            other = group["params"][0] is second
-            light = other or group["params"][0] is next(self.model.light.parameters())
-            group["lr"] = group["start"] * decay * warm
-            if interlude and not light_known:
-                group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
-            elif light and (light_known or self.skin_tells):
-                frozen = interlude or (self.light_given and not other)
-                group["lr"] *= 0.0 if frozen else KNOWN_LIGHT_RATE
-        finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
-        start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
-        self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
-        opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
-        _hashed(self.model).encoding.open_levels(opened)
-        # the reflectance adapts to the new light, not the surface
-        settles = not self.light_given and not self.light_moves
-        still = settles and UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
-        still |= self.skin_tells and p < SKIN_AT + SETTLING
-        return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
+        """Set the rates of this step; returns that of the SDF in asset units."""
+        return set_rates(self)
 
     # ---------------------------------------------------------------- one step
     def move(self, rate: float) -> None:
@@ -394,26 +357,3 @@ class Trainer(TrialLoop):
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.table = None
-
-
-def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
-    """Adam over everything except the SDF, which has its own optimiser in the narrow band. eps is small, because most
-    entries of the hash table rarely have a gradient."""
-    spatial = _hashed(model)
-    groups = [
-        {"params": [spatial.encoding.table], "start": settings.lr_appearance},
-        {"params": [*spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
-        {"params": list(model.light.parameters()), "start": settings.lr_light},
-        {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
-    ]
-    if model.ambient is not None:
-        groups.append({"params": list(model.ambient.parameters()), "start": settings.lr_light})
-    if model.second is not None:
-        groups.append({"params": list(model.second.light.parameters()), "start": settings.lr_light})
-    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-
-def _hashed(model: FaceModel) -> SpatialField:
-    """The Spatial MLP with its hash encoding."""
-    assert isinstance(model.spatial, SpatialField)
-    return model.spatial
