@@ -8,7 +8,9 @@ shadows, w the reflectance; a prime marks the second capture.
 One light can't be told from an albedo that changes with the normal: a(x) g(n) under E / g looks the same as a(x) under
 E. Two lights can. If g turned both E and E' into irradiances again, E' dE = E dE' on the whole sphere; irradiances are
 polynomials of degree 2 in n, so that dE is a multiple of E unless E and E' have a common factor. What is left is one
-factor, the level of the albedo (albedo_level.py).
+factor for each colour: the level of the albedo and the white balance of the lights, which other sources tell
+(albedo_level.py). So the correction keeps them: both lights are divided, in each colour, by the factor by which the
+mean of ln E over the places has risen. Then the mean of ln a stays as well.
 
 The logarithm of the equation is solved by Gauss-Newton steps with Huber's weights, for each colour: the bands 0 to 2 of
 L' and the bands 1 and 2 of L. The prior of a change b, in units of the light's band 0, is N(0, STD^2); band 0 of L' is
@@ -84,6 +86,8 @@ def agree(n: F64, first: Shown, second: Shown) -> Agreed | None:
     a, b = np.array(first.light), np.array(second.light)
     for c in range(3):
         a[:, c], b[:, c] = _solved(first, second, rows, c)
+    risen = _risen(rows[0] @ first.light, rows[0] @ a)
+    a, b = a / risen, b / risen
     after = _spread(replace(first, light=a), replace(second, light=b), rows)
     return Agreed(a, b, before, after) if np.isfinite(after) and after < before else None
 
@@ -106,6 +110,13 @@ def _spread(first: Shown, second: Shown, rows: list[F64]) -> float:
         return float("inf")
     log = np.log(ratio[0][good] / ratio[1][good])
     return float(np.abs(log - np.median(log, 0)).mean())
+
+
+def _risen(before: F64, after: F64) -> F64:
+    """(3,) geometric mean over the places of the ratio of two irradiances (P, 3), where both are positive."""
+    lit = (before > 0) & (after > 0)
+    logs = np.log(np.where(lit, after, 1.0)) - np.log(np.where(lit, before, 1.0))
+    return np.asarray(np.exp(logs.sum(0) / np.maximum(lit.sum(0), 1)), np.float64)
 
 
 def _solved(first: Shown, second: Shown, rows: list[F64], c: int) -> tuple[F64, F64]:

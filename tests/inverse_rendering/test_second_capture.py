@@ -11,10 +11,12 @@ import torch
 from pipeline.fields.face import FaceModel
 from pipeline.maths import sh
 from pipeline.transforms import F64
+from stages.inverse_rendering.albedo_level import set_level
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.model_selection import own_lights
+from stages.inverse_rendering.observations import surface_hits
 from stages.inverse_rendering.second_capture import Samples, Second, first_capture, of_first, solve_light
 from stages.inverse_rendering.training_loop import Hooks, run_fit
 from tests.support.balls import RADIUS, start, texture
@@ -118,6 +120,26 @@ def test_a_decision_that_is_taken_back_leaves_both_lights_as_they_were() -> None
         assert torch.equal(value, before[name]), name
     t.advance()
     assert t.model.calibration.own == (False, True)
+
+
+def test_a_level_that_is_set_changes_no_photo_of_either_capture() -> None:
+    t = trainer()
+    rays = t.pixels.draw(800, 0.0, 1).rays
+    x, n, hit = surface_hits(t.model.geometry, rays, torch.arange(len(rays.d)))
+    rays = rays[hit]
+    assert rays.second is not None and 0 < int(rays.second.sum()) < len(x)
+
+    def colours() -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.no_grad():
+            shaded = t.model.shade(x, n, -rays.d, rays.stations)
+        return shaded.total, shaded.albedo
+
+    total, albedo = colours()
+    labels = [np.ones(v.alpha.shape, np.uint8) for v in t.views]
+    gain = float(set_level(t.model, t.pixels, t.views, labels, ("", "face"), 0.2, {})["gain"])
+    after, darker = colours()
+    assert not 0.9 < gain < 1.1 and torch.allclose(darker, gain * albedo, rtol=1e-3)
+    assert torch.allclose(after, total, rtol=1e-4)
 
 
 def test_only_the_second_capture_has_colour_matrices_where_only_it_needs_them() -> None:

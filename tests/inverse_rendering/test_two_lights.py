@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -61,7 +63,24 @@ def test_both_lights_are_found_although_the_albedo_changes_with_the_normal(noise
         assert now < (0.1 if noise == 0 else 0.75) * was
     level = found.second[0] / found.first[0]
     assert np.allclose(level, second[0] / first[0], rtol=0.02)  # the lights' ratio is told, in each colour
-    assert np.array_equal(found.first[0], begun[0][0])  # the level is not touched
+
+
+@pytest.mark.parametrize("level", [1.0, 3.0])
+def test_the_level_and_the_colour_of_the_albedo_stay(level: float) -> None:
+    """Places that face one way, where lights from the side change the mean: the mean of ln albedo is that before, in
+    each colour, whatever the level of the lights that are believed."""
+    first, second = light(0), light(5)
+    begun = level * wrong(first, 2), wrong(second, 3)
+    n, a, b = scene(first, second, begun)
+    front = n[:, 2] > 0.2
+    a, b = (replace(s, total=s.total[front], glow=s.glow[front], shadow=s.shadow[front]) for s in (a, b))
+    found = agree(n[front], a, b)
+    assert found is not None
+    before, after = (np.log(a.total / (a.shadow * irradiance(n[front], c))).mean(0) for c in (begun[0], found.first))
+    assert np.allclose(before, after, atol=2e-3)
+    other = np.log(a.total / (a.shadow * irradiance(n[front], found.first * begun[0][0] / found.first[0]))).mean(0)
+    assert np.abs(other - before).max() > 0.02
+    assert np.allclose(found.second[0] / found.first[0], second[0] / first[0], rtol=0.05)
 
 
 def test_lights_that_are_right_stay() -> None:
