@@ -42,7 +42,13 @@ from stages.inverse_rendering.schedule import (
     make_optimiser,
     set_rates,
 )
-from stages.inverse_rendering.second_capture import correct_lights, first_capture, light_from_first, of_first
+from stages.inverse_rendering.second_capture import (
+    correct_lights,
+    first_capture,
+    light_from_first,
+    of_first,
+    tell_level,
+)
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
@@ -122,6 +128,11 @@ class Trainer(TrialLoop):
     def light_moves(self) -> bool:
         """Whether the light moves relative to the subject."""
         return self.model.spec.light_frame != WORLD
+
+    @property
+    def light_told(self) -> bool:
+        """Whether the light's low bands are those that skin, or a second capture, tells."""
+        return self.skin_tells or "albedos_differ" in self.known_of_second
 
     def select_model(self) -> None:
         """Select the model by cross-validation, and remove the other parts. Under a light that moves, a point's mean
@@ -255,6 +266,8 @@ class Trainer(TrialLoop):
     def ask_second(self) -> None:
         """Correct both lights so that the two captures show one albedo."""
         found = correct_lights(self, hashed(self.model))
+        if self.choices is not None and self.choices.light_known:
+            found |= tell_level(self)
         self.known_of_second = self.known_of_second | found
         if found:
             self.restart(*own_lights(self.model), self.model.spatial)
@@ -308,8 +321,8 @@ class Trainer(TrialLoop):
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
         later, there is no sparse-albedo prior, which would move albedo into the lobe; nor if the light moves, which
-        shows albedo and light apart. If skin tells the light's colour, or the light is given, nothing draws it to
-        white."""
+        shows albedo and light apart. If skin or a second capture tells the light's colour, or the light is given,
+        nothing draws it to white."""
         if self.light_moves:
             return self.settings.changed(albedo_sparsity=0.0)
         if self.light_given:
@@ -317,7 +330,7 @@ class Trainer(TrialLoop):
         if self.choices is None:
             return self.settings.changed(f0_excess=0.0)
         known = self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
-        return known.changed(white=0.0) if self.skin_tells else known
+        return known.changed(white=0.0) if self.light_told else known
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""
@@ -349,7 +362,7 @@ class Trainer(TrialLoop):
         self.level = state["level"]
         self.views = self.poses.restore(self.views, state["poses"])
         self.robust.restore(state["robust"], self.device)
-        self.known_of_second = state["known_of_second"]
+        self.known_of_second = state.get("known_of_second", {})  # not in checkpoints from before there was one
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
         g.restore(state["model"]["geometry.values"].to(self.device))

@@ -33,7 +33,6 @@ class Scheduled(Protocol):
     step: int
     level: int
     light_given: str
-    skin_tells: bool
 
     def share(self) -> float:
         """Finished share of the fit."""
@@ -42,6 +41,11 @@ class Scheduled(Protocol):
     @property
     def light_moves(self) -> bool:
         """Whether the light moves relative to the subject."""
+        ...
+
+    @property
+    def light_told(self) -> bool:
+        """Whether skin, or a second capture, told the light's low bands."""
         ...
 
     @property
@@ -98,7 +102,7 @@ def set_rates(fit: Scheduled) -> float:
         group["lr"] = group["start"] * decay * warm
         if interlude and not light_known:
             group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
-        elif light and (light_known or fit.skin_tells):
+        elif light and (light_known or fit.light_told):
             frozen = interlude or (fit.light_given and not other)
             group["lr"] *= 0.0 if frozen else KNOWN_LIGHT_RATE
     finest = fit.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - fit.level)
@@ -109,5 +113,5 @@ def set_rates(fit: Scheduled) -> float:
     # the reflectance adapts to the new light, not the surface
     settles = not fit.light_given and not fit.light_moves
     still = settles and UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
-    still |= fit.skin_tells and p < SKIN_AT + SETTLING
+    still |= fit.light_told and p < SKIN_AT + SETTLING
     return 0.0 if still or fit.geometry_frozen else s.lr_sdf * fit.model.geometry.cell * decay * warm
