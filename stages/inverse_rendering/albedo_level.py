@@ -94,17 +94,11 @@ def set_level(
     explained = light.get("explained")
     given, known = (None if v is None or v == AUTO else float(v) for v in (wanted, explained))
     found = decide(seen, given, known, corrected="skin_explains" in light)
-    change_level(model, found.gain)
-    return found.facts
-
-
-def change_level(model: FaceModel, gain: float) -> None:
-    """Apply g to a model with one light, or with those of two captures."""
-    assert isinstance(model.spatial, SpatialField) and isinstance(model.light, ShLight)
-    apply_gain(model.spatial, model.light, gain)
+    apply_gain(model.spatial, model.light, found.gain)
     if model.second is not None and isinstance(model.second.light, ShLight):
         with torch.no_grad():
-            model.second.light.coefficients.div_(gain)
+            model.second.light.coefficients.div_(found.gain)
+    return found.facts
 
 
 def labelled_albedos(

@@ -42,13 +42,7 @@ from stages.inverse_rendering.schedule import (
     make_optimiser,
     set_rates,
 )
-from stages.inverse_rendering.second_capture import (
-    correct_lights,
-    first_capture,
-    light_from_first,
-    of_first,
-    tell_level,
-)
+from stages.inverse_rendering.second_capture import correct_lights, first_capture, light_from_first, of_first
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
@@ -266,8 +260,6 @@ class Trainer(TrialLoop):
     def ask_second(self) -> None:
         """Correct both lights so that the two captures show one albedo."""
         found = correct_lights(self, hashed(self.model))
-        if self.choices is not None and self.choices.light_known:
-            found |= tell_level(self)
         self.known_of_second = self.known_of_second | found
         if found:
             self.restart(*own_lights(self.model), self.model.spatial)

@@ -5,9 +5,7 @@
 Symbols as in light_estimate.py; a prime marks the second capture. The albedo a_p and the reflectance w are those that
 the first capture tells, because the subject is the same; so each colour of L' is a linear least-squares problem. It is
 solved when the first light was estimated. Then both lights are corrected until the two captures show one albedo
-(two_lights.py), and again near the end of the fit, when the shadows are known. Then the lobes of both captures tell the
-level of the albedo again, each with the weight that the level of one has (albedo_level.py): on the finished surface
-they explain more than when the light was estimated.
+(two_lights.py), and again near the end of the fit, when the shadows are known.
 
 Residuals have Huber's weights. The prior of L' is its value before, with a weight of RIDGE of the mean eigenvalue.
 """
@@ -15,7 +13,7 @@ Residuals have Huber's weights. The prior of L' is its value before, with a weig
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -27,10 +25,9 @@ from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from pipeline.maths import sh
 from pipeline.maths.vmf import ATTENUATIONS
-from stages.inverse_rendering.albedo_level import change_level, lobe_std
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.initial_geometry import Start
-from stages.inverse_rendering.light_estimate import DARKEST, MIN_VIEWS, RIDGE, light_from_lobe, reflectance
+from stages.inverse_rendering.light_estimate import DARKEST, MIN_VIEWS, RIDGE, reflectance
 from stages.inverse_rendering.model_selection import MAX_ESTIMATE_ORDER, Fit, own_lights
 from stages.inverse_rendering.observations import (
     Observations,
@@ -233,34 +230,6 @@ def correct_lights(fit: Running, spatial: SpatialField) -> Fact:
     x, n = surface_points(model.geometry, fit.pixels.draw(LEARNED, 0.0, fit.settings.seed).rays)
     change_light(model, spatial, x, n, lambda: set_lights(model, found))
     return {"albedos_differ_before": round(found.before, 5), "albedos_differ": round(found.after, 5)}
-
-
-def tell_level(fit: Running) -> Fact:
-    """Set the level of the albedo that the view-dependent residuals of both captures tell on the present surface; the
-    facts for the report, empty if those of the first do not, or if the first light was given.
-
-    ln g = sum_i ln(L_i / L_lobe_i) / sigma_i^2 / sum_i 1 / sigma_i^2,    i = 1, 2
-
-    with L the bands 0 of the model's lights, mean of the colours, and L_lobe those of light_estimate.py.
-    """
-    if fit.light_given:
-        return {}
-    model, pair = fit.model, places(fit)
-    order = min(model.spec.light_order, MAX_ESTIMATE_ORDER)
-    total, weights = 0.0, 0.0
-    parts = zip((pair.first, pair.second), pair.colours, own_lights(model), strict=True)
-    for number, (seen, colour, light) in enumerate(parts):
-        views = int(seen.view.max()) + 1 if len(seen.view) else 0
-        found = light_from_lobe(replace(seen, colour=colour), order, np.ones((views, 3)), model.spec.attenuation)
-        if found is None and number == 0:
-            return {}
-        if found is not None:
-            weight = lobe_std(found.explained) ** -2
-            total += weight * float(np.log(float(light().detach()[0].mean()) / found.coefficients[0]))
-            weights += weight
-    gain = float(np.exp(total / weights))
-    change_level(model, gain)
-    return {"level_by_both_lobes": round(gain, 4), "log_std_of_level": round(weights**-0.5, 3)}
 
 
 def set_lights(model: FaceModel, found: Agreed) -> None:

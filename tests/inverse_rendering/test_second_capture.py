@@ -17,7 +17,7 @@ from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.model_selection import own_lights
 from stages.inverse_rendering.observations import surface_hits
-from stages.inverse_rendering.second_capture import Samples, Second, first_capture, of_first, solve_light, tell_level
+from stages.inverse_rendering.second_capture import Samples, Second, first_capture, of_first, solve_light
 from stages.inverse_rendering.training_loop import Hooks, run_fit
 from tests.support.balls import RADIUS, start, texture
 from tests.support.lit_balls import FIRST, SECOND, photos
@@ -140,26 +140,6 @@ def test_a_level_that_is_set_changes_no_photo_of_either_capture() -> None:
     after, darker = colours()
     assert not 0.9 < gain < 1.1 and torch.allclose(darker, gain * albedo, rtol=1e-3)
     assert torch.allclose(after, total, rtol=1e-4)
-
-
-@pytest.mark.parametrize("wrong", [0.8, 1.0, 1.3])
-def test_the_lobes_of_both_captures_tell_the_level(wrong: float) -> None:
-    """Lights that are too bright by a factor, as far as the photos tell, and an albedo that is too dark."""
-    t = trainer()
-    lights, true = own_lights(t.model), (FIRST, SECOND)
-    with torch.no_grad():
-        for light, c in zip(lights, true, strict=True):
-            light.coefficients.zero_()
-            light.coefficients[: len(c)] = wrong * torch.from_numpy(c)
-    level = float(t.model.spatial.level)
-    facts = tell_level(t)
-    gain = float(facts["level_by_both_lobes"])
-    assert gain == pytest.approx(wrong, rel=0.05)
-    assert float(t.model.spatial.level) == pytest.approx(level * gain, rel=1e-3)
-    for light, c in zip(lights, true, strict=True):
-        assert np.allclose(light().detach().numpy()[0], wrong / gain * c[0], rtol=1e-3)
-    t.light_given = "a file"
-    assert tell_level(t) == {}
 
 
 def test_only_the_second_capture_has_colour_matrices_where_only_it_needs_them() -> None:
