@@ -117,7 +117,8 @@ OF_CAMERAS = (
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "    if free.all():\n        return bound\n", "",
              f"{KEPT}::test_a_bound_that_empties_no_ray_stays"),
     Mutation("stages/inverse_rendering/choose_start.py",
-             "return start_with_silhouettes(hull, start, views, check), facts", "return start, facts", f"{KEPT}::test_the_chosen_start_has_them"),
+             "return start_with_silhouettes(hull, start, views, check), facts", "return start, facts",
+             f"{KEPT}::test_the_chosen_start_has_them"),
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "np.maximum(kept, hull.values)", "start.values",
              f"{KEPT}::test_a_start_fills_the_silhouettes_that_the_hull_fills"),
     # ---------------------------------------------------------------- look-up in maps and tables

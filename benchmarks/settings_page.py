@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.generated import print_or_write
-from stages.registry import REGISTRY
+from stages.registry import EVERY
 from stages.settings import Setting, all_settings, value_in_words
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "settings.md"
@@ -37,7 +37,7 @@ def row(s: Setting) -> str:
 
 def _lines() -> Iterator[str]:
     settings = all_settings()
-    for stage in REGISTRY:
+    for stage in EVERY:
         for config in stage.configs():
             only = tuple(p for p in stage.variants if stage.config_for(p) is config)
             title = f"### {stage.name}, preset {' or '.join(only)}" if only else f"## {stage.name}"

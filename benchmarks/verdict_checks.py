@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.generated import print_or_write
 from pipeline.verdict import Limits
-from stages.registry import REGISTRY
+from stages.registry import EVERY
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "verdict.md"
@@ -47,7 +47,7 @@ class Check:
 def checks() -> list[Check]:
     """Of all stages, in their order; a check that is judged in two places has one row."""
     found: dict[tuple[str, str], Check] = {}
-    for stage in REGISTRY:
+    for stage in EVERY:
         for path in sorted((ROOT / "stages" / stage.name).glob("*.py")):
             text = path.read_text()
             if "judged(" not in text:

@@ -1,5 +1,5 @@
 """The artifacts that stages exchange: frozen manifests that refer to files by content. Those of the capture are in
-pipeline/capture_artifacts.py.
+pipeline/capture_artifacts.py, those of the asset in pipeline/asset_artifacts.py.
 
 An artifact is a pydantic model saved as `manifest.json` beside its files. It contains figures and `FileRef`s, but no
 arrays and no absolute paths, so that two runs with the same content have the same manifest in any folder.
@@ -14,9 +14,9 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, SerializerFunctionWrapHandler, model_serializer
 
 from pipeline.verdict import Finding
 
@@ -230,11 +230,23 @@ class FittedPhoto(Artifact):
     low_share: float = 0.0
 
 
+class SecondFitted(Artifact):
+    """What the fit tells of a second capture of the subject, under another light. light: its light, as that of the
+    FittedFace, in the same asset coordinates; held_out, photos: of its views, by their own indices; psnr_held_out: mean
+    over its held-out views, dB, over the subject's pixels, None without such views."""
+
+    light: FileRef
+    held_out: tuple[HeldOutView, ...] = ()
+    photos: tuple[FittedPhoto, ...] = ()
+    psnr_held_out: float | None = None
+
+
 class FittedFace(Artifact):
     """The fitted field. `field`: npz of every parameter (see pipeline.fields.face). The figures are from the fit.
     refined: fitted photos whose cameras the fit moved (pipeline.fitted_cameras). registered: held-out photos, for
     figures without the error of their cameras; nothing else uses these poses. photos: the fitted
-    photos, as the finished fit shows them."""
+    photos, as the finished fit shows them. second: of a second capture that was fitted as well; without one, the
+    manifest does not have the entry."""
 
     field: FileRef
     light: FileRef
@@ -251,8 +263,14 @@ class FittedFace(Artifact):
     refined: tuple[RefinedCamera, ...] = ()
     registered: tuple[RegisteredView, ...] = ()
     photos: tuple[FittedPhoto, ...] = ()
+    second: SecondFitted | None = None
     warnings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_empty(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found: dict[str, Any] = dump(self)
+        return {k: v for k, v in found.items() if k != "second" or v is not None}
 
     @property
     def attenuation(self) -> str:
@@ -361,29 +379,3 @@ class TextureSet(Artifact):
     def side(self, tile: int) -> int:
         """Width and height of a tile's maps in texels."""
         return self.sides[tile] if self.sides else self.size
-
-
-# ------------------------------------------------------------------ asset and report
-class UsdAsset(Artifact):
-    """The exported component. `root`: the file to open; `files`: all files, with relative paths.
-
-    figures: measurements of the export, by name. stated: author, licence and consent, as given by the user.
-    """
-
-    name: str
-    root: RelativePath
-    files: tuple[FileRef, ...]
-    views: tuple[HeldOutView, ...] = ()
-    figures: dict[str, float] = {}
-    stated: dict[str, str] = {}
-    checks: int
-    warnings: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
-
-
-class Report(Artifact):
-    """One self-contained page and its figures."""
-
-    files: tuple[FileRef, ...]
-    warnings: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()

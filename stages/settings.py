@@ -92,9 +92,9 @@ def value_in_words(value: Any) -> str:
 
 
 def _registry() -> tuple[Stage[Any, Any, Any], ...]:
-    from stages.registry import REGISTRY
+    from stages.registry import EVERY
 
-    return REGISTRY
+    return EVERY
 
 
 def _settings_of(stage: Stage[Any, Any, Any], presets: Mapping[str, StageConfig]) -> Iterator[Setting]:

@@ -5,7 +5,9 @@ File: npz with `spec` (JSON, utf-8 bytes) and one array per parameter or buffer,
 
 from __future__ import annotations
 
+import copy
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from pipeline.fields.calibration import Calibration
 from pipeline.fields.light import ShLight
 from pipeline.fields.parts import Geometry, Light, Shaded, Skin
 from pipeline.fields.protocol import F32, Material
+from pipeline.fields.second_light import SecondLight, chosen
 from pipeline.fields.shadowing import Shadowing, Surface, near_surface, solve
 from pipeline.fields.spec import FaceSpec
 from pipeline.lighting.moving import MovingLight
@@ -58,16 +61,21 @@ class FaceModel(nn.Module):
             self.ambient = ShLight(AMBIENT_ORDER, AMBIENT_SHARE * spec.light_start)
             self.ambient_shading = system.shading(spec, self.basis, self.ambient)
         self.rendering = system.rendering(spec)
-        self.calibration = Calibration(spec.views)
+        self.calibration = Calibration(spec.views, spec.second_views, (spec.calibrated, spec.second_calibrated))
         self.shadowing = Shadowing(spec.lo, spec.hi) if spec.shadows else None
+        self.second: SecondLight | None = None  # of a second capture of the subject
+        if spec.second_views:
+            self.second = SecondLight(spec, system, self.basis)
         self.uniform_albedo = False  # one albedo for all points, while the light is estimated
         self.register_buffer("beta", torch.tensor(geometry.cell))
         self.register_buffer("level", torch.tensor(0.0))
 
     def shade(self, x: Tensor, n: Tensor, wo: Tensor, stations: Stations | None = None) -> Shaded:
         """Outgoing radiance at x (N, 3) with unit n, wo: [NeuFace eq. 16] + [NeuFace eq. 12]. stations: the cameras,
-        for a light that moves with them."""
-        turn = None
+        for a light that moves with them, or differs between two captures."""
+        turn, second = None, None
+        if self.second is not None and stations is not None:
+            second = stations.second
         if self.spec.light_frame != WORLD:
             assert stations is not None, "a light that moves with the camera needs the cameras"
             turn = turn_of(self.spec.light_frame, stations, x, wo, self.spec.light_distance)
@@ -75,12 +83,12 @@ class FaceModel(nn.Module):
         if self.uniform_albedo:
             albedo = albedo.detach().median(0).values.expand_as(albedo)
         if not self.spec.specular:
-            diffuse = self._diffuse(albedo, x, n, turn)
+            diffuse = self._diffuse(albedo, x, n, turn, second)
             return Shaded(diffuse, diffuse, torch.zeros_like(diffuse), albedo, inv_kappa, torch.zeros_like(rho))
         skin = Skin(albedo, rho, c, inv_kappa)
         base = self.shading.diffuse_albedo(skin)
-        diffuse = self._diffuse(base, x, n, turn)
-        specular = self._specular(skin, x, n, wo, turn)
+        diffuse = self._diffuse(base, x, n, turn, second)
+        specular = self._specular(skin, x, n, wo, turn, second)
         straight = torch.zeros_like(rho)
         if self.has_bases:  # B depends on n . wo only, which is 1 for all points
             straight = rho * (c * self.shading.bases(n[:1], n[:1])).sum(-1)
@@ -91,18 +99,26 @@ class FaceModel(nn.Module):
         """Whether the specular term has bases of the angles only, so that it has an F0."""
         return (self.spec.shading, self.spec.integral, self.spec.basis_inputs) == ("neural", "low_rank", "cosine")
 
-    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor, turn: Turn | None) -> Tensor:
+    def _diffuse(self, albedo: Tensor, x: Tensor, n: Tensor, turn: Turn | None, second: Tensor | None) -> Tensor:
         """L_d (N, 3), including shadows if they are modelled."""
         if turn is not None and self.ambient is not None:
             arriving = turn.strength * self.light.irradiance(turn(n)) + self.ambient.irradiance(n)
             return brdf.lambertian(albedo, arriving)
         open_light = brdf.lambertian(albedo, self.light.irradiance(n))
-        return open_light if self.shadowing is None else open_light * self.shadowing(x)
+        out = open_light if self.shadowing is None else open_light * self.shadowing(x)
+        if second is None or self.second is None:
+            return out
+        return chosen(second, out, self.second.diffuse(albedo, x, n))
 
-    def _specular(self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor, turn: Turn | None) -> Tensor:
+    def _specular(
+        self, skin: Skin, x: Tensor, n: Tensor, wo: Tensor, turn: Turn | None, second: Tensor | None
+    ) -> Tensor:  # fmt: skip
         """L_s (N, 3)."""
         if turn is None:
-            return self.shading.specular(skin, x, n, wo)
+            out = self.shading.specular(skin, x, n, wo)
+            if second is None or self.second is None:
+                return out
+            return chosen(second, out, self.second.shading.specular(skin, x, n, wo))
         moving = turn.strength * self.shading.specular(skin, x, turn(n), turn(wo))
         return moving + self.ambient_shading.specular(skin, x, n, wo)
 
@@ -112,7 +128,24 @@ class FaceModel(nn.Module):
             index, x, n = near_surface(self.shadowing, self.geometry)
             with torch.no_grad():
                 albedo = torch.cat([self.spatial(part)[0] for part in x.split(CHUNK)])
-            solve(self.shadowing, self.geometry, Surface(index, x, n, albedo), self.light())
+            surface = Surface(index, x, n, albedo)
+            solve(self.shadowing, self.geometry, surface, self.light())
+            if self.second is not None and self.second.shadowing is not None:
+                solve(self.second.shadowing, self.geometry, surface, self.second.light())
+
+    def of_light(self, second: bool) -> FaceModel:
+        """A copy with the light, the shadows and the colour matrices of the first or the second capture alone."""
+        assert self.second is not None, "the model has one light"
+        out = copy.deepcopy(self)
+        other = out.second
+        assert other is not None
+        out.second, out.calibration = None, self.calibration.of(second)
+        views, calibrated = self.spec.views, self.spec.calibrated
+        if second:
+            out.light, out.shading, out.shadowing = other.light, other.shading, other.shadowing
+            views, calibrated = self.spec.second_views, self.spec.second_calibrated
+        out.spec = replace(self.spec, views=views, calibrated=calibrated, second_views=0, second_calibrated=False)
+        return out
 
     def save(self, path: Path) -> None:
         """Write the file that `load_model` reads."""

@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 IN_FILE = {"hash_levels": "levels", "hash_log2_size": "log2_size", "hash_fine": "fine"}
-TRIPLES = ("lo", "hi", "albedo_start", "prior_centre")
+TRIPLES = ("lo", "hi", "albedo_start", "prior_centre", "second_light_start")
+OF_SECOND = ("second_views", "second_calibrated", "second_light_start")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +54,20 @@ class FaceSpec:
     prior_scale: float = 0.1
     prior_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     displacement_width: int = 256
+    # a second capture of the subject, under a light of its own; 0 views: none. The file of a field never has one
+    second_views: int = 0
+    second_calibrated: bool = False
+    second_light_start: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    @property
+    def colour_matrices(self) -> bool:
+        """Whether photos of any capture have colour matrices."""
+        return self.calibrated or self.second_calibrated
 
     def stored(self) -> dict[str, Any]:
         """The values by their names in the file."""
-        return {IN_FILE.get(name, name): value for name, value in asdict(self).items()}
+        values = {IN_FILE.get(name, name): value for name, value in asdict(self).items()}
+        return values if self.second_views else {k: v for k, v in values.items() if k not in OF_SECOND}
 
     @classmethod
     def from_stored(cls, values: Mapping[str, Any]) -> FaceSpec:

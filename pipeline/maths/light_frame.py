@@ -35,14 +35,16 @@ NEAREST = 0.05  # of d_0: smallest distance, against the pole of the falloff
 @dataclass(frozen=True, slots=True)
 class Stations:
     """The cameras of N points: eye (N, 3) centres; axes (N, 3, 3), their columns the camera's x, y and z axis (right,
-    down, forward) in asset coordinates."""
+    down, forward) in asset coordinates. second (N,): whether the photo is of the second capture, which has another
+    light; None: none is."""
 
     eye: Tensor
     axes: Tensor
+    second: Tensor | None = None
 
     def __getitem__(self, rows: Tensor) -> Stations:
         """Those of the points `rows`."""
-        return Stations(self.eye[rows], self.axes[rows])
+        return Stations(self.eye[rows], self.axes[rows], None if self.second is None else self.second[rows])
 
 
 @dataclass(frozen=True, slots=True)

@@ -95,6 +95,9 @@ def set_level(
     given, known = (None if v is None or v == AUTO else float(v) for v in (wanted, explained))
     found = decide(seen, given, known, corrected="skin_explains" in light)
     apply_gain(model.spatial, model.light, found.gain)
+    if model.second is not None and isinstance(model.second.light, ShLight):
+        with torch.no_grad():
+            model.second.light.coefficients.div_(found.gain)
     return found.facts
 
 
@@ -140,7 +143,7 @@ def _shown(model: FaceModel, table: PixelTable, x: Tensor, n: Tensor, pixels: Te
         batch = table.at(pixels)
         shaded = model.shade(x, n, -batch.rays.d, batch.rays.stations)
         colour = linear_from_srgb(batch.target)
-        if model.spec.calibrated:
+        if model.spec.colour_matrices:
             colour = torch.linalg.solve(model.calibration()[batch.view], colour)
         albedo = (colour - shaded.specular) * shaded.albedo / shaded.diffuse.clamp(min=1e-6)
         return albedo[(batch.bound == 0).all(-1) & (batch.alpha > WHOLE) & albedo.isfinite().all(-1)]

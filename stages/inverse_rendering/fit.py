@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import torch
 
 from pipeline.artifacts import RefinedCamera
-from pipeline.fields.appearance import SpatialField
-from pipeline.fields.face import FaceModel
 from pipeline.fields.geometry import GridSdf, grid_of
+from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.initial_geometry import Start
@@ -21,6 +20,7 @@ from stages.inverse_rendering.model_selection import (
     apply_light,
     facts_of,
     given_model,
+    own_lights,
     prior_surface,
     restored,
     select_model,
@@ -32,23 +32,24 @@ from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import U8, Batch
 from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
+from stages.inverse_rendering.schedule import (
+    LEVEL_STARTS,
+    SETTLING,
+    SHADOWS_AT,
+    SKIN_AT,
+    UNIFORM_LIGHT_ORDER,
+    hashed,
+    make_optimiser,
+    set_rates,
+)
+from stages.inverse_rendering.second_capture import correct_lights, first_capture, light_from_first, of_first
 from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
 from stages.inverse_rendering.trials import LENGTH, SELECTION, SHADOWS, SKIN, SMOOTHING, Trials
 from stages.inverse_rendering.weakly_seen import SMOOTH_AT, smooth_weakly_seen
 
-LEVEL_STARTS = {1: (0.0,), 2: (0.0, 0.3), 3: (0.0, 0.12, 0.35), 4: (0.0, 0.1, 0.25, 0.5)}
-BAND_EVERY = 250
-UNIFORM_FROM = 0.3  # share of the fit at which the light-only phase with uniform albedo begins
-OPEN_FROM = 0.4  # share of the encoding's levels, coarse first, that are active at the start
-OPEN_UNTIL = 0.5  # share of the fit after which all levels are active
-UNIFORM_LIGHT_ORDER = 3  # diffuse skin determines hardly more of a light
-UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
-KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
-SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
-SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
-SKIN_AT = 0.8  # share of the fit at which the light is corrected by the skin: the albedo is that of the light before
+BAND_EVERY = 250  # steps after which the narrow band is found again
 SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
 
 
@@ -76,12 +77,13 @@ class Trainer(TrialLoop):
     smoothed: float = 0.0  # share of the surface that the last of them reached
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
+    known_of_second: dict[str, str | float | bool] = field(default_factory=dict)  # of the second capture's light
     poses: PoseHistory = field(init=False)
     robust: Robust = field(init=False)
 
     def __post_init__(self) -> None:
         TrainingLoop.__post_init__(self)  # super() has no cell in a dataclass with slots
-        self.validation = validation_views(len(self.views), self.settings)
+        self.validation = validation_views(len(of_first(self.views)), self.settings)
         self.poses = PoseHistory.of(self.views)
         self.robust = Robust(self.views, self.settings.weigh_photos, self.settings.image_side)
         self.trials = Trials(self.settings.trials == "on")
@@ -121,6 +123,11 @@ class Trainer(TrialLoop):
         """Whether the light moves relative to the subject."""
         return self.model.spec.light_frame != WORLD
 
+    @property
+    def light_told(self) -> bool:
+        """Whether the light's low bands are those that skin, or a second capture, tells."""
+        return self.skin_tells or "albedos_differ" in self.known_of_second
+
     def select_model(self) -> None:
         """Select the model by cross-validation, and remove the other parts. Under a light that moves, a point's mean
         over the views is not its diffuse radiance, on which the comparison rests: everything is kept."""
@@ -132,10 +139,14 @@ class Trainer(TrialLoop):
             return
         settled = self.settings.uniform_albedo_until + SETTLING + LENGTH
         wanted = self.trials.allows(self, SELECTION, settled, self.validation)
-        choices, estimate = select_model(self) if wanted else (unselected(self), None)
+        first = first_capture(self)
+        choices, estimate = select_model(first) if wanted else (unselected(first), None)
         self.take(choices)
         for parameter in apply_light(self.model, estimate) if estimate is not None else ():
             self.optimiser.state.pop(parameter, None)
+        if self.model.second is not None and choices.light_known:
+            self.known_of_second = light_from_first(self)
+            self.restart(*own_lights(self.model))
         self.table.exclude(())
 
     def take(self, choices: Choices) -> None:
@@ -170,6 +181,10 @@ class Trainer(TrialLoop):
                 self.model.solve_shadows()
             self.shadows_solved = due
         still_light = not self.light_moves and not self.light_given
+        if self.model.second is not None and self.choices is not None and self.share() >= SKIN_AT:
+            if not self.skin_asked:
+                self.ask_second()
+            self.skin_asked = True
         asked = self.settings.skin_light and still_light and self.share() >= SKIN_AT
         if asked and self.choices is not None and not self.skin_asked:
             if self.trials.allows(self, SKIN):
@@ -240,50 +255,34 @@ class Trainer(TrialLoop):
         else:
             self.skin_tells = True
             self.choices = replace(choices, facts=choices.facts | {"light": light | found})
-            for parameter in (*self.model.light.parameters(), *self.model.spatial.parameters()):
-                self.optimiser.state.pop(parameter, None)
+            self.restart(self.model.light, self.model.spatial)
+
+    def ask_second(self) -> None:
+        """Correct both lights so that the two captures show one albedo."""
+        found = correct_lights(self, hashed(self.model))
+        self.known_of_second = self.known_of_second | found
+        if found:
+            self.restart(*own_lights(self.model), self.model.spatial)
+
+    def second_facts(self) -> dict[str, str | float | bool]:
+        """For the report: where the light of the second capture comes from."""
+        return self.known_of_second
+
+    def restart(self, *parts: Part) -> None:
+        """Forget the momentum of parts that were set."""
+        for parameter in (p for part in parts for p in part.parameters()):
+            self.optimiser.state.pop(parameter, None)
 
     def set_rates(self) -> float:
-        """Set learning rates, beta and active encoding levels of this step; returns the SDF's rate in asset units.
-
-        Differs: beta follows a geometric schedule down to `beta_end` cells of the finest grid and is not learnt: a
-        learnt one stays near a millimetre and blurs silhouettes (docs/benchmarks.md).
-
-        Between UNIFORM_FROM and `uniform_albedo_until`, a light that is known from the lobe (light_estimate.py) is
-        frozen together with the surface, and the reflectance adapts to it; later it has a low rate. A given light is
-        frozen throughout. If the lobe does not determine the light, everything except the light is frozen, and the
-        albedo is uniform: the light, which was uniform at the start, explains the shading that was in the albedo
-        before. Earlier, the surface is still wrong.
-        """
-        s, p = self.settings, self.share()
-        decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
-        warm = min((self.step + 1) / 50, 1.0)
-        interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not self.light_moves
-        light_known = self.light_given != "" or (self.choices is not None and self.choices.light_known)
-        self.model.uniform_albedo = interlude and not light_known
-        for group in self.optimiser.param_groups:
-            light = group["params"][0] is next(self.model.light.parameters())
-            group["lr"] = group["start"] * decay * warm
-            if interlude and not light_known:
-                group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
-            elif light and (light_known or self.skin_tells):
-                group["lr"] *= 0.0 if interlude or self.light_given else KNOWN_LIGHT_RATE
-        finest = self.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - self.level)
-        start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
-        self.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))
-        opened = OPEN_FROM + (1 - OPEN_FROM) * min(p / OPEN_UNTIL, 1.0)
-        _hashed(self.model).encoding.open_levels(opened)
-        # the reflectance adapts to the new light, not the surface
-        settles = not self.light_given and not self.light_moves
-        still = settles and UNIFORM_FROM <= p < s.uniform_albedo_until + SETTLING
-        still |= self.skin_tells and p < SKIN_AT + SETTLING
-        return 0.0 if still or self.geometry_frozen else s.lr_sdf * self.model.geometry.cell * decay * warm
+        """Set the rates of this step; returns that of the SDF in asset units."""
+        return set_rates(self)
 
     # ---------------------------------------------------------------- one step
     def move(self, rate: float) -> None:
         """Update the parameters. rate: of the SDF, asset units."""
         if self.model.uniform_albedo:
-            self.model.light.uniform_gradient(UNIFORM_LIGHT_ORDER)
+            for light in own_lights(self.model):
+                light.uniform_gradient(UNIFORM_LIGHT_ORDER)
         self.optimiser.step()
         self.grid.step(rate)
 
@@ -314,8 +313,8 @@ class Trainer(TrialLoop):
     def weights(self) -> Config:
         """The settings. Before the model selection F0 is free, because the light is not known yet. If it is known
         later, there is no sparse-albedo prior, which would move albedo into the lobe; nor if the light moves, which
-        shows albedo and light apart. If skin tells the light's colour, or the light is given, nothing draws it to
-        white."""
+        shows albedo and light apart. If skin or a second capture tells the light's colour, or the light is given,
+        nothing draws it to white."""
         if self.light_moves:
             return self.settings.changed(albedo_sparsity=0.0)
         if self.light_given:
@@ -323,7 +322,7 @@ class Trainer(TrialLoop):
         if self.choices is None:
             return self.settings.changed(f0_excess=0.0)
         known = self.settings.changed(albedo_sparsity=0.0) if self.choices.light_known else self.settings
-        return known.changed(white=0.0) if self.skin_tells else known
+        return known.changed(white=0.0) if self.light_told else known
 
     def geometry_is_finite(self) -> bool:
         """Whether the gradients outside of the optimiser are finite."""
@@ -341,6 +340,7 @@ class Trainer(TrialLoop):
             "choices": self.choices.plain() if self.choices else None,
             "cell": g.cell,
             "poses": self.poses.stored(self.views),
+            "known_of_second": self.known_of_second,
             "robust": self.robust.stored(),
             "model": self.model.state_dict(),
             "band": g.optimiser_state(),
@@ -354,6 +354,7 @@ class Trainer(TrialLoop):
         self.level = state["level"]
         self.views = self.poses.restore(self.views, state["poses"])
         self.robust.restore(state["robust"], self.device)
+        self.known_of_second = state.get("known_of_second", {})  # not in checkpoints from before there was one
         if state["choices"] is not None:
             self.take(restored(state["choices"]))
         g.restore(state["model"]["geometry.values"].to(self.device))
@@ -361,24 +362,3 @@ class Trainer(TrialLoop):
         g.load_optimiser_state(state["band"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.table = None
-
-
-def make_optimiser(model: FaceModel, settings: Config) -> torch.optim.Optimizer:
-    """Adam over everything except the SDF, which has its own optimiser in the narrow band. eps is small, because most
-    entries of the hash table rarely have a gradient."""
-    spatial = _hashed(model)
-    groups = [
-        {"params": [spatial.encoding.table], "start": settings.lr_appearance},
-        {"params": [*spatial.net.parameters(), *model.basis.parameters()], "start": 0.3 * settings.lr_appearance},
-        {"params": list(model.light.parameters()), "start": settings.lr_light},
-        {"params": list(model.calibration.parameters()), "start": 0.1 * settings.lr_appearance},
-    ]
-    if model.ambient is not None:
-        groups.append({"params": list(model.ambient.parameters()), "start": settings.lr_light})
-    return torch.optim.Adam(groups, lr=1e-3, betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-
-def _hashed(model: FaceModel) -> SpatialField:
-    """The Spatial MLP with its hash encoding."""
-    assert isinstance(model.spatial, SpatialField)
-    return model.spatial

@@ -20,9 +20,10 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import own_parts, pretrain_basis
 from stages.inverse_rendering.moving_light import LightFrame, first_light
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
+from stages.inverse_rendering.second_capture import Second
 
 # Fields of FaceSpec that are computed from settings, or that only the paper's model has with that meaning.
-DERIVED = {"rank", "light_order", "specular", "hash_fine", "prior", "light_frame"}
+DERIVED = {"rank", "light_order", "specular", "hash_fine", "prior", "light_frame", "second_views", "second_calibrated"}
 ALBEDO_START = 0.4  # mean over the channels; their ratios are those of the photos
 
 
@@ -35,18 +36,20 @@ def new_trainer(
     prior: Start | None = None,
     light: GivenLight | None = None,
     lit: LightFrame | None = None,
+    second: Second | None = None,
 ) -> Trainer:
     """A new trainer: geometry from `start`, a uniform white light, the given one or the moving one of `lit`, a uniform
-    albedo. prior: the surface with which refined geometry is compared, if stereo has already moved `start`."""
+    albedo. prior: the surface with which refined geometry is compared, if stereo has already moved `start`. second:
+    photos of the subject under another light, which are fitted as well."""
     torch.manual_seed(settings.seed)
-    model = grid_model(views, start, settings, calibrated, device, light, lit)
+    model = grid_model(views, start, settings, calibrated, device, light, lit, second)
     if lit is not None and lit.flux is not None:
         part = own_parts(model)[2]
         with torch.no_grad():
             first = torch.from_numpy(first_light(lit.flux, model.spec.light_order)).to(part.coefficients)
             part.coefficients.copy_(model.spec.light_start * first[:, None].expand_as(part.coefficients))
     pretrain_basis(own_parts(model)[1])
-    found = trainer_of(model, views, start, settings, device, prior)
+    found = trainer_of(model, views + (second.views if second else []), start, settings, device, prior)
     found.light_given = light.source if light else ""
     return found
 
@@ -59,9 +62,19 @@ def grid_model(
     device: str,
     light: GivenLight | None = None,
     lit: LightFrame | None = None,
+    second: Second | None = None,
 ) -> FaceModel:
     """A new model on a grid of `start`, on the CPU. device: where the photos are read."""
     spec = spec_for(views, start, settings, calibrated, device)
+    if second is not None:  # the same albedo: where its photos are brighter, so is its light
+        own = PixelTable(second.views, 256, device).mean_colour() / torch.tensor(spec.albedo_start, device=device)
+        start_of_second = _triple(own.cpu().numpy())
+        spec = replace(
+            spec,
+            second_views=len(second.views),
+            second_calibrated=second.calibrated,
+            second_light_start=start_of_second,
+        )
     if lit is not None and lit.frame != WORLD:  # what shades the subject from one side moves as well
         spec = replace(spec, light_frame=lit.frame, light_distance=lit.distance, shadows=False)
     values = torch.from_numpy(start.values.copy())  # a copy, because the start may also be the prior

@@ -204,6 +204,12 @@ def own_parts(model: FaceModel) -> tuple[SpatialField, IntegratedBasis, ShLight]
     return spatial, basis, light
 
 
+def own_lights(model: FaceModel) -> list[ShLight]:
+    """The light of every capture of the model, the first one's first; all are SH."""
+    lights = [model.light] if model.second is None else [model.light, model.second.light]
+    return [light for light in lights if isinstance(light, ShLight)]
+
+
 def pretrain_basis(basis: IntegratedBasis) -> None:
     """Pre-train the bases so that their sum is the reflectance of rough skin, for strength START_RHO and all c = 1."""
     basis.learn(lambda cosine: torch.from_numpy(reflectance(cosine.cpu().numpy())).to(cosine) / START_RHO)
@@ -379,20 +385,13 @@ def take_over(model: FaceModel, c: Choices) -> dict[nn.Parameter, tuple[nn.Param
         spatial.rank = c.rank
     if c.light_order < spec.light_order:
         kept = slice(0, sh.count(c.light_order))
-        _, _, light = own_parts(model)
-        old = light.coefficients
-        light.coefficients = nn.Parameter(old.detach()[kept].clone())
-        swaps[light.coefficients] = (old, kept)
-    if not c.calibrated:
-        _reset_calibration(model)
+        for light in own_lights(model):
+            old = light.coefficients
+            light.coefficients = nn.Parameter(old.detach()[kept].clone())
+            swaps[light.coefficients] = (old, kept)
+    if model.second is not None:
+        model.calibration.own = (c.calibrated, spec.second_calibrated)
+    elif not c.calibrated:
+        model.calibration.reset()
     model.spec = replace(spec, rank=c.rank, light_order=c.light_order, specular=c.specular, calibrated=c.calibrated)
     return swaps
-
-
-def _reset_calibration(model: FaceModel) -> None:
-    """Set every colour matrix to the identity."""
-    last = model.calibration.net[-1]
-    assert isinstance(last, nn.Linear)
-    with torch.no_grad():
-        last.weight.zero_()
-        last.bias.zero_()

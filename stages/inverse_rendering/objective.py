@@ -88,7 +88,7 @@ def terms(
     rays = shell.kept[pick]
     shaded = shade_shell(model, shell, batch.rays, pick)
     colour, target = shaded.total, batch.target[rays]
-    if model.spec.calibrated:
+    if model.spec.colour_matrices:
         colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
     rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
     counted = rgb if weights is None else rgb * weights[rays]

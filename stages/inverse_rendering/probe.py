@@ -62,7 +62,7 @@ def psnr_by_view(model: FaceModel, table: PixelTable, pixels: Tensor, count: int
     batch = table.at(pixels)
     with torch.no_grad():
         colour, _ = render_rays(model, batch.rays, samples)
-        if model.spec.calibrated:
+        if model.spec.colour_matrices:
             colour = calibrated_colours(model.calibration(), batch.view, colour)
         square = ((srgb_from_linear(colour.clamp(0, 1)) - batch.target) ** 2).mean(-1)
     view, error = batch.view.cpu().numpy(), square.double().cpu().numpy()

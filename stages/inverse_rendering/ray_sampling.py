@@ -41,7 +41,7 @@ class PhotoView:
     None if none is clipped. doubtful: (H, W) where the mask contradicts the other views; these pixels are not fitted;
     None if nowhere. asked: (H, W) in [0, 1], below 1 where the subject is beyond its extent; only 1 is fitted; None if
     all pixels count. skin: (H, W) bare skin of the face, None if unknown. mirror: (H, W, 3) the mirror reflection
-    alone, of a polarised pair, whose photo shows none; None without a pair.
+    alone, of a polarised pair, whose photo shows none; None without a pair. second: of the second capture.
     """
 
     index: int
@@ -55,6 +55,7 @@ class PhotoView:
     asked: F32 | None = None
     skin: Bool | None = None
     mirror: F32 | None = None
+    second: bool = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -65,21 +66,24 @@ class PhotoView:
 @dataclass(frozen=True, slots=True)
 class Rays:
     """N rays: origins and unit directions (N, 3). axes: (N, 3, 3) of their cameras, columns right, down and forward;
-    only a light that moves with the camera needs them."""
+    only a light that moves with the camera needs them. second: (N,) whether they are of the second capture; None: none
+    is."""
 
     o: Tensor
     d: Tensor
     axes: Tensor | None = None
+    second: Tensor | None = None
 
     def __getitem__(self, chosen: Tensor | slice) -> Rays:
         """The chosen rays."""
         axes = None if self.axes is None else self.axes[chosen].contiguous()
-        return Rays(self.o[chosen].contiguous(), self.d[chosen].contiguous(), axes)
+        second = None if self.second is None else self.second[chosen].contiguous()
+        return Rays(self.o[chosen].contiguous(), self.d[chosen].contiguous(), axes, second)
 
     @property
     def stations(self) -> Stations | None:
-        """The rays' cameras, for a light that moves with them."""
-        return None if self.axes is None else Stations(self.o, self.axes)
+        """The rays' cameras, for a light that moves with them or differs between two captures."""
+        return None if self.axes is None else Stations(self.o, self.axes, self.second)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +151,8 @@ class PixelTable:
         self.inside = torch.from_numpy(np.flatnonzero(kind == 1)).to(device)
         self.outside = torch.from_numpy(np.flatnonzero(kind == 0)).to(device)
         self._all = self._pools = self.inside, self.outside
+        two = any(v.second for v in views)
+        self.second = torch.tensor([v.second for v in views], device=device) if two else None
         self.place(views)
 
     def place(self, views: list[PhotoView]) -> None:
@@ -205,7 +211,8 @@ class PixelTable:
     def _rays(self, xy: Tensor, view: Tensor) -> Rays:
         local = torch.cat([xy, torch.ones_like(xy[:, :1])], -1)
         d = torch.einsum("nij,nj->ni", self.R[view], local)
-        return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True), self.R[view])
+        second = None if self.second is None else self.second[view]
+        return Rays(self.centre[view], d / d.norm(dim=-1, keepdim=True), self.R[view], second)
 
 
 def _pixels_of(view: PhotoView, n: int, factor: int) -> tuple[npt.NDArray[Any], ...]:
@@ -251,4 +258,5 @@ def image_rays(view: PhotoView, factor: int, device: str) -> Rays:
     R = torch.from_numpy(view.world_from_cam[:3, :3].astype(np.float32)).to(device)
     d = torch.cat([xy, torch.ones_like(xy[:, :1])], -1) @ R.T
     o = torch.from_numpy(view.world_from_cam[:3, 3].astype(np.float32)).to(device).expand_as(d)
-    return Rays(o, d / d.norm(dim=-1, keepdim=True), R.expand(len(d), 3, 3))
+    second = torch.ones(len(d), dtype=torch.bool, device=device) if view.second else None
+    return Rays(o, d / d.norm(dim=-1, keepdim=True), R.expand(len(d), 3, 3), second)

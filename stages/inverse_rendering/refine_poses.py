@@ -129,7 +129,7 @@ def in_gauge(poses: Sequence[F64], first: Sequence[F64]) -> list[F64]:
 
 def response_of(model: FaceModel, number: int) -> F64:
     """(3, 3) A_n of a fitted photo. [NeuFace eq. 19]"""
-    if not model.spec.calibrated:
+    if not model.spec.colour_matrices:
         return np.eye(3)
     return np.asarray(model.calibration().detach().cpu().double().numpy()[number], np.float64)
 

@@ -118,7 +118,7 @@ def _rendered(model: FaceModel, batch: Batch, samples: int) -> tuple[Tensor, Ten
     """Linear colour (N, 3) with the photos' colour responses, and opacity (N,)."""
     with torch.no_grad():
         colour, opacity = render_any(model, batch.rays, samples)
-        if model.spec.calibrated:
+        if model.spec.colour_matrices:
             colour = calibrated_colours(model.calibration(), batch.view, colour)
     return colour, opacity
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.errors import StageError
+from pipeline.together_artifacts import Together
 from stages.inverse_rendering.config import AUTO, MAX_ORDER
 from stages.inverse_rendering.config import Config as Config
 from stages.inverse_rendering.systems import COMPARED, paper_config
+
+if TYPE_CHECKING:
+    from stages.inverse_rendering.second_photos import Other
 
 MIN_VIEWS = 3
 
@@ -25,8 +30,39 @@ class Inputs:
     masks: Located[MaskSet]
 
 
+@dataclass(frozen=True, slots=True)
+class BothInputs:
+    """The same of two captures, and where the second lies."""
+
+    capture: Located[Capture]
+    poses: Located[CameraSet]
+    masks: Located[MaskSet]
+    also_capture: Located[Capture]
+    also_poses: Located[CameraSet]
+    also_masks: Located[MaskSet]
+    together: Located[Together]
+
+
 def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     """Fit the field and predict the held-out views."""
+    return fit(inputs, config, context, None)
+
+
+def run_both(inputs: BothInputs, config: Config, context: Context) -> FittedFace:
+    """Fit one field to the photos of two captures, each under its own light, and predict the held-out views of both."""
+    from pipeline.transforms import matrix
+    from stages.inverse_rendering.second_photos import Other, check_supported, moved_poses
+
+    check_supported((inputs.capture.artifact, inputs.also_capture.artifact), config)
+    placed = inputs.together.artifact
+    offset = 1 + max(v.index for v in inputs.capture.artifact.views)
+    poses = moved_poses(inputs.also_poses.artifact, matrix(placed.first_from_second))
+    other = Other(inputs.also_capture, poses, inputs.also_masks, offset, placed)
+    return fit(Inputs(inputs.capture, inputs.poses, inputs.masks), config, context, other)
+
+
+def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -> FittedFace:
+    """Fit the field to a capture, or to two of one subject, and predict the held-out views."""
     from pipeline.faces.landmarks3d import load_landmarks
     from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
@@ -43,6 +79,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     from stages.inverse_rendering.preview import Preview
     from stages.inverse_rendering.registered_views import registered_views
     from stages.inverse_rendering.residuals import view_errors
+    from stages.inverse_rendering.second_photos import read_second, refuse_moving, second_result
     from stages.inverse_rendering.systems import first_surface, trainer_for
     from stages.inverse_rendering.time_budget import MIN_TRAINING, Clock, seconds_to_predict
     from stages.inverse_rendering.training_loop import Hooks, run_fit
@@ -89,11 +126,20 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         fired = [v.flash is True for v in inputs.capture.artifact.views if v.index in set(usable)]
         lit = light_frame(views, start, settings.light_frame, context.device, sum(fired) / len(fired))
     moving = None if lit is None or lit.flux is None else lit.spread > DRIFT
+    names = inputs.masks.artifact.label_names
+    second = None
+    if other is not None:
+        refuse_moving("world" if lit is None else lit.frame, "first")
+        own = calibrated(other.capture.artifact, other.usable, config, lambda: False)
+        second = read_second(other, names, start, settings, own, context.device)
     own_colours = calibrated(
-        inputs, usable, config, lambda: exposures_differ(views, start, context.device) if moving is None else moving
+        inputs.capture.artifact,
+        usable,
+        config,
+        lambda: exposures_differ(views, start, context.device) if moving is None else moving,
     )
-    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, known, lit)
-    labels, names = read_labels(inputs.masks, usable), inputs.masks.artifact.label_names
+    trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, known, lit, second)
+    labels = read_labels(inputs.masks, usable) + (second.labels if second else [])
     trainer.know_labels(labels, names)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
@@ -108,8 +154,12 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
     if known is not None and wanted == "fitted":
         level["why"] = "the light's level is given"
     outline = set_outline_level(model, views)
+    every = model
+    if second is not None:  # the stages after this one know a single capture
+        model = every.of_light(second=False)
     model.save(context.workdir / "field.npz")
     write_light(model, context)
+    widths = {c.index: c.width for c in cameras} | (other.widths if other is not None else {})
     colours = held_out_colours(model, inputs.capture.artifact, inputs.poses.artifact, usable)
     held_out = predict_held_out(
         model, inputs.poses.artifact, colours.responses, config.image_side, config.samples, context
@@ -122,7 +172,13 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         facts["held_out_colours"] = colours.facts
     if lit is not None:
         facts["light_frame"] = lit.facts()
-    left = view_errors(model, trainer.pixels, views, settings.image_side, settings.samples, labels, names)
+    sizes = settings.image_side, settings.samples
+    both, weights = view_errors(every, trainer.pixels, views, *sizes, labels, names), trainer.photo_weights()
+    left, added = [e for e in both if other is None or e.index < other.offset], None
+    if other is not None:
+        theirs = fitted_photos(both[len(left) :], other.fitted, weights[len(usable) :])
+        added = second_result(every.of_light(second=True), other, config, theirs, context)
+        facts["second_capture"] = other.facts(added) | trainer.second_facts()
     fitted = Fitted(left, inputs.capture.artifact, inputs.masks.artifact, trainer.history, facts)
     return FittedFace(
         field=context.file("field.npz"),
@@ -137,19 +193,19 @@ def run(inputs: Inputs, config: Config, context: Context) -> FittedFace:
         beta=float(model.beta),
         cell=model.geometry.cell,
         model=facts,
-        refined=trainer.refined_cameras({c.index: c.width for c in cameras}),
+        refined=tuple(c for c in trainer.refined_cameras(widths) if c.index in set(usable)),
         registered=registered,
-        photos=fitted_photos(left, usable, trainer.photo_weights()),
+        photos=fitted_photos(left, usable, weights[: len(usable)]),
+        second=added,
         findings=findings(fitted),
     )
 
 
-def calibrated(inputs: Inputs, usable: list[int], config: Config, exposures_differ: Callable[[], bool]) -> bool:
+def calibrated(capture: Capture, usable: list[int], config: Config, exposures_differ: Callable[[], bool]) -> bool:
     """Whether per-image colour matrices are fitted at the start: by the setting, else by metadata, cameras or
     photos."""
     if config.calibration != AUTO:
         return config.calibration == "on"
-    capture = inputs.capture.artifact
     cameras = {v.camera_group for v in capture.views if v.index in set(usable)}
     return capture.colours_drift or len(cameras) > 1 or exposures_differ()
 
@@ -163,3 +219,4 @@ STAGE = Stage(
     run=run,
     variants=dict.fromkeys(COMPARED, paper_config),
 )
+BOTH = Stage(STAGE.name, STAGE.version, BothInputs, Config, FittedFace, run_both)  # of two captures

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from stages.inverse_rendering.moving_light import LightFrame
     from stages.inverse_rendering.paper.config import PaperConfig
     from stages.inverse_rendering.ray_sampling import PhotoView, Rays
+    from stages.inverse_rendering.second_capture import Second
     from stages.inverse_rendering.training_loop import TrainingLoop
 
 COMPARED = ("paper", "comparison")  # presets with the settings of paper/config.py
@@ -57,13 +58,15 @@ def trainer_for(
     prior: Start,
     light: GivenLight | None = None,
     lit: LightFrame | None = None,
+    second: Second | None = None,
 ) -> TrainingLoop:
     """A new trainer for these settings. prior: the surface with which refined geometry is compared. light: if it is
-    known; of our own fit only, the others estimate it. lit: where the light stands still, None for a still light."""
+    known; lit: where the light stands still, None for a still light; second: photos under another light. These three
+    are of our own fit only."""
     if settings.preset not in COMPARED:
         from stages.inverse_rendering.initialise import new_trainer
 
-        return new_trainer(views, start, settings, calibrated, device, prior, light, lit)
+        return new_trainer(views, start, settings, calibrated, device, prior, light, lit, second)
     paper = of_the_paper(settings)
     if paper.method == "fast":
         from stages.inverse_rendering.paper.comparison import new_compared_trainer

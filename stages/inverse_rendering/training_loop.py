@@ -133,6 +133,10 @@ class TrainingLoop(ABC):
         """For the report: what the fit did to the surface beside its steps."""
         return {}
 
+    def second_facts(self) -> dict[str, str | float | bool]:
+        """For the report: where the light of a second capture comes from; empty without one."""
+        return {}
+
     def trial_facts(self) -> dict[str, str | float | bool]:
         """For the report: decisions that were tried, if any may be."""
         return {}

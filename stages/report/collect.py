@@ -5,16 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from pipeline.artifacts import (
-    CameraSet,
-    FittedFace,
-    Located,
-    MaskSet,
-    Surface,
-    TextureSet,
-    UsdAsset,
-    UvMesh,
-)
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.capture_artifacts import Capture
 from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.tiles import FIRST

@@ -6,17 +6,8 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from pipeline.artifacts import (
-    CameraSet,
-    FittedFace,
-    Located,
-    MaskSet,
-    Report,
-    Surface,
-    TextureSet,
-    UsdAsset,
-    UvMesh,
-)
+from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureSet, UvMesh
+from pipeline.asset_artifacts import Report, UsdAsset
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.reflectance_artifacts import ReflectanceField

@@ -18,9 +18,9 @@ from pipeline.artifacts import (
     MaskSet,
     Surface,
     TextureSet,
-    UsdAsset,
     UvMesh,
 )
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage
 from pipeline.head_artifacts import RegisteredHead

@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 
 from pipeline import threads
-from pipeline.artifacts import FileRef, Located, Report
+from pipeline.artifacts import FileRef, Located
+from pipeline.asset_artifacts import Report
 from pipeline.contract import Stage, execute, inputs_from, key
 from pipeline.errors import Cancelled, DiskError, StageError
 from pipeline.store import Store, link_or_copy

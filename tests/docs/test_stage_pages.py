@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from stages.registry import REGISTRY
+from stages.registry import EVERY
 
 ROOT = Path(__file__).resolve().parents[2]
 ROW = re.compile(r"^\| `([\w/]+\.py)` \| \S", re.M)
 CHECKS = re.compile(r"^\| (\w+) \| `([^`]+)` \|", re.M)
-NAMES = [s.name for s in REGISTRY]
+NAMES = [s.name for s in EVERY]
 
 
 def page(name: str) -> str:
@@ -49,7 +49,7 @@ def test_a_page_names_every_check_of_its_stage(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_page_names_only_settings_that_there_are(name: str) -> None:
-    known = {f"{s.name}.{key}" for s in REGISTRY for key in s.config.model_fields}
+    known = {f"{s.name}.{key}" for s in EVERY for key in s.config.model_fields}
     stages = "|".join(NAMES)
     named = re.findall(rf"`((?:{stages})\.[a-z]\w*)(?:=[^`]*)?`", page(name))
     assert {n for n in named if not n.endswith((".py", ".npz"))} <= known
@@ -57,7 +57,7 @@ def test_a_page_names_only_settings_that_there_are(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_page_names_only_fields_of_its_manifest(name: str) -> None:
-    stage = next(s for s in REGISTRY if s.name == name)
+    stage = next(s for s in EVERY if s.name == name)
     output = page(name).partition("## Output")[2].partition("## Settings")[0]
     assert f"`{stage.output.__name__}`" in output
     table = output.partition("| field |")[2]

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.artifacts import Artifact, CameraSet, FileRef, TextureMap, TextureSet, UsdAsset, UvMesh
+from pipeline.artifacts import Artifact, CameraSet, FileRef, TextureMap, TextureSet, UvMesh
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.contract import Context
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.images import write_exr

@@ -17,10 +17,10 @@ from pipeline.artifacts import (
     MaskSet,
     Surface,
     TextureSet,
-    UsdAsset,
     UvMesh,
     ViewMask,
 )
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.capture_artifacts import Capture
 from pipeline.film import animated_webp
 from pipeline.images import write_exr, write_png

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import pipeline.threads  # noqa: F401
-from pipeline.artifacts import Artifact, FileRef, Located, UsdAsset
+from pipeline.artifacts import Artifact, FileRef, Located
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.verdict import Finding, Level

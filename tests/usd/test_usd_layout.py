@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf
 
-from pipeline.artifacts import UsdAsset
+from pipeline.asset_artifacts import UsdAsset
 from stages.usd.layout import FOR_ARTISTS, existing, folder_of, is_read_by_the_asset, light_file
 from stages.usd.render.exported import load_exported
 

@@ -14,7 +14,7 @@ import pytest
 from pxr import Tf, Usd, UsdGeom, UsdShade, UsdUtils
 from support.synthetic_asset import RADIUS, ball, cut_in_two, run_stage, write_inputs
 
-from pipeline.artifacts import UsdAsset
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.errors import StageError
 from pipeline.images import read_encoded, write_png
 from pipeline.map_lookup import bilinear

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 from support.synthetic_asset import run_stage, write_inputs
 
-from pipeline.artifacts import FileRef, Located, UsdAsset
+from pipeline.artifacts import FileRef, Located
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import StageError
 from pipeline.store import Store

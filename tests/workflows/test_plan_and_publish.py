@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.artifacts import Artifact, FileRef, HeldOutView, Located, UsdAsset
+from pipeline.artifacts import Artifact, FileRef, HeldOutView, Located
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.contract import Done, execute
 from pipeline.errors import Cancelled, StageError, UsageError
 from workflows.run.output_dirs import writable

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.artifacts import FileRef, Located, Report
+from pipeline.artifacts import FileRef, Located
+from pipeline.asset_artifacts import Report
 from pipeline.contract import Done
 from stages.report.page import with_timing
 from workflows.run.plan import Plan, make_plan

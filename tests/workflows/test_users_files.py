@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.artifacts import FileRef, HeldOutView, Located, UsdAsset
+from pipeline.artifacts import FileRef, HeldOutView, Located
+from pipeline.asset_artifacts import UsdAsset
 from pipeline.contract import Done
 from pipeline.errors import StageError
 from workflows.run import replace

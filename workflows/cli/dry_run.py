@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stages.presets import configs_for
+from stages.registry import ALSO
 from workflows.cli.console import Console
 from workflows.run.estimate import Expected, expected
 from workflows.run.forecast import in_words
@@ -30,7 +31,8 @@ def dry_run(plan: Plan, console: Console) -> None:
 def differing(plan: Plan) -> dict[str, tuple[Any, Any]]:
     """Settings of the planned stages that are not the preset's: stage.name -> (value, the preset's)."""
     found: dict[str, tuple[Any, Any]] = {}
-    for name, preset in configs_for(plan.request.preset, {}, registry=plan.stages).items():
+    own = [s for s in plan.stages if not s.name.startswith(ALSO)]  # those of a second capture have the same settings
+    for name, preset in configs_for(plan.request.preset, {}, registry=own).items():
         ours, theirs = plan.configs[name].model_dump(mode="json"), preset.model_dump(mode="json")
         found |= {f"{name}.{k}": (v, theirs.get(k)) for k, v in ours.items() if v != theirs.get(k)}
     return found

@@ -29,6 +29,7 @@ METAVARS = {
     "holdout": "RULE",
     "template": "DIR",
     "light": "FILE",
+    "also": "DIR",
     "until": "STAGE",
     "from_stage": "STAGE",
     "subjects": "LIST",

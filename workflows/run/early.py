@@ -25,12 +25,18 @@ def early_stages() -> tuple[str, ...]:
     return tuple(names[: names.index(registry.FIT)]) if registry.FIT in names else ()
 
 
+def _before_fit(plan: Plan) -> tuple[str, ...]:
+    """The stages before the fit in a plan, which may have those of a second capture."""
+    names = [s.name for s in plan.stages]
+    return tuple(names[: names.index(registry.FIT)]) if registry.FIT in names else early_stages()
+
+
 def ends_early(plan: Plan, done: Sequence[Done[Any]], watch: Session) -> bool:
     """Whether the run ends early, with the stage that was just done.
 
     Tells the summary after the last stage before the fit, and after an earlier one where the run ends.
     """
-    early, name = early_stages(), done[-1].stage
+    early, name = _before_fit(plan), done[-1].stage
     if name not in early or len(done) == len(plan.stages):
         return False
     ends = verdict_of_done(done).level == "unusable" and not plan.request.force

@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.contract import Done, StageConfig
 from pipeline.store import RUN
+from stages.registry import ALSO
 from workflows.run.plan import Plan, Step, preview
 
 # Seconds on two cores without a GPU, other work beside it. draft: until the surface, medians of four captures of 36 to
@@ -50,7 +51,7 @@ SECONDS: dict[str, dict[str, float]] = {
     },
 }
 # The stages before the fit, whatever the preset: the demo, 16 photos of 160 px, on two cores that other work shared.
-EARLY: dict[str, float] = {"capture": 15, "poses": 55, "masks": 55}
+EARLY: dict[str, float] = {"capture": 15, "poses": 55, "masks": 55, "together": 20}
 REUSED = 0.3  # seconds to compare a stored result with its hashes
 LIGHT_STAGE_ONLY = frozenset({"reflectance"})  # other captures pass through at once
 NOT_OF_TIME = frozenset({"seed", "name", "holdout", "author", "license", "subject_consent", "asset_version"})
@@ -102,7 +103,8 @@ def _of_stage(plan: Plan, name: str) -> tuple[float | None, str]:
         return statistics.median(earlier), "runs"
     if name in LIGHT_STAGE_ONLY and getattr(plan.source.artifact, "kind", "") != "olat":
         return 0.0, "table"
-    return SECONDS.get(plan.request.preset, {}).get(name, EARLY.get(name)), "table"
+    alone = name.removeprefix(ALSO)
+    return SECONDS.get(plan.request.preset, {}).get(alone, EARLY.get(alone)), "table"
 
 
 def _earlier(plan: Plan, name: str, config: StageConfig) -> list[float]:

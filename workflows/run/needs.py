@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.store import MANIFEST, file_refs, read_object
+from stages.registry import ALSO
 from workflows.run.estimate import Expected, records
 from workflows.run.host_info import kilobytes
 from workflows.run.plan import Plan
@@ -59,11 +60,12 @@ def _bytes_of(folder: Path, seen: set[int]) -> float:
 
 def _kept(plan: Plan, stage: str) -> float:
     """Bytes of a stage's result, where no earlier run tells."""
-    photos = sum(ref.size for ref in file_refs(plan.source.artifact))
+    source = plan.also if plan.also is not None and stage.startswith(ALSO) else plan.source
+    photos = sum(ref.size for ref in file_refs(source.artifact))
     side = int(getattr(plan.configs.get("bake"), "size", 0))
     return (
         1e6 * KEPT_MB.get(stage, 1)
-        + photos * COPIES_OF_PHOTOS.get(stage, 0)
+        + photos * COPIES_OF_PHOTOS.get(stage.removeprefix(ALSO), 0)
         + BYTES_A_TEXEL.get(stage, 0) * side * side
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -35,6 +36,13 @@ class Plan:
     configs: dict[str, StageConfig]
     device: str
     anew: frozenset[str]
+    also: Located[Any] | None = None  # what the folder of the second capture holds
+
+    @property
+    def sources(self) -> dict[str, Located[Artifact]]:
+        """What the stages begin with, by the names of their inputs."""
+        out: dict[str, Located[Artifact]] = {registry.SOURCE: self.source}
+        return out if self.also is None else {**out, registry.ALSO + registry.SOURCE: self.also}
 
 
 def make_plan(request: RunRequest) -> Plan:
@@ -47,7 +55,7 @@ def make_plan(request: RunRequest) -> Plan:
     from stages.capture.scan import scan_capture
 
     check_addresses()
-    chosen, anew = _choose(request.until, request.from_stage)
+    chosen, anew = _choose(request)
     configs = check_settings(request)
     _check_template(configs)
     _check_light(configs)
@@ -55,6 +63,7 @@ def make_plan(request: RunRequest) -> Plan:
     _names_a_folder(request.out, "--out")
     capture, out = Path(request.capture).absolute(), Path(request.out).absolute()
     source = scan_capture(capture)
+    also = None if request.also is None else _second(request.also, capture, scan_capture)
     if out.resolve() == capture.resolve():
         raise UsageError(
             "the results would land among the photos",
@@ -78,6 +87,7 @@ def make_plan(request: RunRequest) -> Plan:
         configs,
         device,
         anew,
+        also,
     )
 
 
@@ -87,7 +97,7 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
     Raises:
         UsageError: unknown names, or settings outside their limits.
     """
-    _choose(request.until, request.from_stage)
+    _choose(request)
     if request.budget is not None and request.preset != DEFAULT_PRESET:
         raise UsageError(
             "a budget and a preset both set the size of the fit",
@@ -97,7 +107,7 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
             remedy="leave --preset out, or the budget",
         )
     known(request.device, DEVICES, what="unknown device", where="--device")
-    return configs_for(
+    found = configs_for(
         request.preset,
         parse_sets(request.sets),
         request.config,
@@ -106,9 +116,13 @@ def check_settings(request: RunRequest, planned: Settings | None = None) -> dict
         seed=request.seed,
         template=request.template,
         light=request.light,
-        registry=registry.REGISTRY,
+        registry=registry.REGISTRY if request.also is None else (*registry.REGISTRY, registry.EVERY[-1]),
         planned=planned,
     )
+    if request.also is None:
+        return found
+    of_second = {s.name: found[s.name.removeprefix(registry.ALSO)] for s in registry.with_second()}
+    return found | of_second
 
 
 def of_gpu(request: RunRequest, configs: dict[str, StageConfig]) -> dict[str, StageConfig]:
@@ -149,8 +163,25 @@ def _check_paint(configs: dict[str, StageConfig]) -> None:
         read_masks(Path(folder))
 
 
-def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
-    names = [s.name for s in registry.REGISTRY]
+def _second(named: str, first: Path, scan: Callable[[Path], Located[Any]]) -> Located[Any]:
+    """What the second capture's folder holds."""
+    _names_a_folder(named, "--also")
+    folder = Path(named).absolute()
+    if folder.resolve() == first.resolve():
+        raise UsageError(
+            "the second capture is the first",
+            where="--also",
+            value=folder,
+            limit="another folder than the capture's",
+            remedy="name a capture of the same subject under another light, or leave --also out",
+        )
+    return scan(folder)
+
+
+def _choose(request: RunRequest) -> tuple[tuple[Stage[Any, Any, Any], ...], frozenset[str]]:
+    until, from_stage = request.until, request.from_stage
+    every = registry.REGISTRY if request.also is None else registry.with_second()
+    names = [s.name for s in every]
     for option, value in (("--until", until), ("--from-stage", from_stage)):
         if value is not None:
             known(value, names, what="unknown stage", where=option)
@@ -164,7 +195,7 @@ def _choose(until: str | None, from_stage: str | None) -> tuple[tuple[Stage[Any,
             limit="a first stage that is not after the last",
             remedy="swap them, or leave one out",
         )
-    return tuple(registry.REGISTRY[: last + 1]), frozenset(names[first : last + 1])
+    return tuple(every[: last + 1]), frozenset(names[first : last + 1])
 
 
 def _apart(store: Path, capture: Path, out: Path) -> None:
@@ -231,7 +262,7 @@ class Step:
 
 def preview(plan: Plan) -> list[Step]:
     """What `run` would do, from the manifests in the store; nothing is run, hashed or written."""
-    finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
+    finished = plan.sources
     steps: list[Step] = []
     for stage in plan.stages:
         unplanned = plan.request.budget is not None and stage.name == FIT  # its settings depend on the hour

@@ -164,6 +164,18 @@ def report_files(stages: Mapping[str, Done[Any]], *, exr: bool) -> Copies:
             if exr:
                 copies[f"{folder}/{view.index}.exr"] = located.path(view.exr)
             copies[f"{folder}/{view.index}.png"] = located.path(view.png)
+    return copies | _of_second(stages, exr=exr)
+
+
+def _of_second(stages: Mapping[str, Done[Any]], *, exr: bool) -> Copies:
+    """report/second/: the light of a second capture, and its held-out views as the model shows them."""
+    located = stages["inverse_rendering"].located if "inverse_rendering" in stages else None
+    second = getattr(located.artifact, "second", None) if located is not None else None
+    if located is None or second is None:
+        return {}
+    copies = {"second/light.json": located.path(second.light)}
+    for view in second.held_out:
+        copies |= {f"second/views/{view.index}.{k}": located.path(getattr(view, k)) for k in ("exr", "png")[not exr :]}
     return copies
 
 

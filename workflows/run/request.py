@@ -38,6 +38,11 @@ class RunRequest(BaseModel):
         default=None,
         description="lat-long .exr or .hdr of the photos' light, measured: it is not estimated (docs/captures.md)",
     )
+    also: str | None = Field(
+        default=None,
+        description="folder of a second capture of the same subject, in the same pose, under another light: both are "
+        "fitted together (docs/stages/together.md)",
+    )
     device: str = Field(default="auto", description="where the fit runs: auto, cpu or cuda")
     until: str | None = Field(default=None, description="last stage to run")
     from_stage: str | None = Field(

@@ -20,7 +20,8 @@ from pipeline.store import MANIFEST, Store, file_refs
 SPARE = 4 << 20  # bytes: manifests, records, and a stage's small files
 BYTES_A_TEXEL = 8  # of all maps together; those of the demo's head have 67
 ADDRESSES = 6e9  # bytes: libraries end the process, without a word, where they get none. A draft uses up to 5e9
-COPIED = {"capture": ("source",), "usd": ("bake",)}  # stage -> inputs whose files it copies
+# Stage -> inputs whose files it copies.
+COPIED = {"capture": ("source",), "also_capture": ("also_source",), "usd": ("bake",)}
 
 
 def check_room_for_stage(stage: Stage[Any, Any, Any], inputs: Any, config: StageConfig, store: Store) -> None:

@@ -7,11 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
-from pipeline.artifacts import Artifact, Located, MaskSet
+from pipeline.artifacts import MaskSet
 from pipeline.contract import Done, Stage, StageConfig, execute, inputs_from, key
 from pipeline.errors import Cancelled
 from pipeline.people import shows_person
-from stages import registry
 from stages.registry import FIT
 from workflows.run.budget import START_UP, planned
 from workflows.run.early import ends_early
@@ -43,7 +42,7 @@ def run_stages(
         Cancelled: the user stopped the run.
     """
     watch = watch or Session()
-    finished: dict[str, Located[Artifact]] = {registry.SOURCE: plan.source}
+    finished = plan.sources
     done: list[Done[Any]] = []
     for number, stage in enumerate(plan.stages, 1):
         _stop_if_asked(watch)

@@ -14,7 +14,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from pipeline.artifacts import FileRef, Located, Report
+from pipeline.artifacts import FileRef, Located
+from pipeline.asset_artifacts import Report
 from pipeline.contract import Done
 from pipeline.store import write_synced
 from workflows.run.plan import Plan

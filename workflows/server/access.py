@@ -95,7 +95,7 @@ def check_folders(asked: Mapping[str, Any]) -> None:
 
 
 def _named(asked: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
-    for name in ("capture", "root", "out", "store", "template", "light"):
+    for name in ("capture", "root", "out", "store", "template", "light", "also"):
         if asked.get(name):
             yield name, str(asked[name])
     tables = (asked.get("config") or {}, parse_sets(tuple(asked.get("sets") or ())))
