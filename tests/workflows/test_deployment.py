@@ -117,7 +117,7 @@ def test_deployment_run_on_a_server_with_a_worker(
                 "seed": 7, "device": "cpu", "until": "capture", "from_stage": "capture", "fit_slots": "gpus",
                 "sets": ["capture.min_views=3"], "config": {"capture": {"drop_blurred": False}},
                 "store": str(tmp_path / "store"), "stage_limit": 600.0, "budget": None,  # with a preset there is none
-                "force": True, "strict": True, "pack": "zip", "template": None, "light": None,
+                "force": True, "strict": True, "pack": "zip", "template": None, "light": None, "also": None,
                 "no_exr_views": True, "keep_all": True, "no_live": True,
             }  # fmt: skip
             submit(environment, "capture-to-asset/local", good, "--watch", cwd=tmp_path)
