@@ -19,7 +19,7 @@ from pipeline.errors import StageError
 from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, visual_hull
-from pipeline.hull_needs import grown, is_subject, margin_of, regions, voxels_at, without_far_parts
+from pipeline.hull_needs import grown, is_subject, margin_of, regions, voxels_at
 
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
@@ -117,7 +117,6 @@ def hull_start(
     cell = float((hi - lo).max()) / cells * 2 ** (levels - 1)
     lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
     hull = kept(visual_hull(cameras, alphas, lo, hi, cell))
-    hull = without_far_parts(hull, cameras, [_shrunk(a) for a in alphas])
     if not hull.occupied.any():
         raise StageError(
             "the visual hull of the masks is empty",

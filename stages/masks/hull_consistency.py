@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import cv2
 import numpy as np
@@ -66,16 +67,17 @@ def opinions(
 ) -> list[Opinion]:  # fmt: skip
     """The hull seen from each view. alphas: (h, w) each, small. votes: which views carve the hull (not held-out and
     dropped ones). roi_radius: asset units. cells: voxels per edge. support: the subject is above this plane."""
-    voters = [(c, a) for c, a, v in zip(cameras, alphas, votes, strict=True) if v]
-    lenient, edge = tolerated(len(voters)), CUBE * roi_radius
+    carving = list(compress(cameras, votes)), list(compress(alphas, votes))
+    count = len(carving[0])
+    lenient, edge = tolerated(count), CUBE * roi_radius
     cell = 2 * edge / cells
     sure, possible = (_above(support, h) for h in (
-        visual_hull([c for c, _ in voters], [a for _, a in voters], [-edge] * 3, [edge] * 3, cell,
+        visual_hull(*carving, [-edge] * 3, [edge] * 3, cell,
                     min_views=least, max_outside=lenient, outside_share=WRONG_SHARE)
-        for least in (min(3, len(voters)), 0)
+        for least in (min(3, count), 0)
     ))  # fmt: skip
     hull, may_be = cloud(sure), cloud(possible)
-    inner = _core([c for c, _ in voters], [a for _, a in voters], edge, cell, support, CORE * roi_radius)
+    inner = _core(*carving, edge, cell, support, CORE * roi_radius)
     out = []
     for camera, alpha in zip(cameras, alphas, strict=True):
         h, w = alpha.shape
@@ -92,15 +94,16 @@ def opinions(
         core = np.zeros((h, w), bool) if inner is None else render_silhouette(inner, camera, h, w) >= 0.5
         inside = alpha >= 0.5
         found = Opinion(silhouette, may, here, margin, _iou(inside, silhouette, here), core & silhouette)
-        out.append(_without_empty(found, inside, camera, sure, voters))
+        out.append(_without_empty(found, inside, camera, sure, carving))
     return out
 
 
 def _without_empty(
-    opinion: Opinion, inside: Bool, camera: Camera, hull: Hull, voters: Sequence[tuple[Camera, F32]]
+    opinion: Opinion, inside: Bool, camera: Camera, hull: Hull, carving: tuple[list[Camera], list[F32]]
 ) -> Opinion:
-    """The opinion with a core that does not have what the mask lacks and the other views do not show."""
-    core, carving = opinion.core, list(zip(*voters, strict=True))
+    """The opinion with a core that does not have what the mask lacks and the other views do not show. carving: cameras
+    and masks that carved the hull."""
+    core = opinion.core
     for region_ in regions(_lacks(inside, opinion), NEED * inside.sum()):
         if not is_subject(hull, voxels_at(hull, camera, region_), *carving):
             core = core & ~dilated(region_, opinion.margin)

@@ -52,24 +52,34 @@ class Ball:
 
     def photo(self, index: int) -> PhotoView:
         """A view, 2 x 2 samples a pixel."""
-        angle = 2 * math.pi * index / self.views
-        o = DISTANCE * np.array([math.sin(angle), 0.5 * math.sin(5 * angle), math.cos(angle)])
-        z = -o / np.linalg.norm(o)
-        x = np.cross(z, [0, 1, 0])
-        x /= np.linalg.norm(x)
-        world_from_cam = transforms.rigid(np.stack([x, np.cross(z, x), z], 1), o)
-        K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
-        _, d = transforms.rays(K, world_from_cam, np.zeros(5), transforms.pixel_centres(2 * SIDE, 2 * SIDE) / 2)
-        b = d @ o
-        under = b * b - (o @ o - RADIUS**2)
-        hit = under > 0
-        n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d)[hit] / RADIUS
-        rgb = np.zeros((len(d), 3))
-        rgb[hit] = (texture(n) * (0.7 + 0.3 * n[:, 1:2]) + self.lobe(n, -d[hit])[:, None]) * self.gain(index)
-        rgb[hit] += self.veil(index)
-        image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3))
-        alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3))
-        return PhotoView(index, image.astype(np.float32), alpha.astype(np.float32), K, world_from_cam, np.zeros(5))
+
+        def colour(n: F64, wo: F64) -> F64:
+            lit = texture(n) * (0.7 + 0.3 * n[:, 1:2]) + self.lobe(n, wo)[:, None]
+            return np.asarray(lit * self.gain(index) + self.veil(index))
+
+        return ball_photo(index, self.views, colour)
+
+
+def ball_photo(index: int, views: int, colour: Callable[[F64, F64], F64], turn: float = 0.0) -> PhotoView:
+    """One of the views evenly around the ball and up and down, 2 x 2 samples a pixel. colour: linear (N, 3), from
+    normals and the directions to the camera. turn: of the cameras, rad."""
+    angle = turn + 2 * math.pi * index / views
+    o = DISTANCE * np.array([math.sin(angle), 0.5 * math.sin(5 * angle), math.cos(angle)])
+    z = -o / np.linalg.norm(o)
+    x = np.cross(z, [0, 1, 0])
+    x /= np.linalg.norm(x)
+    world_from_cam = transforms.rigid(np.stack([x, np.cross(z, x), z], 1), o)
+    K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
+    _, d = transforms.rays(K, world_from_cam, np.zeros(5), transforms.pixel_centres(2 * SIDE, 2 * SIDE) / 2)
+    b = d @ o
+    under = b * b - (o @ o - RADIUS**2)
+    hit = under > 0
+    n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d)[hit] / RADIUS
+    rgb = np.zeros((len(d), 3))
+    rgb[hit] = colour(n, -d[hit])
+    image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3))
+    alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3))
+    return PhotoView(index, image.astype(np.float32), alpha.astype(np.float32), K, world_from_cam, np.zeros(5))
 
 
 @lru_cache(maxsize=8)

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pipeline import transforms
 from pipeline.fields.appearance import TYPICAL_INV_KAPPA
 from pipeline.maths import sh
 from pipeline.maths.vmf import ATTENUATIONS
 from pipeline.transforms import F64
 from stages.inverse_rendering.light_estimate import reflectance
 from stages.inverse_rendering.ray_sampling import PhotoView
-from tests.support.balls import DISTANCE, FOCAL, RADIUS, SIDE, texture
+from tests.support.balls import ball_photo, texture
 
 ORDER = 3
 
@@ -50,22 +49,6 @@ def photos(light: F64, views: int, *, second: bool = False, turn: float = 0.0) -
     """Views evenly around the ball. second: marked as of the second capture. turn: of the cameras, rad."""
     out = []
     for index in range(views):
-        angle = turn + 2 * math.pi * index / views
-        o = DISTANCE * np.array([math.sin(angle), 0.5 * math.sin(5 * angle), math.cos(angle)])
-        z = -o / np.linalg.norm(o)
-        x = np.cross(z, [0, 1, 0])
-        x /= np.linalg.norm(x)
-        pose = transforms.rigid(np.stack([x, np.cross(z, x), z], 1), o)
-        K = np.array([[FOCAL, 0, SIDE / 2], [0, FOCAL, SIDE / 2], [0, 0, 1]])
-        _, d = transforms.rays(K, pose, np.zeros(5), transforms.pixel_centres(2 * SIDE, 2 * SIDE) / 2)
-        b = d @ o
-        under = b * b - (o @ o - RADIUS**2)
-        hit = under > 0
-        n = (o + (-b - np.sqrt(np.where(hit, under, 0)))[:, None] * d)[hit] / RADIUS
-        rgb = np.zeros((len(d), 3))
-        rgb[hit] = radiance(n, -d[hit], light)
-        image = rgb.reshape(SIDE, 2, SIDE, 2, 3).mean((1, 3)).astype(np.float32)
-        alpha = hit.reshape(SIDE, 2, SIDE, 2).mean((1, 3)).astype(np.float32)
-        view = PhotoView(index, image, alpha, K, pose, np.zeros(5))
+        view = ball_photo(index, views, lambda n, wo: radiance(n, wo, light), turn)
         out.append(replace(view, index=index + 100, second=True) if second else view)
     return out
