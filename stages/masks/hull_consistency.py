@@ -71,7 +71,7 @@ def opinions(
     count = len(carving[0])
     lenient, edge = tolerated(count), CUBE * roi_radius
     cell = 2 * edge / cells
-    sure, possible = (_above(support, h) for h in (
+    sure, possible = (above(support, h) for h in (
         visual_hull(*carving, [-edge] * 3, [edge] * 3, cell,
                     min_views=least, max_outside=lenient, outside_share=WRONG_SHARE)
         for least in (min(3, count), 0)
@@ -120,7 +120,7 @@ def _core(
     if float(np.linalg.norm(directions.mean(0))) > AROUND:
         return None
     wrong = max(CORE_LEAST, round(CORE_SHARE * len(cameras)))
-    hull = _above(support, visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, cell, max_outside=wrong,
+    hull = above(support, visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, cell, max_outside=wrong,
                                        outside_share=WRONG_SHARE))  # fmt: skip
     known = hull.seen >= KNOWN * len(cameras)
     level = (depth - cell * ndimage.distance_transform_edt((hull.level <= 0) & known)).astype(np.float32)
@@ -129,7 +129,7 @@ def _core(
     return cloud(replace(hull, level=level.clip(-BAND_CELLS * cell, BAND_CELLS * cell), occupied=level <= 0.5 * cell))
 
 
-def _above(support: Support | None, hull: Hull) -> Hull:
+def above(support: Support | None, hull: Hull) -> Hull:
     """The part of a hull that is above the support."""
     if support is None:
         return hull

@@ -91,8 +91,8 @@ def _cut(image: U8, far_out: F32, far_in: F32, reach: int, near: float) -> Bool 
     background, variance, known = continued(colour, far_out > reach, CONTINUED * reach)
     off = ((seen - background) ** 2 / (spread**2 + VARIED * variance)).sum(-1)
     off = np.where(known, off, 0)[open_]
-    behind = np.minimum(0.5 * np.minimum(off, _strange(seen, open_, outer, spread, near, MAX_COST)), MAX_COST)
-    own = np.minimum(0.5 * _strange(seen, open_, inner, spread, near, STRANGE), STRANGE)
+    behind = np.minimum(0.5 * np.minimum(off, unlike(seen, open_, outer, spread, near, MAX_COST)), MAX_COST)
+    own = np.minimum(0.5 * unlike(seen, open_, inner, spread, near, STRANGE), STRANGE)
     pull = np.round(UNIT * (behind - own)).astype(np.int32)
     pull[(far_in > INWARD - 1)[open_]] = ENDLESS
     pull[(far_out > reach - 1)[open_]] = -ENDLESS
@@ -108,7 +108,7 @@ def _noise(seen: F32, where: Bool) -> float:
     return 1.4826 * float(np.median(np.abs(rough))) if len(rough) else 0.0
 
 
-def _strange(seen: F32, of: Bool, known: Bool, spread: float, near: float, most: float) -> F32:
+def unlike(seen: F32, of: Bool, known: Bool, spread: float, near: float, most: float) -> F32:
     """d^2 of the pixels `of` from `known`, of which every second pixel and row is used; inf if half of it exceeds
     `most`."""
     from scipy.spatial import cKDTree

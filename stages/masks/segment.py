@@ -4,26 +4,29 @@ masks."""
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from pipeline.artifacts import Camera, CameraSet, Extent, FileRef, Located, MaskSet, ViewMask
-from pipeline.capture_artifacts import Capture, CaptureView
+from pipeline.artifacts import Camera, CameraSet, Extent, Located, MaskSet, ViewMask
+from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.extent import head_extent
 from pipeline.faces.find import Face
 from pipeline.faces.labels import LABELS
 from pipeline.faces.landmarks3d import head_frame
-from pipeline.images import read_alpha, read_encoded, write_png
+from pipeline.hull import Cloud
+from pipeline.images import read_alpha, write_png
 from pipeline.meshes import F64
 from pipeline.support import Support
+from stages.masks import beyond_hull
 from stages.masks.config import Config
 from stages.masks.extent import MAX_OPEN, asked, cut_by_head, kept_whole, outline_points, whole_hull
 from stages.masks.face_labels import labels_with, subjects_face
@@ -31,7 +34,8 @@ from stages.masks.grabcut import cut
 from stages.masks.hull_consistency import Opinion, contradiction, hole, lacking, opinions, outliers, trimap
 from stages.masks.judge import Seen, extent_finding, judge, open_share
 from stages.masks.landmarks import agreed, save_landmarks
-from stages.masks.region import F32, U8, Disc, eight_bit, region, resized, working_size
+from stages.masks.photos import at_once, photos_of
+from stages.masks.region import F32, Bool, resized, working_size
 from stages.masks.segment_person import of_subject, settled
 from stages.masks.sources import PhotoToMask, Plan, inverted, mask, plan, to_full_size
 from stages.masks.support_object import SupportedObject, distinct, find_supported_object
@@ -42,12 +46,12 @@ MIN_AGREEMENT = 0.8  # smallest IoU of a mask and the hull of all masks, in the 
 MAX_DEVIATION = 0.05  # IoU below the median from which a mask may be an outlier
 LIMITS = 0.001, 0.999  # mean alpha of a mask that is neither empty nor full
 SMALL = 512  # pixels, longest edge of the masks for the consistency check
+FINER = 2  # voxels of the hull that limits the masks, per voxel of the hull that is compared with them
 CONTRADICTED = 0.007  # share of a mask's area from which the view is segmented again
 HOLE = 0.001  # the same for a hole: one in a single mask makes a tunnel through the subject
 FEWEST = 3  # views that must remain
-ROOM, PIXEL_BYTES = 3 << 30, 40  # memory for the photos at work at once; bytes that a pixel of them takes at most
-MOST_AT_ONCE = 8
 INVERTED = "given, inverted"
+BY_HULL = "+hull"  # appended to the method of a mask that was corrected by the hull
 LEARNED = ("model", "person")  # methods with a network's contour
 COMPUTED = ("plate", "model", "person", "object", "grabcut")  # methods whose masks the hull may contradict
 Labelled = tuple[Path, tuple[str, ...]]
@@ -85,7 +89,7 @@ def segment(
 ) -> MaskSet:  # fmt: skip
     """Masks of all registered views: the whole stage. See stages.masks.stage.run."""
     poses = located.artifact
-    pairs, threads = _views(capture, poses), at_once(capture.artifact.views, os.cpu_count() or 1)
+    pairs, threads = photos_of(capture, poses), at_once(capture.artifact.views, os.cpu_count() or 1)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
                lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
@@ -102,6 +106,7 @@ def segment(
         bad = [a or _wrong_held_out(m) for a, m in zip(_outliers(masked), masked, strict=True)]
         corrected = _each(lambda t: _segment_again(t[0], t[1], t[2], config, context),
                           list(zip(masked, found, bad, strict=True)), threads, context, "checking masks")  # fmt: skip
+        corrected = _without_background(corrected, poses.roi_radius, config, support, threads, context)
         if any(a is not b for a, b in zip(corrected, masked, strict=True)):
             voting = [not m.view.holdout and not m.useless for m in corrected]
             found = _opinions(corrected, voting, poses, config, support)
@@ -172,56 +177,6 @@ def _asked(
 
     found = _each(one, masked, threads, context, "computing the extent")
     return {index: path for index, path in found if path is not None}
-
-
-def _views(capture: Located[Capture], poses: CameraSet) -> list[tuple[PhotoToMask, Camera]]:
-    by_index = {v.index: v for v in capture.artifact.views}
-    out = []
-    for camera in poses.cameras:
-        v = by_index[camera.index]
-        disc = region(camera, poses.roi_radius) or Disc(v.width / 2, v.height / 2, min(v.width, v.height) / 2, 0)
-        out.append(
-            (
-                PhotoToMask(
-                    v.index,
-                    v.name,
-                    camera,
-                    disc,
-                    v.holdout,
-                    _reader(capture, v.image),
-                    _mask_reader(capture, v),
-                    None if v.plate is None else _reader(capture, v.plate),
-                ),
-                camera,
-            )
-        )
-    return out
-
-
-def _reader(capture: Located[Capture], picture: FileRef) -> Callable[[], U8]:
-    return lambda: eight_bit(read_encoded(capture.path(picture)))
-
-
-def _mask_reader(capture: Located[Capture], view: CaptureView) -> Callable[[], F32] | None:
-    if view.mask is None:
-        return None
-    path = capture.path(view.mask)
-
-    def read() -> F32:
-        alpha = read_alpha(path)
-        if alpha.shape != (view.height, view.width):
-            raise StageError("the mask does not have the photo's size", where=f"view {view.index} ({view.name})",
-                             value=f"{alpha.shape[1]} x {alpha.shape[0]}", limit=f"{view.width} x {view.height}",
-                             remedy="give a mask of the photo's size")  # fmt: skip
-        return alpha
-
-    return read
-
-
-def at_once(views: Sequence[CaptureView], cores: int) -> int:
-    """How many photos are worked on at once: one a core, but no more than memory has room for."""
-    largest = max((v.width * v.height for v in views), default=1)
-    return max(1, min(MOST_AT_ONCE, cores, ROOM // (PIXEL_BYTES * largest)))
 
 
 def _each(work: Callable[[T], R], items: list[T], threads: int, context: Context, message: str) -> list[R]:
@@ -312,7 +267,39 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     before, after = (contradiction(m, opinion_here, filled=filled) + hole(m, opinion_here) for m in (prior, new))
     if after >= before or not LIMITS[0] <= new.mean() <= LIMITS[1]:
         return made
-    return _keep(made.view, made.camera, to_full_size(image, new), f"{made.source}+hull", context)
+    return _keep(made.view, made.camera, to_full_size(image, new), made.source + BY_HULL, context)
+
+
+def _without_background(
+    masked: list[Masked], roi_radius: float, config: Config, support: Support | None, threads: int, context: Context
+) -> list[Masked]:
+    """The masks without what lies beyond the hull of all and has the background's colours; see beyond_hull."""
+    votes = [not m.view.holdout and not m.useless for m in masked]
+    hull = beyond_hull.strict_hull([m.camera for m in masked], [m.small for m in masked], votes, roi_radius,
+                                   FINER * config.hull_cells, support)  # fmt: skip
+    return _each(partial(_cut, hull, roi_radius, context), masked, threads, context, "cutting off background")
+
+
+def _cut(hull: Cloud, roi_radius: float, context: Context, m: Masked) -> Masked:
+    """The view's mask without the background beyond the hull; unchanged if there is none, or if the user gave it."""
+    name = m.source.removesuffix(BY_HULL)
+    if name not in COMPUTED or m.useless:
+        return m
+    disc, width = m.view.disc, m.camera.width
+
+    def limits(shape: tuple[int, int]) -> tuple[Bool, int]:
+        return beyond_hull.limits(hull, m.camera, disc.scaled(shape[1] / width), roi_radius, shape)
+
+    if not beyond_hull.beyond(m.small >= 0.5, *limits((m.small.shape[0], m.small.shape[1]))):
+        return m
+    image = m.view.read()
+    w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
+    inside = np.asarray(resized(m.small, w, h)) >= 0.5
+    found = beyond_hull.background(np.asarray(resized(image, w, h), np.uint8), inside, *limits((h, w)))
+    if not found.any() or (inside & ~found).mean() < LIMITS[0]:
+        return m
+    alpha = beyond_hull.cut(read_alpha(_path(m.view.index, context)), image, inside, found)
+    return _keep(m.view, m.camera, alpha, name + BY_HULL, context)
 
 
 def _at_size(o: Opinion, width: int, height: int) -> Opinion:

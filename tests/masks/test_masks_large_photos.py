@@ -14,7 +14,7 @@ import pytest
 from stages.masks import matting
 from stages.masks.keying import EDGE, MAX_SPREAD, UNCHANGED, Background, _inside, key_out, key_out_plate
 from stages.masks.matting import soft_edge
-from stages.masks.segment import MOST_AT_ONCE, PIXEL_BYTES, ROOM, at_once
+from stages.masks.photos import MOST_AT_ONCE, PIXEL_BYTES, ROOM, at_once
 
 U8 = npt.NDArray[np.uint8]
 BLACK = Background((0.0, 0.0, 0.0), 2 * MAX_SPREAD)
