@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.eyes.fit import FittedBall
 from pipeline.head_artifacts import FittedEye
+from pipeline.registration.inside import shown_through
 from pipeline.registration.quality import Distances, distances, face_piercings, outer_quads, quad_quality, seen_share
 from pipeline.registration.scan import Scan
 from stages.template.register import Registration
@@ -44,6 +45,7 @@ def figures_of(found: Registration, regions: tuple[str, ...], skin: Distances) -
         "iris_pixels": min((b.pixels for b in found.eyes.values()), default=0.0),
         "folded": found.fitted.folded,
         "pierced": face_piercings(head, regions),
+        "shown_through": shown_through(head, regions, found.placed.scale),
         "repairs": found.fitted.repairs,
         "angle_least": quads.least,
         "angle_largest": quads.largest,

@@ -16,6 +16,7 @@ MOST = Limits(1.5, 3.0, lower=False)  # .9 to 1.2 on captures from all sides
 LANDMARKS = Limits(4.0, 8.0, lower=False)  # the network's own scatter is 2 to 3 mm
 FOLDED = Limits(4, 40, lower=False)  # of 4,906; an old man with thin lips has one where they press together
 PIERCED = Limits(0, 200, lower=False)
+SHOWN_THROUGH = Limits(0, 20, lower=False)  # of 6,293 points; four of them were a dark spot beside a nose
 
 SHAPE = "look at the surface in the report; better masks and cameras make it smoother"
 
@@ -36,6 +37,8 @@ def judge(figures: Mapping[str, float]) -> tuple[Finding, ...]:
         judged("folded", f["folded"], FOLDED, f"{f['folded']:g} quads of the head are folded", SHAPE),
         judged("pierced", f["pierced"], PIERCED,
                f"{f['pierced']:g} edges of the face pass through another part of it", SHAPE),
+        judged("shown_through", f["shown_through"], SHOWN_THROUGH,
+               f"{f['shown_through']:g} points of the mouth's inside lie outside of the face", SHAPE),
     )  # fmt: skip
 
 

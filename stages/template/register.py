@@ -18,6 +18,7 @@ from pipeline.registration.displacement import displacement
 from pipeline.registration.followers import followed
 from pipeline.registration.head import Head, limit_surface
 from pipeline.registration.identity_fit import PlacedHead
+from pipeline.registration.inside import beneath
 from pipeline.registration.lids import LIDS, REST, UPPER_LIDS, between, closing, lids_closed, with_lids
 from pipeline.registration.lips import LIPS, closing_lips, lips_closed
 from pipeline.registration.neck import sunk
@@ -124,6 +125,8 @@ def register(
     meet = np.isin(np.arange(len(template.quads)), [q for n in names for q in template.regions.get(n, ())])
     moved, seen = displacement(points, normals, quads, free, scan, placed.scale, np.repeat(meet, 4**levels))
     moved = moved - placed.scale * (level.stencil @ sunk(template))
+    moved = moved + beneath(points, normals, moved, quads, np.repeat(regions, 4**levels), tuple(template.regions),
+                            placed.scale)  # fmt: skip
     lids = points[np.unique(quads[free])]
     for part, eye in known_eyes.items():
         own = eye_rows(level, template.parts[part], levels)

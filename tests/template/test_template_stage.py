@@ -30,7 +30,14 @@ from stages.uv.config import Config as UvConfig
 from tests.support.ball_head import ball_scan, ball_template, no_head
 from tests.support.textured_ball import camera_on_orbit
 
-GOOD = {"distance_mm": 0.1, "distance_95_mm": 0.5, "landmarks_mm": 2.0, "folded": 0.0, "pierced": 0.0}
+GOOD = {
+    "distance_mm": 0.1,
+    "distance_95_mm": 0.5,
+    "landmarks_mm": 2.0,
+    "folded": 0.0,
+    "pierced": 0.0,
+    "shown_through": 0.0,
+}
 
 
 def inputs(tmp_path: Path, landmarks: np.ndarray | None = None) -> Inputs:
@@ -87,7 +94,7 @@ def test_a_folder_s_content_is_part_of_the_settings(tmp_path: Path) -> None:
 def test_checks_and_reasons() -> None:
     assert {f.level for f in judge(GOOD)} == {"good"}
     for name, bad in (("distance_mm", 2.0), ("distance_95_mm", 9.0), ("landmarks_mm", 12.0), ("folded", 99.0),
-                      ("pierced", 999.0)):  # fmt: skip
+                      ("pierced", 999.0), ("shown_through", 99.0)):  # fmt: skip
         levels = {f.check: f.level for f in judge(GOOD | {name: bad})}
         assert levels.pop(name) == "unusable" and set(levels.values()) == {"good"}
     assert not refused_placing(2.0, 1.1, metric=True) and not refused_placing(2.0, 9.0, metric=False)
@@ -101,7 +108,7 @@ def test_checks_and_reasons() -> None:
 
 def test_without_a_fault_is_with_every_check_good_and_eyes() -> None:
     assert faults(judge(GOOD), "") == ""
-    for name, bad in (("distance_95_mm", 2.0), ("pierced", 1.0)):
+    for name, bad in (("distance_95_mm", 2.0), ("pierced", 1.0), ("shown_through", 1.0)):
         why = faults(judge(GOOD | {name: bad}), "")
         assert "uv.mesh=template" in why and f"{bad:g}" in why
     assert "(eye_left: no edge)" in faults(judge(GOOD), "eye_left: no edge")
