@@ -12,6 +12,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
+from scipy import ndimage
 
 from pipeline.colour import srgb_from_linear
 from pipeline.verdict import Finding, Limits, judged
@@ -25,6 +26,9 @@ OVERLAP = Limits(0.97, 0.9)  # of the silhouettes, intersection over union
 LOBE = Limits(1.2, np.inf, lower=False)
 FAULTS = Limits(0, 0, lower=False)
 WARNINGS = Limits(0, np.inf, lower=False)
+# A spot differs by CLEARLY of 1, sRGB-encoded, has SPOT of the subject's area, and is RIM of its size from its outline.
+CLEARLY, SPOT, RIM = 0.4, 1e-4, 0.008
+SPOTTED = Limits(0.5, np.inf, lower=False)  # of the views: one with the mouth's inside beside the nose 1, others to .29
 SHOWN = 3  # faults that are quoted
 EQUAL = 1e-10  # lower limit of the mean squared difference: 100 dB
 
@@ -53,9 +57,11 @@ def validity(found: Sequence[tuple[str, checks.Finding]]) -> tuple[Finding, ...]
 def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
     """Compare renders of the asset with those of the model: (photo's name, model's, asset's) with pictures (H, W, 4)
     linear, premultiplied."""
-    seen = [(name, *_compared(model, asset)) for name, model, asset in views]
+    pictures = list(views)
+    seen = [(name, *_compared(model, asset)) for name, model, asset in pictures]
     if not seen:
         return ()
+    spotted = [name for name, model, asset in pictures if spots(model, asset)]
     db = -10 * np.log10(max(float(np.mean([10 ** (-p / 10) for _, p, _ in seen])), EQUAL))
     share = float(np.mean([s for _, _, s in seen]))
     worst = [name for name, _, _ in sorted(seen, key=lambda s: s[1])]
@@ -78,7 +84,27 @@ def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
             "a part of the model is missing in the mesh: see the findings of the surface stage",
             views=[name for name, _, _ in sorted(seen, key=lambda s: s[2])],
         ),
+        judged(
+            "asset_spots",
+            len(spotted) / len(seen),
+            SPOTTED,
+            f"in {len(spotted)} of {len(seen)} views the asset has a spot that the fitted model does not have",
+            "look at these views in the report: a part may come through another, or a face may be turned around",
+            views=spotted,
+        ),
     )
+
+
+def spots(model: F32, asset: F32) -> int:
+    """Regions inside of the asset's outline that differ clearly from the model's picture, holes included. Pictures
+    (H, W, 4) linear, premultiplied."""
+    shown = (model[..., 3] > 0.5) & ndimage.binary_fill_holes(asset[..., 3] > 0.5)
+    area = int(shown.sum())
+    rim = max(1, round(RIM * area**0.5))
+    differ = np.abs(_encoded(model) - _encoded(asset)).max(-1) > CLEARLY
+    differ &= ndimage.distance_transform_edt(np.pad(shown, 1))[1:-1, 1:-1] > rim
+    label, count = ndimage.label(ndimage.median_filter(differ, 3))
+    return int((np.bincount(label.ravel(), minlength=count + 1)[1:] > SPOT * area).sum())
 
 
 def lobe(figures: dict[str, float]) -> tuple[Finding, ...]:

@@ -71,7 +71,7 @@ def picture(seed: int = 0) -> np.ndarray:
 
 def test_the_asset_is_compared_with_the_model() -> None:
     same = judge.against_model([("a.jpg", picture(), picture())])
-    assert [f.level for f in same] == ["good", "good"] and same[0].value == pytest.approx(100)
+    assert [f.level for f in same] == ["good", "good", "good"] and same[0].value == pytest.approx(100)
     near = picture() + np.float32([0.02, 0.02, 0.02, 0]) * picture()[..., 3:]
     assert judge.against_model([("a.jpg", picture(), near)])[0].level == "good"
     found = judge.against_model([("a.jpg", picture(), near), ("b.jpg", picture(), picture(1))])
@@ -87,3 +87,38 @@ def test_lobes_that_no_shader_shows_are_told(residual: float, level: str) -> Non
     (found,) = judge.lobe({"ggx_residual": residual})
     assert found.level == level and f"{residual:.0%}" in found.said
     assert judge.lobe({}) == ()
+
+
+def face(spot: float = 0.0, radius: float = 60.0) -> np.ndarray:
+    """A bright disc, linear premultiplied RGBA, with a black spot of a radius in pixels."""
+    y, x = np.mgrid[:160, :160]
+    inside = (np.hypot(x - 80, y - 80) < radius).astype(np.float32)[..., None]
+    colour = np.full((160, 160, 3), 0.5, np.float32)
+    colour[np.hypot(x - 70, y - 60) < spot] = 0
+    return np.concatenate([colour * inside, inside], -1)
+
+
+def test_a_black_spot_that_the_model_does_not_have_is_told() -> None:
+    assert judge.spots(face(), face(spot=4)) == judge.spots(face(spot=4), face()) == 1
+    assert judge.spots(face(), face()) == judge.spots(face(spot=4), face(spot=4)) == 0
+    assert judge.spots(face(), face(spot=0.9)) == 0  # one pixel
+    assert judge.spots(face(), face(radius=55)) == 0  # a smaller outline is no spot
+    hole = face()
+    hole[56:64, 66:74] = 0  # transparent
+    assert judge.spots(face(), hole) == 1
+    dim = face() * np.float32([0.5, 0.5, 0.5, 1])
+    assert judge.spots(face(), dim) == 0  # another exposure is no spot
+
+
+def test_spots_in_most_views_are_a_finding() -> None:
+    good, bad = ("a", face(), face()), ("b", face(), face(spot=4))
+    for views, level, named in (([good, bad], "good", []), ([bad, bad, good], "usable", ["b", "b"])):
+        found = {f.check: f for f in judge.against_model(views)}["asset_spots"]
+        assert found.level == level and list(found.views) == named
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_pictures_of_nothing_have_no_spots(value: float) -> None:
+    nothing = np.zeros((32, 32, 4), np.float32)
+    assert judge.spots(nothing, nothing) == judge.spots(np.full_like(nothing, value), nothing) == 0
+    assert judge.spots(nothing, np.full_like(nothing, value)) == 0
