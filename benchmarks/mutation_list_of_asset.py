@@ -24,6 +24,15 @@ OF_ASSET = (
              "tests/registration/test_scan.py::test_a_surface_that_is_seen_otherwise_answers_as_a_new_one"),
     Mutation("pipeline/visibility.py", "self._kept.move_to_end(key)", "pass",
              "tests/bake/test_bake_sight.py::test_masks_that_were_read_are_kept_up_to_a_limit"),
+    # ---------------------------------------------------------------- the inside of the mouth
+    Mutation("pipeline/registration/inside.py", "np.maximum(depth(at) + wanted, 0.0)", "np.maximum(depth(at), 0.0)",
+             "tests/registration/test_inside.py::test_what_comes_through_the_cheek_is_put_back_beneath_it"),
+    Mutation("pipeline/registration/inside.py", "np.minimum(DEEP * unit, EDGE * away)", "np.full(len(away), DEEP)",
+             "tests/registration/test_inside.py::test_the_template_s_own_mouth_hardly_moves"),
+    Mutation("pipeline/registration/inside.py", "surface = points + moved[:, None] * normals", "surface = points",
+             "tests/registration/test_inside.py::test_a_displaced_cheek_counts"),
+    Mutation("pipeline/registration/inside.py", "_spread(step, inner)", "step",
+             "tests/registration/test_inside.py::test_the_way_is_smooth"),
     # ---------------------------------------------------------------- registration of the head template
     Mutation("pipeline/registration/outgrown.py", ">= OUTSIDE * away", "<= OUTSIDE * away",
              "tests/registration/test_outgrown.py::test_the_places_are_those_that_stand_out"),

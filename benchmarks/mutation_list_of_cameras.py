@@ -10,6 +10,7 @@ ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/tes
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
+BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
 OF_CAMERAS = (
@@ -28,6 +29,24 @@ OF_CAMERAS = (
              "tests/inverse_rendering/test_initial_geometry.py::test_a_mask_carves_what_few_frames_show"),
     Mutation("stages/masks/hull_consistency.py", "if not is_subject(", "if is_subject(",
              "tests/masks/test_hull_consistency.py::test_the_core_of_a_hull_is_empty_where_few_frames_show_it"),
+    # ---------------------------------------------------------------- background beyond the hull
+    Mutation("stages/masks/beyond_hull.py", "out[of] = own - other", "out[of] = other - own",
+             f"{BEYOND}::test_a_region_with_the_subjects_colours_stays_because_the_hull_may_lack_it"),
+    Mutation("stages/masks/beyond_hull.py", "rather > np.where(part, -OWN, 0)", "rather > -100",
+             f"{BEYOND}::test_between_a_region_and_the_hulls_outline_each_pixel_is_decided_alone"),
+    Mutation("stages/masks/beyond_hull.py", "eroded(silhouette & inside, 2 * margin)", "inside",
+             f"{BEYOND}::test_a_region_beyond_the_hull_with_the_walls_colours_is_background"),
+    Mutation("stages/masks/beyond_hull.py", "np.where(zone, np.minimum(", "np.where(zone | True, np.minimum(",
+             f"{BEYOND}::test_alpha_changes_only_where_background_was_found"),
+    Mutation("stages/masks/beyond_hull.py", "list(compress(alphas, votes))", "list(alphas)",
+             f"{BEYOND}::test_the_hull_is_that_of_all_voting_masks"),
+    Mutation("stages/masks/segment.py", "if name not in COMPUTED or m.useless:", "if m.useless:",
+             f"{BEYOND}::test_given_masks_are_not_cut"),
+    # ---------------------------------------------------------------- spots of an asset
+    Mutation("stages/usd/judge.py", ".max(-1) > CLEARLY", ".max(-1) > 0.1",
+             f"{SPOTS}::test_a_black_spot_that_the_model_does_not_have_is_told"),
+    Mutation("stages/usd/judge.py", "ndimage.binary_fill_holes(asset[..., 3] > 0.5)", "(asset[..., 3] > 0.5)",
+             f"{SPOTS}::test_a_black_spot_that_the_model_does_not_have_is_told"),
     # ---------------------------------------------------------------- held-out photos
     Mutation("stages/poses/held_out.py", "if j != fitted + number:", "if j != number:",
              f"{HELD_OUT}::test_matches_with_observations_of_points_are_sightings"),

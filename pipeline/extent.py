@@ -4,8 +4,9 @@ Symbols: h length from the chin to the top of the forehead (the landmarks'); s(x
 inside, asset units: the larger of the ellipsoid's and the planes'.
 
 Everything outside is neither fitted nor scored, and the mesh ends there. All stages use the same solid, with these
-margins: pixels count from ASKED h inside it, because a visual hull is a little too thick; the mesh is cut at the solid
-itself; the fit reaches GROWN h further, so that it has no rim at the cut.
+margins: pixels count from ASKED h inside it, because a visual hull is a little too thick; behind their place on the
+hull the surface may lie further out, so that the mesh is cut MESH h outside; the fit reaches GROWN h, so that it has no
+rim at the cut.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ RADIUS = 1.65  # h: leaves 0.8 h around a head for hair, and includes some of th
 # The same for the head and neck alone, with which the rest of the subject is compared.
 HEAD_BELOW, HEAD_RADIUS = 0.6, 1.4
 CORE, CORE_MIDDLE = 0.6, (0.0, 0.1, -0.55)  # h: radius of a ball inside every head, and its centre as above
-ASKED, GROWN = 0.04, 0.1  # h
+ASKED, MESH, GROWN = 0.04, 0.08, 0.1  # h
 
 
 def head_extent(frame: HeadFrame, below_chin: float = BELOW, radius: float = RADIUS) -> Extent:

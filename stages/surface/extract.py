@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import Extent
 from pipeline.errors import StageError
-from pipeline.extent import signed, signed_and_gradient
+from pipeline.extent import MESH, signed, signed_and_gradient
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Faces, Indices, Mask
 
@@ -96,7 +96,7 @@ def wall_distance(points: F64, grid: Lattice) -> tuple[F64, F64]:
     box, slope = sides.max(1), np.concatenate([-np.eye(3), np.eye(3)])[sides.argmax(1)]
     if grid.extent is None:
         return box, slope
-    beyond, away = signed_and_gradient(grid.extent, points)
+    beyond, away = signed_and_gradient(grid.extent, points, MESH * grid.extent.head)
     return np.maximum(box, beyond), np.where((beyond > box)[:, None], away, slope)
 
 
@@ -107,7 +107,9 @@ def _wall(points: F64, grid: Lattice) -> F64:
     for i in (1, 2):
         np.maximum(out, low[i] - points[:, i], out=out)
         np.maximum(out, points[:, i] - high[i], out=out)
-    return np.asarray(out if grid.extent is None else np.maximum(out, signed(grid.extent, points)), np.float64)
+    if grid.extent is not None:
+        np.maximum(out, signed(grid.extent, points, MESH * grid.extent.head), out=out)
+    return np.asarray(out, np.float64)
 
 
 def cut(value: npt.NDArray[np.floating], wall: F64, grid: Lattice) -> F64:

@@ -105,4 +105,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> Surface:
     )
 
 
-STAGE = Stage(name="surface", version=5, inputs=Inputs, config=Config, output=Surface, run=run)
+STAGE = Stage(name="surface", version=6, inputs=Inputs, config=Config, output=Surface, run=run)

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from pipeline import meshes
 from pipeline.artifacts import Cut, Extent
 from pipeline.errors import StageError
-from pipeline.extent import signed
+from pipeline.extent import MESH, signed
 from stages.surface import clean, extract
 from stages.surface.build import Built, build
 from stages.surface.judge import judge
@@ -206,11 +206,12 @@ def test_the_mesh_is_closed_at_the_extent() -> None:
     got = build(AnalyticField(sphere(0.1), (0.12, 0.13, 0.12)), 64, quiet, extent=extent)
     assert got.topology.manifold and got.topology.euler == 2 and got.cap > 0.1
     x = got.mesh.vertices.astype(np.float64)
-    outside = signed(extent, x)
+    reach = MESH * extent.head
+    outside = signed(extent, x, reach)
     assert outside.max() < 0.3 * got.cell  # the rim, where both meet
     on_sphere = np.abs(np.linalg.norm(x, axis=1) - 0.1) < 0.02 * got.cell
     on_wall = np.abs(outside) < 0.02 * got.cell
     assert (on_sphere | on_wall).mean() > 0.95 and on_sphere.sum() > 500 and on_wall.sum() > 500
     grid = np.random.default_rng(0).uniform(-0.1, 0.1, (200_000, 3))
-    kept = (np.linalg.norm(grid, axis=1) < 0.1) & (signed(extent, grid) < 0)
+    kept = (np.linalg.norm(grid, axis=1) < 0.1) & (signed(extent, grid, reach) < 0)
     assert meshes.volume(x, got.mesh.faces) == pytest.approx(kept.mean() * 0.2**3, rel=0.02)
