@@ -37,4 +37,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
     return build(inputs.capture, inputs.poses, inputs.uv, config, context)
 
 
-STAGE = Stage(name="reflectance", version=7, inputs=Inputs, config=Config, output=ReflectanceField, run=run)
+STAGE = Stage(name="reflectance", version=8, inputs=Inputs, config=Config, output=ReflectanceField, run=run)

@@ -18,6 +18,7 @@ U8 = npt.NDArray[np.uint8]
 LIFT = 1e-3  # asset units (metres): rays start this far above the surface
 AROUND = 1.2e-3  # the photos' blur: a texel this near to an edge of the silhouette shows what lies behind
 GRAZING, MARGIN = 0.15, 2.0  # least n.v of a texel; pixels at the frame's border that are not used
+SURE = 0.3  # least n.v of a texel, towards the camera that faces it best, whose fitted values are kept
 DISC, RAYS = 0.016, 3  # lamps have an extent: shadows are traced to this many points on a ring of that radius
 TURN = 0.4  # radians: the first of them
 BEHIND = -0.1  # least n.l of a texel whose shadow is traced
@@ -50,6 +51,14 @@ class Pairs:
     def seen(self) -> npt.NDArray[np.bool_]:
         """(T,) whether any camera sees the texel."""
         return np.asarray(np.diff(self.first) > 0)
+
+    @property
+    def sure(self) -> npt.NDArray[np.bool_]:
+        """(T,) whether a camera sees the texel well enough for its colour: at the rim of what is seen, grazing pixels
+        show the background as well."""
+        best = np.zeros(len(self.first) - 1)
+        np.maximum.at(best, self.texel, self.weight)
+        return np.asarray(best >= SURE**2)
 
 
 def points_of(mesh: Mesh, charts: Charts, size: int) -> Points:

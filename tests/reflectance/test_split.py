@@ -217,3 +217,13 @@ def test_the_share_that_arrives_is_that_of_the_model(arrived: float) -> None:
     observe(point, normal, np.array([0, 2]), np.array([0, 1]), np.ones(2), samples, light, axis, eyes, alphas, albedo,
             lobes, 0.1, share, trust)  # fmt: skip
     assert float(share[0, 0]) == pytest.approx(arrived, abs=1e-5) and float(trust[0, 0]) == 1
+
+
+def test_colours_of_texels_that_only_grazing_pixels_show_are_not_kept() -> None:
+    """Squared cosines: the best camera decides; a texel that none sees, and one of a single grazing camera."""
+    weight = np.array([0.04, 0.5, 0.08, 0.089, 0.091])
+    pairs = Pairs(np.array([0, 2, 2, 4, 5]), np.array([0, 0, 2, 2, 3]), np.zeros(5, np.int32), weight)
+    assert pairs.seen.tolist() == [True, False, True, True]
+    assert pairs.sure.tolist() == [True, False, False, True]
+    nobody = Pairs(np.zeros(3, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0))
+    assert not nobody.sure.any() and nobody.sure.shape == (2,)

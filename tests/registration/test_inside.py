@@ -46,12 +46,25 @@ def mended(h: Head, unit: float) -> tuple[Head, np.ndarray]:
     return replace(h, displacement=(h.displacement + more).astype(np.float32)), more
 
 
+def deepest(h: Head, unit: float) -> float:
+    """Distance outside of the skin that comes closest to it, of the mouth's inside 6 mm and more from the lips."""
+    _, _, quads = h.surface()
+    region, moved = np.repeat(h.region, 4), h.displaced()
+    inside = region == NAMES.index(CAVITY)
+    own = np.setdiff1d(quads[inside], quads[~inside])
+    rim = np.intersect1d(quads[inside], quads[~inside])
+    far = own[cKDTree(moved[rim]).query(moved[own])[0] > 0.006 * unit]
+    skin = np.unique(quads[np.isin(region, [NAMES.index(n) for n in ("face", "lips", "nose")])])
+    return -float(cKDTree(moved[skin]).query(moved[far])[0].min())
+
+
 @pytest.mark.parametrize("unit", [1.0, 1.3, 250.0])
 def test_what_comes_through_the_cheek_is_put_back_beneath_it(unit: float) -> None:
     wrong = head(unit, PUSH)
     found, more = mended(wrong, unit)
     assert shown_through(wrong, NAMES, unit) > 3
     assert shown_through(found, NAMES, unit) == 0
+    assert deepest(found, unit) < -0.5 * DEEP * unit  # not only just beneath it
     assert 0.001 * unit < more.max() <= MOST * unit
     inside = np.unique(wrong.surface()[2][np.repeat(wrong.region, 4) == NAMES.index(CAVITY)])
     assert not np.delete(more, inside).any()  # the skin, the teeth and the tongue stay
