@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pipeline.meshes import F64, Faces, Indices, Mask, triangles_of
 from pipeline.registration.head import Head
 from pipeline.registration.quality import outer_quads
-from pipeline.registration.shell import border_loops, shell_distance
+from pipeline.registration.shell import border_loops, fans, shell_distance
 
 CAVITY, PASSAGE = "mouth_inside", "nostrils"  # regions: of what stays beneath, and of what is skin, but cannot be shown
 DEEP = 1.5e-3  # metres of the template beneath the skin
@@ -103,9 +103,8 @@ def _own(quads: Indices, region: Indices, names: tuple[str, ...], count: int) ->
 def _closed(points: F64, quads: Indices) -> tuple[F64, Faces]:
     """Quads (Q, 4) of points (n, 3) as triangles, with fans over their open borders."""
     loops = border_loops(quads)
-    fans = [np.stack([np.roll(b, -1), b, np.full(len(b), len(points) + i)], 1) for i, b in enumerate(loops)]
     vertices = np.concatenate([points, *(points[loop].mean(0)[None] for loop in loops)])
-    return vertices, np.concatenate([triangles_of(quads), *fans]).astype(np.int32)
+    return vertices, np.concatenate([triangles_of(quads), *fans(loops, len(points))]).astype(np.int32)
 
 
 def _spread(values: F64, quads: Indices) -> F64:

@@ -7,6 +7,7 @@ fans around their middle.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,10 +45,14 @@ def outer_shell(template: Template) -> Shell:
     keep = np.setdiff1d(template.parts[SKIN], np.concatenate(left_out) if left_out else np.zeros(0, np.int64))
     quads = template.quads[keep]
     loops = border_loops(quads)
-    middle = len(template.vertices) + np.arange(len(loops))
-    caps = [np.stack([np.roll(b, -1), b, np.full(len(b), m)], 1) for b, m in zip(loops, middle, strict=True)]
+    caps = fans(loops, len(template.vertices))
     quad = np.concatenate([np.repeat(keep, 2), np.full(sum(map(len, caps)), -1)])
     return Shell(np.concatenate([triangles_of(quads), *caps]).astype(np.int32), quad.astype(np.int64), tuple(loops))
+
+
+def fans(loops: Sequence[Indices], count: int) -> list[Indices]:
+    """Triangles that close each loop around its middle, which is vertex count, count + 1, ..."""
+    return [np.stack([np.roll(b, -1), b, np.full(len(b), count + i)], 1) for i, b in enumerate(loops)]
 
 
 def border_loops(quads: Indices) -> list[Indices]:
