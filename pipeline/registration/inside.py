@@ -41,8 +41,9 @@ def beneath(
     if not own.any():
         return more
     surface = points + moved[:, None] * normals
-    depth = _Depth(surface, quads[_skin(region, names)], surface[own], unit)
-    shared = np.intersect1d(quads[_skin(region, names)], quads[region == names.index(CAVITY)])
+    skin = quads[_skin(region, names)]
+    depth = _Depth(surface, skin, surface[own], unit)
+    shared = np.intersect1d(skin, quads[region == names.index(CAVITY)])
     away = cKDTree(surface[shared]).query(surface[own])[0] if len(shared) else np.full(int(own.sum()), np.inf)
     wanted = np.minimum(DEEP * unit, EDGE * away)
     inner = quads[own[quads].all(1)]

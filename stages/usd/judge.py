@@ -57,11 +57,13 @@ def validity(found: Sequence[tuple[str, checks.Finding]]) -> tuple[Finding, ...]
 def against_model(views: Iterable[tuple[str, F32, F32]]) -> tuple[Finding, ...]:
     """Compare renders of the asset with those of the model: (photo's name, model's, asset's) with pictures (H, W, 4)
     linear, premultiplied."""
-    pictures = list(views)
-    seen = [(name, *_compared(model, asset)) for name, model, asset in pictures]
+    seen, spotted = [], []
+    for name, model, asset in views:  # one by one: they are read from files
+        seen.append((name, *_compared(model, asset)))
+        if spots(model, asset):
+            spotted.append(name)
     if not seen:
         return ()
-    spotted = [name for name, model, asset in pictures if spots(model, asset)]
     db = -10 * np.log10(max(float(np.mean([10 ** (-p / 10) for _, p, _ in seen])), EQUAL))
     share = float(np.mean([s for _, _, s in seen]))
     worst = [name for name, _, _ in sorted(seen, key=lambda s: s[1])]
