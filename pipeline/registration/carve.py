@@ -37,6 +37,7 @@ SIDEWAYS = 0.9  # part of a normal to the person's left or right from which it c
 WIDER, DEEPER = 3.0, 0.5  # growth of a below the chin, sideways and to the front, over the depth
 BELOW = 0.01  # metres below the lowest landmark at which that begins
 CHEST, BACK = 0.02, 0.06  # metres that anything may lie in front of the nose, and behind the back of the head
+FAR = 0.08  # the same for both where the photos are from all around: only what few cameras leave, a tail behind a neck
 SMOOTH_STEPS = 12  # of averaging over neighbours: a changes over about two centimetres
 BLUR = 0.006  # metres: so that a has no steps where the nearest place of the template changes
 
@@ -58,9 +59,25 @@ def possible_space(
     below = np.maximum(float((marks @ up).min()) / head.scale - BELOW - height / head.scale, 0.0)
     bound = bound + below * np.where(ahead > float(rim.mean(0) @ front), DEEPER, WIDER)
     bound = head.scale * ndimage.gaussian_filter(bound, BLUR * head.scale / cell)
+    return np.asarray(np.maximum(values - bound, _slab(template, head, ahead, CHEST, BACK)), np.float32)
+
+
+def space_near_head(template: Template, head: PlacedHead, lo: F64, cell: float, shape: tuple[int, int, int]) -> F32:
+    """(X, Y, Z) distance at lo + cell (i, j, k) from the space between FAR before the nose and FAR behind the back of
+    the head, world units, negative inside. Few cameras all around leave a hull that goes on behind a neck where nothing
+    is."""
+    front = head.world_from_template[:3, 2] / head.scale
+    ahead = _along(front, [low + cell * np.arange(n) for low, n in zip(lo, shape, strict=True)])
+    return np.asarray(_slab(template, head, ahead, FAR, FAR), np.float32)
+
+
+def _slab(template: Template, head: PlacedHead, ahead: F64, chest: float, back: float) -> F64:
+    """(X, Y, Z) distance from the space between `chest` before the nose and `back` behind the head, metres of the
+    template. ahead (X, Y, Z): coordinate of the nodes to the front."""
+    front = head.world_from_template[:3, 2] / head.scale
     reach = head.vertices[template.quads[template.parts[SKIN]]] @ front
-    slab = np.maximum(ahead - float(reach.max()) - CHEST * head.scale, float(reach.min()) - BACK * head.scale - ahead)
-    return np.asarray(np.maximum(values - bound, slab), np.float32)
+    nose, behind = float(reach.max()) + chest * head.scale, float(reach.min()) - back * head.scale
+    return np.maximum(ahead - nose, behind - ahead)
 
 
 def _prolonged(values: F32, height: F64, up: F64) -> F32:

@@ -17,7 +17,13 @@ from stages.inverse_rendering.keep_silhouettes import start_with_silhouettes
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.stereo import SWEEPS, Sweep
 from stages.inverse_rendering.stereo_choice import Facts, stereo_start
-from stages.inverse_rendering.template_start import BEYOND_STEREO, FAR, carved_by_template, landmarks_off
+from stages.inverse_rendering.template_start import (
+    BEYOND_STEREO,
+    FAR,
+    carved_by_template,
+    landmarks_off,
+    without_far_parts,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +72,13 @@ def choose_start(
         "landmarks_off_hull_mm": round(1e3 * before, 3),
     }
     if settings.prior == AUTO and before <= BEYOND_STEREO:
-        start, stereo = _after_stereo(hull, views, settings, device, check)
+        near = without_far_parts(hull, template, head, views, check)
+        start, stereo = _after_stereo(near, views, settings, device, check)
         off = landmarks_off(start, landmarks, head.scale)
         known["landmarks_off_mm"] = round(1e3 * off, 3)
         if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
-            return ChosenStart(start, hull, _facts("hull", why, known, stereo))
+            return ChosenStart(start, near, _facts("hull", why, known, stereo))
     cut = carved_by_template(hull, template, head, views, check)
     # on smooth skin, longer sweeps find depths at random, and remove hair
     start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])

@@ -212,7 +212,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=36,
+    version=37,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -3,6 +3,8 @@
 Photos from one side leave a hull that reaches centimetres in front of and behind the face. No sweep along its normals
 finds the nose in it. But the photos' face landmarks tell where the face is, and the template placed on them how it
 goes on (pipeline.registration.carve). The hull remains the outer limit; the template only carves.
+
+Few cameras all around leave a hull that has the face, but goes on behind the neck: such parts are cut off too.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import numpy as np
 import torch
 
 from pipeline.meshes import F64
-from pipeline.registration.carve import possible_space
+from pipeline.registration.carve import possible_space, space_near_head
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.model import Template
 from stages.inverse_rendering.initial_geometry import Start
@@ -46,6 +48,20 @@ def carved_by_template(
     x, y, z = start.values.shape
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
+    front = head.world_from_template[:3, 2] / head.scale
+    space = bound_with_silhouettes(start, space, front, views, check)
+    return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)
+
+
+def without_far_parts(
+    start: Start, template: Template, head: PlacedHead, views: list[PhotoView], check: Callable[[], None] = lambda: None
+) -> Start:
+    """The start without what lies far before or behind the head and no silhouette needs; the same start if that is
+    nothing."""
+    x, y, z = start.values.shape
+    space = space_near_head(template, head, start.lo.astype(np.float64), start.cell, (x, y, z))
+    if not ((start.values < 0) & (space > 0)).any():
+        return start
     front = head.world_from_template[:3, 2] / head.scale
     space = bound_with_silhouettes(start, space, front, views, check)
     return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import StageError
+from pipeline.maths.tracing import box_interval
 from pipeline.meshes import F64
 from pipeline.registration.shell import outer_shell, shell_distance
 from pipeline.template.load import load_template
 from stages.inverse_rendering.choose_start import ChosenStart, choose_start
 from stages.inverse_rendering.config import PRIORS, Config
+from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.template_start import FAR, landmarks_off
@@ -61,6 +63,31 @@ def test_a_hull_with_the_face_stays() -> None:
     found = chosen(hull, marks())
     assert found.start is hull and found.facts["geometry"]["prior"] == PRIORS["hull"]
     assert float(found.facts["geometry"]["landmarks_off_hull_mm"]) < 1e3 * FAR
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_a_tail_behind_the_neck_is_cut_off_unless_a_photo_shows_it(shown: bool) -> None:
+    """Few cameras all around leave such a tail; a photo from the side tells whether it is there."""
+    lo, shape = LO - [0, 0, 30 * CELL], (*SHAPE[:2], SHAPE[2] + 30)
+    shell = outer_shell(TEMPLATE)
+    found = shell_distance(shell.vertices(TEMPLATE.vertices), shell.faces, lo, CELL, shape)
+    node = np.stack(np.meshgrid(*(lo[a] + CELL * np.arange(shape[a]) for a in range(3)), indexing="ij"), -1)
+    back, low = TEMPLATE.vertices[:, 2].min(), TEMPLATE.vertices[:, 1].min()
+    tail = np.max(np.abs(node - [0, low + 0.06, back - 0.04]) - [0.03, 0.03, 0.13], axis=-1)
+    hull = Start(np.minimum(found.values, tail).astype(np.float32), lo.astype(np.float32), CELL)
+    side = np.eye(4)
+    side[:3, :3], side[:3, 3] = np.array([[0, 0, 1.0], [0, -1, 0], [1, 0, 0]]), [-1.2, 0, back]
+    K = np.array([[300.0, 0, 100], [0, 300.0, 100], [0, 0, 1]])
+    rows, columns = (x.ravel() for x in np.mgrid[:200, :200])
+    o, d, _ = pixel_rays(K, side, rows, columns)
+    surface = (hull if shown else Start(found.values, hull.lo, CELL)).surface("cpu")
+    mask = np.asarray(surface.trace(o, d, *box_interval(o, d, *surface.box()))[1]).reshape(200, 200)
+    view = PhotoView(0, np.zeros((200, 200, 3), np.float32), mask.astype(np.float32), K, side, np.zeros(5))
+    start = choose_start(hull, [*CAMERAS, view], marks(), Config(stereo="off"), "cpu").start
+    far = (node[..., 2] < back - 0.12) & (tail < -CELL)
+    assert far.any() and bool((start.values[far] < 0).any()) is shown
+    near = node[..., 2] > back - 0.07
+    assert ((start.values < 0) == (hull.values < 0))[near].mean() > 0.9999
 
 
 def test_without_a_face_the_hull_stays() -> None:

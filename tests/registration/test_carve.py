@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.hull import Hull
 from pipeline.meshes import F64
-from pipeline.registration.carve import CHEST, ELSEWHERE, carved_hull, possible_space
+from pipeline.registration.carve import CHEST, ELSEWHERE, FAR, carved_hull, possible_space, space_near_head
 from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
 from pipeline.transforms import apply, similarity
@@ -69,6 +69,19 @@ def test_shoulders_are_free_below_the_chin_but_not_in_front_of_the_chest(space: 
     assert space(shoulder[None])[0] < 0
     nose = TEMPLATE.vertices[:, 2].max()
     assert space(np.array([[0.0, chin - 0.12, nose + CHEST + 0.03]]))[0] > 0
+
+
+def test_what_is_far_before_and_behind_is_told_in_any_world() -> None:
+    """Twice as large, turned and elsewhere: the distances are those of the world."""
+    world = similarity(2.0, np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]]), np.array([0.3, 0.1, -0.2]))
+    head = placed_on_face(TEMPLATE, marks(apply(world, TEMPLATE.vertices)))
+    assert head is not None
+    z = TEMPLATE.vertices[np.unique(TEMPLATE.quads[TEMPLATE.parts["skin"]]), 2]
+    points = np.array([[0.1, -0.2, z.min() - FAR - 0.02], [0.1, -0.2, z.min() - FAR + 0.02], [0, 0, 0],
+                       [0, 0.1, z.max() + FAR + 0.02]])  # fmt: skip
+    found = [float(space_near_head(TEMPLATE, head, p, 1.0, (1, 1, 1))[0, 0, 0]) for p in apply(world, points)]
+    assert found[:2] == pytest.approx([0.04, -0.04], abs=0.01) and found[3] == pytest.approx(0.04, abs=0.01)
+    assert found[2] < -2 * FAR
 
 
 def test_a_block_becomes_a_head() -> None:
