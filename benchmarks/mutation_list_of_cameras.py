@@ -10,6 +10,7 @@ ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/tes
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
+FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
 BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
@@ -121,6 +122,26 @@ OF_CAMERAS = (
              f"{WEAK}::test_a_slot_that_masks_show_open_is_not_filled"),
     Mutation("stages/inverse_rendering/weakly_seen.py", "length[nearest[weak]] ** -4, wrong)",
              "length[nearest[weak]] ** 4, wrong)", f"{WEAK}::test_the_side_that_no_view_determines_is_smoothed"),
+    # ---------------------------------------------------------------- depth from optical flow
+    Mutation("stages/inverse_rendering/depth_from_flow.py", "(u * n).sum(1) * (1 - left).clip(0, 1)",
+             "(u * n).sum(1)", f"{FLOW}::test_views_from_one_place_tell_no_depth"),
+    Mutation("stages/inverse_rendering/depth_from_flow.py", "(0.5 * (first + second)) / total * used",
+             "(0.5 * (first + second)) / total",
+             f"{FLOW}::test_noise_and_what_half_of_the_views_contradict_move_little"),
+    Mutation("stages/inverse_rendering/depth_from_flow.py", "weight = 1 / (1 + (off**2).sum(1) / (2 * NOISE) ** 2)",
+             "weight = 1 / (1 + 0 * (off**2).sum(1))",
+             f"{FLOW}::test_a_wild_view_is_outvoted_and_no_flow_is_no_motion"),
+    Mutation("stages/inverse_rendering/depth_from_flow.py", "values[tuple(node.T)] -= d[nearest]",
+             "values[tuple(node.T)] += d[nearest]",
+             f"{FLOW}::test_a_ball_of_the_wrong_size_comes_to_the_right_one_in_front"),
+    Mutation("stages/inverse_rendering/depth_from_flow.py", ">= MISSED]] = 0", ">= 10**6]] = 0",
+             f"{FLOW}::test_nothing_moves_out_of_the_masks"),
+    # ---------------------------------------------------------------- what lies far from a head
+    Mutation("stages/inverse_rendering/template_start.py", "if not ((start.values < 0) & (space > 0)).any():",
+             "if True:", "tests/inverse_rendering/test_choose_start.py"),
+    Mutation("pipeline/registration/carve.py", "return np.maximum(ahead - nose, behind - ahead)",
+             "return ahead - nose", "tests/registration/test_carve.py"),
+    Mutation("stages/masks/judge.py", "UNSEEN_HEAD if face else UNSEEN", "UNSEEN", "tests/masks/test_masks_judge.py"),
     # ---------------------------------------------------------------- what silhouettes show is kept
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "lost = ~left.trace(o, d, near, far)[1]",
              "lost = left.trace(o, d, near, far)[1]", KEPT),

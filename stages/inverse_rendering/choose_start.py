@@ -35,6 +35,11 @@ class ChosenStart:
     prior: Start
     facts: dict[str, Facts]
 
+    @property
+    def cut_by_template(self) -> bool:
+        """Whether the hull was cut by the head template, so that the start's depth is a guess."""
+        return self.facts["geometry"]["prior"] == PRIORS["template"]
+
 
 def choose_start(
     hull: Start,

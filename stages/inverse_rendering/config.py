@@ -183,6 +183,11 @@ class Config(StageConfig):
         description="initial geometry; hull: of the masks; template: the hull, cut by the head template on the face "
         "landmarks; auto: template where the hull hides the face",
     )
+    follow_flow: Decision = Field(
+        default=AUTO,
+        description="move the surface during the fit to the depth that the optical flow from the model's pictures to "
+        "the photos tells; auto: where the head template cut the hull",
+    )
     unseen_smoothing: Metres = Field(
         default=0.006,
         ge=0,

@@ -13,6 +13,7 @@ from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
+from stages.inverse_rendering.depth_from_flow import F64, FOLLOW_AT, follow_flow
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import (
     SELECTION_AT,
@@ -30,7 +31,7 @@ from stages.inverse_rendering.model_selection import (
 )
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import U8, Batch
-from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
+from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory, response_of
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
 from stages.inverse_rendering.schedule import (
     LEVEL_STARTS,
@@ -64,6 +65,8 @@ class Trainer(TrialLoop):
         "skin_asked",
         "skin_tells",
         "refinements",
+        "followed",
+        "flowed",
         "smoothings",
         "smoothed",
     )
@@ -73,6 +76,8 @@ class Trainer(TrialLoop):
     level: int = 0
     shadows_solved: int = 0
     refinements: int = 0  # of the camera poses
+    followed: int = 0  # times that the surface was moved by the flow
+    flowed: float = 0.0  # asset units, by which 95 % of it moved at most
     smoothings: int = 0  # of surface that the photos hardly determine
     smoothed: float = 0.0  # share of the surface that the last of them reached
     skin_asked: bool = False
@@ -173,6 +178,7 @@ class Trainer(TrialLoop):
             self.select_model()
         rate = self.set_rates()
         self.refine_poses()
+        self.follow_flow()
         self.smooth()
         self.weigh_photos()
         due = sum(self.share() >= s for s in SHADOWS_AT)
@@ -200,6 +206,20 @@ class Trainer(TrialLoop):
         self.views = self.poses.refine(self.model, self.views, self.settings, self.device)
         self.pixels.place(self.views)
         self.refinements = due
+
+    def follow_flow(self) -> None:
+        """Move the surface to the depth that optical flow tells, when it is due."""
+        due = sum(self.share() >= s for s in FOLLOW_AT)
+        if self.settings.follow_flow != "on" or self.followed >= due or self.geometry_frozen or self.choices is None:
+            return
+        side, samples = self.settings.image_side, self.settings.samples
+        moved = follow_flow(self.model, self.grid, self.views, side, samples, self.device, self.response)
+        self.flowed = max(self.flowed, moved)
+        self.followed = due
+
+    def response(self, number: int) -> F64:
+        """(3, 3) of a photo, from the model's colours to the photo's."""
+        return response_of(self.model, number)
 
     def smooth(self) -> None:
         """Smooth the surface where the photos hardly determine it, when it is due."""
@@ -240,8 +260,9 @@ class Trainer(TrialLoop):
         return self.poses.facts(self.views, self.settings.refine_poses)
 
     def surface_facts(self) -> dict[str, str | float | bool]:
-        """For the report: the share of the surface that was smoothed, because the photos hardly determine it."""
-        return {"smoothed_share": round(self.smoothed, 4)}
+        """For the report: how far optical flow moved the surface, and the share that was smoothed, because the photos
+        hardly determine it."""
+        return {"flow_moved_mm": round(1e3 * self.flowed, 3), "smoothed_share": round(self.smoothed, 4)}
 
     def ask_skin(self, choices: Choices) -> None:
         """Correct the light by the skin, if photos show a face."""

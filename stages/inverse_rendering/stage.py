@@ -121,6 +121,8 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     landmarks = None if ref is None else load_landmarks(inputs.masks.path(ref))
     chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
     start = chosen.start
+    if settings.follow_flow == AUTO:
+        settings = settings.changed(follow_flow="on" if chosen.cut_by_template else "off")
     lit = None
     if settings.preset not in COMPARED and known is None:  # a given light stands still
         fired = [v.flash is True for v in inputs.capture.artifact.views if v.index in set(usable)]

@@ -60,13 +60,13 @@ def smooth_weakly_seen(grid: GridSdf, views: Sequence[PhotoView], side: int, lon
     """Smooth the zero set where the views hardly determine it, in place. side: pixels, of the photos in the fit;
     longest: largest q, asset units. Returns the share of the surface that was smoothed."""
     start = Start(grid.values.detach().cpu().numpy(), grid.lo.cpu().numpy(), grid.cell)
-    x, n = _on_surface(grid, surface_of(start, POINTS)[0])
+    x, n = on_surface(grid, surface_of(start, POINTS)[0])
     looked = footprint(start, list(views), side)
     if not len(x) or looked is None:
         return 0.0
     longest = min(longest, MOST * grid.cell)
     length = lengths(information(grid, views, x, n), x, looked.pixel, longest) / grid.cell
-    node = np.argwhere(_band(start.values, grid.cell))
+    node = np.argwhere(band(start.values, grid.cell))
     nearest = cKDTree(x).query(start.lo + grid.cell * node, workers=-1)[1]
     weak = length[nearest] >= LEAST
     if not weak.any():
@@ -103,7 +103,7 @@ def _smoothed(values: F64, node: npt.NDArray[np.int64], weight: F64, wrong: Call
     return out
 
 
-def _band(values: npt.NDArray[np.float32], cell: float) -> Bool:
+def band(values: npt.NDArray[np.float32], cell: float) -> Bool:
     """(X, Y, Z) nodes near the zero set and not at the grid's faces."""
     near = np.zeros(values.shape, np.bool_)
     near[1:-1, 1:-1, 1:-1] = np.abs(values[1:-1, 1:-1, 1:-1]) < BAND * cell
@@ -186,7 +186,7 @@ def _seen(grid: GridSdf, view: PhotoView, x: F64, n: F64) -> tuple[npt.NDArray[n
     return seen, cosine[seen], toward[seen]
 
 
-def _on_surface(grid: GridSdf, near: F64) -> tuple[F64, F64]:
+def on_surface(grid: GridSdf, near: F64) -> tuple[F64, F64]:
     """Points near the zero set, (N, 3), moved onto it by one Newton step, and their unit normals."""
     x = torch.from_numpy(near.astype(np.float32)).to(grid.lo)
     with torch.no_grad():

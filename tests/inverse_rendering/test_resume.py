@@ -23,6 +23,7 @@ STEPS, BAND_EVERY, TOGETHER = 60, 25, 2
 SMALL = Config(  # what a draft leaves to the evidence is left to it here; steps are few, so that all can be tried
     refine_geometry="on",
     refine_poses="on",
+    follow_flow="on",
     weigh_photos=True,
     image_side=96,
     steps=STEPS,
@@ -35,7 +36,7 @@ SMALL = Config(  # what a draft leaves to the evidence is left to it here; steps
     width=16,
 )
 # Before, at and after: warm steps, level, choices and the first shadows; light; settling; other shadows; the end.
-SAVED = (1, 17, 18, 19, 21, 22, 24, 25, 26, 29, 30, 31, 36, 37, 41, 42, 43, 49, 58)
+SAVED = (1, 17, 18, 19, 21, 22, 24, 25, 26, 29, 30, 31, 32, 33, 36, 37, 41, 42, 43, 45, 46, 49, 58)
 
 
 def gains(view: int) -> F64:
