@@ -1,8 +1,8 @@
 """Moves the surface to the depth that the optical flow from the model's pictures to the photos tells.
 
-A step of the fit sees a photo's colours a pixel around the place where the model shows a point. Where the surface is
-millimetres off, as hair before a forehead on an arc of photos, the picture is off by several pixels, the albedo becomes
-the mean of what is shifted against itself, and no gradient leads back. Optical flow finds such shifts.
+A step of the fit sees a photo's colours a pixel around the place where the model shows a point. Hair before a forehead,
+on an arc of photos, starts millimetres off, and its picture is off by pixels. The albedo becomes the mean of pictures
+that are shifted against each other, and no gradient leads back. Optical flow finds such shifts.
 
 Symbols: f_v flow in pixels, from the model's picture to the photo, at a place x of the surface; J_v = d pixel / d x
 (2, 3); g_v gradient of the model's picture; T_v = g g^T / (|g|^2 + FLAT^2), because flow is told across edges only; u
@@ -29,18 +29,17 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from pipeline.fields.face import FaceModel
-from pipeline.fields.geometry import GridSdf
+from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.transforms import projection_slope
 from stages.inverse_rendering.footprint import surface_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView, evenly_spaced
+from stages.inverse_rendering.refine_poses import response_of
 from stages.inverse_rendering.registration import Pair
 from stages.inverse_rendering.sight import pair_of
 from stages.inverse_rendering.weakly_seen import MISSED, band, on_surface, outside
 
-F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 I64 = npt.NDArray[np.int64]
 FOLLOW_AT = (0.54, 0.75)  # shares of the fit: the model is sharp, and has time left; the first before a smoothing
 POINTS = 20_000  # of the surface
@@ -92,11 +91,9 @@ def flow_of(pair: Pair) -> Flow:
 
 def depth(flows: Sequence[Flow], x: F64, n: F64) -> Depth:
     """d at places x with unit normals n, (N, 3)."""
-    near = _window(x, NEAR)
     tree = cKDTree(x)
-    place = [tree.query(f.x)[1] for f in flows]
-    first, second = (_along(n, *_solved(flows[k::2], place[k::2], near, len(x), EXPECTED), EXPECTED)
-                     for k in (0, 1))  # fmt: skip
+    near, place = _window(tree), [tree.query(f.x)[1] for f in flows]
+    first, second = (_along(n, *_solved(flows[k::2], place[k::2], near)) for k in (0, 1))
     signal, noise = near @ (first * second), near @ ((first - second) ** 2) / 4
     used = np.maximum(signal, 0) / np.maximum(np.maximum(signal, 0) + noise, 1e-30)
     total = np.asarray(near.sum(1)).ravel()
@@ -104,30 +101,26 @@ def depth(flows: Sequence[Flow], x: F64, n: F64) -> Depth:
     return Depth(np.clip(d, -MOST, MOST), used)
 
 
-def _window(x: F64, sigma: float) -> csr_array:
+def _window(places: cKDTree) -> csr_array:
     """(N, N) Gaussian weights of the places about each place."""
-    count = min(NEIGHBOURS, len(x))
-    far, index = cKDTree(x).query(x, k=count, workers=-1)
-    far, index = far.reshape(len(x), count), index.reshape(len(x), count)
-    weight = np.exp(-0.5 * (far / sigma) ** 2)
-    rows = np.repeat(np.arange(len(x)), count)
-    return csr_array((weight.ravel(), (rows, index.ravel())), shape=(len(x), len(x)))
+    n = len(places.data)
+    count = min(NEIGHBOURS, n)
+    far, index = places.query(places.data, k=count, workers=-1)
+    weight = np.exp(-0.5 * (far / NEAR) ** 2)
+    return csr_array((weight.ravel(), (np.repeat(np.arange(n), count), index.ravel())), shape=(n, n))
 
 
-def _along(n: F64, u: F64, spread: F64, expected: float) -> F64:
+def _along(n: F64, u: F64, spread: F64) -> F64:
     """(N,) n . u, times the share of the prior's variance along n that the views have taken away: what one view tells
     of a depth is as well a shift along the surface. spread (N, 3, 3): covariance of u."""
-    left = np.einsum("ni,nij,nj->n", n, spread, n) / expected**2
+    left = np.einsum("ni,nij,nj->n", n, spread, n) / EXPECTED**2
     return np.asarray((u * n).sum(1) * (1 - left).clip(0, 1), np.float64)
 
 
-def _solved(
-    flows: Sequence[Flow], place: Sequence[I64], near: csr_array, count: int, expected: float
-) -> tuple[F64, F64]:
-    """u (N, 3) and its covariance (N, 3, 3)."""
-    u = np.zeros((count, 3))
-    prior = np.eye(3) / expected**2
-    spread = np.tile(np.eye(3) * expected**2, (count, 1, 1))
+def _solved(flows: Sequence[Flow], place: Sequence[I64], near: csr_array) -> tuple[F64, F64]:
+    """u (N, 3) and its covariance (N, 3, 3). place: number of the nearest place of each flow's blocks."""
+    count = near.shape[0]
+    u, spread = np.zeros((count, 3)), np.zeros((count, 3, 3))
     for _ in range(ROUNDS):
         A, b = np.zeros((count, 9)), np.zeros((count, 3))
         for f, at in zip(flows, place, strict=True):
@@ -141,23 +134,21 @@ def _solved(
                 A[:, k] += np.bincount(at, square[:, k], count)
             for k in range(3):
                 b[:, k] += np.bincount(at, right[:, k], count)
-        spread = np.linalg.inv((near @ A).reshape(-1, 3, 3) + prior)
+        spread = np.linalg.inv((near @ A).reshape(-1, 3, 3) + np.eye(3) / EXPECTED**2)
         u = np.einsum("nij,nj->ni", spread, near @ b)
     return u, spread
 
 
-def follow_flow(model: FaceModel, grid: GridSdf, views: Sequence[PhotoView], side: int, samples: int, device: str,
-                responses: Callable[[int], F64]) -> float:  # fmt: skip
+def follow_flow(model: FaceModel, views: Sequence[PhotoView], side: int, samples: int, device: str) -> float:
     """Move the zero set of the model's grid, in place, by the flow to photos that are evenly spaced over the views.
 
-    side: of the fit's photos in pixels; responses: (3, 3) of the view of a number. Returns what 95 % of the surface
-    moved by at most, asset units."""
+    side: of the fit's photos in pixels. Returns what 95 % of the surface moved by at most, asset units."""
     chosen = evenly_spaced(len(views), min(MOST_VIEWS, len(views)))
 
     def pair(k: int) -> Pair:
-        return pair_of(model, views[chosen[k]], responses(chosen[k]), side, samples, device)
+        return pair_of(model, views[chosen[k]], response_of(model, chosen[k]), side, samples, device)
 
-    return move_surface(grid, [views[i] for i in chosen], pair, side)
+    return move_surface(grid_of(model.geometry), [views[i] for i in chosen], pair, side)
 
 
 def move_surface(grid: GridSdf, views: Sequence[PhotoView], pairs: Callable[[int], Pair], side: int) -> float:
@@ -169,7 +160,7 @@ def move_surface(grid: GridSdf, views: Sequence[PhotoView], pairs: Callable[[int
     x, n = on_surface(grid, surface_of(start, POINTS)[0])
     if not len(x):
         return 0.0
-    d = depth([flow_of(pairs(i)) for i in range(len(views))], x, n).d.copy()
+    d = depth([flow_of(pairs(i)) for i in range(len(views))], x, n).d
     grown = np.flatnonzero(d > 0)
     d[grown[outside(views, x[grown] + d[grown, None] * n[grown], side) >= MISSED]] = 0
     node = np.argwhere(band(start.values, grid.cell))

@@ -13,7 +13,7 @@ from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
 from stages.inverse_rendering.config import Config
-from stages.inverse_rendering.depth_from_flow import F64, FOLLOW_AT, follow_flow
+from stages.inverse_rendering.depth_from_flow import FOLLOW_AT, follow_flow
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.model_selection import (
     SELECTION_AT,
@@ -31,7 +31,7 @@ from stages.inverse_rendering.model_selection import (
 )
 from stages.inverse_rendering.objective import Terms, terms
 from stages.inverse_rendering.ray_sampling import U8, Batch
-from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory, response_of
+from stages.inverse_rendering.refine_poses import REFINE_AT, PoseHistory
 from stages.inverse_rendering.robust import OBSERVE_FROM, WEIGH_AT, Robust
 from stages.inverse_rendering.schedule import (
     LEVEL_STARTS,
@@ -213,13 +213,9 @@ class Trainer(TrialLoop):
         if self.settings.follow_flow != "on" or self.followed >= due or self.geometry_frozen or self.choices is None:
             return
         side, samples = self.settings.image_side, self.settings.samples
-        moved = follow_flow(self.model, self.grid, self.views, side, samples, self.device, self.response)
+        moved = follow_flow(self.model, self.views, side, samples, self.device)
         self.flowed = max(self.flowed, moved)
         self.followed = due
-
-    def response(self, number: int) -> F64:
-        """(3, 3) of a photo, from the model's colours to the photo's."""
-        return response_of(self.model, number)
 
     def smooth(self) -> None:
         """Smooth the surface where the photos hardly determine it, when it is due."""

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from pipeline.meshes import F64
+from pipeline.meshes import F32, F64
 from pipeline.registration.carve import possible_space, space_near_head
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.model import Template
@@ -48,9 +48,7 @@ def carved_by_template(
     x, y, z = start.values.shape
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
-    front = head.world_from_template[:3, 2] / head.scale
-    space = bound_with_silhouettes(start, space, front, views, check)
-    return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)
+    return _cut(start, space, head, views, check)
 
 
 def without_far_parts(
@@ -62,6 +60,11 @@ def without_far_parts(
     space = space_near_head(template, head, start.lo.astype(np.float64), start.cell, (x, y, z))
     if not ((start.values < 0) & (space > 0)).any():
         return start
+    return _cut(start, space, head, views, check)
+
+
+def _cut(start: Start, space: F32, head: PlacedHead, views: list[PhotoView], check: Callable[[], None]) -> Start:
+    """The start within a space (X, Y, Z), negative inside, and what else the silhouettes need of it."""
     front = head.world_from_template[:3, 2] / head.scale
-    space = bound_with_silhouettes(start, space, front, views, check)
-    return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)
+    bound = bound_with_silhouettes(start, space, front, views, check)
+    return Start(distances(np.maximum(start.values, bound), start.lo, start.cell), start.lo, start.cell)

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.errors import StageError
-from pipeline.maths.tracing import box_interval
 from pipeline.meshes import F64
 from pipeline.registration.shell import outer_shell, shell_distance
 from pipeline.template.load import load_template
 from stages.inverse_rendering.choose_start import ChosenStart, choose_start
 from stages.inverse_rendering.config import PRIORS, Config
-from stages.inverse_rendering.dense_stereo import pixel_rays
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.template_start import FAR, landmarks_off
+from tests.inverse_rendering.test_keep_silhouettes import met
 
 TEMPLATE = load_template()
 CELL, SHAPE = 0.006, (56, 76, 62)
@@ -79,10 +78,8 @@ def test_a_tail_behind_the_neck_is_cut_off_unless_a_photo_shows_it(shown: bool) 
     side = np.eye(4)
     side[:3, :3], side[:3, 3] = np.array([[0, 0, 1.0], [0, -1, 0], [1, 0, 0]]), [-1.2, 0, back]
     K = np.array([[300.0, 0, 100], [0, 300.0, 100], [0, 0, 1]])
-    rows, columns = (x.ravel() for x in np.mgrid[:200, :200])
-    o, d, _ = pixel_rays(K, side, rows, columns)
     surface = (hull if shown else Start(found.values, hull.lo, CELL)).surface("cpu")
-    mask = np.asarray(surface.trace(o, d, *box_interval(o, d, *surface.box()))[1]).reshape(200, 200)
+    mask = met(surface, K, side, 200)
     view = PhotoView(0, np.zeros((200, 200, 3), np.float32), mask.astype(np.float32), K, side, np.zeros(5))
     start = choose_start(hull, [*CAMERAS, view], marks(), Config(stereo="off"), "cpu").start
     far = (node[..., 2] < back - 0.12) & (tail < -CELL)

@@ -111,6 +111,17 @@ def sight(pose: F64, shown: float, true: float) -> Pair:
                 inverse_rigid(pose), NONE, 1)  # fmt: skip
 
 
+def grid_and_views(radius: float, alpha: float) -> tuple[GridSdf, list[PhotoView]]:
+    """A ball around the origin, and views of an arc whose masks are the same everywhere."""
+    cell, count = 0.004, 60
+    lo = np.full(3, -0.5 * cell * (count - 1))
+    node = np.stack(np.meshgrid(*(lo[a] + cell * np.arange(count) for a in range(3)), indexing="ij"), -1)
+    values = torch.from_numpy((np.linalg.norm(node, axis=-1) - radius).astype(np.float32))
+    black, mask = np.zeros((SIDE, SIDE, 3), np.float32), np.full((SIDE, SIDE), alpha, np.float32)
+    views = [PhotoView(i, black, mask, SMALL, p, NONE) for i, p in enumerate(poses(25))]
+    return GridSdf(values, torch.from_numpy(lo.astype(np.float32)), cell), views
+
+
 def test_flow_of_pictures_agrees_with_the_projection() -> None:
     pose = poses(20)[2]
     found = flow_of(sight(pose, 0.098, RADIUS))
@@ -125,13 +136,7 @@ def test_flow_of_pictures_agrees_with_the_projection() -> None:
 
 @pytest.mark.parametrize("shown", [0.097, 0.103])
 def test_a_ball_of_the_wrong_size_comes_to_the_right_one_in_front(shown: float) -> None:
-    cell, count = 0.004, 60
-    lo = np.full(3, -0.5 * cell * (count - 1))
-    node = np.stack(np.meshgrid(*(lo[a] + cell * np.arange(count) for a in range(3)), indexing="ij"), -1)
-    values = torch.from_numpy((np.linalg.norm(node, axis=-1) - shown).astype(np.float32))
-    grid = GridSdf(values, torch.from_numpy(lo.astype(np.float32)), cell)
-    views = [PhotoView(i, np.zeros((SIDE, SIDE, 3), np.float32), np.ones((SIDE, SIDE), np.float32), SMALL, p, NONE)
-             for i, p in enumerate(poses(25))]  # fmt: skip
+    grid, views = grid_and_views(shown, 1.0)
     moved = move_surface(grid, views, lambda k: sight(views[k].world_from_cam, shown, RADIUS), SIDE)
     front = torch.from_numpy((RADIUS * cap()[cap()[:, 2] > 0.75]).astype(np.float32))
     back = torch.tensor([[0.0, 0.0, -shown]])
@@ -141,15 +146,9 @@ def test_a_ball_of_the_wrong_size_comes_to_the_right_one_in_front(shown: float) 
 
 
 def test_nothing_moves_out_of_the_masks() -> None:
-    """The model is too small; photos whose masks end at the model's outline hold it there."""
-    cell, count, shown = 0.004, 60, 0.097
-    lo = np.full(3, -0.5 * cell * (count - 1))
-    node = np.stack(np.meshgrid(*(lo[a] + cell * np.arange(count) for a in range(3)), indexing="ij"), -1)
-    values = torch.from_numpy((np.linalg.norm(node, axis=-1) - shown).astype(np.float32))
-    grid = GridSdf(values, torch.from_numpy(lo.astype(np.float32)), cell)
-    nothing = np.zeros((SIDE, SIDE), np.float32)
-    views = [PhotoView(i, np.zeros((SIDE, SIDE, 3), np.float32), nothing, SMALL, p, NONE)
-             for i, p in enumerate(poses(25))]  # fmt: skip
+    """The model is too small, but the masks show nothing, so that it does not grow."""
+    shown = 0.097
+    grid, views = grid_and_views(shown, 0.0)
     assert move_surface(grid, views, lambda k: sight(views[k].world_from_cam, shown, RADIUS), SIDE) < 1e-3
     with torch.no_grad():
         assert float(grid(torch.tensor([[0.0, 0.0, RADIUS]]))[0]) > 0.0025

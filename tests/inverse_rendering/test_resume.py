@@ -35,7 +35,7 @@ SMALL = Config(  # what a draft leaves to the evidence is left to it here; steps
     hash_fine=0.004,
     width=16,
 )
-# Before, at and after: warm steps, level, choices and the first shadows; light; settling; other shadows; the end.
+# Before, at and after: warm steps, level, choices and the first shadows; light; settling; flow; other shadows; the end.
 SAVED = (1, 17, 18, 19, 21, 22, 24, 25, 26, 29, 30, 31, 32, 33, 36, 37, 41, 42, 43, 45, 46, 49, 58)
 
 
