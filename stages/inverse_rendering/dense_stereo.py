@@ -57,7 +57,7 @@ SPECKLE = 60  # pixels
 MIN_SCORE = 0.4  # NCC below which a depth is not used
 CLEAR = 7  # pixels: side of the square around a blank pixel in which no depth is estimated: highlights have no place
 WHITE = 0.9  # of the photo's largest value: a clipped pixel is blank if all its channels exceed it
-MARGIN = 1.0  # cells by which the range of a ray exceeds the hull
+MARGIN = 3.0  # cells by which the surface may exceed the hull, which masks that are too small cut into the subject
 
 
 @dataclass(frozen=True, slots=True)

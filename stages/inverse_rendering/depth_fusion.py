@@ -3,7 +3,8 @@
 Near a depth map's surface a grid node's distance is known, and so is that a camera sees through the nodes in front of
 it. The surface between is the smoothest one: the squared Laplacian of the distance is minimised, with the surface that
 is known so far as a weak target: the hull, or the hull after the plane sweep. So a hole in the depth maps is closed by
-continuing the surface around it, and what no depth map shows keeps the known shape. The result never exceeds the hull.
+continuing the surface around it, and what no depth map shows keeps the known shape. The result exceeds the hull by at
+most the margin of the depth maps' own ranges.
 
 Symbols: f distance at the nodes in the hull, t and W the depth maps' mean distance and its weight, s that of the known
 surface, all in cells; L the Laplacian of the grid. Minimised: sum W (f - t)^2 + SCREEN (f - s)^2 + |L f|^2.
@@ -19,7 +20,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline import transforms
-from stages.inverse_rendering.dense_stereo import DepthMaps
+from stages.inverse_rendering.dense_stereo import MARGIN, DepthMaps
 from stages.inverse_rendering.depth_kernels import integrate
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.smoothest import smoothest
@@ -29,7 +30,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 BAND = 3.0  # cells in front of and behind a depth in which its distance counts
-SHELL = 1.0  # cells outside of the hull that are solved for
+SHELL = MARGIN + 1  # cells outside of the hull that are solved for
 CERTAIN = 1.0  # sum of weights at which a node's data counts half of its most
 MIN_VOTES = 0.3  # smaller sums are a single view's: not used
 SUPPORT = 5  # nodes: side of the cube whose nodes must mostly have votes, too, so that stray ones weigh little
@@ -42,7 +43,9 @@ def fused(hull: Start, maps: DepthMaps, check: Callable[[], None] = lambda: None
     """The start whose surface goes through the depth maps. known: on the hull's grid, the surface where they say
     nothing, itself if they are empty; None: the hull."""
     known = known or hull
-    limit, level = (np.clip(x.values / hull.cell, -BAND, BAND).astype(np.float64) for x in (hull, known))
+    limit, level = (
+        np.clip(x / hull.cell, -BAND, BAND).astype(np.float64) for x in (hull.values - MARGIN * hull.cell, known.values)
+    )
     inside = hull.values < SHELL * hull.cell
     mean, weight = votes(hull, inside, maps, check)
     if not (weight > 0).any():
