@@ -44,6 +44,8 @@ COMPARED = 4  # neighbours of each validation view
 VALIDATION, MIN_VIEWS = 6, 8  # validation views; with fewer views than MIN_VIEWS there is no choice: the sweep
 HIDDEN = 0.02  # share of the depth by which a point may lie behind the surface that a neighbour sees
 
+GAIN = 0.01  # by how much the mean correlation of depth maps must be higher: exact masks know outlines better than they
+
 
 def stereo_start(
     hull: Start,
@@ -75,13 +77,14 @@ def stereo_start(
     maps = depth_maps(hull, views, check, waiting)
     without_them = dense(without(maps, waiting), seen)
     swept, found = (correlation(s, known, poses, waiting, neighbours, check) for s in (sweep, without_them))
+    better = found > swept + GAIN
     facts: Facts = {
-        "start": "dense" if found > swept else "sweep",
+        "start": "dense" if better else "sweep",
         "sweep_correlation": round(swept, 4),
         "dense_correlation": round(found, 4),
     }
     log.info("start from stereo: %s", facts)
-    start = dense(maps, views) if found > swept else sweep
+    start = dense(maps, views) if better else sweep
     return start, {**facts, "why": "correlation of the photos on validation views"}
 
 

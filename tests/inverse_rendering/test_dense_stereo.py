@@ -331,8 +331,8 @@ def test_blank_photos_keep_the_sweep() -> None:
     assert facts["start"] == "sweep"
 
 
-@pytest.mark.parametrize(("correlation", "chosen"), [(0.49, "sweep"), (0.5, "sweep"), (0.51, "dense")])
-def test_depth_maps_are_used_where_they_show_validation_views_better(
+@pytest.mark.parametrize(("correlation", "chosen"), [(0.49, "sweep"), (0.509, "sweep"), (0.511, "dense")])
+def test_depth_maps_are_used_where_they_show_validation_views_clearly_better(
     monkeypatch: pytest.MonkeyPatch, correlation: float, chosen: str
 ) -> None:
     """Starts are named by what they are made of; the sweep's correlation is 0.5. The maps that are compared lack the
