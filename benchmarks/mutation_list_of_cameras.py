@@ -10,7 +10,7 @@ ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/tes
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
-FLOW, DENSE = "tests/inverse_rendering/test_depth_from_flow.py", "tests/inverse_rendering/test_dense_stereo.py"
+FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
 BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
 IMAGES, RENDER = "tests/core/test_images.py", "tests/usd/test_usd_render.py"
 
@@ -136,16 +136,6 @@ OF_CAMERAS = (
              f"{FLOW}::test_a_ball_of_the_wrong_size_comes_to_the_right_one_in_front"),
     Mutation("stages/inverse_rendering/depth_from_flow.py", ">= MISSED]] = 0", ">= 10**6]] = 0",
              f"{FLOW}::test_nothing_moves_out_of_the_masks"),
-    # ---------------------------------------------------------------- depth maps on the sweep's surface
-    Mutation("stages/inverse_rendering/depth_fusion.py", "hull.values - MARGIN * hull.cell", "hull.values",
-             f"{DENSE}::test_a_hull_that_cuts_into_the_subject_is_exceeded"),
-    Mutation("stages/inverse_rendering/depth_fusion.py", "(1 - share) * level", "(1 - share) * limit",
-             f"{DENSE}::test_what_no_depth_map_shows_is_the_known_surface"),
-    Mutation("stages/inverse_rendering/stereo_choice.py", "dense(maps, views) if better else sweep",
-             "without_them if better else sweep",
-             f"{DENSE}::test_depth_maps_are_used_where_they_show_validation_views_clearly_better"),
-    Mutation("stages/inverse_rendering/stereo_choice.py", "maps, check, sweep)", "maps, check, hull)",
-             f"{DENSE}::test_depth_maps_are_used_where_they_show_validation_views_clearly_better"),
     # ---------------------------------------------------------------- what lies far from a head
     Mutation("stages/inverse_rendering/template_start.py", "if not ((start.values < 0) & (space > 0)).any():",
              "if True:", "tests/inverse_rendering/test_choose_start.py"),

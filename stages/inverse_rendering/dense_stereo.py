@@ -36,7 +36,7 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.intp]
-COARSE, FINE = 224, 320  # pixels of the subject's longest side in the sweep and in the refinement
+COARSE, FINE = 160, 320  # pixels of the subject's longest side in the sweep and in the refinement
 BORDER = 6  # pixels around the subject
 BLUR = 0.6  # pixels, against noise and aliasing
 NEIGHBOURS, REFINED = 6, 4  # of a view; of these, the best ones with which its depths are refined
@@ -46,7 +46,7 @@ MIN_ANGLE, MAX_ANGLE = 2.0, 40.0  # degrees
 HALF = 3  # the sweep's windows have 2 HALF + 1 pixels
 PLANES_PER_PIXEL, MIN_PLANES, MAX_PLANES = 1.4, 16, 256
 P1, P2 = 0.03, 0.25  # penalties of the aggregation: step of one plane, larger step
-STRIDE, ROUNDS, PULL = 2, 1, 0.04
+STRIDE, ROUNDS, PULL = 2, 2, 0.04
 SAME_DEPTH, SAME_PIXEL, AGREEING = (
     3.0,
     1.0,
@@ -57,7 +57,7 @@ SPECKLE = 60  # pixels
 MIN_SCORE = 0.4  # NCC below which a depth is not used
 CLEAR = 7  # pixels: side of the square around a blank pixel in which no depth is estimated: highlights have no place
 WHITE = 0.9  # of the photo's largest value: a clipped pixel is blank if all its channels exceed it
-MARGIN = 3.0  # cells by which the surface may exceed the hull, which masks that are too small cut into the subject
+MARGIN = 1.0  # cells by which the range of a ray exceeds the hull
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +94,13 @@ def depth_maps(
     views: list[PhotoView],
     check: Callable[[], None] = lambda: None,
     alone: tuple[int, ...] = (),
+    scale: float = 1.0,
 ) -> DepthMaps:
     """Consistent depth maps of all views within the hull. check: raises if the run was cancelled. alone: positions of
-    views that are nobody's neighbour, so that the other views' depths do not depend on them."""
+    views that are nobody's neighbour, so that the other views' depths do not depend on them. scale: of the pictures."""
     poses = np.stack([v.world_from_cam for v in views])
     neighbours = neighbours_of(hull, views, alone)
-    coarse, fine = (pictures_of(views, hull, side) for side in (COARSE, FINE))
+    coarse, fine = (pictures_of(views, hull, round(scale * side)) for side in (COARSE, FINE))
     planes = np.full((*fine.grey.shape, 3), np.nan, np.float32)
     score = np.full(fine.grey.shape, kernels.FAILED, np.float32)
 

@@ -1,13 +1,12 @@
 """Fusion of depth maps into a signed distance within the hull.
 
 Near a depth map's surface a grid node's distance is known, and so is that a camera sees through the nodes in front of
-it. The surface between is the smoothest one: the squared Laplacian of the distance is minimised, with the surface that
-is known so far as a weak target: the hull, or the hull after the plane sweep. So a hole in the depth maps is closed by
-continuing the surface around it, and what no depth map shows keeps the known shape. The result exceeds the hull by at
-most the margin of the depth maps' own ranges.
+it. The surface between is the smoothest one: the squared Laplacian of the distance is minimised, with the hull as a
+weak target. So a hole in the depth maps is closed by continuing the surface around it, and what no depth map shows
+keeps the hull's shape. The result never exceeds the hull.
 
-Symbols: f distance at the nodes in the hull, t and W the depth maps' mean distance and its weight, s that of the known
-surface, all in cells; L the Laplacian of the grid. Minimised: sum W (f - t)^2 + SCREEN (f - s)^2 + |L f|^2.
+Symbols: f distance at the nodes in the hull, t and W the depth maps' mean distance and its weight, s the hull's
+distance, all in cells; L the Laplacian of the grid. Minimised: sum W (f - t)^2 + SCREEN (f - s)^2 + |L f|^2.
 Source: Curless and Levoy, A volumetric method for building complex models (1996); smoothest.py for the closing.
 """
 
@@ -20,7 +19,7 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from pipeline import transforms
-from stages.inverse_rendering.dense_stereo import MARGIN, DepthMaps
+from stages.inverse_rendering.dense_stereo import DepthMaps
 from stages.inverse_rendering.depth_kernels import integrate
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.smoothest import smoothest
@@ -30,32 +29,28 @@ F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 BAND = 3.0  # cells in front of and behind a depth in which its distance counts
-SHELL = MARGIN + 1  # cells outside of the hull that are solved for
+SHELL = 1.0  # cells outside of the hull that are solved for
 CERTAIN = 1.0  # sum of weights at which a node's data counts half of its most
 MIN_VOTES = 0.3  # smaller sums are a single view's: not used
 SUPPORT = 5  # nodes: side of the cube whose nodes must mostly have votes, too, so that stray ones weigh little
-DATA, SCREEN = 20.0, 7.7e-4  # weights of data and known surface; SCREEN^(-1/4) = 6 cells: larger holes keep its shape
-REACH = 6.0  # cells from the nearest data: from there on the known surface takes over, fully at twice of it
+DATA, SCREEN = 20.0, 7.7e-4  # weights of data and hull; SCREEN^(-1/4) = 6 cells: larger holes keep the hull's shape
+REACH = 6.0  # cells from the nearest data: from there on the hull's own distance takes over, fully at twice of it
 COARSEST = 24  # nodes of the longest side at which no coarser grid is used
 
 
-def fused(hull: Start, maps: DepthMaps, check: Callable[[], None] = lambda: None, known: Start | None = None) -> Start:
-    """The start whose surface goes through the depth maps. known: on the hull's grid, the surface where they say
-    nothing, itself if they are empty; None: the hull."""
-    known = known or hull
-    limit, level = (
-        np.clip(x / hull.cell, -BAND, BAND).astype(np.float64) for x in (hull.values - MARGIN * hull.cell, known.values)
-    )
+def fused(hull: Start, maps: DepthMaps, check: Callable[[], None] = lambda: None) -> Start:
+    """The start whose surface goes through the depth maps; the hull itself if they are empty."""
+    level = np.clip(hull.values / hull.cell, -BAND, BAND).astype(np.float64)
     inside = hull.values < SHELL * hull.cell
     mean, weight = votes(hull, inside, maps, check)
     if not (weight > 0).any():
-        return known
+        return hull
     away = ndimage.distance_transform_edt(weight < 0.1)
     share = np.clip(2 - away / REACH, 0, 1)  # of the smooth surface; the closing rounds what it need not change
     values = share * closed(level, inside, mean, weight, check) + (1 - share) * level
-    values = np.maximum(values, limit) * hull.cell
+    values = np.maximum(values, level) * hull.cell
     if not (values < 0).any():
-        return known
+        return hull
     return Start(distances(values, hull.lo, hull.cell), hull.lo, hull.cell)
 
 

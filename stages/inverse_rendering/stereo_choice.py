@@ -3,7 +3,9 @@
 Photos of the neighbours are projected onto a candidate's surface and from there into a validation view, where windows
 of both are compared by normalised cross-correlation, which does not depend on exposure. A pixel that no neighbour sees
 scores 0, so that a surface cannot win by hiding what it shows wrong. Depth maps are fused without the validation
-views for this comparison. What they do not show is the sweep's.
+views for this comparison.
+
+Depth maps take most of the time, and where the sweep is right they are not used. So small ones are compared first.
 """
 
 from __future__ import annotations
@@ -43,8 +45,12 @@ WINDOW = 9  # pixels
 COMPARED = 4  # neighbours of each validation view
 VALIDATION, MIN_VIEWS = 6, 8  # validation views; with fewer views than MIN_VIEWS there is no choice: the sweep
 HIDDEN = 0.02  # share of the depth by which a point may lie behind the surface that a neighbour sees
+GAIN = (
+    0.01  # by how much the mean correlation of dense stereo must be higher: below, the sweep's finer steps are better
+)
 
-GAIN = 0.01  # by how much the mean correlation of depth maps must be higher: exact masks know outlines better than they
+
+QUICK, FINER = 0.6, 0.015  # scale of the small depth maps; by how much the whole ones may be better (docs/model.md)
 
 
 def stereo_start(
@@ -59,33 +65,40 @@ def stereo_start(
 
     The sweep has read the validation views, too, so that the comparison favours it a little.
     """
-    sweep = start_from_photos(hull, views, device, check, sweeps)
     if kind == "sweep" or (kind == "auto" and len(views) < MIN_VIEWS):
-        return sweep, {"start": "sweep", "why": "setting" if kind == "sweep" else f"fewer than {MIN_VIEWS} views"}
+        why = "setting" if kind == "sweep" else f"fewer than {MIN_VIEWS} views"
+        return start_from_photos(hull, views, device, check, sweeps), {"start": "sweep", "why": why}
 
-    def dense(maps: DepthMaps, seen: list[PhotoView]) -> Start:
+    def dense_start(maps: DepthMaps, seen: list[PhotoView]) -> Start:
         """The fused surface; the short sweeps along its normals, which are right by now, add what fusion smoothed."""
-        return start_from_photos(fused(hull, maps, check, sweep), seen, device, check, SWEEPS[1:])
+        return start_from_photos(fused(hull, maps, check), seen, device, check, SWEEPS[1:])
 
     if kind == "dense":
-        return dense(depth_maps(hull, views, check), views), {"start": "dense", "why": "setting"}
+        return dense_start(depth_maps(hull, views, check), views), {"start": "dense", "why": "setting"}
     waiting = validation_views(len(views))
     seen = [v for n, v in enumerate(views) if n not in waiting]
     known = pictures_of(views, None, SIDE)
     neighbours = neighbours_of(hull, views, waiting)
     poses = np.stack([v.world_from_cam for v in views])
-    maps = depth_maps(hull, views, check, waiting)
-    without_them = dense(without(maps, waiting), seen)
-    swept, found = (correlation(s, known, poses, waiting, neighbours, check) for s in (sweep, without_them))
-    better = found > swept + GAIN
-    facts: Facts = {
-        "start": "dense" if better else "sweep",
-        "sweep_correlation": round(swept, 4),
-        "dense_correlation": round(found, 4),
-    }
+
+    def score(start: Start) -> float:
+        return correlation(start, known, poses, waiting, neighbours, check)
+
+    def dense_score(maps: DepthMaps) -> float:
+        return score(dense_start(without(maps, waiting), seen))
+
+    start = start_from_photos(hull, views, device, check, sweeps)
+    swept = score(start)
+    least = swept + GAIN
+    found, sized, name = dense_score(depth_maps(hull, views, check, waiting, QUICK)), "small ", "sweep"
+    maps = depth_maps(hull, views, check, waiting) if found > least - FINER else None
+    if maps is not None and found <= least:
+        found, sized = dense_score(maps), ""
+    if maps is not None and found > least:
+        start, name = dense_start(maps, views), "dense"
+    facts: Facts = {"start": name, "sweep_correlation": round(swept, 4), "dense_correlation": round(found, 4)}
     log.info("start from stereo: %s", facts)
-    start = dense(maps, views) if better else sweep
-    return start, {**facts, "why": "correlation of the photos on validation views"}
+    return start, {**facts, "why": f"correlation of the {sized}photos on validation views"}
 
 
 def validation_views(views: int) -> tuple[int, ...]:

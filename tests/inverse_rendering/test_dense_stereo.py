@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -264,42 +265,6 @@ def test_a_hole_in_a_plane_is_closed_by_the_plane_and_not_by_the_hull() -> None:
     assert abs(nothing[12, 12, 16]) < 0.5
 
 
-def exact_maps(views: int = 9) -> dense.DepthMaps:
-    """Depth maps of the ball in closed form, 80 pixels wide."""
-    inverse, slope, Ks, poses = [], [], [], []
-    for i in range(views):
-        K, pose = camera(i, views)
-        K[:2] *= 80 / SIDE
-        o, d = transforms.rays(K, pose, np.zeros(5), transforms.pixel_centres(80, 80))
-        w = (1 / (hits(o, d, bowl=False) * (d @ pose[:3, 2]))).reshape(80, 80)
-        rows, columns = np.gradient(w)
-        w[~np.isfinite(rows + columns)] = np.nan
-        inverse, slope = [*inverse, w], [*slope, np.stack([columns, rows], -1)]
-        Ks, poses = [*Ks, K], [*poses, pose]
-    known = np.isfinite(inverse)
-    return dense.DepthMaps(np.array(inverse, np.float32), np.nan_to_num(np.array(slope, np.float32)),
-                           known.astype(np.float32), np.array(Ks), np.array(poses))  # fmt: skip
-
-
-def test_a_hull_that_cuts_into_the_subject_is_exceeded() -> None:
-    """By masks that are too small: the hull lies more than a cell within the ball."""
-    tight = hull(0.93 * RADIUS)
-    assert along_axis(fused(tight, exact_maps())) == pytest.approx(RADIUS, abs=0.1 * tight.cell)
-
-
-def test_what_no_depth_map_shows_is_the_known_surface() -> None:
-    """The cameras are in front of the ball: there the surface is the ball's, behind it the known one's."""
-    limit, maps = hull(), exact_maps()
-    known = Start(limit.values + np.float32(0.04 * RADIUS), limit.lo, limit.cell)  # of 1.06 RADIUS
-    found = fused(limit, maps, known=known)
-    n = len(found.values) // 2
-    assert along_axis(found) == pytest.approx(RADIUS, abs=0.1 * limit.cell)
-    behind = np.abs(known.values[n, n, :n]) < 1.5 * limit.cell
-    assert np.allclose(found.values[n, n, :n][behind], known.values[n, n, :n][behind], atol=0.2 * limit.cell)
-    nothing = dataclasses.replace(maps, weight=np.zeros_like(maps.weight))
-    assert fused(limit, nothing, known=known) is known and fused(limit, nothing) is limit
-
-
 # ------------------------------------------------------------------ choice
 def test_windowed_correlation() -> None:
     rng = np.random.default_rng(1)
@@ -331,21 +296,38 @@ def test_blank_photos_keep_the_sweep() -> None:
     assert facts["start"] == "sweep"
 
 
-@pytest.mark.parametrize(("correlation", "chosen"), [(0.49, "sweep"), (0.509, "sweep"), (0.511, "dense")])
-def test_depth_maps_are_used_where_they_show_validation_views_clearly_better(
-    monkeypatch: pytest.MonkeyPatch, correlation: float, chosen: str
+@pytest.mark.parametrize(
+    ("small", "whole", "made", "chosen"),
+    [
+        (0.494, 0.9, [0.6], "sweep"),  # clearly worse: the whole depth maps are not made
+        (0.5, 0.505, [0.6, 1.0], "sweep"),
+        (0.5, 0.52, [0.6, 1.0], "dense"),
+        (0.52, float("nan"), [0.6, 1.0], "dense"),  # clearly better: they are made without another comparison
+    ],
+)
+def test_small_depth_maps_are_compared_first(
+    monkeypatch: pytest.MonkeyPatch, small: float, whole: float, made: list[float], chosen: str
 ) -> None:
-    """Starts are named by what they are made of; the sweep's correlation is 0.5. The maps that are compared lack the
-    votes of the validation views; those of the final start have them."""
-    scores = {"sweep": 0.5, "maps without votes on sweep": correlation}
-    monkeypatch.setattr(stereo_choice, "depth_maps", lambda hull, views, check, alone: "maps")
-    monkeypatch.setattr(stereo_choice, "without", lambda made, waiting: f"{made} without votes")
-    monkeypatch.setattr(stereo_choice, "fused", lambda hull, made, check, known: f"{made} on {known}")
-    monkeypatch.setattr(stereo_choice, "start_from_photos", lambda base, *_: base if isinstance(base, str) else "sweep")
+    """Starts are named by what they are made of; the sweep's correlation is 0.5."""
+    scales: list[float] = []
+    scores = {"sweep": 0.5, 0.6: small, 1.0: whole}
+    many = photos(9)
+
+    def maps(hull: Any, views: Any, check: Any, alone: Any, scale: float = 1.0) -> float:
+        scales.append(scale)
+        return scale
+
+    monkeypatch.setattr(stereo_choice, "depth_maps", maps)
+    monkeypatch.setattr(stereo_choice, "without", lambda made, waiting: made)
+    monkeypatch.setattr(stereo_choice, "fused", lambda hull, made, check: made)
+    monkeypatch.setattr(
+        stereo_choice, "start_from_photos", lambda base, *_: base if isinstance(base, float) else "sweep"
+    )
     monkeypatch.setattr(stereo_choice, "correlation", lambda start, *_: scores[start])
-    start, facts = stereo_start(hull(), photos(9), "auto", "cpu")
-    assert facts["start"] == chosen
-    assert start == ("maps on sweep" if chosen == "dense" else "sweep")
+    start, facts = stereo_start(hull(), many, "auto", "cpu")
+    assert scales == made and facts["start"] == chosen
+    assert start == (1.0 if chosen == "dense" else "sweep")
+    assert ("small photos" in str(facts["why"])) == (facts["dense_correlation"] == small and whole != small)
 
 
 def test_few_views_give_no_choice() -> None:

@@ -33,9 +33,9 @@ CORNER = 8 * 2 * 2 + 12  # one level of the hash encoding: eight corners of two 
 HARMONIC = 4 * 3  # one function of the light in three colours, with its recurrence
 ADAM, ADAM_BYTES, BAND = 12, 28, 6  # one coefficient; bytes it reads and writes; cells of the band that is fitted
 SWEPT = 17 + 13  # sample of the plane sweep: projection, bilinear look-up, sums of a correlation
-PLANES, PLANE = 140, 100  # planes of a small picture; pixel on one in one neighbour: warp, running sums, aggregation
+PLANES, PLANE = 100, 100  # planes of a small picture; pixel on one in one neighbour: warp, running sums, aggregation
 PATCH = 25 * 30  # plane of a pixel in one neighbour: 25 projected samples
-CANDIDATES = 7  # planes that are tried for a pixel in each round
+TRIALS = 1 + 2 * 7  # planes that are tried for a pixel
 SHADOW_POINTS, SHADOW_RAYS = 12_000, 400  # nodes where shadows are solved; rays from each
 BLOCK = 8  # lattice points evaluated for one that the surface crosses
 COLLAPSE = 600  # face that decimation removes: quadrics and a heap
@@ -185,16 +185,18 @@ def swept(c: Counts) -> float:
 
 
 def depth_maps(c: Counts) -> float:
-    """Operations of the depth maps."""
+    """Operations of the depth maps: the small ones, and the whole ones where the fit made them."""
     from stages.inverse_rendering import dense_stereo as dense
+    from stages.inverse_rendering.stereo_choice import QUICK
 
     if c.choice("inverse_rendering.stereo") in ("off", "sweep"):
         return 0.0
-    trials = 1 + CANDIDATES * dense.ROUNDS
+    chosen = c.choice("inverse_rendering.stereo") == "auto"
+    scales = ([QUICK] if chosen else []) + ([1.0] if c.whole_maps or not chosen else [])
     per_view = 0.5 * (
-        dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE + dense.FINE**2 * trials * dense.REFINED * PATCH
+        dense.COARSE**2 * PLANES * dense.NEIGHBOURS * PLANE + dense.FINE**2 * TRIALS * dense.REFINED * PATCH
     )
-    return c.fitted * per_view
+    return c.fitted * per_view * sum(s * s for s in scales)
 
 
 def surface(c: Counts) -> Work:
