@@ -8,6 +8,9 @@ from torch import Tensor
 from pipeline.colour import srgb_from_linear
 from pipeline.maths.precision import full_precision
 
+RGB_SCALE = 0.06  # sRGB; residual at which the colour loss pulls as hard as an absolute value
+RGB_LINEAR = 0.25  # sRGB; residual from which on it pulls no harder: hands, moved shadows, wrong masks
+
 
 @full_precision
 def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
@@ -20,17 +23,32 @@ def rgb_l1(predicted: Tensor, target_srgb: Tensor) -> Tensor:
 
 
 @full_precision
-def rgb_bounded(predicted: Tensor, target_srgb: Tensor, bound: Tensor) -> Tensor:
-    """`rgb_l1` with clipped values as inequalities: (N, 3) linear, (N, 3) encoded, (N, 3) -> (N,). Not in the paper.
+def rgb_residual(predicted: Tensor, target_srgb: Tensor, bound: Tensor) -> Tensor:
+    """|I - I_bar| by channel, with clipped values as inequalities: (N, 3) linear, (N, 3) encoded, (N, 3) -> (N, 3).
 
-        |r| where bound = 0,  max(-r, 0) where bound > 0,  max(r, 0) where bound < 0;  r = I - I_bar, mean over channels
+        |r| where bound = 0,  max(-r, 0) where bound > 0,  max(r, 0) where bound < 0;  r = I - I_bar, sRGB-encoded
 
     A sensor's largest value only says that the radiance is at least this value (bound > 0), its smallest that it is at
-    most this value (bound < 0).
+    most this value (bound < 0). Not in the paper.
     """
     r = srgb_from_linear(predicted) - target_srgb
     allowed = ((bound > 0) & (r > 0)) | ((bound < 0) & (r < 0))
-    return torch.where(allowed, torch.zeros_like(r), r.abs()).mean(-1)
+    return torch.where(allowed, torch.zeros_like(r), r.abs())
+
+
+@full_precision
+def rgb_cost(residual: Tensor) -> Tensor:
+    """Mean over the channels of Huber's loss of residuals r >= 0, sRGB-encoded: (N, 3) -> (N,).
+
+        r^2 / (2 RGB_SCALE) up to RGB_LINEAR, from there on continued by its tangent
+
+    At r = RGB_SCALE its slope is that of `rgb_l1`. Below, it is smaller: the absolute value pulls at a pixel that is
+    wrong by its noise alone as hard as at any other, and moves the surface by that.
+    Differs from [NeuFace eq. 21], which is `rgb_l1`. Source: Huber, Robust estimation of a location parameter (1964).
+    """
+    square = residual**2 / 2
+    tail = RGB_LINEAR * (residual - RGB_LINEAR / 2)
+    return torch.where(residual < RGB_LINEAR, square, tail).mean(-1) / RGB_SCALE
 
 
 @full_precision

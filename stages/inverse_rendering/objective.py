@@ -90,11 +90,12 @@ def terms(
     colour, target = shaded.total, batch.target[rays]
     if model.spec.colour_matrices:
         colour = calibrated_colours(model.calibration(), batch.view[rays], colour)
-    rgb = losses.rgb_bounded(colour, target, batch.bound[rays])
+    residual = losses.rgb_residual(colour, target, batch.bound[rays])
+    rgb = losses.rgb_cost(residual)
     counted = rgb if weights is None else rgb * weights[rays]
     out.add("rgb", settings.rgb * counted.sum() / n_rays, rgb, rays)
     x = shell.x[pick].detach()
-    out.seen = Seen(rays, rgb.detach(), x, shell.n[pick].detach())
+    out.seen = Seen(rays, residual.detach().mean(-1), x, shell.n[pick].detach())
     out.add("white", settings.white * losses.white_light(model.light()).sum())
     if model.ambient is not None:
         out.add("hidden_light", HIDDEN_LIGHT * hidden_light(model.light(), model.spec.light_start))
