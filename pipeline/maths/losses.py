@@ -8,8 +8,7 @@ from torch import Tensor
 from pipeline.colour import srgb_from_linear
 from pipeline.maths.precision import full_precision
 
-RGB_SCALE = 0.06  # sRGB; residual at which the colour loss pulls as hard as an absolute value
-RGB_LINEAR = 0.25  # sRGB; residual from which on it pulls no harder: hands, moved shadows, wrong masks
+RGB_SCALE = 0.03  # sRGB; residual from which on the colour loss pulls as hard as an absolute value
 
 
 @full_precision
@@ -40,15 +39,14 @@ def rgb_residual(predicted: Tensor, target_srgb: Tensor, bound: Tensor) -> Tenso
 def rgb_cost(residual: Tensor) -> Tensor:
     """Mean over the channels of Huber's loss of residuals r >= 0, sRGB-encoded: (N, 3) -> (N,).
 
-        r^2 / (2 RGB_SCALE) up to RGB_LINEAR, from there on continued by its tangent
+        r^2 / (2 RGB_SCALE)  where r < RGB_SCALE,  else r - RGB_SCALE / 2
 
-    At r = RGB_SCALE its slope is that of `rgb_l1`. Below, it is smaller: the absolute value pulls at a pixel that is
-    wrong by its noise alone as hard as at any other, and moves the surface by that.
-    Differs from [NeuFace eq. 21], which is `rgb_l1`. Source: Huber, Robust estimation of a location parameter (1964).
+    The absolute value pulls at a pixel that is wrong by its noise alone as hard as at any other, and moves the surface
+    by that. Differs from [NeuFace eq. 21], which is `rgb_l1`. Source: Huber, Robust estimation of a location parameter
+    (1964).
     """
-    square = residual**2 / 2
-    tail = RGB_LINEAR * (residual - RGB_LINEAR / 2)
-    return torch.where(residual < RGB_LINEAR, square, tail).mean(-1) / RGB_SCALE
+    tail = residual - RGB_SCALE / 2
+    return torch.where(residual < RGB_SCALE, residual**2 / (2 * RGB_SCALE), tail).mean(-1)
 
 
 @full_precision

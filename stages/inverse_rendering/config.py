@@ -197,7 +197,7 @@ class Config(StageConfig):
     )
     # weights
     rgb: float = Field(default=1.0, ge=0, description="weight of the colour loss, lambda 1 [NeuFace eq. 21]")
-    mask: float = Field(default=0.2, ge=0, description="weight of the mask loss (cross-entropy of the opacity)")
+    mask: float = Field(default=0.1, ge=0, description="weight of the mask loss (cross-entropy of the opacity)")
     white: float = Field(default=0.02, ge=0, description="weight of the white-light loss, lambda 2 [NeuFace eq. 22]")
     specular_energy: float = Field(
         default=0.02, ge=0, description="weight of the specular-energy loss, lambda 3 [NeuFace eq. 23]"

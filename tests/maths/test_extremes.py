@@ -178,8 +178,11 @@ def cross_entropy(m: Module) -> None:
 def colours(m: Module) -> None:
     """Black, white, saturated and dazzling, and a prediction below zero."""
     x = torch.tensor([[0.0, 0, 0], [1, 1, 1], [1e5, 1e5, 1e5], [-1.0, 0, 1e-8], [0.0031308, 0.0031308, 0.5]])
+    free = torch.zeros(5, 3, dtype=torch.int8)
     for target in (0.0, 0.5, 1.0):
         out, (g,) = derive(lambda p, t=target: m.rgb_l1(p, torch.full_like(p, t)), x)
+        assert (g[2] > 0).all() and g.abs().max() < 10
+        out, (g,) = derive(lambda p, t=target: m.rgb_cost(m.rgb_residual(p, torch.full_like(p, t), free)), x)
         assert (g[2] > 0).all() and g.abs().max() < 10
 
 

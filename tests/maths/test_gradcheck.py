@@ -55,8 +55,9 @@ CASES: dict[str, tuple[Callable[..., Any], tuple[torch.Tensor, ...]]] = {
     "density.crossing_weights": (density.crossing_weights, (draw(3, 5, low=-0.9), BETA)),
     "density.opacity_cross_entropy": (density.opacity_cross_entropy, (draw(6, high=3.0), draw(6, seed=1))),
     "losses.rgb_l1": (lambda p: losses.rgb_l1(p, torch.full((4, 3), 0.05, dtype=torch.float64)), (draw(4, 3),)),
-    "losses.rgb_bounded": (  # predictions are .1 and more, the targets smaller, so that no residual is 0
-        lambda p: losses.rgb_bounded(p, torch.full((4, 3), 0.05, dtype=torch.float64), torch.tensor([[0, 1, -1]] * 4)),
+    "losses.rgb_cost": (losses.rgb_cost, (draw(4, 3, low=0.001, high=0.06),)),  # on both sides of RGB_SCALE
+    "losses.rgb_residual": (  # predictions are .1 and more, the targets smaller, so that no residual is 0
+        lambda p: losses.rgb_residual(p, torch.full((4, 3), 0.05, dtype=torch.float64), torch.tensor([[0, 1, -1]] * 4)),
         (draw(4, 3),),
     ),
     "losses.above": (lambda v: losses.above(v, 0.05), (draw(4),)),

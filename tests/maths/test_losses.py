@@ -29,9 +29,9 @@ def test_a_clipped_value_is_a_limit() -> None:
         srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.003) ** (1 / 2.4) - 0.055)
         r, b = srgb - target.numpy(), bound.numpy()
         cost = np.where(b == 0, np.abs(r), np.where(b > 0, np.maximum(-r, 0), np.maximum(r, 0)))
-        return np.asarray(cost.mean(1))
+        return np.asarray(cost)
 
-    found = losses.rgb_bounded(colour, target, bound)
+    found = losses.rgb_residual(colour, target, bound)
     values = colour.detach().numpy()
     assert np.allclose(found.detach().numpy(), by_hand(values), rtol=1e-6, atol=1e-7)
     found.sum().backward()
@@ -41,19 +41,43 @@ def test_a_clipped_value_is_a_limit() -> None:
         step = np.zeros((200, 3))
         step[:, c] = h
         slope = (by_hand(values + step) - by_hand(values - step)) / (2 * h)
-        assert np.allclose(colour.grad[:, c].numpy(), slope, rtol=1e-3, atol=1e-6)
+        assert np.allclose(colour.grad[:, c].numpy(), slope[:, c], rtol=1e-3, atol=1e-6)
 
 
 def test_clipped_values_at_the_extremes() -> None:
     target = torch.tensor([[1.0, 1.0, 1.0]] * 3)
     bright = torch.tensor([[1e6] * 3, [1.0] * 3, [0.0] * 3], requires_grad=True)
-    cost = losses.rgb_bounded(bright, target, torch.ones(3, 3, dtype=torch.int8))
+    cost = losses.rgb_residual(bright, target, torch.ones(3, 3, dtype=torch.int8)).mean(-1)
     assert cost.tolist() == pytest.approx([0, 0, 1], abs=1e-6)
     cost.sum().backward()
     assert bright.grad is not None and torch.isfinite(bright.grad).all()
     assert not bright.grad[0].any() and (bright.grad[2] < 0).all()
     free = torch.zeros(3, 3, dtype=torch.int8)
-    assert torch.equal(losses.rgb_bounded(bright, target, free), losses.rgb_l1(bright, target))
+    assert torch.equal(losses.rgb_residual(bright, target, free).mean(-1), losses.rgb_l1(bright, target))
+
+
+def test_colour_loss_against_scipys_huber() -> None:
+    from scipy.special import huber
+
+    t = losses.RGB_SCALE
+    r = np.abs(np.random.default_rng(0).normal(0, t, (500, 3)))
+    assert 0.1 < (r > t).mean() < 0.5
+    residual = torch.from_numpy(r).requires_grad_()
+    cost = losses.rgb_cost(residual)
+    assert np.allclose(cost.detach().numpy(), huber(t, r).mean(1) / t, rtol=1e-6, atol=1e-9)
+    cost.sum().backward()
+    assert residual.grad is not None
+    h = 1e-7
+    slope = (huber(t, r + h) - huber(t, r - h)) / (2 * h * 3 * t)
+    assert np.allclose(residual.grad.numpy(), slope, rtol=1e-4, atol=1e-6)
+
+
+def test_the_colour_loss_pulls_as_an_absolute_value_from_its_scale_on() -> None:
+    r = torch.tensor([0.0, 1e-20, 0.5 * losses.RGB_SCALE, losses.RGB_SCALE, 1.0, 1e6])[:, None].expand(6, 3).clone()
+    cost = losses.rgb_cost(r.requires_grad_())
+    cost.sum().backward()
+    assert torch.isfinite(cost).all() and r.grad is not None
+    assert (3 * r.grad[:, 0]).tolist() == pytest.approx([0, 0, 0.5, 1, 1, 1], rel=1e-5, abs=1e-9)
 
 
 def test_what_is_above_its_limit_costs() -> None:
