@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from pipeline import transforms
+from pipeline.maths.losses import RGB_SCALE
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.objective import terms
@@ -116,10 +117,20 @@ def test_weights_multiply_the_colour_term_alone() -> None:
     assert plain == ones
     assert halves.pop("rgb") == pytest.approx(0.5 * plain.pop("rgb")) and halves == plain
     one = torch.zeros(256)
-    seen = terms(t.model, batch, SMALL, torch.Generator().manual_seed(0), 1.0).seen
-    assert seen is not None
-    one[seen.rays[7]] = 2.0
-    assert parts(one)["rgb"] == pytest.approx(2 * float(seen.residual[7]) / 256, rel=1e-5)
+    found = terms(t.model, batch, SMALL, torch.Generator().manual_seed(0), 1.0)
+    cost, rays = found.values["rgb"]
+    one[rays[7]] = 2.0
+    assert parts(one)["rgb"] == pytest.approx(2 * float(cost[7]) / 256, rel=1e-5)
+
+
+def test_what_is_weighed_is_the_absolute_residual() -> None:
+    """Not the cost of the colour loss, which is smaller for small residuals."""
+    t = new_trainer(photos(covered=False)[:4], ball_start(), SMALL, False, "cpu")
+    found = terms(t.model, t.pixels.draw(256, 0.25, 1), SMALL, torch.Generator().manual_seed(0), 1.0)
+    assert found.seen is not None
+    cost, _ = found.values["rgb"]
+    off = found.seen.residual
+    assert ((off - RGB_SCALE / 2 <= cost + 1e-6) & (cost <= off)).all() and (off > 1.01 * cost).any()
 
 
 def test_each_ray_has_the_weight_of_its_cell() -> None:
