@@ -8,6 +8,10 @@ irradiance of the light with coefficients L_lm + E_0 b_lm, whose mean radiance o
 then scaled so that the mean irradiance of the face, and with it the level of its albedo, stays as it was.
 Without this, light of two colours, of a window and a lamp, colours the two sides of the albedo.
 
+The corrected light must leave some irradiance in every direction, also in those that no skin faces: kappa E' >=
+kappa E_min(d), linear in the unknowns, at directions d all around; E_min is DARKEST of the mean, or the irradiance
+before where that is less. Such a quadratic problem is a least distance problem [Lawson and Hanson 1974, ch. 23].
+
 Prior: b ~ N(0, std^2). A face is nearly mirror-symmetric, so that light from the side can't be mistaken for its
 colours: the terms odd in x have ODD_STD. The others, from above or from the front, also fit the skin's own pattern:
 their standard deviation is small where the lobe determined the light (light_estimate.py).
@@ -24,6 +28,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import nnls
 from torch import Tensor
 
 from pipeline.fields.appearance import SpatialField
@@ -52,6 +58,7 @@ LEVEL_STD = 10.0  # of kappa: free
 ROUNDS = 15
 HUBER, LEAST_NOISE = 1.5, 1e-3
 DARKEST, DIRECTIONS = 0.1, 512  # of the mean irradiance; directions in which the corrected one is at least as bright
+FEASIBLE = 1e-9  # least share of the distance that is left: below it no light meets the limits
 SEED = 31_337
 
 
@@ -82,12 +89,14 @@ def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tu
     return torch.cat([x for x, _ in found]), torch.cat([n for _, n in found])
 
 
-def correction(albedo: F64, irradiance: F64, n: F64, even_std: float) -> SkinLight | None:
+def correction(albedo: F64, irradiance: F64, n: F64, even_std: float, around: F64) -> SkinLight | None:
     """The correction from albedo and irradiance (N, 3) at skin with unit normals n (N, 3), x to the person's left.
-    None if the points are too few or not finite, or have no light."""
-    if len(albedo) < MIN_POINTS or not (np.isfinite(albedo).all() and np.isfinite(irradiance).all()):
+
+    around: (DIRECTIONS, 3) irradiance at directions(). None if the points are too few or not finite, or have no light.
+    """
+    if len(albedo) < MIN_POINTS or not all(np.isfinite(v).all() for v in (albedo, irradiance, around)):
         return None
-    basis, mirrored = irradiance_basis(n), irradiance_basis(n * [-1, 1, 1])
+    basis, mirrored, elsewhere = irradiance_basis(n), irradiance_basis(n * [-1, 1, 1]), irradiance_basis(directions())
     odd = np.abs(basis + mirrored).max(0) < np.abs(basis - mirrored).max(0)
     std = np.where(odd, ODD_STD, even_std)
     std[0] = LEVEL_STD
@@ -98,8 +107,10 @@ def correction(albedo: F64, irradiance: F64, n: F64, even_std: float) -> SkinLig
             return None
         rows = basis * (mean / irradiance[:, c, None])
         rows[:, 0] = 1
+        limits = mean * elsewhere
+        limits[:, 0] = around[:, c] - least_irradiance(around[:, c])
         y = albedo[:, c] / level
-        solved = _robust(rows, y, std)
+        solved = _robust(rows, y, std, limits)
         residual, spread = y - rows @ solved, float(((y - y.mean()) ** 2).sum())
         explained[c] = 1 - float((residual**2).sum()) / max(spread, 1e-300)
         b = solved / max(solved[0], 1e-3)
@@ -108,32 +119,56 @@ def correction(albedo: F64, irradiance: F64, n: F64, even_std: float) -> SkinLig
     return SkinLight(change, explained)
 
 
+def directions() -> F64:
+    """(DIRECTIONS, 3) unit vectors all around, at which the irradiance is limited from below."""
+    return np.asarray(fibonacci(DIRECTIONS).double().numpy(), np.float64)
+
+
+def least_irradiance(irradiance: F64) -> F64:
+    """(D,) what a correction must leave of an irradiance (D,): DARKEST of the mean, or what there was, if that is
+    less."""
+    return np.minimum(irradiance, DARKEST * float(irradiance.mean()))
+
+
 def irradiance_basis(n: F64) -> F64:
     """A_l Y_lm (N, 9) at unit normals n (N, 3): E = irradiance_basis @ coefficients. [NeuFace eq. 14]"""
     d = torch.from_numpy(np.asarray(n, np.float64))
     return np.asarray((sh.sh_basis(d, ORDER) * sh.clamped_cosine(ORDER).to(d)).numpy(), np.float64)
 
 
-def _robust(rows: F64, y: F64, std: F64) -> F64:
-    """Maximum a posteriori of y = rows s + noise with Huber's weights. Noise counts as that of PATCHES observations."""
+def _robust(rows: F64, y: F64, std: F64, limits: F64) -> F64:
+    """Maximum a posteriori of y = rows s + noise with Huber's weights, where limits @ s >= 0. Noise counts as that of
+    PATCHES observations."""
     solved: F64 = np.zeros_like(std)
     residual = y - np.median(y)
     for _ in range(ROUNDS):
         noise = max(1.4826 * float(np.median(np.abs(residual))), LEAST_NOISE)
         weight = PATCHES / len(y) / noise**2 / np.maximum(np.abs(residual) / (HUBER * noise), 1)
-        solved[:] = np.linalg.solve(
-            (rows * weight[:, None]).T @ rows + np.diag(std**-2), (rows * weight[:, None]).T @ y
-        )
+        gram = (rows * weight[:, None]).T @ rows + np.diag(std**-2)
+        solved = limited(gram, (rows * weight[:, None]).T @ y, limits)
         residual = y - rows @ solved
     return solved
 
 
-def bright_enough(change: F64, irradiance: F64) -> float:
-    """The largest factor in [0, 1] of a change (N,) of the irradiance (N,) that leaves DARKEST of its mean in every
-    direction, or what there was, if that is less."""
-    floor = np.minimum(irradiance, DARKEST * irradiance.mean())
-    room = np.where(change < 0, (irradiance - floor) / np.maximum(-change, 1e-300), np.inf)
-    return float(np.clip(room.min(), 0, 1))
+def limited(gram: F64, g: F64, limits: F64) -> F64:
+    """s (M,) with the least s' gram s / 2 - g's where limits (D, M) @ s >= 0; gram (M, M) is positive definite.
+
+    With gram = R'R and z = R (s - s_0), s_0 the solution without limits: the least |z| where
+    limits R^-1 z >= -limits s_0, from non-negative least squares [Lawson and Hanson 1974, ch. 23]. s = 0 meets all
+    limits, so that there always is a solution.
+    """
+    root = cholesky(gram)
+    free: F64 = solve_triangular(root, solve_triangular(root, g, trans="T"))
+    short = -limits @ free
+    if (short <= 0).all():
+        return free
+    scale = np.linalg.norm(limits, axis=1).clip(1e-300)
+    sides = solve_triangular(root, limits.T / scale, trans="T")
+    system = np.vstack([sides, short / scale])
+    target = np.zeros(len(system))
+    target[-1] = 1
+    left = system @ nnls(system, target)[0] - target
+    return free if abs(left[-1]) < FEASIBLE else free + solve_triangular(root, -left[:-1] / left[-1])
 
 
 def correct_light(
@@ -153,8 +188,11 @@ def correct_light(
         albedo = spatial(skin)[0] if len(skin) else skin
         irradiance = light.irradiance(n)
         even = EVEN_STD if explained is None else min(TRUSTED * lobe_std(explained) ** 2, EVEN_STD)
-        a, e, normals = (np.asarray(t.double().cpu().numpy(), np.float64) for t in (albedo, irradiance, n))
-        found = correction(a, e, normals, even)
+        around = light.irradiance(torch.from_numpy(directions()).to(light.coefficients))
+        a, e, normals, limits = (
+            np.asarray(t.double().cpu().numpy(), np.float64) for t in (albedo, irradiance, n, around)
+        )
+        found = correction(a, e, normals, even, limits)
     if found is None:
         return None
     x, facing = surface_points(model.geometry, rays)
@@ -165,10 +203,6 @@ def correct_light(
 def _apply(light: ShLight, found: SkinLight, n: Tensor, irradiance: Tensor) -> None:
     """Add the correction to a light, with the irradiance (N, 3) of skin with normals n (N, 3) before."""
     with torch.no_grad():
-        around = fibonacci(DIRECTIONS)
-        before = light.irradiance(around.to(light.coefficients)).double().cpu().numpy()
-        basis = irradiance_basis(around.double().numpy())
-        share = min(bright_enough(basis @ found.change[:, c], before[:, c]) for c in range(3))
-        light.coefficients[: len(found.change)] += torch.from_numpy(share * found.change).to(light.coefficients)
+        light.coefficients[: len(found.change)] += torch.from_numpy(found.change).to(light.coefficients)
         # the level of the face's albedo stays what other sources say (albedo_level.py)
         light.coefficients.mul_(float(irradiance.mean()) / float(light.irradiance(n).mean()))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.light import ShLight
@@ -20,10 +21,12 @@ from stages.inverse_rendering.skin_light import (
     EVEN_STD,
     MIN_POINTS,
     SkinLight,
-    bright_enough,
     correct_light,
     correction,
+    directions,
     irradiance_basis,
+    least_irradiance,
+    limited,
     skin_points,
 )
 from tests.support.small_ball import fit_of_the_ball
@@ -52,6 +55,14 @@ def of_three(*colours: F64) -> F64:
     return np.stack(colours, 1)
 
 
+def around(seen: F64) -> F64:
+    """(DIRECTIONS, 3) irradiance of the light `seen` (9, 3) in all directions."""
+    return np.asarray(irradiance_basis(directions()) @ seen)
+
+
+BRIGHT = around(of_three(WHITE, WHITE, WHITE)) * 100  # so much light that no limit is reached
+
+
 def test_the_basis_gives_the_irradiance_by_quadrature() -> None:
     """int L(w) max(n . w, 0) dw over a fine grid of the sphere."""
     z = (np.arange(400) + 0.5) / 200 - 1
@@ -70,7 +81,7 @@ def test_a_window_of_another_colour_is_found_from_white_light() -> None:
     n = face()
     true = of_three(WHITE + 1.2 * WINDOW, WHITE + 0.6 * WINDOW, WHITE - 0.3 * WINDOW)
     albedo, irradiance = fitted(n, true, of_three(WHITE, WHITE, WHITE))
-    found = correction(albedo, irradiance, n, EVEN_STD)
+    found = correction(albedo, irradiance, n, EVEN_STD, BRIGHT)
     assert found is not None and (found.explained > 0.99).all()
     np.testing.assert_allclose(found.change[1:], (true - of_three(WHITE, WHITE, WHITE))[1:], atol=0.05)
     np.testing.assert_array_equal(found.change[0], 0)  # the light stays white on the mean
@@ -86,7 +97,7 @@ def test_a_known_light_is_corrected_from_the_side_only() -> None:
     assert irradiance_basis(np.array([[1.0, 0, 0]])) @ side > 0.5 < irradiance_basis(np.array([[0, 1.0, 0]])) @ below
     for extra, found_share in ((side, 1.0), (below, 0.0)):
         true = of_three(*[WHITE + extra] * 3)
-        found = correction(*fitted(n, true, of_three(WHITE, WHITE, WHITE)), n, 1e-3)
+        found = correction(*fitted(n, true, of_three(WHITE, WHITE, WHITE)), n, 1e-3, BRIGHT)
         assert found is not None
         wanted = found_share * (true - of_three(WHITE, WHITE, WHITE))
         np.testing.assert_allclose(irradiance_basis(n) @ (found.change - wanted), 0, atol=0.1)
@@ -97,7 +108,7 @@ def test_lips_and_brows_do_not_turn_the_light() -> None:
     albedo, irradiance = fitted(n, of_three(WHITE, WHITE, WHITE), of_three(WHITE, WHITE, WHITE))
     lips = (np.abs(n[:, 0] - 0.3) < 0.1) & (n[:, 1] < 0)
     albedo[lips] *= [1.0, 0.4, 0.4]
-    found = correction(albedo, irradiance, n, EVEN_STD)
+    found = correction(albedo, irradiance, n, EVEN_STD, BRIGHT)
     assert 0.01 < lips.mean() < 0.1 and found is not None and np.abs(found.change).max() < 0.05
 
 
@@ -105,8 +116,8 @@ def test_lips_and_brows_do_not_turn_the_light() -> None:
 def test_the_change_scales_with_the_light(scale: float) -> None:
     n = face()
     white, true = of_three(WHITE, WHITE, WHITE), of_three(WHITE + WINDOW, WHITE, WHITE)
-    one = correction(*fitted(n, true, white), n, EVEN_STD)
-    many = correction(*fitted(n, scale * true, scale * white), n, EVEN_STD)
+    one = correction(*fitted(n, true, white), n, EVEN_STD, around(white))
+    many = correction(*fitted(n, scale * true, scale * white), n, EVEN_STD, around(scale * white))
     assert one is not None and many is not None
     np.testing.assert_allclose(many.change, scale * one.change, rtol=1e-6, atol=1e-9 * scale)
 
@@ -115,18 +126,61 @@ def test_nothing_is_corrected_without_skin_light_or_finite_values() -> None:
     n = face()
     albedo, irradiance = fitted(n, of_three(WHITE, WHITE, WHITE), of_three(WHITE, WHITE, WHITE))
     few = MIN_POINTS - 1
-    assert correction(albedo[:few], irradiance[:few], n[:few], EVEN_STD) is None
-    assert correction(albedo, 0 * irradiance, n, EVEN_STD) is None
-    assert correction(0 * albedo, irradiance, n, EVEN_STD) is None
-    assert correction(albedo * np.where(np.arange(len(n))[:, None] == 7, np.nan, 1), irradiance, n, EVEN_STD) is None
+    assert correction(albedo[:few], irradiance[:few], n[:few], EVEN_STD, BRIGHT) is None
+    assert correction(albedo, 0 * irradiance, n, EVEN_STD, BRIGHT) is None
+    assert correction(0 * albedo, irradiance, n, EVEN_STD, BRIGHT) is None
+    hole = np.where(np.arange(len(n))[:, None] == 7, np.nan, 1)
+    assert correction(albedo * hole, irradiance, n, EVEN_STD, BRIGHT) is None
+    assert correction(albedo, irradiance, n, EVEN_STD, BRIGHT * np.inf) is None
 
 
-def test_the_light_is_nowhere_made_dark() -> None:
-    irradiance = np.array([1.0, 1.0, 1.0, 0.05])
-    assert bright_enough(np.array([0.5, 0.0, -0.1, 0.0]), irradiance) == 1
-    share = bright_enough(np.array([0.5, 0.0, -2.0, 0.0]), irradiance)
-    assert 1 - 2 * share == pytest.approx(DARKEST * irradiance.mean())
-    assert bright_enough(np.array([0.0, 0.0, 0.0, -0.1]), irradiance) == 0
+def test_the_least_irradiance_is_a_tenth_of_the_mean_or_what_there_was() -> None:
+    found = least_irradiance(np.array([1.0, 1.5, 0.6, 0.05, -0.15]))
+    np.testing.assert_allclose(found, [0.06, 0.06, 0.06, 0.05, -0.15])
+    assert DARKEST == 0.1
+
+
+@pytest.mark.parametrize("behind", [0.0, -0.5, -1.5])
+def test_a_light_that_is_dark_where_nothing_faces_is_corrected_all_the_same(behind: float) -> None:
+    """Dark or less behind the head, by high bands that no skin feels: the sides of the face become equal, and the light
+    stays as bright behind as it must."""
+    n = face()
+    true, white = of_three(WHITE + WINDOW, WHITE, WHITE - 0.5 * WINDOW), of_three(WHITE, WHITE, WHITE)
+    albedo, irradiance = fitted(n, true, white)
+    behind_it = (directions()[:, 2] < -0.8)[:, None]
+    everywhere = np.where(behind_it, behind, around(white))
+    found = correction(albedo, irradiance, n, EVEN_STD, everywhere)
+    assert found is not None
+    corrected = albedo * irradiance / (irradiance + irradiance_basis(n) @ found.change)
+    assert corrected.std(0).max() < 0.25 * albedo.std(0).max()
+    left = everywhere + irradiance_basis(directions()) @ found.change
+    assert (left >= np.stack([least_irradiance(c) for c in everywhere.T], 1) - 1e-6).all()
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_the_limited_solution_is_that_of_a_general_solver(count: int) -> None:
+    """Against sequential quadratic programming [scipy]; without limits it is the linear system's."""
+    rng = np.random.default_rng(count)
+    rows, g = rng.normal(size=(20, 5)), 10 * rng.normal(size=5)
+    gram, limits = rows.T @ rows, rng.normal(size=(count, 5)) + [1.0, 0, 0, 0, 0]
+    found = limited(gram, g, limits)
+    by_steps = minimize(
+        lambda s: s @ gram @ s / 2 - g @ s,
+        np.zeros(5),
+        jac=lambda s: gram @ s - g,
+        constraints={"type": "ineq", "fun": lambda s: limits @ s} if count else (),
+        method="SLSQP",
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    np.testing.assert_allclose(found, by_steps.x, atol=1e-5)
+    assert (limits @ found >= -1e-9).all() and (count == 0 or (limits @ np.linalg.solve(gram, g) < 0).any())
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_limits_count_by_their_direction_not_their_size(scale: float) -> None:
+    limits = np.array([[-1.0, 1.0], [-1.0, -0.5]]) * scale
+    np.testing.assert_allclose(limited(np.eye(2), np.array([1.0, 0.0]), limits), [0, 0], atol=1e-9)
+    np.testing.assert_allclose(limited(np.eye(2), np.array([1.0, 0.0]), limits[:1]), [0.5, 0.5])
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +226,7 @@ def test_light_from_above_is_free_only_where_the_lobe_did_not_tell_it(
 ) -> None:
     """The numbers of the heads beside the constant."""
     asked: list[float] = []
-    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even: asked.append(even))
+    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even, around: asked.append(even))
     views = [replace(v, skin=v.alpha > 0.99) for v in ball.views]
     assert correct_light(ball.model, views, ball.pixels.draw(100, 0.0, 3).rays, explained, "cpu") is None
     assert asked == pytest.approx([wanted], abs=0.003)
@@ -186,7 +240,7 @@ def test_noise_counts_as_that_of_fifty_places() -> None:
     rows[:, 0] = 1
     true = np.array([1.0, 0, 0, 0.3, 0, 0, 0, 0, 0])
     y = rows @ true + a * rng.uniform(-1, 1, len(n))
-    found = correction(np.repeat(y[:, None], 3, 1), np.ones((len(n), 3)), n, EVEN_STD)
+    found = correction(np.repeat(y[:, None], 3, 1), np.ones((len(n), 3)), n, EVEN_STD, BRIGHT)
     std = np.array([10.0, 0.3, 0.3, 0.5, 0.5, 0.3, 0.3, 0.5, 0.3])  # xy, xz and x are odd
     weight = 50 / len(n) / (1.4826 * a / 2) ** 2
     y = y / np.median(y)
@@ -202,7 +256,7 @@ def test_the_fitted_light_may_have_sides_of_its_own() -> None:
     n = face()
     seen = of_three(WHITE + 0.8 * WINDOW, WHITE + 0.5 * WINDOW, WHITE - 0.4 * WINDOW)
     true = of_three(WHITE - 0.5 * WINDOW, WHITE + WINDOW, WHITE + 0.3 * WINDOW)
-    found = correction(*fitted(n, true, seen), n, EVEN_STD)
+    found = correction(*fitted(n, true, seen), n, EVEN_STD, around(seen))
     assert found is not None and (found.explained > 0.99).all()
     np.testing.assert_allclose(found.change[1:], (true - seen)[1:], atol=0.05)
 
