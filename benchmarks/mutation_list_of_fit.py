@@ -88,6 +88,12 @@ OF_FIT = (
              "float(irradiance.mean()) / float(light.irradiance(n).mean())",
              "float(light.irradiance(n).mean()) / float(irradiance.mean())",
              "tests/inverse_rendering/test_skin_light.py::test_the_faces_mean_irradiance_stays"),
+    Mutation("stages/inverse_rendering/skin_light.py", "around[:, c] - least_irradiance(around[:, c])",
+             "around[:, c] + mean",
+             "tests/inverse_rendering/test_skin_light.py::"
+             "test_a_light_that_is_dark_where_nothing_faces_is_corrected_all_the_same"),
+    Mutation("stages/inverse_rendering/skin_light.py", "free + solve_triangular(root, -left[:-1] / left[-1])", "free",
+             "tests/inverse_rendering/test_skin_light.py::test_the_limited_solution_is_that_of_a_general_solver"),
     Mutation("stages/inverse_rendering/skin_light.py", "weight = PATCHES / len(y) / noise**2",
              "weight = 1 / noise**2",
              "tests/inverse_rendering/test_skin_light.py::test_noise_counts_as_that_of_fifty_places"),

@@ -15,8 +15,7 @@ import numpy as np
 
 from pipeline.meshes import F32, F64, Indices, Mask
 from pipeline.registration.subdivision import Level, edges_of, limit, subdivided
-
-LEFT_OUT = ("lashes",)  # regions that the asset leaves out: they need a material with opacity
+from pipeline.template.model import LEFT_OUT
 
 
 @dataclass(frozen=True)  # no slots: the surface is kept

@@ -12,8 +12,12 @@ import numpy.typing as npt
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.template.files import refuse
 from pipeline.template.manifest import REMEDY
+from pipeline.template.model import LEFT_OUT
+from pipeline.tiles import FIRST, MAX_TILES
 
-MAX_VERTICES, MAX_TILES = 1_000_000, 10
+MAX_VERTICES = 1_000_000
+BESIDE = 2  # tiles that the asset adds to the template's: clothes and hair
+MOST_TILES = MAX_TILES - BESIDE
 FARTHEST = 1e9  # units of length from the origin
 UV_SLACK = 1e-6  # of a tile, for rounded coordinates
 SYMMETRIC = 1e-3  # of the mesh's size: how far from its mirror image a vertex may be where no mirror is given
@@ -104,14 +108,27 @@ def check_uvs(path: Path, uvs: F64, uv_quads: Indices) -> None:
     tile = np.floor(corners[..., 0].mean(1))[:, None]
     u, v = corners[..., 0] - tile, corners[..., 1]
     out = (u < -UV_SLACK) | (u > 1 + UV_SLACK) | (v < -UV_SLACK) | (v > 1 + UV_SLACK)
-    out |= (tile < 0) | (tile >= MAX_TILES)
+    out |= (tile < 0) | (tile >= MOST_TILES)
     if out.any():
         row, corner = np.argwhere(out)[0]
         refuse(
             "texture coordinates of a template lie outside their tile", f"{path}: quad {row}",
             f"({corners[row, corner, 0]:.4g}, {corners[row, corner, 1]:.4g}), {int(out.any(1).sum())} quads in all",
-            f"each quad inside one of the tiles 1001 to {1000 + MAX_TILES}, which are one row",
+            f"each quad inside one of the tiles {FIRST} to {FIRST + MOST_TILES - 1}, which are one row",
             "move the chart into a tile",
+        )  # fmt: skip
+
+
+def check_tiles(path: Path, uvs: F64, uv_quads: Indices, regions: Mapping[str, Indices]) -> None:
+    """No tile without a quad between others: the asset has maps for each, and its renderers read the row. Quads that
+    the asset leaves out do not count."""
+    quads = np.concatenate([rows for name, rows in regions.items() if name not in LEFT_OUT])
+    used = np.unique(np.floor(uvs[uv_quads[quads], 0].mean(1)).astype(np.int64))
+    if not np.array_equal(used, np.arange(len(used))):
+        found = ", ".join(str(FIRST + t) for t in used.tolist())
+        refuse(
+            "a template leaves a tile of its row empty", f"{path}: uvs", found,
+            f"tiles from {FIRST} on without a gap", "move the charts of the later tiles",
         )  # fmt: skip
 
 

@@ -51,6 +51,7 @@ def load_template(folder: Path | None = None) -> Template:
     if SKIN not in parts or not len(parts[SKIN]):
         refuse("a template has no skin", f"{manifest.path}: parts", ", ".join(parts), f"a part named {SKIN!r}", REMEDY)
     regions = checks.rows_of(manifest.path, "regions", manifest.regions, mesh.group, mesh.groups)
+    checks.check_tiles(mesh.path, mesh.uvs, mesh.uv_quads, regions)
     return Template(
         name=manifest.name,
         licence=manifest.licence,

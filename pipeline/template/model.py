@@ -20,6 +20,7 @@ from pipeline.errors import UsageError
 from pipeline.meshes import F64, Faces, Indices, Mask, triangles_of
 
 SKIN = "skin"  # the part that every template has
+LEFT_OUT = ("lashes",)  # regions that the asset leaves out: they need a material with opacity
 
 
 @dataclass(frozen=True, slots=True)

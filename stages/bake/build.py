@@ -20,8 +20,9 @@ from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
+from stages.bake.detail import shade
 from stages.bake.dilate import HALO, nearest_rows
-from stages.bake.eyes import Eyes
+from stages.bake.eyes import OPEN, Eyes, usual_behind_lids
 from stages.bake.lit import Measured
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
@@ -30,6 +31,7 @@ from stages.bake.outline_depth import outline_depth
 from stages.bake.regions import Votes, areas, unanimous
 from stages.bake.relief import relief
 from stages.bake.sources import sources
+from stages.bake.standard_fit import CORRECTION, Fitted
 from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
@@ -132,6 +134,7 @@ class Baker:
                 self._known.albedo, region,
             )  # fmt: skip
             if fitted.plausible:
+                fitted = fitted if eyes is None else _with_eyes(fitted, eyes, field, mesh, self._known)
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
@@ -218,6 +221,15 @@ def _known(
         albedo = mouth.in_place_of(albedo, cosine == 0)
     unseen = (cosine == 0).astype(np.float32)
     return Known(around, unseen, replaced.astype(np.float32), albedo.astype(np.float32))
+
+
+def _with_eyes(fitted: Fitted, eyes: Eyes, field: Field, mesh: Mesh, known: Known) -> Fitted:
+    """The fitted material with the correction of the eyes: their albedo is not the field's."""
+    ratio = np.asarray(field.irradiance_ratio(mesh.vertices), np.float32)
+    lit = shade(field.light, meshes.unit(mesh.normals), ratio).astype(np.float64)
+    own = np.where((eyes.of_vertex >= 0)[:, None], lit / np.maximum(fitted.received, 1e-6), fitted.correction)
+    shown = (known.unseen < 0.5) & (known.ambient > OPEN)
+    return replace(fitted, correction=usual_behind_lids(eyes, mesh, own.clip(*CORRECTION), shown))
 
 
 def _detail(

@@ -5,6 +5,9 @@ reflects of the captured light towards a photo (pipeline/eyes/material.py), S ra
 (stages/bake/detail.py); a = (I - G) / S, at least LEAST of I / S. Renderers of the asset add G again. What no photo
 shows of the iris takes the median of its ring around the gaze; the sclera behind the lids that of the sclera that is
 seen. Seen and completed fade over FADE.
+
+Standard shaders get a / S' of the traced light S' instead (standard_fit.py). Behind the lids S' is about 0, but no
+photo shows that a ratio is needed there: the usual one of the eye is taken, and what opens later has its colour.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from pipeline.lighting.moving import Standpoint
 from pipeline.maths import brdf
 from pipeline.meshes import F32, F64, Indices, Mask, Mesh
 from pipeline.registration.head import load_head, of_triangles
+from pipeline.smoothing import continued
 from pipeline.transforms import matrix
 from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake.detail import lit_at_least, shade
@@ -36,6 +40,8 @@ FADE = 0.0008  # metres
 LIMBUS = 1.1  # angles of the iris from which on the ball is sclera
 RINGS = 24  # of the iris
 LEAST = 0.2
+OPEN = 0.5  # ambient occlusion from which on a point of an eye is not behind a lid
+RIM = 0.001  # metres over which the correction becomes the eye's usual one
 WIDTH, ATTENUATION = ROUGHNESS**4 / 2, "exponential"  # 1 / kappa of a lobe of alpha = ROUGHNESS^2: nearly a mirror
 PLAIN = (0.62, 0.56, 0.52)  # albedo of a sclera that no photo shows
 
@@ -58,6 +64,24 @@ class Eyes:
             own = which[rows] == i
             out[own] = looked_up(image, places_of(eye.local(points[rows[own]])))
         return rows, out
+
+
+def usual_behind_lids(eyes: Eyes, mesh: Mesh, correction: F64, shown: Mask) -> F32:
+    """(V, 3) the correction (V, 3) of the albedo for standard shaders, with the median of an eye's shown vertices (V,)
+    where it is not shown. An eye that is nowhere shown has a correction of 1."""
+    out = correction.copy()
+    for i in range(len(eyes.eyes)):
+        own = eyes.of_vertex == i
+        some = np.flatnonzero(own)
+        row = np.cumsum(own) - 1
+        faces = row[mesh.faces[own[mesh.faces].all(1)]]
+        usual = np.median(out[some][shown[some]], axis=0) if shown[some].any() else np.ones(3)
+        if not shown[some].any() or not len(faces):
+            out[some] = usual
+            continue
+        ball = Mesh(mesh.vertices[some], mesh.normals[some], faces.astype(mesh.faces.dtype))
+        out[some] = continued(ball, out[some], shown[some], np.broadcast_to(usual, (len(some), 3)), RIM)
+    return np.asarray(out, np.float32)
 
 
 def eye_of(stored: FittedEye) -> Eye:

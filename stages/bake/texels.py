@@ -27,7 +27,7 @@ from stages.bake.detail import Detail, Points, shade
 from stages.bake.eyes import Eyes
 from stages.bake.lit import Measured
 from stages.bake.relief import FAR, Relief
-from stages.bake.standard_fit import CORRECTION, Fitted
+from stages.bake.standard_fit import Fitted
 
 NEWTON_STEPS = 3
 MIN_SLOPE = 0.3  # of d along N: lower limit of the slope in Newton's step
@@ -183,7 +183,7 @@ def sample(
     if known is not None and known.measured is not None:
         found = _with_measured(found, at, known.measured.at(hits.texel))
     if known is not None and known.eyes is not None:
-        found = _with_eyes(found, field, mesh, hits, at, known.eyes, known.standard)
+        found = _with_eyes(found, mesh, hits, at, known.eyes, known.standard)
     for name in ("albedo", "rho", "coefficients", "inv_kappa", "irradiance_ratio", "normal"):
         _check(name, getattr(found, name))
     return found
@@ -217,9 +217,7 @@ def _with_measured(found: Samples, at: Placed, values: F32) -> Samples:
     )
 
 
-def _with_eyes(
-    found: Samples, field: Field, mesh: Mesh, hits: Hits, at: Placed, eyes: Eyes, standard: Fitted | None
-) -> Samples:
+def _with_eyes(found: Samples, mesh: Mesh, hits: Hits, at: Placed, eyes: Eyes, standard: Fitted | None) -> Samples:
     """The samples with the fitted eyes: their own colours, the cornea's reflection, and the ball as it is."""
     corner = mesh.faces[hits.face]
     rows, albedo = eyes.at(corner[:, 0].astype(np.int64), at.x - at.moved[:, None] * at.n)
@@ -227,9 +225,7 @@ def _with_eyes(
         return found
     base = albedo
     if standard is not None:
-        received = tangents.mixed(standard.received[corner[rows]], hits.weights[rows])
-        lit = shade(field.light, at.n[rows], found.irradiance_ratio[rows])
-        base = albedo * (lit / np.maximum(received, 1e-6)).clip(*CORRECTION)
+        base = albedo * tangents.mixed(standard.correction[corner[rows]], hits.weights[rows])
     changed = {f.name: getattr(found, f.name).copy() for f in fields(Samples)}
     changed["albedo"][rows] = albedo.clip(*ALBEDO_RANGE)
     changed["base_color"][rows] = base.clip(*ALBEDO_RANGE)

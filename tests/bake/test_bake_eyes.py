@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from pipeline.meshes import Charts, Mesh, triangles_of
 from pipeline.registration.head import Head
 from pipeline.visibility import Occluder
 from stages.bake.detail import shade
-from stages.bake.eyes import Eyes, completed, eye_of, painted, painted_eyes
+from stages.bake.eyes import Eyes, completed, eye_of, painted, painted_eyes, usual_behind_lids
 from stages.bake.stage import unfitted_eyes
 from stages.bake.texels import Known, sample
 from tests.support.analytic_fields import AnalyticField, sphere
@@ -127,6 +128,24 @@ def test_only_the_eye_s_texels_get_its_surface() -> None:
     assert (found.normal[eye] == [0, 0, 1]).all() and (found.displacement[eye] == 0).all()
     for name in ("base_color", "albedo", "f0", "roughness", "normal", "displacement"):
         assert (getattr(found, name)[~eye] == getattr(plain, name)[~eye]).all()
+
+
+def test_behind_the_lids_the_correction_is_the_eye_s_usual_one() -> None:
+    """Traced light behind a lid is about 0: the largest ratio there, which no photo asks for. Where the eye is shown it
+    stays."""
+    ball = ball_scan(0.012, 16)
+    mesh = Mesh(ball.vertices, ball.normals, ball.faces)
+    angle = np.degrees(np.arccos((ball.normals[:, 2]).clip(-1, 1)))
+    shown = angle < 35
+    ratio = np.where(shown[:, None], 1.2 + 0.1 * ball.normals[:, :1], 2.5) * np.ones(3)
+    eyes = Eyes(np.zeros(len(ball.vertices), np.int64), (EYE,), (np.zeros((4, 4, 3), np.float32),))
+    found = usual_behind_lids(eyes, mesh, ratio, shown)
+    np.testing.assert_allclose(found[shown], ratio[shown], atol=0.01)
+    np.testing.assert_allclose(found[angle > 60], 1.2, atol=0.02)
+    hidden = usual_behind_lids(eyes, mesh, ratio, np.zeros(len(shown), np.bool_))
+    np.testing.assert_array_equal(hidden, 1)
+    other = replace(eyes, of_vertex=np.full(len(shown), -1))
+    np.testing.assert_allclose(usual_behind_lids(other, mesh, ratio, shown), ratio, rtol=1e-6)
 
 
 def test_the_cornea_reflects_as_its_index_says() -> None:

@@ -191,6 +191,8 @@ BAD: dict[str, tuple[Change, str]] = {
     "uvs above": (poke("uvs", (0, 1), 1.2), "outside their tile"),
     "uvs across tiles": (swap("uvs", lambda u: u + [0.1, 0]), "outside their tile"),
     "uvs before the first tile": (swap("uvs", lambda u: u - [1, 0]), "outside their tile"),
+    "uvs on the ninth tile": (swap("uvs", lambda u: u + [8, 0]), "outside their tile"),
+    "uvs not on the first tile": (swap("uvs", lambda u: u + [1, 0]), "tile of its row empty"),
     "uvs out of range": (poke("uv_quads", (0, 0), 30), "array of a template is wrong"),
     "mirror no pairs": (poke("mirror", 0, 3), "array of a template is wrong"),
     "mirror out of range": (poke("mirror", 0, 70), "array of a template is wrong"),

@@ -57,7 +57,7 @@ def test_it_is_a_prim_with_its_own_tile_and_material(made: tuple[SyntheticInputs
     assert points(hair)[:, 1].min() > ABOVE and points(rest)[:, 1].max() < ABOVE < points(rest)[:, 0].max()
     assert len(hair.GetFaceVertexCountsAttr().Get()) == made[0].uv.artifact.hair_faces
     assert tiles_of(hair) == {3} and tiles_of(rest) == {2}
-    assert hair.GetPurposeAttr().Get() == "render" and hair.GetSubdivisionSchemeAttr().Get() == "none"
+    assert hair.GetPurposeAttr().Get() == "default" and hair.GetSubdivisionSchemeAttr().Get() == "none"
     assert hair.GetDoubleSidedAttr().Get() and not rest.GetDoubleSidedAttr().Get()
     material = bound(hair)
     assert str(material.GetPath()) == "/head/mtl/hair" and str(bound(rest).GetPath()) == "/head/mtl/clothes"
@@ -78,9 +78,9 @@ def test_the_variants_have_it_where_the_template_is(made: tuple[SyntheticInputs,
     sets.SetSelection("mesh", "scan")
     assert shown() == {"scan", "proxy"}
     sets.SetSelection("mesh", "template")
-    for level in ("high", "proxy"):
+    for level, there in (("high", {"high"}), ("proxy", {"proxy", "rest", "hair"})):
         sets.SetSelection("lod", level)
-        assert shown() == {level}
+        assert shown() == there
     sets.SetSelection("lod", "render")
     looks = {}
     for look in ("standard", "specular_workflow", "neuface_basis"):
@@ -93,6 +93,26 @@ def test_the_variants_have_it_where_the_template_is(made: tuple[SyntheticInputs,
             )
             assert looks.setdefault(look, found) == found  # the same network of all materials
     assert len(set(looks.values())) == 3
+
+
+@pytest.mark.parametrize("purpose", ["render", "proxy"])
+def test_every_viewport_shows_hair_and_clothes(made: tuple[SyntheticInputs, Path], purpose: str) -> None:
+    """One that shows the proxy in place of the cage shows both beside it, and the hints say how large each is."""
+    stage = Usd.Stage.Open(str(made[1] / "head.usd"))
+    boxes = {}
+    for hints in (False, True):
+        cache = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default", purpose], hints)
+        boxes[hints] = cache.ComputeWorldBound(stage.GetDefaultPrim()).ComputeAlignedRange()
+    shown = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    there = [p for p in shown if UsdGeom.Imageable(p).ComputePurpose() in ("default", purpose)]
+    assert {p.GetName() for p in there} == {purpose, "rest", "hair"}
+    all_points = np.concatenate([points(UsdGeom.Mesh(p)) for p in there])
+    np.testing.assert_allclose(boxes[True].GetMin(), all_points.min(0), atol=0.004)  # the surface, not its cage
+    np.testing.assert_allclose(boxes[True].GetMax(), all_points.max(0), atol=0.004)
+    room = 0.06  # of the expressions
+    for low, high in ((boxes[False].GetMin(), boxes[False].GetMax()),):
+        assert (np.array(low) <= all_points.min(0) + 1e-6).all() and (np.array(low) > all_points.min(0) - room).all()
+        assert (np.array(high) >= all_points.max(0) - 1e-6).all() and (np.array(high) < all_points.max(0) + room).all()
 
 
 @pytest.mark.parametrize("file", ["head.usd", "lookdev.usda", "head.usdz"])

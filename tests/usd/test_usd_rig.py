@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import struct
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,36 @@ def test_a_shape_moves_the_cage_as_the_rig_says(inputs: SyntheticInputs, asset: 
     rows = [int(np.linalg.norm(head.vertices - p, axis=1).argmin()) for p in rest]
     np.testing.assert_allclose(moved, wanted[rows], atol=1e-6)
     assert np.abs(moved - rest).max() > 1e-3
+
+
+def test_the_proxy_follows_the_expressions(asset: Path) -> None:
+    """It has the cage's vertices, on the surface."""
+    rest, moved = deformed(opened(asset / "head.usd"), "/head/geo/proxy", {"jawOpen": 0.5})
+    cage, open_ = deformed(opened(asset / "head.usd"), "/head/geo/render", {"jawOpen": 0.5})
+    assert len(rest) == len(cage) and np.linalg.norm(rest - cage, axis=1).max() < 0.02
+    np.testing.assert_allclose(moved - rest, open_ - cage, atol=1e-6)
+    assert np.abs(moved - rest).max() > 1e-3
+
+
+@pytest.mark.parametrize("file", ["head.usd", "head.usdz"])
+def test_the_whole_head_is_in_the_box_of_what_moves_it(asset: Path, file: str) -> None:
+    """Points at rest and with an open jaw; without the authored box, USD's own would miss what lies beside."""
+    stage = opened(asset / file)
+    root = next(p for p in stage.Traverse() if p.IsA(UsdSkel.Root))
+    low, high = np.array(UsdGeom.Boundable(root).GetExtentAttr().Get(), np.float64)
+    names = [str(p.GetPath()) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    for points in (x for name in names for x in deformed(opened(asset / file), name, {"jawOpen": 1.0})):
+        assert (points >= low - 1e-6).all() and (points <= high + 1e-6).all()
+
+
+@pytest.mark.parametrize("box", [None, [(-0.01, -0.01, -0.01), (0.01, 0.01, 0.01)]])
+def test_a_box_that_is_missing_or_too_small_is_found(asset: Path, tmp_path: Path, box: list[Any] | None) -> None:
+    copy = Path(shutil.copytree(asset, tmp_path / "asset"))
+    stage = Usd.Stage.Open(str(copy / "payload.usdc"))
+    extent = UsdGeom.Boundable(stage.GetPrimAtPath("/head/geo")).GetExtentAttr()
+    extent.Clear() if box is None else extent.Set(Vt.Vec3fArray([Gf.Vec3f(*p) for p in box]))
+    stage.GetRootLayer().Save()
+    assert {f.check for f in validate(copy / "head.usd") if f.level == "error"} == {"extent"}
 
 
 def test_the_jaw_turns_about_its_joint(asset: Path) -> None:

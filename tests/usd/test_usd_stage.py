@@ -390,4 +390,4 @@ def test_ior(f0: float, ior: float) -> None:
 
 
 def test_ior_of_implausible_reflectance_stays_finite() -> None:
-    assert 1 < ior_from_f0(-1.0) < ior_from_f0(5.0) < 3
+    assert 1 == ior_from_f0(-1.0) == ior_from_f0(0.0) < ior_from_f0(5.0) < 3  # no layer reflects nothing

@@ -94,6 +94,21 @@ def test_nothing_is_wrong_with_it(tiled: tuple[Path, UsdAsset], file: str) -> No
     assert not [f for f in validate(tiled[0] / file) if f.level == "error"]
 
 
+def test_each_tile_has_the_index_of_refraction_of_its_own_f0(tiled: tuple[Path, UsdAsset]) -> None:
+    """Skin and clothes are materials of their own. Here F0 rises from the first tile to the second."""
+    stage = Usd.Stage.Open(str(tiled[0] / "head.usd"))
+    said = dict[str, float]()
+    for number in NUMBERS:
+        f0 = read_encoded(tiled[0] / f"textures/head_f0.{number}.exr")[..., 0]
+        covered = read_encoded(tiled[0] / f"internal/head_coverage.{number}.png")[..., 0] > 0
+        surface = UsdShade.Shader.Get(stage, f"/head/mtl/captured_{number}/preview")
+        said[number] = surface.GetInput("ior").Get()
+        assert ((said[number] - 1) / (said[number] + 1)) ** 2 == pytest.approx(f0[covered].mean(), rel=0.02)
+        mtl = (tiled[0] / "head.mtl").read_text().split(f"newmtl captured_{number}")[1]
+        assert float(mtl.split("Ni ")[1].split()[0]) == pytest.approx(said[number], abs=1e-4)
+    assert said["1002"] > said["1001"] + 0.02
+
+
 def test_it_looks_as_on_one_tile(tiled: tuple[Path, UsdAsset], exported: tuple[Path, UsdAsset]) -> None:
     two, one = load_exported(tiled[0] / "head.usd"), load_exported(exported[0] / "asset/head.usd")
     assert (two.tiles, one.tiles) == (2, 1) and two.albedo.shape == (128, 256, 3)

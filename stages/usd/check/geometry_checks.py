@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from stages.usd.check.chart_checks import chart_findings
 from stages.usd.check.findings import Finding
@@ -66,6 +66,22 @@ def _extent(mesh: UsdGeom.Mesh, points: F64) -> list[Finding]:
     found, true = np.array(attribute.Get(), np.float64), np.stack([points.min(0), points.max(0)])
     if found.shape != true.shape or np.abs(found - true).max() > EXTENT_TOLERANCE * np.ptp(true, axis=0).max():
         return [Finding("error", "extent", f"{found.round(5).tolist()}, points span {true.round(5).tolist()}", where)]
+    return []
+
+
+def skeleton_findings(root: UsdSkel.Root) -> list[Finding]:
+    """Findings on the extent of a SkelRoot: without one, USD computes a box from the joints alone; one that is authored
+    must contain the meshes below."""
+    where, extent = str(root.GetPath()), UsdGeom.Boundable(root).GetExtentAttr().Get()
+    if not extent:
+        return [Finding("error", "extent", "a SkelRoot has none, so that its box is that of the joints", where)]
+    below = [UsdGeom.Mesh(p) for p in Usd.PrimRange(root.GetPrim()) if p.IsA(UsdGeom.Mesh)]
+    low, high = np.array(extent, np.float64)
+    room = EXTENT_TOLERANCE * np.ptp(np.array(extent), axis=0).max()
+    for mesh in below:
+        points = np.array(mesh.GetPointsAttr().Get() or [], np.float64).reshape(-1, 3)
+        if len(points) and ((points.min(0) < low - room).any() or (points.max(0) > high + room).any()):
+            return [Finding("error", "extent", f"the SkelRoot's box does not contain {mesh.GetPath().name}", where)]
     return []
 
 

@@ -17,12 +17,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from pxr import Ar, Sdf, Usd, UsdGeom, UsdUtils, UsdValidation
+from pxr import Ar, Sdf, Usd, UsdGeom, UsdSkel, UsdUtils, UsdValidation
 
 from pipeline.errors import StageError
 from stages.usd.check import tile_checks
 from stages.usd.check.findings import Finding
-from stages.usd.check.geometry_checks import mesh_findings
+from stages.usd.check.geometry_checks import mesh_findings, skeleton_findings
 from stages.usd.check.material_checks import colour_findings, material_findings, materialx_findings, materialx_surfaces
 
 ABSOLUTE = re.compile(r"^(/|[A-Za-z]:[\\/]|file:|\\\\|https?:)")
@@ -186,11 +186,12 @@ def _shown(text: str, path: Path) -> str:
 
 # ------------------------------------------------------------------ geometry
 def meshes(stage: Usd.Stage, path: Path) -> list[Finding]:
-    """Topology, extent, normals and primvars of every mesh."""
+    """Topology, extent, normals and primvars of every mesh, and the extent of what moves them."""
     found = [UsdGeom.Mesh(p) for p in stage.Traverse(Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
     if not found:
         return [Finding("error", "mesh", "the asset has no mesh", path.name)]
-    return [f for m in found for f in mesh_findings(m)]
+    roots = [UsdSkel.Root(p) for p in stage.Traverse() if p.IsA(UsdSkel.Root)]
+    return [f for m in found for f in mesh_findings(m)] + [f for r in roots for f in skeleton_findings(r)]
 
 
 # ------------------------------------------------------------------ materials

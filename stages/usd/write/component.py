@@ -34,6 +34,7 @@ from stages.usd.write.tile_materials import (
 )
 from stages.usd.write.variants import (
     HAIR,
+    PROXY,
     RENDER,
     REST,
     SCAN,
@@ -140,12 +141,15 @@ def payload_layer(
     scan: tuple[UvSurface, Look] | None = None,
     hair: Look | None = None,
 ) -> Sdf.Layer:
-    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default. scan:
-    the scan's mesh with its own maps, beside the template's. hair: the look of the template's hair."""
+    """payload.usdc: geometry and material. With a proxy the full mesh has purpose render, else purpose default. Clothes
+    and hair have purpose default. scan: the scan's mesh with its own maps, beside the template's. hair: the look of the
+    template's hair."""
     stage = new_stage("Geometry and material of the captured head.", name)
     _fill(stage, name, mesh, proxy, look, hair)
     if scan is not None:
         _scan(stage, name, *scan, purposes=proxy is not None)
+    if isinstance(mesh, TemplateMesh) and mesh.rig is not None:
+        _bounded(stage, name, mesh.rig)
     return detached(stage)
 
 
@@ -195,6 +199,8 @@ def package_layer(
                 made.CreateDoubleSidedAttr(True)  # an open shell, which is seen from inside at its rim
             if rig is not None and skeleton is not None and kind in (RENDER, HAIR):
                 bind(stage, made, with_head(rig, len(used)) if kind == HAIR else rig.of_vertices(used), skeleton)
+        if rig is not None:
+            _bounded(stage, who.name, rig)
     return detached(stage)
 
 
@@ -221,14 +227,27 @@ def _fill(
         hairs.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*hair.mean_albedo)]))
         if rig is not None and skeleton is not None:
             bind(stage, hairs, with_head(rig, len(template.hair.vertices)), skeleton)
-    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/proxy", proxy, made)
+    stand_in = None if proxy is None else _mesh(stage, f"/{name}/geo/{PROXY}", proxy, made)
     for one in shown if stand_in is None else [*shown, stand_in]:
         one.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
-    if stand_in is not None:
+    if proxy is not None and stand_in is not None:
         stand_in.CreatePurposeAttr(UsdGeom.Tokens.proxy)
-        for one in shown if hairs is None else [*shown, hairs]:
-            one.CreatePurposeAttr(UsdGeom.Tokens.render)
+        shown[0].CreatePurposeAttr(UsdGeom.Tokens.render)  # clothes and hair have no stand-in: they always show
         shown[0].SetProxyPrim(stand_in)
+        # the template's proxy has the cage's vertices, in the same order
+        if rig is not None and skeleton is not None and len(proxy.vertices) == len(rig.weights):
+            bind(stage, stand_in, rig, skeleton)
+
+
+def _bounded(stage: Usd.Stage, name: str, rig: MeshRig) -> None:
+    """Author the extent of the SkelRoot: all meshes below, grown by what expressions move at most. Without it, USD
+    computes one from the joints alone."""
+    geo = stage.GetPrimAtPath(f"/{name}/geo")
+    boxes = [UsdGeom.Mesh(p).GetExtentAttr().Get() for p in geo.GetChildren() if p.IsA(UsdGeom.Mesh)]
+    corners = np.array([np.array(box, np.float64) for box in boxes])
+    grown = max((float(np.linalg.norm(s.offsets, axis=1).max()) for s in rig.shapes if len(s.rows)), default=0.0)
+    ends = corners[:, 0].min(0) - grown, corners[:, 1].max(0) + grown
+    UsdGeom.Boundable(geo).CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*end.tolist()) for end in ends]))
 
 
 def _scan(stage: Usd.Stage, name: str, mesh: UvSurface, look: Look, *, purposes: bool) -> None:
@@ -237,7 +256,7 @@ def _scan(stage: Usd.Stage, name: str, mesh: UvSurface, look: Look, *, purposes:
     made.CreateDisplayColorPrimvar(UsdGeom.Tokens.constant).Set(Vt.Vec3fArray([Gf.Vec3f(*look.mean_albedo)]))
     if purposes:
         made.CreatePurposeAttr(UsdGeom.Tokens.render)
-        made.SetProxyPrim(UsdGeom.Mesh.Get(stage, f"/{name}/geo/proxy"))
+        made.SetProxyPrim(UsdGeom.Mesh.Get(stage, f"/{name}/geo/{PROXY}"))
 
 
 def _geo(stage: Usd.Stage, name: str, rig: MeshRig | None) -> UsdSkel.Skeleton | None:

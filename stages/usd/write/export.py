@@ -24,7 +24,7 @@ from stages.usd.config import Config
 from stages.usd.layout import LIGHT
 from stages.usd.texture_names import check_apart, keep_pattern
 from stages.usd.write import component
-from stages.usd.write.cage import template_mesh, with_rest
+from stages.usd.write.cage import TemplateMesh, template_mesh, with_rest
 from stages.usd.write.dense import coarser
 from stages.usd.write.field_files import write_field
 from stages.usd.write.gltf import write_glb
@@ -101,8 +101,7 @@ def export(
     scan = _scan(uv, bake, light, config, folder, check, scatters=scatters)
     written += [] if scan is None else scan[1].written
     who = component.Identity(name, config.asset_version, config.author, config.license, config.subject_consent)
-    boxes = [_corners(mesh)] if proxy is None else [_corners(mesh), _corners(proxy)]
-    hints = [Gf.Vec3f(*c.tolist()) for c in (_hints(boxes) if proxy is not None else boxes[0])]
+    hints = _hints(mesh, head, proxy)
     holdout = frozenset(v.index for v in capture.artifact.views if v.holdout)
     cameras = tuple(sorted(cameras_of(poses.artifact, face.artifact).cameras, key=lambda c: c.index))
     materials = tile_materials(head or mesh)
@@ -192,10 +191,15 @@ def _corners(mesh: UvSurface) -> npt.NDArray[np.float64]:
     return np.stack([points.min(0), points.max(0)]).astype(np.float64)
 
 
-def _hints(boxes: list[npt.NDArray[np.float64]]) -> list[npt.NDArray[np.float64]]:
-    """Boxes for extentsHint: one per purpose, in the order default, render, proxy; an unused one is empty."""
-    empty = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
-    return [row for box in (empty, *boxes) for row in box]
+def _hints(mesh: UvSurface, head: TemplateMesh | None, proxy: UvSurface | None) -> list[Gf.Vec3f]:
+    """Boxes for extentsHint: of the whole; with a proxy one per purpose, in the order default, render, proxy."""
+    boxes = [_corners(mesh)]
+    if proxy is not None:
+        beside = [] if head is None else [_corners(part) for part in (head.rest, head.hair) if part is not None]
+        nothing = np.stack([np.full(3, 3.0e38), np.full(3, -3.0e38)])
+        always = np.stack([np.min([b[0] for b in beside], 0), np.max([b[1] for b in beside], 0)]) if beside else nothing
+        boxes = [always, *boxes, _corners(proxy)]
+    return [Gf.Vec3f(*corner.tolist()) for box in boxes for corner in box]
 
 
 def _scan(

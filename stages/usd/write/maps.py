@@ -268,7 +268,7 @@ def look_of(
     bake: Located[TextureSet], name: str, asset: Path, of_tiles: Sequence[int] | None = None, space: str = SRGB
 ) -> Look:
     """The files for the material's networks, and the index of refraction of the mean F0 over covered texels of some
-    tiles; None: of all."""
+    tiles, and of each of them; None: of all."""
 
     count = bake.artifact.tiles
 
@@ -283,19 +283,22 @@ def look_of(
         return tuple(f for i in range(99) if (f := found(f"{map_name}_rgb{i}", "exr", of)))
 
     has_f0, texels = "f0" in bake.artifact.maps, 0
-    albedo, f0 = np.zeros(3), 0.0
+    albedo, f0, own = np.zeros(3), 0.0, dict[int, float]()
     for tile in range(count) if of_tiles is None else of_tiles:
         covered = covered_texels(bake, tile)
         texels += int(covered.sum())
         shown = read_exr(map_file(asset, name, "albedo", tiles.form("exr", tile, count)))[0][..., :3]
         albedo += shown[covered].sum(0, dtype=np.float64)
-        f0 += float(_map(bake, "f0", tile)[covered].sum(dtype=np.float64)) if has_f0 else 0.0
+        reflected = float(_map(bake, "f0", tile)[covered].sum(dtype=np.float64)) if has_f0 else 0.0
+        f0, own[tile] = f0 + reflected, reflected / max(int(covered.sum()), 1)
     red, green, blue = (round(float(x), 6) for x in albedo / texels)
+    usual = f0 / texels if has_f0 else microfacet.SKIN_F0
+    iors = [round(ior_from_f0(own.get(tile, usual)), 5) for tile in range(count)]
     return Look(
         str(found("albedo", "png")),
         found("roughness", "png"),
         found("normal", "png"),
-        round(ior_from_f0(f0 / texels if has_f0 else microfacet.SKIN_F0), 5),
+        round(ior_from_f0(usual), 5),
         (red, green, blue),
         specular=found("specular_color", "png"),
         f0=found("f0", "exr"),
@@ -307,6 +310,7 @@ def look_of(
         base_color=None if space == SRGB else found(*FILES[space]),
         base_space=space,
         subsurface=found(SUBSURFACE, "exr"),
+        iors=tuple(iors) if has_f0 else (),
     )
 
 

@@ -24,6 +24,7 @@ class Look:
     coefficients, basis: pictures of three coefficients c_j(x) each, and of three tables B_j / R each; () for none.
     displacement: metres along the normal, of a mesh that is subdivided.
     neuface_albedo: the field's own albedo, if `albedo` is the base colour of a fitted standard material.
+    iors: the index of refraction of each tile; () if all have `ior`.
     subsurface: picture of where skin scatters light below its surface.
     base_color, base_space: picture and colour space of the base colour in MaterialX networks; None: `albedo`.
     """
@@ -43,17 +44,20 @@ class Look:
     base_color: str | None = None
     base_space: str = SRGB
     subsurface: str | None = None
+    iors: tuple[float, ...] = ()
 
     def base(self) -> tuple[str, str]:
         """The picture of the base colour for MaterialX networks, and its colour space."""
         return self.base_color or self.albedo, self.base_space if self.base_color else SRGB
 
     def on_tile(self, tile: int) -> Look:
-        """The same look with the files of one tile."""
+        """The same look with the files and the index of refraction of one tile."""
         number = str(tiles.FIRST + tile)
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         named: dict[str, Any] = {k: p.replace(tiles.TOKEN, number) for k, p in values.items() if isinstance(p, str)}
-        return replace(self, **named, coefficients=tuple(c.replace(tiles.TOKEN, number) for c in self.coefficients))
+        ior = self.iors[tile] if tile < len(self.iors) else self.ior
+        own = tuple(c.replace(tiles.TOKEN, number) for c in self.coefficients)
+        return replace(self, **named, coefficients=own, ior=ior)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +75,9 @@ WHOLE = Part()  # of an asset with one tile
 def ior_from_f0(f0: float) -> float:
     """Index of refraction whose reflectance at normal incidence is f0: (1 + sqrt(f0)) / (1 - sqrt(f0)).
 
-    Domain: clamped to [0.005, 0.2], beyond which a dielectric surface is implausible.
+    Domain: clamped to [0, 0.2], beyond which a dielectric surface is implausible. 0, where the fit has no layer: 1.
     """
-    root = float(np.sqrt(np.clip(f0, 0.005, 0.2)))
+    root = float(np.sqrt(np.clip(f0, 0.0, 0.2)))
     return (1 + root) / (1 - root)
 
 

@@ -51,8 +51,9 @@ def write_looks(
 def write_levels(
     stage: Usd.Stage, prim: Usd.Prim, *, beside: tuple[str, ...], scan: bool, high: Sequence[str], proxy: bool
 ) -> None:
-    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy alone. beside: names of
-    the meshes beside the template (REST, HAIR). high: names of the dense mesh's materials, none without it."""
+    """Variant set `lod`: the textured mesh (with its proxy), the dense mesh alone, or the proxy in its
+    place. beside: names of the meshes beside the template (REST, HAIR). high: names of the dense mesh's materials, none
+    without it."""
     path = prim.GetPath()
     lods = prim.GetVariantSets().AddVariantSet("lod")
     for variant, made in ((HIGH, bool(high)), (RENDER, True), (PROXY, proxy)):
@@ -63,7 +64,8 @@ def write_levels(
         if variant == RENDER:
             continue
         with lods.GetVariantEditContext():
-            for hidden in (RENDER, *beside, *([SCAN] if scan else [])):
+            # clothes and hair have no proxy: beside the head's they stay as they are
+            for hidden in (RENDER, *(beside if variant == HIGH else ()), *([SCAN] if scan else [])):
                 stage.OverridePrim(path.AppendPath(f"geo/{hidden}")).SetActive(False)
             if variant == HIGH:
                 if proxy:
