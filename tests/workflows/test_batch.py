@@ -13,9 +13,10 @@ from tests.support.scripted_batch import BAD, DISK, LOST, MEMORY, Scripted, capt
 from workflows.batch import failures
 from workflows.batch.captures import find
 from workflows.batch.failures import Failure
+from workflows.batch.fingerprint import fingerprint
 from workflows.batch.loop import run_batch
 from workflows.batch.request import BatchRequest
-from workflows.batch.state import BatchState, Entry, fingerprint, idempotency_key
+from workflows.batch.state import BatchState, Entry, idempotency_key
 
 
 @pytest.fixture

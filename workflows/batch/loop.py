@@ -21,9 +21,10 @@ from workflows.batch import captures
 from workflows.batch.after import check_parts, make_average, to_measure
 from workflows.batch.captures import Item
 from workflows.batch.failures import Failure, back_off, smaller
+from workflows.batch.fingerprint import fingerprint
 from workflows.batch.page import write_page
 from workflows.batch.request import BatchRequest
-from workflows.batch.state import ENDED, BatchState, Entry, Summary, fingerprint
+from workflows.batch.state import ENDED, BatchState, Entry, Summary
 from workflows.run.plan import check_settings
 from workflows.run.request import RunRequest
 from workflows.run.run_lock import exclusive_run

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import uuid
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +13,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.artifacts import RelativePath
 from pipeline.verdict import Level
-from stages import registry
 from workflows.batch.captures import Item
 from workflows.batch.failures import Failure
-from workflows.run.request import RunRequest
 from workflows.run.verdict import is_refused
 
 State = Literal["waiting", "submitted", "done", "unusable", "failed"]
@@ -132,28 +129,6 @@ class BatchState:
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name.replace('/', '__')}.json"
-
-
-def fingerprint(request: RunRequest) -> str:
-    """Of a request, the stages' versions, and names, sizes and times of the capture's files.
-
-    It only decides whether a finished capture is looked at again; what is reused then, the store decides by content.
-    """
-    asked = request.model_dump(mode="json", exclude={"stage_limit", "fit_slots", "store", "device", "strict"})
-    parts = [asked, [(s.name, s.version) for s in registry.REGISTRY], _files(Path(request.capture))]
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
-
-
-def _files(folder: Path) -> list[tuple[str, int, int]]:
-    found = []
-    for place in (folder, folder / "mask", folder / "masks"):
-        if place.is_dir():
-            with os.scandir(place) as entries:
-                for e in entries:
-                    if e.is_file():
-                        stat = e.stat()
-                        found.append((f"{place.name}/{e.name}", stat.st_size, stat.st_mtime_ns))
-    return sorted(found)
 
 
 def idempotency_key(entry: Entry, out: str) -> str:

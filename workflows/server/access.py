@@ -81,7 +81,7 @@ def check_folders(asked: Mapping[str, Any]) -> None:
         UsageError: one does not, or no folders were allowed.
     """
     roots = [Path(r).resolve() for r in os.environ.get(ROOTS, "").split(os.pathsep) if r]
-    for name, text in _named(asked):
+    for name, text in named_paths(asked):
         path = Path(text).resolve()  # links are followed: one that leads out is out
         if not any(path.is_relative_to(r) for r in roots):
             raise UsageError(
@@ -94,7 +94,8 @@ def check_folders(asked: Mapping[str, Any]) -> None:
             )
 
 
-def _named(asked: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+def named_paths(asked: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+    """Every folder and file that a request names, after the name of its option or setting."""
     for name in ("capture", "root", "out", "store", "template", "light", "also"):
         if asked.get(name):
             yield name, str(asked[name])
