@@ -10,7 +10,10 @@ from typing import Any
 import pytest
 
 from pipeline.artifacts import sha256_of
+from pipeline.contract import execute, inputs_from
 from pipeline.store import LINEAGE, Store, lineage
+from stages.registry import of_second
+from tests.support.toy_stages import FIRST, source
 from workflows.batch.state import BatchState, Entry
 from workflows.cli.main import main
 from workflows.live.folder import LiveFolder
@@ -204,6 +207,25 @@ def test_the_same_photos_from_two_folders_are_found_from_both(photos: Path, tmp_
     run(copy, tmp_path / "b", tmp_path / "store")
     purge(belongings("copy", tmp_path / "b", Store(tmp_path / "store")), Store(tmp_path / "store"))
     assert finished(tmp_path / "store") == []
+
+
+def test_the_second_capture_of_a_run_goes_with_the_first(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Both show one person; the stages before the fit read the second one under names of their own."""
+    second, out = tmp_path / "second_light", tmp_path / "out"
+    second.mkdir()
+    (second / "a.jpg").write_bytes(b"the same head under another light")
+    plan = make_plan(RunRequest(capture=str(photos), out=str(out)))
+    out.mkdir()
+    stage = of_second(FIRST)
+    also = execute(stage, inputs_from(stage, {"also_source": source(second)}), stage.config(), plan.store)
+    publish(plan, [*run_stages(plan), also])
+    assert "also_first" in finished(out / ".store")
+    assert main(["store", "purge", "photos", "--out", str(out)]) == 0
+    assert finished(out / ".store") == [] and second.is_dir()
+    said = capsys.readouterr().out
+    assert all(f"the photos themselves are yours to remove: {p}\n" in said for p in (photos, second))
 
 
 def test_a_run_that_was_started_with_relative_paths(

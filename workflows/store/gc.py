@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.store import LINEAGE, LOCKS, Store, lineage
-from stages.registry import SOURCE
+from stages.registry import ALSO, SOURCE
 from workflows.batch.captures import RECORDS
 from workflows.batch.page import AVERAGE, TABLES, captures_in
 from workflows.batch.state import Entry
@@ -232,9 +232,11 @@ def _is_of(subject: str, root: Root, out: Path) -> bool:
 
 
 def _photos_of(root: Root, store: Store) -> Iterator[Path]:
-    """The folders that a run's first stage read; run.json may name them relative to an unknown folder."""
+    """The folders that a run's first stages read, also of its second capture, which shows the same person; run.json
+    may name them relative to an unknown folder."""
     for stage, key in root.keys.items():
-        yield from (Path(p) for p in lineage(store.root / LINEAGE / f"{stage}-{key}.json").get(SOURCE, ()))
+        origins = lineage(store.root / LINEAGE / f"{stage}-{key}.json")
+        yield from (Path(p) for name in (SOURCE, ALSO + SOURCE) for p in origins.get(name, ()))
 
 
 def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:
