@@ -47,6 +47,10 @@ class Artifact(BaseModel):
         """sha256 of the canonical manifest, and through its FileRefs of the content of all its files."""
         return hashlib.sha256(self.canonical_json().encode()).hexdigest()
 
+    def origin(self, folder: Path) -> Path:
+        """What the lineage calls this artifact, whose files are in `folder`: the folder, if it holds nothing else."""
+        return folder
+
 
 class FileRef(Artifact):
     """A file of an artifact: path in the artifact's folder, hash and size."""
@@ -77,6 +81,11 @@ class Located(Generic[A]):
 
     artifact: A
     folder: Path
+
+    @property
+    def origin(self) -> Path:
+        """What the lineage calls it."""
+        return self.artifact.origin(self.folder)
 
     def path(self, ref: FileRef) -> Path:
         """The absolute path of one of the artifact's files."""

@@ -5,6 +5,7 @@ They are manifests as in pipeline/artifacts.py.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 from pipeline.artifacts import Artifact, FileRef, Matrix
@@ -56,6 +57,10 @@ class CaptureSource(Artifact):
     stage: tuple[FileRef, ...] = ()
     brackets: tuple[Bracket, ...] = ()
     pairs: tuple[PolarisedPair, ...] = ()
+
+    def origin(self, folder: Path) -> Path:
+        """Of a video the file itself: other people's videos may lie in the same folder."""
+        return folder / self.photos[0].path if self.kind == "video" else folder
 
 
 class GivenCamera(Artifact):

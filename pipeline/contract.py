@@ -228,7 +228,7 @@ def execute(
     """
     k = key(stage, inputs, config)
     with store.lock(stage.name, k), _disk_faults(store.root):
-        read = {f.name: getattr(inputs, f.name).folder for f in dataclasses.fields(inputs)}  # type: ignore[arg-type]
+        read = {f.name: getattr(inputs, f.name).origin for f in dataclasses.fields(inputs)}  # type: ignore[arg-type]
         store.trace(stage.name, k, read | config.made_from())
         found = store.load(stage.name, k, stage.output)
         if found is not None:

@@ -99,6 +99,8 @@ def purge_command(options: argparse.Namespace, console: Console) -> int:
         print(f"{len(found.paths)} paths, {size / 1e6:.1f} MB removed")
     for path in found.users:
         print(f"a file of your own, yours to remove: {path}")
+    for path in found.unsure:
+        print(f"not removed, as an older version did not record of which video in its folder it is: {path}")
     for photos in found.photos:
         print(f"the photos themselves are yours to remove: {photos}")
     return 0

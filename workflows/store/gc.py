@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.store import LINEAGE, LOCKS, Store, lineage
-from stages.registry import ALSO, SOURCE
 from workflows.batch.captures import RECORDS
 from workflows.batch.page import AVERAGE, TABLES, captures_in
 from workflows.batch.state import Entry
@@ -22,6 +21,7 @@ from workflows.run.published import FOLDERS, LIST, TRUTH, is_ours, is_record, li
 from workflows.run.published import entries as files_in
 from workflows.run.room import size_of
 from workflows.run.run_lock import lock_is_free
+from workflows.store.films import Known, films_in, is_made_from, of_older_versions, photos_of
 from workflows.store.roots import Root, forget_root, roots
 
 DAY = 86400.0
@@ -107,8 +107,9 @@ def _is_ours(store: Store, stage: str, key: str) -> bool:
 class Purge:
     """All that a subject left: folders and files to remove, and the runs among them.
 
-    What stays: the photos, and users: files of the user's own, and edited ones, in the folders of results. top: the
-    folder that the user named.
+    What stays: the photos, users: files of the user's own, and edited ones, in the folders of results, and unsure:
+    results of an older version from a video in the same folder, perhaps of another person's. top: the folder that the
+    user named.
     """
 
     top: Path
@@ -116,6 +117,7 @@ class Purge:
     outs: tuple[Path, ...]
     photos: tuple[Path, ...]
     users: tuple[Path, ...]
+    unsure: tuple[Path, ...] = ()
 
     @property
     def size(self) -> int:
@@ -128,9 +130,13 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     out = out.absolute()
     runs = [r for r in _roots_of(out, store) if _is_of(subject, r, out)]
     entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
-    photos = {p for r in runs for p in _photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
+    photos = {p for r in runs for p in photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
+    known = _lineages(store)
+    photos |= set(films_in(photos, known))
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
-    paths, users = set(_made_from(photos, store)), set[Path]()
+    own = {f"{stage}/{key}" for r in runs for stage, key in r.keys.items()}
+    paths, users = set(_made_from(photos, own, known, store)), set[Path]()
+    unsure = set(_unsure(photos, known, store)) - paths
     outs |= {r.out for r in _roots_of(out, store) if any(store.folder(*m) in paths for m in _shapes_of(r, store))}
     outs |= {out} if _tells_of(subject, out) else set()
     for o in (o for o in outs if o.is_dir()):
@@ -149,7 +155,8 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     for o in outs:  # the throw-away server of a run keeps its parameters
         home = store.root / ".prefect" / hashlib.sha256(str(o.resolve()).encode()).hexdigest()[:8]
         paths |= {home} if home.is_dir() else set()
-    return Purge(out, tuple(sorted(paths)), tuple(sorted(outs)), tuple(sorted(photos)), tuple(sorted(users)))
+    found = (paths, outs, photos, users, unsure)
+    return Purge(out, *(tuple(sorted(f)) for f in found))
 
 
 def _tells_of(subject: str, out: Path) -> bool:
@@ -231,14 +238,6 @@ def _is_of(subject: str, root: Root, out: Path) -> bool:
     return inside[:1] == (subject,) if inside else Path(root.capture).name == subject
 
 
-def _photos_of(root: Root, store: Store) -> Iterator[Path]:
-    """The folders that a run's first stages read, also of its second capture, which shows the same person; run.json
-    may name them relative to an unknown folder."""
-    for stage, key in root.keys.items():
-        origins = lineage(store.root / LINEAGE / f"{stage}-{key}.json")
-        yield from (Path(p) for name in (SOURCE, ALSO + SOURCE) for p in origins.get(name, ()))
-
-
 def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:
     for path in sorted((out / RECORDS / "captures").glob("*.json")):
         try:
@@ -247,21 +246,39 @@ def _entries(out: Path) -> Iterator[tuple[Path, Entry]]:
             continue
 
 
-def _made_from(photos: set[Path], store: Store) -> Iterator[Path]:
-    """Every folder of the store that comes, over any number of stages, from one of these folders; and its lineage."""
-    folder = store.root / LINEAGE
-    known = {p: {x for names in lineage(p).values() for x in names} for p in sorted(folder.glob("*.json"))}
+def _lineages(store: Store) -> dict[Path, set[str]]:
+    files = sorted((store.root / LINEAGE).glob("*.json"))
+    return {p: {x for names in lineage(p).values() for x in names} for p in files}
+
+
+def _made_from(photos: set[Path], own: set[str], known: Known, store: Store) -> Iterator[Path]:
+    """Every folder of the store that comes, over any number of stages, from one of these photos or is one of the runs'
+    `own`; and its lineage."""
     reached, grown = {str(p) for p in photos}, True
     taken: set[Path] = set()
     while grown:
         grown = False
         for path, origins in known.items():
             stage, _, key = path.stem.rpartition("-")
-            if path not in taken and origins & reached and _KEY.fullmatch(key):
+            if path in taken or not _KEY.fullmatch(key):
+                continue
+            if f"{stage}/{key}" in own or is_made_from(origins, reached, store, stage, key):
                 taken.add(path)
                 reached.add(f"{stage}/{key}")
                 grown = True
     for path in taken:
-        stage, _, key = path.stem.rpartition("-")
         yield path
-        yield from (p for p in (store.root / stage).glob(f"{key}*") if _KEY.fullmatch(p.name))
+        yield from _folders_of(path, store)
+
+
+def _folders_of(path: Path, store: Store) -> Iterator[Path]:
+    """What the store has of the key that a file of the lineage is of, finished or not."""
+    stage, _, key = path.stem.rpartition("-")
+    return (p for p in (store.root / stage).glob(f"{key}*") if _KEY.fullmatch(p.name))
+
+
+def _unsure(photos: set[Path], known: Known, store: Store) -> Iterator[Path]:
+    """What may be of this person's video or of another one's, and of no published run."""
+    named = {f"{stage}-{key}" for r in roots(store) for stage, key in r.keys.items()}
+    for path in of_older_versions(photos, known):
+        yield from _folders_of(path, store) if path.stem not in named else ()
