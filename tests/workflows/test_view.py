@@ -209,7 +209,10 @@ def test_each_fault_is_said_and_the_rest_is_shown(run: Path, tmp_path: Path) -> 
     finished(run, request={"out": str(tmp_path / "before")})
     assert "was moved" in troubles(run) and "before" in troubles(run)
     finished(run, request={"out": str(tmp_path / "before")}, store=str(tmp_path / "gone"))
+    assert "was moved" in troubles(run) and "store is not" not in troubles(run)  # its own store moved with it
+    (run / ".store").rename(run / "elsewhere")
     assert "store is not where it was" in troubles(run)
+    (run / "elsewhere").rename(run / ".store")
     finished(run, stages={"report": {"key": "other"}})
     assert "no longer in the store" in troubles(run)
     finished(run, verdict=None)

@@ -14,6 +14,7 @@ from workflows.cli.console import Console
 from workflows.cli.dry_run import dry_run
 from workflows.cli.keys import keys_of
 from workflows.cli.options import request_from, with_provenance, with_viewer
+from workflows.cli.report import report_request
 from workflows.cli.summary import tell
 from workflows.cli.view import server_of
 from workflows.live.look import REPORT, check_is_run
@@ -218,11 +219,7 @@ def render_command(options: argparse.Namespace, console: Console) -> int:
 def report_command(options: argparse.Namespace, console: Console) -> int:
     """neuface report"""
     out = Path(options.folder)
-    record = read_record(out)
-    request = RunRequest(
-        **{**record["request"], "out": str(out), "store": record["store"], "from_stage": "report", "until": None}
-    )
-    record = run(request, console)
+    record = run(report_request(read_record(out), out), console)
     tell(record, out, console)
     return exit_code(record)
 

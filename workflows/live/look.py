@@ -16,6 +16,7 @@ from pipeline.errors import StageError
 from pipeline.store import MANIFEST, read_object
 from workflows.live.folder import FOLDER, FORMAT, PICTURES, STATE, is_state, read_small
 from workflows.live.publisher import told
+from workflows.run.moved import keys_of, store_of
 from workflows.run.published import LIST, listed
 from workflows.run.run_lock import is_held
 
@@ -126,18 +127,17 @@ def _of_the_record(out: Path, record: dict[str, Any]) -> Iterator[str]:
     request = record["request"] if isinstance(record["request"], dict) else {}
     before = request.get("out")
     if isinstance(before, str) and before and Path(before).absolute().resolve() != out.resolve():
-        lost = not Path(str(record["store"])).is_dir()
+        lost = not store_of(record, out).is_dir()
         more = " Its store is not where it was: `neuface report` can't find finished stages." if lost else ""
         yield f"The folder was moved: the run wrote to {before}.{more}"
-    elif not _has_stages(record):
+    elif not _has_stages(record, out):
         yield "The finished stages are no longer in the store: a next run makes them again."
 
 
-def _has_stages(record: dict[str, Any]) -> bool:
+def _has_stages(record: dict[str, Any], out: Path) -> bool:
     """Whether the store has the manifests of all stages."""
-    store = Path(str(record["store"]))
-    keys = {n: s.get("key") for n, s in record["stages"].items() if isinstance(s, dict)}
-    return all((store / n / str(k) / MANIFEST).is_file() for n, k in keys.items())
+    store = store_of(record, out)
+    return all((store / stage / key / MANIFEST).is_file() for stage, key in keys_of(record))
 
 
 def _last(record: dict[str, Any]) -> str:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from pipeline import threads
 from pipeline.contract import Stage
 from pipeline.store import RUN, Store, read_object
 from stages.registry import SOURCE
+from workflows.run.moved import keys_of, store_of
 from workflows.run.plan import Plan, Step
 
 SETTINGS_SHOWN = 3  # of one stage
@@ -56,11 +56,9 @@ def _reason(plan: Plan, stage: Stage[Any, Any, Any], step: Step, before: str | N
 def _keys_before(plan: Plan) -> dict[str, str]:
     """Stage -> key of the run that the output folder is from; empty where there is none, or it used another store."""
     record = read_object(plan.out / "run.json")
-    if Path(str(record.get("store", ""))).resolve() != plan.store.root.resolve():
+    if store_of(record, plan.out).resolve() != plan.store.root.resolve():
         return {}
-    stages = record.get("stages")
-    listed = stages.items() if isinstance(stages, Mapping) else ()
-    return {name: str(s["key"]) for name, s in listed if isinstance(s, Mapping) and "key" in s}
+    return dict(keys_of(record))
 
 
 def _settings_changed(plan: Plan, stage: Stage[Any, Any, Any], before: str) -> str:

@@ -22,7 +22,7 @@ from workflows.run.published import entries as files_in
 from workflows.run.room import size_of
 from workflows.run.run_lock import lock_is_free
 from workflows.store.films import Known, films_in, is_made_from, of_older_versions, photos_of
-from workflows.store.roots import Root, forget_root, roots
+from workflows.store.roots import Root, forget_root, notes_of_moved, roots
 
 DAY = 86400.0
 MEASURED = "measured"  # setting of usd, and folder in the store (workflows/batch/measure.py)
@@ -136,6 +136,7 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
     own = {f"{stage}/{key}" for r in runs for stage, key in r.keys.items()}
     paths, users = set(_made_from(photos, own, known, store)), set[Path]()
+    paths |= {note for r in runs for note in notes_of_moved(store, r.keys)}
     unsure = set(_unsure(photos, known, store)) - paths
     outs |= {r.out for r in _roots_of(out, store) if any(store.folder(*m) in paths for m in _shapes_of(r, store))}
     outs |= {out} if _tells_of(subject, out) else set()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.store import Store, read_object
+from workflows.run.moved import keys_of
 
 ROOTS = ".roots"
 
@@ -38,6 +39,14 @@ def forget_root(store: Store, out: Path) -> None:
     (store.root / ROOTS / f"{_name(out)}.json").unlink(missing_ok=True)
 
 
+def notes_of_moved(store: Store, keys: Mapping[str, str]) -> Iterator[Path]:
+    """Notes of a run with these keys at a place where no run is any more: they name its former folder."""
+    for path in sorted((store.root / ROOTS).glob("*.json")):
+        out = _out_of(path)
+        if read_object(path).get("keys") == dict(keys) and out is not None and not (out / "run.json").is_file():
+            yield path
+
+
 def roots(store: Store) -> Iterator[Root]:
     """Every published folder that still exists, by its run.json: a later run may have replaced it."""
     folders = {_out_of(p) for p in sorted((store.root / ROOTS).glob("*.json"))}
@@ -46,14 +55,20 @@ def roots(store: Store) -> Iterator[Root]:
         folders |= {p.parent for pattern in ("run.json", "*/run.json", "*/*/run.json") for p in beside.glob(pattern)}
     for out in sorted(f for f in folders if f is not None):
         record = read_object(out / "run.json")
-        stages = record.get("stages")
-        if isinstance(stages, dict) and _serves(store, record):
-            keys = {n: str(s["key"]) for n, s in stages.items() if isinstance(s, dict) and "key" in s}
-            yield Root(out, str(record.get("request", {}).get("capture", "")), keys)
+        if _serves(store, record):
+            asked = record.get("request")
+            capture = str(asked.get("capture", "")) if isinstance(asked, dict) else ""
+            yield Root(out, capture, dict(keys_of(record)))
 
 
 def _serves(store: Store, record: dict[str, Any]) -> bool:
-    return Path(str(record.get("store", ""))).resolve() == store.root.resolve()
+    """Whether run.json names this store, or one that is not known there by its place any more: a folder that was moved,
+    or is mounted elsewhere, has the run's results under the run's keys."""
+    if not isinstance(record.get("stages"), dict):
+        return False
+    if Path(str(record.get("store", ""))).resolve() == store.root.resolve():
+        return True
+    return any(store.folder(stage, key).is_dir() for stage, key in keys_of(record))
 
 
 def _out_of(path: Path) -> Path | None:
