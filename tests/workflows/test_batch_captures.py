@@ -11,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import StageError, UsageError
-from tests.support.scripted_batch import capture_tree
+from tests.support.scripted_batch import capture_tree, go
 from workflows.batch import captures
 from workflows.batch.captures import NAME, find, ranges
 from workflows.batch.request import BatchRequest, asset_name
+from workflows.batch.state import BatchState
 
 
 @pytest.fixture
@@ -34,6 +35,41 @@ def test_photos_without_params_are_a_fault_and_not_passed_over(tree: Path) -> No
     (tree / "2/1_neutral/params.json").unlink()
     item = next(i for i in find(tree) if i.name == "2/1_neutral")
     assert item.fault is not None and "params.json is missing" in item.fault
+
+
+ODD_NAMES = [
+    "12 b/1_neutral",
+    "3/1 smile",
+    "Jörg/1_neutral",
+    "3/schön",
+    "-x/1",
+    "4/" + "a" * 70,
+    "5/a\nb",
+    "6/b\udcff",
+]
+
+
+@pytest.mark.parametrize("place", ODD_NAMES)
+@pytest.mark.parametrize("cameras", [True, False])
+def test_a_folder_whose_name_no_result_can_have_is_a_fault_of_its_own(tree: Path, place: str, cameras: bool) -> None:
+    """The others run; its record and its line in the table have a name that is near to the folder's."""
+    folder = tree / place
+    folder.mkdir(parents=True)
+    (folder / ("params.json" if cameras else "0.jpg")).write_text("{}")
+    (odd,) = (i for i in find(tree) if i.fault is not None)
+    assert NAME.fullmatch(odd.name) and odd.fault is not None and "rename it" in odd.fault
+    assert ascii(place.split("/")[0])[1:-1] in ascii(odd.fault)
+    summary, runner = go(tree, {})
+    assert len(runner.started) == 5 and summary.counts()["failed"] == 1
+    entry = BatchState(tree.parent / "out/batch").read(odd)
+    assert entry.state == "failed" and entry.fault is not None and entry.fault.message == odd.fault
+
+
+def test_two_odd_names_with_the_same_letters_are_two_captures(tree: Path) -> None:
+    for name in ("Jörg", "Järg"):
+        (tree / name / "1").mkdir(parents=True)
+        (tree / name / "1/params.json").write_text("{}")
+    assert len(find(tree)) == 7 and len(find(tree, "1-10")) == 5
 
 
 @pytest.mark.parametrize("text", ["", "a", "3-1", "1,,2", "-1", "1-2-3", "1 2"])

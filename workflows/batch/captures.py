@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -84,23 +86,40 @@ def find(root: Path, subjects: str | None = None, expressions: str | None = None
 
 # ------------------------------------------------------------------ a tree
 def _tree(root: Path) -> Iterator[Item]:
-    """ID/EXPRESSION. A folder of photos without params.json is reported, not skipped."""
+    """ID/EXPRESSION. A folder of photos without params.json, or with a name that no result can have, is reported and
+    not skipped."""
     for subject in _folders(root):
         for folder in _folders(subject):
-            name = f"{subject.name}/{folder.name}"
-            if not NAME.fullmatch(name):
-                continue
-            if (folder / PARAMS).is_file():
-                yield Item(name=name, capture=folder, subject=subject.name, expression=folder.name)
-            elif any(p.suffix.lower() in PHOTOS for p in folder.iterdir()):
-                yield Item(
-                    name=name,
-                    capture=folder,
-                    subject=subject.name,
-                    expression=folder.name,
-                    fault=f"{PARAMS} is missing: put it back, or name the folder in a list if its cameras are to be "
-                    "solved",
+            fault = None
+            if not (folder / PARAMS).is_file():
+                if not any(p.suffix.lower() in PHOTOS for p in folder.iterdir()):
+                    continue
+                fault = (
+                    f"{PARAMS} is missing: put it back, or name the folder in a list if its cameras are to be solved"
                 )
+            yield _in_tree(subject, folder, fault)
+
+
+def _in_tree(subject: Path, folder: Path, fault: str | None) -> Item:
+    """The item of one folder. The records of the batch are kept under its name: where the folder's own can't be that
+    of a result, it gets one that is near to it, and a fault."""
+    name = f"{subject.name}/{folder.name}"
+    if NAME.fullmatch(name):
+        return Item(name=name, capture=folder, subject=subject.name, expression=folder.name, fault=fault)
+    shown, *parts = (t.encode("utf-8", "backslashreplace").decode() for t in (str(folder), subject.name, folder.name))
+    mark = hashlib.sha256(os.fsencode(name)).hexdigest()[:6]  # two such names may have the same plain letters
+    return Item(
+        name=f"{_plain(parts[0])}/{_plain(parts[1])}-{mark}",
+        capture=Path(shown),
+        subject=parts[0],
+        expression=parts[1],
+        fault=f"no result can have the name of the folder {shown}: rename it, or give the capture a name in a list "
+        "(letters a to z, digits, _ - ., at most 64 each for subject and expression)",
+    )
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"^[.-]", "_", re.sub(r"[^A-Za-z0-9_.-]", "_", text))[:50]
 
 
 def _folders(of: Path) -> list[Path]:
