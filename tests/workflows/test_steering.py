@@ -22,6 +22,7 @@ from tests.support.points import wait_for
 from tests.support.steered import Recorded, in_thread, plan_of
 from workflows.cli.console import Console
 from workflows.cli.keys import HELP, Keys, keys_of
+from workflows.cli.main import main
 from workflows.live.folder import ASK, FOLDER, PICTURES, LiveFolder, put_whole
 from workflows.live.look import look_at
 from workflows.live.publisher import Live, told_live
@@ -35,6 +36,43 @@ from workflows.run.session import Session
 from workflows.run.steering import LOOK, Steering
 
 TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
+
+
+# ------------------------------------------------------------------ how to resume
+@pytest.mark.usefixtures("toys")
+@pytest.mark.parametrize("again", [True, False])
+def test_a_stopped_run_from_a_stage_says_how_to_resume_and_that_is_right(
+    again: bool, photos: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of six steps three are done when it is stopped; they are kept only without --from-stage."""
+    command = ["run", str(photos), "--out", str(photos.parent / "out"), "--set", "second.steps=6"]
+    assert main(command) == 0
+    seen: list[int] = []
+
+    def progress(console: Console, done: int, total: int, message: str = "", **figures: float) -> None:
+        seen.append(done)
+        if seen == [0, 1, 2, 3]:
+            raise Cancelled("stopped by the user")
+
+    monkeypatch.setattr(Console, "progress", progress)
+    capsys.readouterr()
+    assert main([*command, "--from-stage", "second"]) == 130
+    assert "to resume, run it again without --from-stage: with it, second begins anew" in capsys.readouterr().err
+    begun = len(seen)
+    assert main([*command, *(["--from-stage", "second"] if again else [])]) == 0
+    assert seen[begun:] == ([0, 1, 2, 3, 4, 5] if again else [3, 4, 5])
+
+
+@pytest.mark.usefixtures("toys")
+def test_another_stopped_run_resumes_with_the_same_command(
+    photos: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def progress(console: Console, *given: object, **figures: float) -> None:
+        raise Cancelled("stopped by the user")
+
+    monkeypatch.setattr(Console, "progress", progress)
+    assert main(["run", str(photos), "--out", str(photos.parent / "out"), "--set", "second.steps=6"]) == 130
+    assert "stopped; run the same command again to resume" in capsys.readouterr().err
 
 
 # ------------------------------------------------------------------ the wishes

@@ -81,10 +81,17 @@ def run_command(options: argparse.Namespace, console: Console) -> int:
         record = run(request, console)
     except Cancelled:
         console.close()
-        console.note("stopped; run the same command again to resume")
+        console.note(f"stopped; {how_to_resume(request)}")
         raise
     tell(record, Path(options.out), console)
     return exit_code(record)
+
+
+def how_to_resume(request: RunRequest) -> str:
+    """What to do after a stop. --from-stage once more would throw the new checkpoint away, as it did the old result."""
+    if request.from_stage is not None:
+        return f"to resume, run it again without --from-stage: with it, {request.from_stage} begins anew"
+    return "run the same command again to resume"
 
 
 def demo_command(options: argparse.Namespace, console: Console) -> int:
