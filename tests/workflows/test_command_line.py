@@ -14,9 +14,11 @@ from typing import Any
 
 import pytest
 
+from pipeline.errors import Cancelled
 from stages import registry
 from tests.support.points import PATIENCE, hold, read_until
 from tests.support.toy_stages import TOYS
+from workflows.cli.console import Console
 from workflows.cli.main import COMMANDS, main, parser
 
 TOY = Path(__file__).parents[1] / "support" / "toy_neuface.py"
@@ -98,6 +100,43 @@ def test_a_capture_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert main(["run", str(tmp_path / "gone"), "--out", str(tmp_path / "out")]) == 1
     assert str(tmp_path / "gone") in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.usefixtures("toys")
+@pytest.mark.parametrize(
+    ("options", "stopped", "code", "event"),
+    [
+        (["--set", "second.fault=stage"], None, 1, "error"),
+        (["--preset", "drfat"], None, 2, "error"),
+        ([], 130, 130, "stopped"),
+        ([], 143, 143, "stopped"),
+    ],
+)
+def test_verbose_adds_a_traceback_and_changes_nothing_else(
+    options: list[str],
+    stopped: int | None,
+    code: int,
+    event: str,
+    photos: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def progress(console: Console, *given: object, **figures: float) -> None:
+        if stopped is not None:
+            error = Cancelled("stopped by the user")
+            error.exit_code = stopped  # as after a signal
+            raise error
+
+    monkeypatch.setattr(Console, "progress", progress)
+    said = []
+    for verbose in ([], ["--verbose"]):
+        assert main([*verbose, "run", str(photos), "--out", str(photos.parent / "out"), "--json", *options]) == code
+        told = capsys.readouterr()
+        last = json.loads(told.out.splitlines()[-1])
+        assert (last["event"], last["exit_code"]) == (event, code)
+        assert ("Traceback" in told.err) == bool(verbose)
+        said.append(last["text"])
+    assert said[0] == said[1]
 
 
 # ------------------------------------------------------------------ runs

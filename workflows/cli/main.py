@@ -16,6 +16,7 @@ import logging
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
@@ -148,8 +149,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         known = (
             e if isinstance(e, NeufaceError) else stage_error_from_os_error(e, "") if isinstance(e, OSError) else None
         )
-        if known is None or options.verbose:
+        if known is None:
             raise
+        if options.verbose:
+            with suppress(OSError):  # as below
+                traceback.print_exception(e)
         code = known.exit_code
         console.result("stopped" if isinstance(known, Cancelled) else "error", text=str(known), exit_code=code)
         with suppress(OSError):  # the terminal may be gone
