@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -10,6 +12,7 @@ import pytest
 
 from pipeline.errors import UsageError
 from workflows.cli import turntable
+from workflows.cli.main import main
 from workflows.cli.turntable import TurntableRequest, write_turntable
 
 
@@ -32,3 +35,35 @@ def test_a_film_has_its_frames(kind: str, tmp_path: Path, monkeypatch: pytest.Mo
 def test_films_that_no_player_shows_are_refused(name: str, size: int, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="film"):
         write_turntable(TurntableRequest(tmp_path, tmp_path / name, size=size))
+
+
+@pytest.mark.parametrize("kind", ["mp4", "webp"])
+def test_a_full_disk_is_told_and_the_former_film_stays(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A limit for files stands for the disk: OpenCV's writer of MP4 tells of neither."""
+    rng = np.random.default_rng(0)
+    noise = [rng.integers(0, 256, (128, 128, 3), np.uint8) for _ in range(20)]
+    monkeypatch.setattr(turntable, "frames", lambda request: iter(noise))
+    out = tmp_path / f"film.{kind}"
+    out.write_bytes(b"the former film")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (65536, limits[1]))
+    try:
+        code = main(["turntable", str(tmp_path), "--out", str(out), "--frames", "20", "--size", "128"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = capsys.readouterr().err
+    assert code == 1 and "what to do:" in said and "Traceback" not in said
+    assert [p.name for p in tmp_path.iterdir()] == [out.name] and out.read_bytes() == b"the former film"
+
+
+def test_a_film_that_is_interrupted_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(request: TurntableRequest) -> Iterator[np.ndarray]:
+        yield np.zeros((64, 64, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(turntable, "frames", broken)
+    with pytest.raises(KeyboardInterrupt):
+        write_turntable(TurntableRequest(tmp_path, tmp_path / "film.mp4", frames=5, size=64))
+    assert list(tmp_path.iterdir()) == []

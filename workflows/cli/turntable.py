@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from pipeline.errors import StageError, UsageError
 from workflows.cli.render import CAPTURED, component_in, light_named
+from workflows.run.owned import partial_name
 
 U8 = npt.NDArray[np.uint8]
 KINDS = (".mp4", ".webp")
@@ -31,7 +32,7 @@ class TurntableRequest:
 
 
 def write_turntable(request: TurntableRequest) -> Path:
-    """Render one turn and write it as a film.
+    """Render one turn and write it as a film. It has its name when it is whole; a former one stays until then.
 
     Raises:
         UsageError: not a film's name, or an odd size, which no player of MP4 shows. StageError: something of the asset
@@ -47,7 +48,12 @@ def write_turntable(request: TurntableRequest) -> Path:
             remedy="for example --out film.mp4 --size 1080",
         )
     request.out.parent.mkdir(parents=True, exist_ok=True)
-    (_write_mp4 if kind == ".mp4" else _write_webp)(request, frames(request))
+    partial = partial_name(request.out.parent, request.out.name)
+    try:
+        (_write_mp4 if kind == ".mp4" else _write_webp)(request, frames(request), partial)
+        partial.replace(request.out)
+    finally:
+        partial.unlink(missing_ok=True)
     return request.out
 
 
@@ -67,11 +73,11 @@ def frames(request: TurntableRequest) -> Iterator[U8]:
         yield np.round(srgb_from_linear(shown.clip(0, 1)) * 255).astype(np.uint8)
 
 
-def _write_mp4(request: TurntableRequest, pictures: Iterator[U8]) -> None:
+def _write_mp4(request: TurntableRequest, pictures: Iterator[U8], path: Path) -> None:
     import cv2
 
     code = cv2.VideoWriter_fourcc(*"mp4v")  # type: ignore[attr-defined]
-    film = cv2.VideoWriter(str(request.out), code, RATE, (request.size, request.size))
+    film = cv2.VideoWriter(str(path), code, RATE, (request.size, request.size))
     if not film.isOpened():
         raise _unwritten(request.out)
     try:
@@ -79,23 +85,38 @@ def _write_mp4(request: TurntableRequest, pictures: Iterator[U8]) -> None:
             film.write(np.ascontiguousarray(picture[..., ::-1]))
     finally:
         film.release()
+    count = _frames_in(path)  # where the disk is full, OpenCV says nothing
+    if count != request.frames:
+        raise _unwritten(request.out, f"a film of which {count} of {request.frames} pictures can be read")
 
 
-def _write_webp(request: TurntableRequest, pictures: Iterator[U8]) -> None:
+def _frames_in(path: Path) -> int:
+    import cv2
+
+    film, count = cv2.VideoCapture(str(path)), 0
+    while film.grab():
+        count += 1
+    film.release()
+    return count
+
+
+def _write_webp(request: TurntableRequest, pictures: Iterator[U8], path: Path) -> None:
     import cv2
 
     film: Any = cv2.Animation()
     film.frames = [np.ascontiguousarray(p[..., ::-1]) for p in pictures]
     film.durations = np.full(len(film.frames), round(1000 / RATE), np.int32)
-    if not cv2.imwriteanimation(str(request.out), film, [cv2.IMWRITE_WEBP_QUALITY, 85]):
+    made, data = cv2.imencodeanimation(".webp", film, [cv2.IMWRITE_WEBP_QUALITY, 85])
+    if not made:
         raise _unwritten(request.out)
+    path.write_bytes(data.tobytes())
 
 
-def _unwritten(path: Path) -> StageError:
+def _unwritten(path: Path, value: str = "OpenCV reported a failure") -> StageError:
     return StageError(
         "the film can't be written",
         where=path,
-        value="OpenCV reported a failure",
-        limit="a writable folder, and OpenCV with its video writers",
-        remedy="try the other kind, .webp or .mp4",
+        value=value,
+        limit="a writable folder with enough free space, and OpenCV with its video writers",
+        remedy="free space on this disk, or try the other kind, .webp or .mp4",
     )
