@@ -18,6 +18,7 @@ from stages.reflectance.field import save
 from tests.reflectance.test_field import field_of
 from tests.support.light_stage import SIZE, make_stage, write_stage
 from workflows.cli.main import main
+from workflows.cli.parsing import joined
 from workflows.cli.relight import environment, lamp_from
 from workflows.cli.render import capture_from_asset_of
 from workflows.run.publish import reflectance_files
@@ -42,6 +43,31 @@ def test_pictures_are_written_and_lights_add_up(run: Path) -> None:
         assert (run.parent / name / "1.png").is_file()
     assert made["a"].shape == (SIZE, SIZE, 4) and made["a"][..., 0].max() > 0.2
     np.testing.assert_allclose(made["both"][..., :3], made["a"][..., :3] + made["b"][..., :3], atol=1e-5)
+
+
+def test_a_lamp_to_the_left_needs_no_equals_sign(run: Path) -> None:
+    """Its place begins with a minus, as options do."""
+    common = ["render", str(run), "--cameras", str(run.parent / "in" / "params.json"), "--views", "1"]
+    for name, light in (("a", ["--light", "-0.3,0.4,1.2"]), ("b", ["--light=-0.3,0.4,1.2"])):
+        assert main([*common, *light, "--light", "-.2,0,1", "--out", str(run.parent / name)]) == 0
+    assert (run.parent / "a/1.exr").read_bytes() == (run.parent / "b/1.exr").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        ("render x --light -0.3,0,1 --quick", ["render", "x", "--light=-0.3,0,1", "--quick"]),
+        ("--light -.3 --light 1", ["--light=-.3", "--light", "1"]),
+        ("--light --quick", ["--light", "--quick"]),
+        ("--light -q", ["--light", "-q"]),
+        ("--env -1", ["--env", "-1"]),
+        ("-- --light -1", ["--", "--light", "-1"]),
+        ("--light", ["--light"]),
+        ("-1", ["-1"]),
+    ],
+)
+def test_a_value_with_a_minus_is_joined_with_its_option(words: str, wanted: list[str]) -> None:
+    assert joined(words.split()) == wanted == joined(wanted)
 
 
 def test_an_environment_is_a_light_too(run: Path) -> None:

@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 import sys
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
+
+SIGNED = ("--light",)  # options whose values may begin with a minus
 
 
 def meant(word: str, choices: Collection[str]) -> str:
     """ "; did you mean run?", or nothing where no choice is like the word."""
     near = difflib.get_close_matches(word, list(choices), n=1)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def joined(words: Sequence[str]) -> list[str]:
+    """`--light -0.3,0.4,1.2` as one word: argparse takes a value that begins with a minus for an option."""
+    out: list[str] = []
+    for word in words:
+        if out and out[-1] in SIGNED and re.match(r"-[\d.]", word) and "--" not in out:
+            out[-1] += f"={word}"
+        else:
+            out.append(word)
+    return out
 
 
 class Parser(argparse.ArgumentParser):
@@ -28,7 +42,7 @@ class Parser(argparse.ArgumentParser):
         fill, self.fill = self.fill, None
         if fill is not None:
             fill(self)
-        words = sys.argv[1:] if args is None else list(args)
+        words = joined(sys.argv[1:] if args is None else list(args))
         self._refuse_unknown(words if self._subparsers is None else words[: self._own(words)])
         return super().parse_known_args(words, namespace)
 
