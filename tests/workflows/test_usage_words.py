@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from workflows.cli.main import main
+from workflows.cli.numbers import number, whole, whole_list
 from workflows.cli.summary import summary
 
 
@@ -56,6 +57,42 @@ def test_an_abbreviated_option_and_a_value_after_an_equals_sign_are_known(capsys
     assert json.loads(capsys.readouterr().out)
     assert main(["settings", "--", "--json"]) == 2  # after -- it is a name
     assert "--json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        ("schedule RUN --gpus a,b", "--gpus"),
+        ("schedule RUN --gpus 1,,8", "--gpus"),
+        ("schedule RUN --gpus 0", "--gpus"),
+        ("schedule RUN --captures -5", "--captures"),
+        ("schedule RUN --captures 99999999999999999999", "--captures"),
+        ("schedule RUN --workers 0", "--workers"),
+        ("schedule RUN --lost 1.5", "--lost"),
+        ("schedule RUN --link 0", "--link"),
+        ("schedule RUN --spread nan", "--spread"),
+        ("schedule RUN --fit-seconds inf", "--fit-seconds"),
+        ("serve --server-only --port 99999999", "--port"),
+        ("serve --server-only --port 0", "--port"),
+        ("serve --limit 0", "--limit"),
+        ("batch tree --out o --workers ten", "--workers"),
+        ("demo --views 7", "--views"),
+    ],
+)
+def test_numbers_outside_of_their_limits_are_wrong_usage(
+    arguments: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as e:
+        main(arguments.split())
+    assert e.value.code == 2
+    said = capsys.readouterr().err
+    assert f"argument {option}" in said and " number " in said
+
+
+def test_numbers_within_their_limits() -> None:
+    assert whole(1, 65535)("65535") == 65535 and whole(0)("0") == 0
+    assert whole_list(1, 100)("1, 8,64") == (1, 8, 64)
+    assert number(0)("0") == 0 and number(0, 0.9)("0.9") == 0.9 and number(0, above=True)("1e-3") == 1e-3
 
 
 # ------------------------------------------------------------------ the summary

@@ -9,6 +9,7 @@ from pathlib import Path
 from pipeline.errors import Cancelled, UsageError
 from workflows.batch.request import BatchRequest
 from workflows.cli.console import Console
+from workflows.cli.numbers import whole
 from workflows.cli.options import a_time, add_request_options, request_from
 from workflows.run.verdict import REFUSED
 from workflows.server import environment
@@ -19,7 +20,7 @@ ON_A_SERVER = ("deployment", "chunk", "priority", "gpus", "lost_after")
 def batch_options(batch: argparse.ArgumentParser) -> None:
     """Those of neuface batch."""
     add_request_options(batch, BatchRequest, without=ON_A_SERVER)
-    batch.add_argument("--workers", type=int, default=1, metavar="N", help="captures at a time here (%(default)s)")
+    batch.add_argument("--workers", type=whole(1), default=1, metavar="N", help="captures at a time here (%(default)s)")
     batch.add_argument("--dry-run", action="store_true", help="say what would run, and run nothing")
     server = batch.add_argument_group("on a Prefect server with a pool of workers")
     server.add_argument("--server", action="store_true", help="submit a run for each capture to $PREFECT_API_URL")
@@ -30,8 +31,8 @@ def batch_options(batch: argparse.ArgumentParser) -> None:
 def serve_options(serve: argparse.ArgumentParser) -> None:
     """Those of neuface serve."""
     serve.add_argument("--host", default="127.0.0.1", help="address of the server's page (%(default)s: this machine)")
-    serve.add_argument("--port", type=int, default=4200, help="(%(default)s)")
-    serve.add_argument("--limit", type=int, default=1, metavar="N", help="captures at a time (%(default)s)")
+    serve.add_argument("--port", type=whole(1, 65535), default=4200, help="(%(default)s)")
+    serve.add_argument("--limit", type=whole(1), default=1, metavar="N", help="captures at a time (%(default)s)")
     serve.add_argument("--home", default="~/.neuface", metavar="DIR", help="the server's records (%(default)s)")
     serve.add_argument(
         "--root",
@@ -81,7 +82,7 @@ def batch_command(options: argparse.Namespace, console: Console) -> int:
             from workflows.batch.local import Processes
             from workflows.run.interrupt import interruptible
 
-            runner = Processes(request, slots=max(1, options.workers))
+            runner = Processes(request, slots=options.workers)
             with interruptible(stop, console.note, runner.kill):
                 summary = run_batch(request, runner, stopped=stop.is_set, notify=console.note)
     except Cancelled:

@@ -22,6 +22,7 @@ from typing import Any
 from pipeline.errors import StageError
 from stages.registry import FIT
 from workflows.cli.console import Console
+from workflows.cli.numbers import number, whole, whole_list
 
 HOUR = 3600.0
 
@@ -192,14 +193,22 @@ def _bytes(folder: Path) -> float:
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of `neuface schedule`."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="--out of measured runs (their mean is taken)")
-    parser.add_argument("--captures", type=int, default=7180, help="359 people with 20 expressions (%(default)s)")
-    parser.add_argument("--gpus", default="1,8,64", help="farms to compare (%(default)s)")
-    parser.add_argument("--workers", type=int, default=2, help="captures under way for each GPU (%(default)s)")
-    parser.add_argument("--fit-seconds", type=float, help="of the fit, instead of the measured time: what-if")
-    parser.add_argument("--link", type=float, default=1000.0, help="of the storage, MB a second (%(default)s)")
-    parser.add_argument("--gpu-hour", type=float, default=0.0, help="price of a GPU with its workers, for one hour")
-    parser.add_argument("--spread", type=float, default=0.2, help="of the times, as a share (%(default)s)")
-    parser.add_argument("--lost", type=float, default=0.01, help="share of stages whose worker is lost (%(default)s)")
+    parser.add_argument(
+        "--captures", type=whole(1, 1_000_000), default=7180, help="359 people with 20 expressions (%(default)s)"
+    )
+    parser.add_argument("--gpus", type=whole_list(1, 10_000), default="1,8,64", help="farms to compare (%(default)s)")
+    parser.add_argument(
+        "--workers", type=whole(1, 1000), default=2, help="captures under way for each GPU (%(default)s)"
+    )
+    parser.add_argument("--fit-seconds", type=number(0), help="of the fit, instead of the measured time: what-if")
+    parser.add_argument(
+        "--link", type=number(0, above=True), default=1000.0, help="of the storage, MB a second (%(default)s)"
+    )
+    parser.add_argument("--gpu-hour", type=number(0), default=0.0, help="price of a GPU with its workers, for one hour")
+    parser.add_argument("--spread", type=number(0, 3), default=0.2, help="of the times, as a share (%(default)s)")
+    parser.add_argument(
+        "--lost", type=number(0, 0.9), default=0.01, help="share of stages whose worker is lost (%(default)s)"
+    )
     parser.set_defaults(run=schedule_command)
 
 
@@ -212,8 +221,8 @@ def schedule_command(options: argparse.Namespace, console: Console) -> int:
         f"one capture: {load.before:.0f} s before the fit, {load.fit:.0f} s fit, {load.after:.0f} s after it; "
         f"reads {load.read / 1e6:.0f} MB, keeps {load.kept / 1e6:.0f} MB"
     )
-    for gpus in (int(g) for g in options.gpus.split(",")):
-        farm = Farm(gpus, gpus * options.workers, options.link * 1e6, options.spread, min(options.lost, 0.9))
+    for gpus in options.gpus:
+        farm = Farm(gpus, gpus * options.workers, options.link * 1e6, options.spread, options.lost)
         f = simulate(load, options.captures, farm)
         use = ", ".join(f"{n} {100 * share:.0f} %" for n, share in f.busy.items())
         cost = f", cost {f.hours * gpus * options.gpu_hour:,.0f}" if options.gpu_hour else ""

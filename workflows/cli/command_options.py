@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from workflows.cli import commands
+from workflows.cli.numbers import whole
 from workflows.cli.options import add_request_options
 from workflows.run.request import RunRequest
 
@@ -27,8 +28,8 @@ def run_options(run: argparse.ArgumentParser) -> None:
 def demo_options(demo: argparse.ArgumentParser) -> None:
     """neuface demo"""
     demo.add_argument("--out", default="out/demo", metavar="DIR", help="folder for the results (%(default)s)")
-    demo.add_argument("--views", type=_at_least(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
-    demo.add_argument("--size", type=_at_least(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
+    demo.add_argument("--views", type=whole(8), default=commands.DEMO_VIEWS, help="photos to render (%(default)s)")
+    demo.add_argument("--size", type=whole(64), default=commands.DEMO_SIZE, help="pixels a side (%(default)s)")
     add_request_options(demo, RunRequest, only=("preset", "device", "store"))
     demo.add_argument("--json", action="store_true", help=JSON_HELP)
     demo.set_defaults(run=commands.demo_command)
@@ -58,8 +59,8 @@ def render_options(render: argparse.ArgumentParser) -> None:
     render.add_argument("--quick", action="store_true", help="with --field and --env: fewer lamps for the environment")
     render.add_argument("--cameras", metavar="FILE", help="params.json of a capture; default: the captured cameras")
     render.add_argument("--views", metavar="LIST", help="indices such as 2,7; default: the held-out ones, else all")
-    render.add_argument("--turntable", type=_at_least(1), metavar="N", help="N views around the head instead")
-    render.add_argument("--width", type=_at_least(16), metavar="W", help="pixels; default: the camera's own")
+    render.add_argument("--turntable", type=whole(1), metavar="N", help="N views around the head instead")
+    render.add_argument("--width", type=whole(16), metavar="W", help="pixels; default: the camera's own")
     render.add_argument("--samples", type=int, choices=range(5), default=0, help="rays along a pixel's side")
     render.set_defaults(run=commands.render_command)
 
@@ -69,8 +70,8 @@ def turntable_options(turntable: argparse.ArgumentParser) -> None:
     turntable.add_argument("folder", metavar="DIR", help="the --out of a run, or its asset folder")
     turntable.add_argument("--out", required=True, metavar="FILE", help="film.mp4 or film.webp")
     turntable.add_argument("--env", default="captured", help=f"{ENV_HELP} (%(default)s)")
-    turntable.add_argument("--frames", type=_at_least(1), default=120, help="pictures of the turn (%(default)s)")
-    turntable.add_argument("--size", type=_at_least(16), default=1080, help="pixels along each side (%(default)s)")
+    turntable.add_argument("--frames", type=whole(1), default=120, help="pictures of the turn (%(default)s)")
+    turntable.add_argument("--size", type=whole(16), default=1080, help="pixels along each side (%(default)s)")
     turntable.set_defaults(run=commands.turntable_command)
 
 
@@ -98,15 +99,3 @@ def doctor_options(doctor: argparse.ArgumentParser) -> None:
     """neuface doctor"""
     doctor.add_argument("--out", default=".", metavar="DIR", help="where results would go (%(default)s)")
     doctor.set_defaults(run=commands.doctor_command)
-
-
-class _at_least:  # noqa: N801  (used like a function)
-    """An integer with a lower limit, as argparse wants it."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit = limit
-
-    def __call__(self, text: str) -> int:
-        if not text.isdecimal() or int(text) < self.limit:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {self.limit}")
-        return int(text)
