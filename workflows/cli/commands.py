@@ -52,7 +52,10 @@ def run(request: RunRequest, console: Console) -> dict[str, Any]:
         environment.defaults()
         from workflows.flows import run_with_session
 
-        return run_with_session(request, watch)
+        try:
+            return run_with_session(request, watch)
+        except Exception as e:
+            raise environment.unanswered(e) or e from e
     with (
         keys_of(watch.steering, console) as keys,
         interruptible(watch.stop, console.note, keys.restore) as caught,

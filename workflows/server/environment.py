@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+from pipeline.errors import NeufaceError, StageError
+
 # Offline and quiet. Whoever sets one of these decides it; these are only defaults.
 OFFLINE = {
     "DO_NOT_TRACK": "1",
@@ -34,3 +36,24 @@ def defaults() -> None:
 def has_server() -> bool:
     """Whether the user named a Prefect server. Without one no run needs Prefect."""
     return bool(os.environ.get("PREFECT_API_URL"))
+
+
+def unanswered(error: Exception) -> StageError | None:
+    """The error for the user where Prefect's client could not begin; None for any other. Prefect has one class for many
+    faults, so that its words tell."""
+    said = str(error)
+    if isinstance(error, NeufaceError):
+        return None
+    if isinstance(error, RuntimeError) and "Failed to reach API" in said:
+        what, remedy = "the Prefect server does not answer", "start it (neuface serve --server-only), or "
+    elif "Unauthorized" in said:
+        what, remedy = "the Prefect server wants a login", "set PREFECT_API_AUTH_STRING (docs/running.md), or "
+    else:
+        return None
+    return StageError(
+        what,
+        where=f"PREFECT_API_URL {os.environ.get('PREFECT_API_URL', '')}",
+        value=said.splitlines()[0],
+        limit="a server that takes runs, or none named",
+        remedy=f"{remedy}run here without one: unset PREFECT_API_URL",
+    )
