@@ -25,6 +25,7 @@ from workflows.bench.captures import commit
 from workflows.bench.rows import budget_of, kept, plan_of, rows_with, shared_options
 from workflows.cli.console import Console
 from workflows.run import host_info
+from workflows.run.output_dirs import make_folder
 
 F32 = npt.NDArray[np.float32]
 Looks = tuple[float, float, float, float]
@@ -120,7 +121,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench ablations"""
     chosen = rows_with(given.rows, unique(TABLES), "--rows", "row")
     out = Path(given.out)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     path = out / "ablations.json"
     budget = budget_of(given, ("steps", "side", "batch", "holdout"))
     results, _ = kept(path, budget, "rows", Result)

@@ -18,6 +18,7 @@ from workflows.bench.floors import STAGES, Work
 from workflows.bench.machine_rates import Rates, measured
 from workflows.cli.console import Console
 from workflows.run import host_info
+from workflows.run.output_dirs import make_folder
 
 FILE = "machine.json"
 SHOWN: dict[str, tuple[str, float, str]] = {  # what a rate is, its unit, the unit's name
@@ -67,7 +68,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
     if found is None:
         console.note("measuring the machine")
         if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out)
         rates = measured(out or Path.cwd())
         found = {"machine": host_info.machine(), "commit": commit(), "rates": asdict(rates)}
     rates = Rates(**found["rates"])

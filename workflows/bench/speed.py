@@ -19,6 +19,7 @@ from workflows.bench.captures import commit
 from workflows.cli.console import Console
 from workflows.run import host_info
 from workflows.run.calibration_scene import WHOLE, ball_trainer, ball_view
+from workflows.run.output_dirs import make_folder
 
 if TYPE_CHECKING:
     from stages.inverse_rendering.fit import Trainer
@@ -71,7 +72,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
     from workflows.run.plan import device_for
 
     out, device = Path(given.out), device_for(given.device)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     found: dict[str, Any] = {"machine": host_info.machine(), "commit": commit(), "device": device, "batch": given.batch}
     points: list[Point] = []
     for number, setup in enumerate(setups(), 1):

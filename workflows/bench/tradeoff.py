@@ -21,6 +21,7 @@ from workflows.bench.tradeoff_measure import Knob, Measured, measure
 from workflows.bench.tradeoff_plot import plot
 from workflows.cli.console import Console
 from workflows.run import host_info
+from workflows.run.output_dirs import make_folder
 
 MIDDLE = Knob("middle")
 SPLIT = {
@@ -66,7 +67,7 @@ def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench tradeoff"""
     chosen = rows_with(given.points, KNOBS, "--points", "point") + presets_named(given.presets)
     out = Path(given.out)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     path, begun = out / "tradeoff.json", time.monotonic()
     budget = budget_of(given, ("steps", "side", "batch", "cells", "holdout"))
     found, earlier = kept(path, budget, "points", Measured)

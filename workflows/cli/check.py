@@ -48,6 +48,8 @@ def add_options(check: argparse.ArgumentParser) -> None:
 
 def check_command(options: argparse.Namespace, console: Console) -> int:
     """neuface check. Exit code 3 if the photos, their cameras or masks are unusable, 1 if they can't be judged."""
+    if options.json not in (None, "-"):
+        output_dirs.check_file(Path(options.json), "--json")
     done: list[Done[Any]] = []
     fault: StageError | None = None
     with ExitStack() as stack:

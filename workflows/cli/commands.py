@@ -183,6 +183,8 @@ def validate_command(options: argparse.Namespace, console: Console) -> int:
     """neuface validate"""
     from stages.usd.check.validate import checks_run, validate
 
+    if options.json not in (None, "-"):
+        output_dirs.check_file(Path(options.json), "--json")
     found = validate(Path(options.asset))
     counts = {level: sum(f.level == level for f in found) for level in ("error", "warning", "info")}
     if options.json:

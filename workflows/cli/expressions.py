@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from stages.presets import known
 from workflows.cli.render import component_in, put_file
+from workflows.run.output_dirs import make_folder
 
 if TYPE_CHECKING:
     from pipeline.meshes import F64
@@ -44,7 +45,7 @@ def write_expressions(request: ExpressionsRequest, notify: Callable[[str], None]
     cage = load_cage(root)
     for name in request.only:
         known(name, cage.shapes, what="no such expression", where="--only")
-    request.out.mkdir(parents=True, exist_ok=True)
+    make_folder(request.out)
     faces = "\n".join(_faces(cage))
     for number, name in enumerate((NEUTRAL, *cage.shapes)):
         if name != NEUTRAL and request.only and name not in request.only:

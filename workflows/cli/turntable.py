@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from pipeline.errors import StageError, UsageError
 from workflows.cli.render import CAPTURED, component_in, light_named
+from workflows.run.output_dirs import check_file, make_folder
 from workflows.run.owned import partial_name
 
 U8 = npt.NDArray[np.uint8]
@@ -47,7 +48,8 @@ def write_turntable(request: TurntableRequest) -> Path:
             limit=f"a name that ends with {' or '.join(KINDS)}; an even size",
             remedy="for example --out film.mp4 --size 1080",
         )
-    request.out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(request.out.parent)
+    check_file(request.out, "--out")
     partial = partial_name(request.out.parent, request.out.name)
     try:
         (_write_mp4 if kind == ".mp4" else _write_webp)(request, frames(request), partial)

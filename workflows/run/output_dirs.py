@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline.errors import StageError, stage_error_from_os_error
+from pipeline.errors import StageError, UsageError, stage_error_from_os_error
 
 OWN = (".locks", ".prefect", ".lineage", ".roots")  # in the store, but not results
 
@@ -36,12 +36,14 @@ def missing(folder: Path) -> list[Path]:
     return [p for p in chain if not p.exists() and not p.is_symlink()]
 
 
-def _probe(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make a folder for results, and those above it.
+
+    Raises:
+        StageError: a file is in its place. OSError: any other fault.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".probe-{uuid.uuid4().hex[:8]}"
-        probe.write_bytes(b"x")
-        probe.unlink()
     except FileExistsError as e:
         raise StageError(
             "a file is where a folder is needed",
@@ -50,6 +52,30 @@ def _probe(folder: Path) -> None:
             limit="a folder, or nothing",
             remedy="remove that file or choose another folder",
         ) from e
+
+
+def check_file(path: Path, option: str) -> None:
+    """See, before any work, that a file which the user names can be there.
+
+    Raises:
+        UsageError: there is no such folder, or the name is that of a folder.
+    """
+    if path.is_dir() or not path.parent.is_dir():
+        raise UsageError(
+            "this file can't be written",
+            where=f"{option} {path}",
+            value="a folder" if path.is_dir() else f"no folder {path.parent}",
+            limit="the name of a file in a folder that is there",
+            remedy="name a file, and make its folder first",
+        )
+
+
+def _probe(folder: Path) -> None:
+    try:
+        make_folder(folder)
+        probe = folder / f".probe-{uuid.uuid4().hex[:8]}"
+        probe.write_bytes(b"x")
+        probe.unlink()
     except OSError as e:
         known = stage_error_from_os_error(e, folder)
         raise known or StageError(

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.artifacts import sha256_of
+from workflows.run.output_dirs import make_folder
 from workflows.run.published import is_ours, listed, note_published, written_whole
 from workflows.run.replace import free_side
 
@@ -24,7 +25,7 @@ def write_owned(
     name: a path below folder. before_lists: whether an unlisted file is of an older version, which kept no list.
     """
     target = folder / name
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(target.parent)
     data = content.encode() if isinstance(content, str) else content
     with written_whole(target, data) as partial:
         return put_owned(folder, name, partial, before_lists)
