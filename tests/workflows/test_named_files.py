@@ -61,6 +61,15 @@ def test_a_film_where_none_can_be(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.mp4"]
 
 
+def test_bench_speed_looks_for_the_run_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(speed.host_info, "apart", None)  # it measures nothing
+    out = tmp_path / "out"
+    arguments = ["bench", "speed", "--run", str(tmp_path / "none"), "--out", str(out)]
+    assert "there is no asset" in refused(main(arguments), 1, capsys) and not out.exists()
+
+
 def test_bench_into_a_file(file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(speed.host_info, "apart", None)
     refused(main(["bench", "speed", "--out", str(file)]), 1, capsys)

@@ -69,9 +69,12 @@ def options(sub: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, console: Console) -> int:
     """neuface bench speed"""
+    from workflows.cli.render import component_in
     from workflows.run.plan import device_for
 
     out, device = Path(given.out), device_for(given.device)
+    if given.asset:
+        component_in(Path(given.asset))  # before minutes of measuring
     make_folder(out)
     found: dict[str, Any] = {"machine": host_info.machine(), "commit": commit(), "device": device, "batch": given.batch}
     points: list[Point] = []
