@@ -11,10 +11,12 @@ import pytest
 
 from pipeline.artifacts import sha256_of
 from pipeline.contract import execute, inputs_from
+from pipeline.errors import Cancelled
 from pipeline.store import LINEAGE, Store, lineage
 from stages.registry import of_second
 from tests.support.toy_stages import FIRST, source
 from workflows.batch.state import BatchState, Entry
+from workflows.cli.console import Console
 from workflows.cli.main import main
 from workflows.live.folder import LiveFolder
 from workflows.run.plan import make_plan
@@ -255,6 +257,25 @@ def test_purge_command_of_a_single_run(photos: Path, tmp_path: Path, capsys: pyt
     assert str(photos) in capsys.readouterr().out
     assert finished(out / ".store") == [] and not (out / "run.json").exists()
     assert (out / "notes.txt").is_file() and photos.is_dir()
+
+
+def test_purge_takes_what_a_stopped_run_left_in_its_store(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its first stage was finished: it has copies of the photos. The command was given with relative paths."""
+
+    def stopped(console: Console, *given: object, **figures: float) -> None:
+        raise Cancelled("stopped by the user")
+
+    monkeypatch.chdir(tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Console, "progress", stopped)
+        assert main(["run", "photos", "--out", "out"]) == 130
+    assert finished(tmp_path / "out/.store") == ["first"]
+    monkeypatch.chdir("/")
+    assert main(["store", "purge", "photos", "--out", str(tmp_path / "out")]) == 0
+    assert finished(tmp_path / "out/.store") == [] and photos.is_dir()
+    assert f"yours to remove: {photos}\n" in capsys.readouterr().out
 
 
 def test_purge_takes_what_a_stopped_run_told(photos: Path, tmp_path: Path) -> None:

@@ -79,9 +79,11 @@ class Live:
         self._works, self._written, self._next_preview = True, -math.inf, 0.0
         seconds = {e.step.stage: e.seconds for e in expected(plan)}
         self.forecast = Forecast(seconds, self._now(), plan.request.budget)
+        photos = plan.request.whole_paths()
         self.state: dict[str, Any] = {
             "run": self.run, "out": str(plan.out.resolve()), "store": str(plan.store.root.resolve()),
-            "capture": plan.request.capture, "preset": plan.request.preset, "budget": plan.request.budget,
+            "capture": photos["capture"], "also": photos.get("also"),
+            "preset": plan.request.preset, "budget": plan.request.budget,
             "began": time.time(), "status": "running",
             "stages": [{"name": s.name, "state": "waiting", "share": 0.0, "seconds": None} for s in plan.stages],
             "message": "", "figures": {}, "presets": OFFERED_PRESETS, "minutes": OFFERED_MINUTES,

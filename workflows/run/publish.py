@@ -20,7 +20,6 @@ from workflows.run.plan import Plan
 from workflows.run.published import is_record, note_published, published
 from workflows.run.replace import Replacement, drop, prepare, put, tidy
 from workflows.run.report_timing import TIMED, with_seconds
-from workflows.run.request import RunRequest
 from workflows.run.room import check_room_for_copies
 from workflows.run.spare_page import owns_its_store, page_in_one_place
 from workflows.run.verdict import verdict_of_done
@@ -205,7 +204,7 @@ def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
             for n, d in stages.items()
         },
         "timing": {**taken, "total": round(sum(taken.values()), 3)},
-        "request": plan.request.model_dump(mode="json") | _whole_paths(plan.request),
+        "request": plan.request.model_dump(mode="json") | plan.request.whole_paths(),
         "store": str(plan.store.root.resolve()),
         "device": plan.device,
         "seed": plan.request.seed,
@@ -217,12 +216,6 @@ def run_record(plan: Plan, stages: Mapping[str, Done[Any]]) -> dict[str, Any]:
         record["asset"] = f"asset/{Path(stages['usd'].located.artifact.root).name}"
         record["asset_hash"] = asset_hash(stages["usd"].located.artifact.files)
     return record
-
-
-def _whole_paths(request: RunRequest) -> dict[str, str]:
-    """The user's own folders and files as absolute paths: later commands have other working folders."""
-    named = {n: getattr(request, n) for n in ("capture", "also", "template", "light")}
-    return {n: str(Path(text).absolute()) for n, text in named.items() if text}
 
 
 def asset_hash(files: Iterable[FileRef]) -> str:

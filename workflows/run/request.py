@@ -79,3 +79,8 @@ class RunRequest(BaseModel):
     def store_path(self) -> Path:
         """Where finished artifacts are kept."""
         return Path(self.store) if self.store else Path(self.out) / OWN_STORE
+
+    def whole_paths(self) -> dict[str, str]:
+        """The user's own folders and files as absolute paths: later commands have other working folders."""
+        named = {n: getattr(self, n) for n in ("capture", "also", "template", "light")}
+        return {n: str(Path(text).absolute()) for n, text in named.items() if text}

@@ -131,6 +131,7 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
     runs = [r for r in _roots_of(out, store) if _is_of(subject, r, out)]
     entries = [(p, e) for p, e in _entries(out) if e.name == subject or e.name.startswith(f"{subject}/")]
     photos = {p for r in runs for p in photos_of(r, store)} | {Path(e.capture).absolute() for _, e in entries}
+    photos |= set(_told_photos(subject, out))
     known = _lineages(store)
     photos |= set(films_in(photos, known))
     outs = {r.out for r in runs} | {out / e.name for _, e in entries}
@@ -163,6 +164,13 @@ def belongings(subject: str, out: Path, store: Store) -> Purge:
 def _tells_of(subject: str, out: Path) -> bool:
     """Whether a run of this capture tells of itself in OUT/live: one that ended before its results leaves no more."""
     return Path(str(read_small(out / LIVE / STATE).get("capture", ""))).name == subject
+
+
+def _told_photos(subject: str, out: Path) -> Iterator[Path]:
+    """What a run read that tells of itself there: where it was stopped no list names it, and the store has copies."""
+    if _tells_of(subject, out):
+        told = read_small(out / LIVE / STATE)
+        yield from (Path(str(p)) for p in (told.get("capture"), told.get("also")) if p and Path(str(p)).is_absolute())
 
 
 def _shapes_of(root: Root, store: Store) -> Iterator[tuple[str, str]]:
