@@ -136,10 +136,11 @@ def import_photo(
 
 
 def _write_clipped(where: npt.NDArray[np.bool_], photo: Path) -> Path | None:
-    """Write a photo's clipped pixels (255) to clipped/ beside its folder; None if there are none."""
+    """Write a photo's clipped pixels (255) to clipped_FOLDER beside its folder; None if there are none. A clean plate
+    and the second photo of a pair may have the photo's name, so that each folder of photos has its own."""
     if not where.any():
         return None
-    path = photo.parent.parent / "clipped" / f"{photo.stem}.png"
+    path = photo.parent.parent / f"clipped_{photo.parent.name}" / f"{photo.stem}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
     _write_png(path, where[..., None].astype(np.uint8) * 255)
     return path

@@ -55,10 +55,9 @@ def with_pairs(
             raise _brighter(candidate, share)
         if share > ALIKE:
             alike.append(candidate.name)
-        ends = None if other.clipped is None else _own_folder(other.clipped, context)
         out.append(view.model_copy(update={
             "parallel": FileRef.of(context.workdir, other.image), "parallel_exposure": round(exposure, 6),
-            "parallel_clipped": None if ends is None else FileRef.of(context.workdir, ends),
+            "parallel_clipped": None if other.clipped is None else FileRef.of(context.workdir, other.clipped),
         }))  # fmt: skip
     if moved:
         warnings.append(f"the camera moved between the photos of {len(moved)} polarised pairs ({_some(moved)}); their "
@@ -67,13 +66,6 @@ def with_pairs(
         warnings.append(f"the photos of {len(alike)} polarised pairs hardly differ ({_some(alike)}): the filters are "
                         "not crossed, or nothing shines")  # fmt: skip
     return out
-
-
-def _own_folder(ends: Path, context: Context) -> Path:
-    """The clipped pixels' picture, moved to where it can't be taken for that of the cross-polarised photo."""
-    target = context.workdir / "clipped_parallel" / ends.name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    return ends.replace(target)
 
 
 def _forget(photo: ImportedPhoto) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline import polarised
 from pipeline.errors import StageError
-from pipeline.images import read_linear
+from pipeline.images import read_alpha, read_linear
 from stages.capture.scan import scan_capture
 from tests.capture.test_brackets import BASE, jpeg
 from tests.capture.test_hdr import photo, scene
@@ -67,6 +67,23 @@ def test_each_way_of_naming(tmp_path: Path, gather, cross: str, parallel: str) -
         assert np.abs(2 * polarised.specular(one, two) - mirror).mean() < 0.006
         assert np.abs(2 * polarised.unpolarised(one, two) - diffuse - mirror).mean() < 0.006
         assert np.abs(2 * one - diffuse).mean() < 0.006
+
+
+@pytest.mark.parametrize(("cross", "parallel"), WAYS)
+def test_both_photos_of_a_pair_may_be_clipped(tmp_path: Path, gather, cross: str, parallel: str) -> None:
+    """Also where both have one name: each has a picture of its own clipped pixels."""
+    folder = tmp_path / "c"
+    for n in range(3):
+        for rows, name, image in zip((slice(8), slice(16)), (cross, parallel), filtered(n), strict=True):
+            image[rows] = 255
+            path = folder / name.format(view="abc"[n])
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(jpeg(image, BASE))
+    found = gather(folder)
+    for view in found.artifact.views:
+        assert view.clipped is not None and view.parallel_clipped is not None
+        ends, of_pair = (read_alpha(found.path(f))[:, :20] > 0 for f in (view.clipped, view.parallel_clipped))
+        assert ends[:8].all() and not ends[9:].any() and of_pair[:16].all() and not of_pair[17:].any()
 
 
 def test_the_setting_uses_the_cross_polarised_ones_as_any_photos(tmp_path: Path, gather) -> None:
