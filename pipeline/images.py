@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from pipeline.colour import REC709, Chromaticities, linear_from_srgb, srgb_from_linear
 from pipeline.errors import StageError
-from pipeline.picture_size import PNG, declared_size_of, png_claims_more
+from pipeline.picture_size import PNG, declared_size_of, png_claims_more, without_orientation
 
 F32 = npt.NDArray[np.float32]
 SOFTWARE = "NeuFace Asset"  # in every EXR; without a version, so that equal maps have equal bytes
@@ -94,7 +94,7 @@ def _decoded(path: Path) -> npt.NDArray[Any] | None:
         if data.startswith(PNG) and png_claims_more(data):
             return None
         try:
-            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            return cv2.imdecode(np.frombuffer(without_orientation(data), np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:
             return None
     try:

@@ -1,4 +1,5 @@
-"""The size of a picture from its header, so that a decompression bomb is rejected before it is decoded.
+"""The size of a picture from its header, so that a decompression bomb is rejected before it is decoded; and a TIFF
+whose orientation the decoder does not apply.
 
 A file of a few kilobytes can declare a picture that fills the memory. Only headers are read here, and lengths in them
 are compared with the size of the file. Sources: PNG (ISO 15948), JPEG (T.81), TIFF 6.0, OpenEXR file layout.
@@ -15,7 +16,7 @@ Data = bytes | mmap
 PNG = b"\x89PNG\r\n\x1a\n"
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # frame headers; the others in that range are tables
 _ALONE = {0x01, *range(0xD0, 0xD9)}  # JPEG markers without a length
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_TIFF_WIDTH, _TIFF_HEIGHT, _ORIENTATION = 256, 257, 274
 _MAX_TAGS, _HEAD = 1000, 65_536
 
 
@@ -58,6 +59,40 @@ def png_claims_more(data: Data) -> bool:
             return False
         at += 12 + length
     return False
+
+
+def without_orientation(data: bytes) -> bytes:
+    """The same file with the orientation 1 if it is a TIFF or BigTIFF. OpenCV turns the pixels of a TIFF even where it
+    leaves those of other files as they are stored."""
+    big = data[:4] in (b"II+\0", b"MM\0+")
+    if not big and data[:4] not in (b"II*\0", b"MM\0*"):
+        return data
+    order = "<" if data[:1] == b"I" else ">"
+    try:
+        wrong = [
+            at for at in _entries(data, order, big=big) if data[at : at + 2] == struct.pack(f"{order}H", _ORIENTATION)
+        ]
+    except struct.error:  # the directory is cut off: the decoder will report it
+        return data
+    upright = struct.pack(f"{order}HH{'Q' if big else 'I'}H", _ORIENTATION, 3, 1, 1)
+    wrong = [at for at in wrong if data[at : at + len(upright)] != upright]
+    if not wrong:
+        return data  # a copy of a large file takes time and memory
+    changed = bytearray(data)
+    for at in wrong:
+        changed[at : at + len(upright)] = upright
+    return bytes(changed)
+
+
+def _entries(data: bytes, order: str, *, big: bool) -> list[int]:
+    """Offsets of the entries of a TIFF's first directory, those that lie in the file. Raises struct.error."""
+    offset, length, size = ("Q", 8, 20) if big else ("I", 2, 12)
+    (first,) = struct.unpack_from(f"{order}{offset}", data, 8 if big else 4)
+    if first > len(data):
+        return []
+    (count,) = struct.unpack_from(f"{order}{'Q' if big else 'H'}", data, first)
+    start = first + length
+    return [start + size * i for i in range(min(count, _MAX_TAGS, (len(data) - start) // size))]
 
 
 def _jpeg(data: Data) -> tuple[int, int] | None:

@@ -24,7 +24,8 @@ EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
 FOCAL = (0.05, 100.0)  # of the longest edge: values outside come from damaged metadata
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8)}
+_TYPES = {1: ("B", 1), 2: ("s", 1), 3: ("H", 2), 4: ("I", 4), 5: ("II", 8), 7: ("B", 1), 9: ("i", 4), 10: ("ii", 8),
+          16: ("Q", 8)}  # fmt: skip
 _MAX_TAGS, _MAX_VALUES = 1000, 1_000_000
 _WANTED = {
     MAKE,
@@ -179,11 +180,17 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
         at += 12 + length
 
 
+def is_tiff(data: bytes) -> bool:
+    """Whether a file is a TIFF, or a BigTIFF, whose offsets and counts have eight bytes."""
+    return data[:4] in (b"II*\0", b"MM\0*") or _is_big(data)
+
+
 def first_ifd(block: bytes) -> Tags:
-    """Tags of a TIFF block's first directory; empty if it is damaged or a BigTIFF."""
-    if block[:4] not in (b"II*\0", b"MM\0*") or len(block) < 8:
+    """Tags of a TIFF block's first directory; empty if it is damaged."""
+    at, offset = (8, "Q") if _is_big(block) else (4, "I")
+    if not is_tiff(block) or len(block) < 2 * at:
         return {}
-    return _ifd(block, struct.unpack_from(_order(block) + "I", block, 4)[0])
+    return _ifd(block, struct.unpack_from(_order(block) + offset, block, at)[0])
 
 
 def _exif_block(data: bytes) -> bytes | None:
@@ -192,7 +199,11 @@ def _exif_block(data: bytes) -> bytes | None:
         return next((b[6:] for b in blocks if b[:6] == b"Exif\0\0"), None)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return next((data[a:b] for t, a, b in png_chunks(data) if t == b"eXIf"), None)
-    return data if data[:4] in (b"II*\0", b"MM\0*") else None
+    return data if is_tiff(data) else None
+
+
+def _is_big(data: bytes) -> bool:
+    return data[:4] in (b"II+\0", b"MM\0+")
 
 
 def _order(block: bytes) -> str:
@@ -201,18 +212,21 @@ def _order(block: bytes) -> str:
 
 def _ifd(block: bytes, offset: int) -> Tags:
     """The tags of one directory, without entries that point outside the block."""
-    order, tags = _order(block), Tags()
-    if offset + 2 > len(block):
+    order, tags, big = _order(block), Tags(), _is_big(block)
+    length, offset_code, head = (8, "Q", 12) if big else (2, "I", 8)  # of the number of entries, and before the value
+    room = struct.calcsize("<" + offset_code)
+    if offset + length > len(block):
         return tags
-    for i in range(min(struct.unpack_from(order + "H", block, offset)[0], _MAX_TAGS)):
-        entry = offset + 2 + 12 * i
-        if entry + 12 > len(block):
+    for i in range(min(struct.unpack_from(order + ("Q" if big else "H"), block, offset)[0], _MAX_TAGS)):
+        entry = offset + length + (head + room) * i
+        if entry + head + room > len(block):
             break
-        tag, kind, count = struct.unpack_from(order + "HHI", block, entry)
+        tag, kind, count = struct.unpack_from(f"{order}HH{offset_code}", block, entry)
         code, size = _TYPES.get(kind, ("", 0))
         if not size or count > _MAX_VALUES or tag in tags or tag not in _WANTED:
             continue
-        at = entry + 8 if size * count <= 4 else struct.unpack_from(order + "I", block, entry + 8)[0]
+        inline = size * count <= room
+        at = entry + head if inline else struct.unpack_from(order + offset_code, block, entry + head)[0]
         if at + size * count <= len(block):
             tags[tag] = _values(block, order, code, at, count)
     return tags

@@ -1,7 +1,8 @@
 """Checks one photo or mask and copies it.
 
 A photo's bytes are copied unchanged. Only these are written as PNG: a photo whose EXIF orientation is not 1 is rotated
-upright, because later stages read the stored pixels and ignore EXIF; and HEIC and raw files are developed.
+upright, because later stages read the stored pixels and ignore EXIF; and HEIC and raw files are developed. A TIFF of
+floats that is rotated becomes EXR.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def import_photo(
     merged: Decoded | None = None,
 ) -> ImportedPhoto:  # fmt: skip
     """Check one photo and copy it to `target` (whose suffix becomes .png if it has to be rotated or developed, and .exr
-    if it was merged from several).
+    if it was merged from several, or holds floats and has to be rotated).
 
     chart: search for a colour checker. merged: pixels to take in place of the file's.
     declared: (width, height) from the camera's description, or None. If the stored pixels have this size, the given
@@ -123,6 +124,9 @@ def import_photo(
     if merged is not None:
         target = target.with_suffix(".exr")
         write_exr(target, np.asarray(image, np.float32), half=True)
+    elif turn and np.issubdtype(image.dtype, np.floating):
+        target = target.with_suffix(".exr")  # a PNG would hold 256 of its levels, none above 1
+        write_exr(target, np.asarray(image, np.float32))
     elif turn or found.developed:
         target = target.with_suffix(".png")
         _write_png(target, image)

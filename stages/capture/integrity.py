@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from stages.capture.exif import first_ifd, jpeg_segments, png_chunks
+from stages.capture.exif import first_ifd, is_tiff, jpeg_segments, png_chunks
 
 _STRIPS, _TILES = (273, 279), (324, 325)  # TIFF tags: offsets, byte counts
 _NEXT_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")  # in a scan, FF 00 is a data byte and FF D0..D7 are restarts
@@ -28,7 +28,7 @@ def fault_of(data: bytes) -> str | None:
         return _jpeg_fault(data)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return _png_fault(data)
-    return _tiff_fault(data) if data[:4] in (b"II*\0", b"MM\0*") else None
+    return _tiff_fault(data) if is_tiff(data) else None
 
 
 def _jpeg_fault(data: bytes) -> str | None:
