@@ -1,5 +1,5 @@
-"""The size of a picture from its header, so that a decompression bomb is rejected before it is decoded; and a TIFF
-whose orientation the decoder does not apply.
+"""The size of a picture from its header, so that a decompression bomb is rejected before it is decoded; attributes of
+an EXR; and a TIFF whose orientation the decoder does not apply.
 
 A file of a few kilobytes can declare a picture that fills the memory. Only headers are read here, and lengths in them
 are compared with the size of the file. Sources: PNG (ISO 15948), JPEG (T.81), TIFF 6.0, OpenEXR file layout.
@@ -144,16 +144,27 @@ def _radiance(data: Data) -> tuple[int, int] | None:
 
 
 def _exr(data: Data) -> tuple[int, int] | None:
-    """The dataWindow attribute: name, type, size in bytes, value; an empty name ends the header."""
+    window = exr_attribute(data, b"dataWindow")
+    if window is None:
+        return None
+    left, top, right, bottom = struct.unpack("<4i", window[:16])
+    return right - left + 1, bottom - top + 1
+
+
+def exr_attribute(data: Data, name: bytes) -> bytes | None:
+    """The value of an attribute in an EXR's header, None if it has none or is damaged. Each is name, type, size in
+    bytes, value; an empty name ends the header."""
     at = 8
-    while data[at]:
+    while at < len(data) and data[at]:
         name_end = data.find(b"\0", at)
         type_end = data.find(b"\0", name_end + 1)
-        (size,) = struct.unpack_from("<i", data, type_end + 1)
-        if size < 0 or name_end < at or type_end < name_end:
+        if name_end < at or type_end < name_end or type_end + 5 > len(data):
             return None
-        if data[at:name_end] == b"dataWindow":
-            left, top, right, bottom = struct.unpack_from("<4i", data, type_end + 5)
-            return right - left + 1, bottom - top + 1
-        at = type_end + 5 + size
+        (size,) = struct.unpack_from("<i", data, type_end + 1)
+        value = type_end + 5
+        if size < 0 or value + size > len(data):
+            return None
+        if data[at:name_end] == name:
+            return bytes(data[value : value + size])
+        at = value + size
     return None

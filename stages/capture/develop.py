@@ -73,7 +73,7 @@ def _heic(path: Path, data: bytes) -> Developed:
         )
     block = base64.b64decode(about["exif"]).removeprefix(b"Exif\0\0")
     exif = replace(read_exif(block), orientation=1)
-    return Developed(image, exif, description_of(base64.b64decode(about["icc"])))
+    return Developed(image, exif, description_of(base64.b64decode(about["icc"])) or exif.colours)
 
 
 def _raw(path: Path, data: bytes) -> Developed:

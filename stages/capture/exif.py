@@ -19,6 +19,8 @@ FOCAL_MM, FOCAL_35MM, PIXEL_X, LENS = 0x920A, 0xA405, 0xA002, 0xA434
 PLANE_X_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 GPS_IFD, LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT = 0x8825, 1, 2, 3, 4, 5, 6
 EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE, FLASH = 0x829A, 0x829D, 0x8827, 0xA403, 0x9209
+COLOUR_SPACE, INTEROP_IFD, INTEROP_INDEX, ICC_PROFILE = 0xA001, 0xA005, 1, 34675
+ADOBE_RGB, UNCALIBRATED = "Adobe RGB, by EXIF", "uncalibrated"
 WHITE_BALANCES: dict[tuple[float, ...], str] = {(0,): "auto", (1,): "manual"}
 EARTH_M, FLATTENING = 6_378_137.0, 1 / 298.257223563  # WGS 84
 FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)  # CIPA DC-X001: equivalent focal lengths compare diagonals
@@ -50,6 +52,10 @@ _WANTED = {
     ISO,
     WHITE_BALANCE,
     FLASH,
+    COLOUR_SPACE,
+    INTEROP_IFD,
+    INTEROP_INDEX,
+    ICC_PROFILE,
     273,
     279,
     324,
@@ -62,8 +68,8 @@ class Exif:
     """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
 
     exposure: seconds x ISO / f-number^2, to which the linear value of a grey is proportional; None if one is missing.
-    white_balance: auto, manual, or "" if unknown. flash: whether a flash fired, None if unknown. place: degrees north,
-    degrees east, metres up.
+    white_balance: auto, manual, or "" if unknown. colours: ADOBE_RGB, UNCALIBRATED (not sRGB), or None. flash: whether
+    a flash fired, None if unknown. place: degrees north, degrees east, metres up.
     """
 
     orientation: int = 1
@@ -76,6 +82,7 @@ class Exif:
     white_balance: str = ""
     flash: bool | None = None
     place: tuple[float, float, float] | None = None
+    colours: str | None = None
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Focal length in pixels of an image of width x height, or None."""
@@ -113,6 +120,7 @@ def read_exif(data: bytes) -> Exif:
         white_balance=WHITE_BALANCES.get(_values_of(tags, WHITE_BALANCE)[:1], ""),
         flash=_fired(_values_of(tags, FLASH)),
         place=_place(_ifd(block, int(_values_of(tags, GPS_IFD)[0])) if _values_of(tags, GPS_IFD) else {}),
+        colours=_colours(block, tags),
     )
 
 
@@ -133,6 +141,18 @@ def _fired(value: tuple[float, ...]) -> bool | None:
     """Bit 0 of the tag Flash."""
     known = len(value) == 1 and math.isfinite(value[0]) and 0 <= value[0] < 256
     return bool(int(value[0]) & 1) if known else None
+
+
+def _colours(block: bytes, tags: Tags) -> str | None:
+    """What EXIF says of colours that are not sRGB. Cameras that are set to Adobe RGB write "uncalibrated", and name it
+    in the directory of interoperability (R03, of the DCF standard); some programs write 2."""
+    space, at = _number(tags, COLOUR_SPACE), _values_of(tags, INTEROP_IFD)[:1]
+    if space not in (2, 65535):
+        return None
+    index = _text(_ifd(block, int(at[0])), INTEROP_INDEX) if at and math.isfinite(at[0]) and at[0] >= 0 else ""
+    if index == "R98":
+        return None  # sRGB after all
+    return ADOBE_RGB if space == 2 or index == "R03" else UNCALIBRATED
 
 
 def _exposure(tags: Tags) -> float | None:

@@ -35,9 +35,10 @@ _TURNS = {3: (2, False), 6: (3, False), 8: (1, False), 2: (0, True), 4: (2, True
 @dataclass(frozen=True, slots=True)
 class ImportedPhoto:
     """A checked photo in the artifact. width, height: of the copy, pixels. turned: rotated upright and written as PNG.
-    detail: see stages.capture.quality, None if the photo is blank. profile: name of its ICC profile, None without one.
-    clipped: picture of the clipped pixels, None if there are none. light: mean linear luminance. chart: its colour
-    checker, None if not searched or not found. look: its quality figures, None if it is blank."""
+    detail: see stages.capture.quality, None if the photo is blank. profile: name of its ICC profile, or what EXIF says
+    in its place, None without both. clipped: picture of the clipped pixels, None if there are none. light: mean linear
+    luminance. chart: its colour checker, None if not searched or not found. look: its quality figures, None if it is
+    blank."""
 
     image: Path
     width: int
@@ -79,7 +80,8 @@ def decoded(path: Path, ref: FileRef) -> Decoded:
     made = _developed(path, data)
     if made is not None:
         return Decoded(made.image, made.exif, made.profile, developed=True)
-    return Decoded(_decode(path, data), read_exif(data), profile_name(data), data=data)
+    exif = read_exif(data)
+    return Decoded(_decode(path, data), exif, profile_name(data) or exif.colours, data=data)
 
 
 def import_photo(

@@ -14,7 +14,7 @@ from stages.capture.candidates import Candidate
 from stages.capture.colour_correction import correct_colours, read_charts
 from stages.capture.develop import is_raw
 from stages.capture.exif import metres_from
-from stages.capture.icc_profile import is_srgb
+from stages.capture.icc_profile import foreign, is_srgb
 from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
 from stages.capture.photometry import exposures
 
@@ -154,13 +154,17 @@ def _group(width: int, height: int, serial: str, body: str, focal: float | None)
 
 
 def foreign_colours(candidates: list[Candidate], photos: list[ImportedPhoto]) -> list[str]:
-    """A warning for each ICC profile that is not sRGB."""
+    """A warning for each ICC profile that is not sRGB, or what a photo says in its place."""
     named: dict[str, list[str]] = {}
     for candidate, photo in zip(candidates, photos, strict=True):
         if photo.profile is not None and not is_srgb(photo.profile):
             named.setdefault(photo.profile, []).append(candidate.name)
-    return [f"{len(names)} photos have the colour profile {profile!r}, such as {names[0]}; their colours are read as "
-            "sRGB; export them as sRGB for correct colours" for profile, names in sorted(named.items())]  # fmt: skip
+    told = []
+    for profile, names in sorted(named.items()):
+        what, taken, wanted = foreign(profile)
+        told.append(f"{len(names)} photos {what}, such as {names[0]}; their colours are read as {taken}; export them "
+                    f"as {wanted} for correct colours")  # fmt: skip
+    return told
 
 
 def not_read(names: Sequence[str]) -> list[str]:
