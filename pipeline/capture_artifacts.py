@@ -42,9 +42,10 @@ class CaptureSource(Artifact):
 
     photos: or the single video file. cameras: files that describe cameras, for the kinds that have them. plates: photos
     of the same views without the subject. metres_from_world: 4x4 similarity to metres, +Y up and the face along +Z, if
-    a file beside the capture contains it. passed_over: names of pictures whose format is not supported. stage: the
-    pictures under single lights and the tracking pictures of a light stage. brackets: views that were photographed at
-    several exposures; pairs: under polarised light.
+    a file beside the capture contains it. passed_over: names of pictures whose format is not supported; twins: of
+    those that are one of the photos in another format. stage: the pictures under single lights and the tracking
+    pictures of a light stage. brackets: views that were photographed at several exposures; pairs: under polarised
+    light.
     """
 
     kind: CaptureKind
@@ -57,6 +58,7 @@ class CaptureSource(Artifact):
     stage: tuple[FileRef, ...] = ()
     brackets: tuple[Bracket, ...] = ()
     pairs: tuple[PolarisedPair, ...] = ()
+    twins: tuple[str, ...] = ()
 
     def origin(self, folder: Path) -> Path:
         """Of a video the file itself: other people's videos may lie in the same folder."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from pipeline.artifacts import FileRef, Located
@@ -36,6 +37,9 @@ FOREIGN_SUFFIXES = (".heic", ".heif", ".webp", ".avif", ".dng", ".cr2", ".cr3", 
                     ".crw", ".x3f", ".3fr", ".fff", ".iiq", ".nrw", ".rwl", ".erf", ".kdc", ".dcr", ".mrw", ".sr2",
                     ".srf", ".gpr")  # fmt: skip
 CAMERA_FILES = (*transforms.NAMES, *idr.NAMES, facescape.PARAMS)
+# In this order of preference: linear floats, then 16 bits where the format has them, then the camera's own picture. A
+# raw file comes last, because its colours are not those that the photographer chose.
+KINDS = ((".exr",), (".tif", ".tiff"), (".png",), (".jpg", ".jpeg"), HEIF_SUFFIXES, RAW_SUFFIXES)
 MASK_FOLDERS, PLATE_FOLDERS = ("mask", "masks"), ("clean_plate",)
 MIN_PHOTOS = 3  # two views leave the depth along their common line undetermined, and nothing can check it
 
@@ -63,7 +67,8 @@ def scan_capture(folder: Path) -> Located[CaptureSource]:
     found = find_reader(folder)
     if found is not None:
         return _described(folder, *found)
-    shots = grouped(folder, _photos(folder), _photos, given=False)
+    found_photos = _photos(folder)
+    shots = grouped(folder, found_photos, partial(_photos, beside=found_photos), given=False)
     photos = shots.photos
     videos = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in FILM_SUFFIXES and not p.name.startswith(".")]
     if not photos and len(videos) == 1:
@@ -81,7 +86,7 @@ def _described(folder: Path, kind: CaptureKind, files: Sequence[Path]) -> Locate
     if not photos:
         raise _none_named(folder, files[0], described)
     _once(described.views)
-    shots = grouped(folder, photos, _photos, given=True)
+    shots = grouped(folder, photos, partial(_photos, beside=photos), given=True)
     masks = {v.photo: v.mask for v in described.views if v.photo is not None and v.mask is not None}
     by_stem = (
         _beside(folder, [p for p in photos if p not in masks], MASK_FOLDERS, "mask") if len(masks) < len(photos) else []
@@ -108,7 +113,8 @@ def _source(
     brackets, pairs = shots.manifest(folder)
     return CaptureSource(kind=kind, photos=refs[0], cameras=refs[1], masks=refs[2], plates=refs[3],
                          metres_from_world=None if world is None else rows(world),
-                         passed_over=_passed_over(photos), stage=refs[4], brackets=brackets, pairs=pairs)  # fmt: skip
+                         passed_over=_passed_over(photos), stage=refs[4], brackets=brackets, pairs=pairs,
+                         twins=() if cameras else _twins(shots))  # fmt: skip
 
 
 def _passed_over(photos: Sequence[Path]) -> tuple[str, ...]:
@@ -164,14 +170,31 @@ def _once(views: Sequence[Declared]) -> None:
             of[mark] = view.name
 
 
-def _photos(folder: Path) -> list[Path]:
-    """Photos directly in the folder, in natural order. Of files with one stem only the first kind is taken: a camera
-    writes a JPEG beside its raw file, and a phone an HEIC."""
-    found: list[Path] = []
-    for suffixes in (PHOTO_SUFFIXES, HEIF_SUFFIXES, RAW_SUFFIXES):
-        taken = {p.stem for p in found}
-        found += [p for p in _pictures(folder, suffixes) if p.stem not in taken]
-    return sorted(found, key=lambda p: natural_key(p.name))
+def _photos(folder: Path, beside: Sequence[Path] = ()) -> list[Path]:
+    """Photos directly in the folder, in natural order: of files with one stem the one of the first of KINDS.
+
+    beside: photos that are taken already. They are preferred, and files of their formats to others: the second photos
+    of pairs and clean plates are compared with them.
+    """
+    chosen, like = set(beside), {p.suffix.lower() for p in beside}
+
+    def rank(path: Path) -> tuple[bool, bool, int]:
+        suffix = path.suffix.lower()
+        return path not in chosen, suffix not in like, next(i for i, kind in enumerate(KINDS) if suffix in kind)
+
+    of_stem: dict[str, Path] = {}
+    for path in sorted(_pictures(folder, [s for kind in KINDS for s in kind]), key=rank):
+        of_stem.setdefault(path.stem, path)
+    return sorted(of_stem.values(), key=lambda p: natural_key(p.name))
+
+
+def _twins(shots: Shots) -> tuple[str, ...]:
+    """Names of the files beside the photos that are the same photo in another format."""
+    used = {*shots.photos, *shots.files()}
+    stems, known = {(p.parent, p.stem) for p in used}, {s for kind in KINDS for s in kind}
+    beside = sorted({f for p in {q.parent for q in used} for f in p.iterdir()}, key=lambda f: natural_key(f.name))
+    return tuple(printable(f.name) for f in beside
+                 if f not in used and (f.parent, f.stem) in stems and f.suffix.lower() in known)  # fmt: skip
 
 
 def _pictures(folder: Path, suffixes: Sequence[str] = PHOTO_SUFFIXES) -> list[Path]:
@@ -208,8 +231,8 @@ def _beside(folder: Path, photos: Sequence[Path], folders: Sequence[str], what: 
         )
     owners = {name: p for p in photos for name in (p.stem, p.name)}
     found: dict[Path, Path] = {}
-    listed = _photos if folders == PLATE_FOLDERS else _pictures  # a clean plate is a photo, a mask is drawn
-    for mask in listed(present[0]) if present else []:
+    plate = folders == PLATE_FOLDERS  # a clean plate is a photo, a mask is drawn
+    for mask in (_photos(present[0], photos) if plate else _pictures(present[0])) if present else []:
         owner = owners.get(mask.stem)
         if owner is not None and owner in found:
             raise StageError(

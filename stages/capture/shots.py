@@ -103,7 +103,8 @@ def _brackets(
                 )
             owner[path] = name
     extra = {o for _, _, others, _ in groups for o in others}
-    own = [p for p in photos if p not in extra]
+    same = {(p.parent, p.stem) for p in owner}  # brackets.json may list a photo's file of another format
+    own = [p for p in photos if p not in extra and (p in owner or (p.parent, p.stem) not in same)]
     own += [photo for _, photo, _, _ in groups if photo not in own]
     return own, groups
 

@@ -112,6 +112,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> Capture:
     warnings = (
         selection.warnings + made.not_read(source.artifact.passed_over) + made.foreign_colours(candidates, photos)
     )
+    warnings += made.twins(source.artifact.twins)
     warnings += made.partly_masked(views) + made.mixed_kinds(candidates) + made.contradicting_flash(views)
     return Capture(kind=source.artifact.kind, views=tuple(views), colours_drift=drift, chart=chart,
                    metres_from_world=source.artifact.metres_from_world, stage=stage,
@@ -140,4 +141,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=13, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)
+STAGE = Stage(name="capture", version=14, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)

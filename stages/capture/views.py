@@ -176,6 +176,15 @@ def not_read(names: Sequence[str]) -> list[str]:
             "PNG, TIFF or EXR, or move them out of the folder"]  # fmt: skip
 
 
+def twins(names: Sequence[str]) -> list[str]:
+    """A warning about files that are one of the photos in another format."""
+    if not names:
+        return []
+    some = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    return [f"{len(names)} files are not used, because a photo of the same name is taken in their place: {some}; to "
+            "use them, move the others out of the folder"]  # fmt: skip
+
+
 def mixed_kinds(candidates: Sequence[Candidate]) -> list[str]:
     """A warning if some photos are developed from raw files and others are not."""
     raw = [c.name for c in candidates if is_raw(Path(c.name))]

@@ -87,7 +87,7 @@ def plain(folder: Path, names: tuple[str, ...] = ("a.jpg", "b.jpg", "c.jpg")) ->
 @pytest.mark.parametrize(("names", "indices"), [
     (("00007.jpg", "9.png", "10.jpg"), [7, 9, 10]),
     (("img1.jpg", "img10.jpg", "img2.jpg"), [0, 1, 2]),
-    (("1.jpg", "1.png", "2.jpg"), [0, 1, 2]),
+    (("01.jpg", "1.jpg", "2.jpg"), [0, 1, 2]),
 ])  # fmt: skip
 def test_indices_of_plain_photos(tmp_path: Path, gather, names: tuple[str, ...], indices: list[int]) -> None:
     capture = gather(plain(tmp_path / "c", names)).artifact
