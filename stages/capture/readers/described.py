@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol
 
@@ -104,26 +105,51 @@ def indices_of(names: Sequence[str]) -> list[int]:
 
 
 def find_photo(folder: Path, written: str) -> Path | None:
-    """The photo for a path in a cameras' file, or None: the path itself, the path with another suffix, or the file name
-    in one of PHOTO_FOLDERS.
+    """The photo for a path in a cameras' file, or None: the path itself, the path with a suffix added, or the file name
+    in one of PHOTO_FOLDERS. If no file has that spelling, one whose name differs in capital letters only: cameras write
+    DSC_0001.JPG, and programs write the name without a suffix or with a small one.
 
     Paths that lead out of the capture are not followed. A name longer than file systems allow gives None.
     """
     plain = written.replace("\\", "/").removeprefix("./")
     lengths = [len(part.encode("utf-8", "backslashreplace")) for part in plain.split("/")]
-    if max(lengths) > LONGEST_NAME or sum(lengths) > LONGEST_PATH:
+    if not PurePosixPath(plain).name or max(lengths) > LONGEST_NAME or sum(lengths) > LONGEST_PATH:
         return None
     inside = not PurePosixPath(plain).is_absolute() and ".." not in PurePosixPath(plain).parts
     candidates = [folder / root / plain for root in PHOTO_FOLDERS] if inside else []
     candidates += [folder / root / PurePosixPath(plain).name for root in PHOTO_FOLDERS]
     for candidate in candidates:
-        if candidate.suffix.lower() in PHOTO_SUFFIXES and candidate.is_file():
-            return candidate
-        for suffix in PHOTO_SUFFIXES:
-            with_suffix = candidate.with_name(candidate.name + suffix)
-            if with_suffix.is_file():
-                return with_suffix
+        for name in _names(candidate):
+            if (candidate.parent / name).is_file():
+                return candidate.parent / name
+    for candidate in candidates:
+        spelt = _spellings(candidate.parent)
+        for name in _names(candidate):
+            found = spelt.get(name.casefold())
+            if found is not None and (candidate.parent / found).is_file():
+                return candidate.parent / found
     return None
+
+
+def _names(candidate: Path) -> list[str]:
+    """Names that the photo of this path may have."""
+    own = [candidate.name] if candidate.suffix.lower() in PHOTO_SUFFIXES else []
+    return own + [candidate.name + suffix for suffix in PHOTO_SUFFIXES]
+
+
+def _spellings(folder: Path) -> Mapping[str, str]:
+    """File names in a folder by their small letters."""
+    try:
+        return _listing(folder, folder.stat().st_mtime_ns)
+    except (OSError, ValueError):  # there is no such folder, or its name can't be one
+        return {}
+
+
+@lru_cache(maxsize=4 * len(PHOTO_FOLDERS))
+def _listing(folder: Path, changed: int) -> Mapping[str, str]:
+    """The same, once for the cameras of a file, which may be ten thousand. changed: when the folder was, as a key."""
+    names = sorted((p.name for p in folder.iterdir()), reverse=True)
+    return {n.casefold(): n for n in names if PurePosixPath(n).suffix.lower() in PHOTO_SUFFIXES}
 
 
 def five_terms(
