@@ -133,10 +133,24 @@ def linear_levels(kind: np.dtype[Any]) -> F32:
 
 def read_alpha(path: Path) -> F32:
     """(H, W) in [0, 1]: a mask's grey value, or the alpha channel of an RGBA file."""
-    image = read_encoded(path)
-    plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
-    peak = float(np.iinfo(plane.dtype).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
-    return (plane.astype(np.float32) / peak).clip(0, 1)
+    plane = mask_plane(read_encoded(path))
+    return (plane.astype(np.float32) / peak_of(plane.dtype)).clip(0, 1)
+
+
+def mask_plane(stored: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """The values (H, W) of a mask as it is stored, (H, W, C): alpha, or the grey value without one. The alpha of a grey
+    picture that is opaque everywhere is none: many programs save black and white with it. A coloured picture is a
+    cut-out, whose subject may fill the frame."""
+    if stored.shape[2] < 4:
+        return stored[..., 0]
+    opaque = bool((stored[..., 3] >= peak_of(stored.dtype)).all())
+    grey = opaque and bool((stored[..., 1:3] == stored[..., :1]).all())
+    return stored[..., 0 if grey else 3]
+
+
+def peak_of(kind: np.dtype[Any]) -> float:
+    """The value of white in a file of this kind."""
+    return float(np.iinfo(kind).max) if np.issubdtype(kind, np.integer) else 1.0
 
 
 PNG_EFFORT = [cv2.IMWRITE_PNG_COMPRESSION, 6]  # a fifth smaller than by default; 40 ms for a map of 1024 x 1024

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from pipeline.artifacts import FileRef, sha256_of
 from pipeline.errors import StageError
-from pipeline.images import read_encoded, refuse_bombs, write_exr
+from pipeline.images import mask_plane, peak_of, read_encoded, refuse_bombs, write_exr
 from pipeline.sharpness import detail
 from stages.capture.colour_checker import Patches, find_chart
 from stages.capture.develop import Developed, develop
@@ -165,9 +165,8 @@ def import_mask(path: Path, ref: FileRef, target: Path, photo: ImportedPhoto) ->
     if size != (photo.width, photo.height) and not turn:
         sizes = f"{size[0]} x {size[1]} pixels, its photo {photo.width} x {photo.height}"
         return f"the mask {path.name} has {sizes}; export it at the photo's size"
-    plane = image[..., 3] if image.shape[2] == 4 else image[..., 0]
-    peak = float(np.iinfo(plane.dtype.name).max) if np.issubdtype(plane.dtype, np.integer) else 1.0
-    inside = float((plane.astype(np.float64) > peak / 2).mean())
+    plane = mask_plane(image)
+    inside = float((plane.astype(np.float64) > peak_of(plane.dtype) / 2).mean())
     if inside in (0.0, 1.0):
         return (f"the mask {path.name} is {'empty' if inside == 0 else 'full'}; draw it again, 0 on the background and "
                 "255 on the subject")  # fmt: skip

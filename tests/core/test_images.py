@@ -73,6 +73,17 @@ def test_read_alpha(tmp_path: Path) -> None:
     assert np.allclose(images.read_alpha(tmp_path / "m.png"), codes(16, 1)[..., 0])
 
 
+def test_read_alpha_of_opaque_pictures(tmp_path: Path) -> None:
+    """Of a grey one its values, of a coloured one the alpha: it shows a subject that fills the frame."""
+    for bits in (8, 16):
+        grey, colours = codes(bits, 1), codes(bits, 3)
+        opaque = np.ones_like(grey)
+        images.write_png(tmp_path / "g.png", np.concatenate([grey, grey, grey, opaque], 2), bits)
+        assert np.allclose(images.read_alpha(tmp_path / "g.png"), grey[..., 0])
+        images.write_png(tmp_path / "c.png", np.concatenate([colours, opaque], 2), bits)
+        assert (images.read_alpha(tmp_path / "c.png") == 1).all()
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4, 6])
 def test_exr_round_trip(tmp_path: Path, channels: int) -> None:
     data = np.random.default_rng(1).normal(0, 100, (6, 9, channels)).astype(np.float32)
