@@ -15,7 +15,7 @@ from dataclasses import dataclass
 Tags = dict[int, tuple[float, ...] | str]
 
 MAKE, MODEL, ORIENTATION, EXIF_IFD = 0x10F, 0x110, 0x112, 0x8769
-FOCAL_MM, FOCAL_35MM, PIXEL_X, LENS = 0x920A, 0xA405, 0xA002, 0xA434
+FOCAL_MM, FOCAL_35MM, PIXEL_X, PIXEL_Y, LENS = 0x920A, 0xA405, 0xA002, 0xA003, 0xA434
 PLANE_X_RESOLUTION, PLANE_UNIT = 0xA20E, 0xA210
 GPS_IFD, LAT_REF, LAT, LON_REF, LON, ALT_REF, ALT = 0x8825, 1, 2, 3, 4, 5, 6
 EXPOSURE_S, F_NUMBER, ISO, WHITE_BALANCE, FLASH = 0x829A, 0x829D, 0x8827, 0xA403, 0x9209
@@ -37,6 +37,7 @@ _WANTED = {
     FOCAL_MM,
     FOCAL_35MM,
     PIXEL_X,
+    PIXEL_Y,
     LENS,
     PLANE_X_RESOLUTION,
     PLANE_UNIT,
@@ -66,6 +67,7 @@ _WANTED = {
 @dataclass(frozen=True, slots=True)
 class Exif:
     """orientation: 1..8 as in EXIF. body: "make model lens", "" if unknown. Focal lengths in mm, None if unknown.
+    recorded_edge: the longer edge of the frame as recorded, pixels.
 
     exposure: seconds x ISO / f-number^2, to which the linear value of a grey is proportional; None if one is missing.
     white_balance: auto, manual, or "" if unknown. colours: ADOBE_RGB, UNCALIBRATED (not sRGB), or None. flash: whether
@@ -77,7 +79,7 @@ class Exif:
     focal_mm: float | None = None
     focal_35mm: float | None = None
     pixels_per_mm: float | None = None
-    recorded_width: int | None = None
+    recorded_edge: int | None = None
     exposure: float | None = None
     white_balance: str = ""
     flash: bool | None = None
@@ -89,9 +91,9 @@ class Exif:
         found = None
         if self.focal_35mm:
             found = self.focal_35mm / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
-        elif self.focal_mm and self.pixels_per_mm and self.recorded_width:
+        elif self.focal_mm and self.pixels_per_mm and self.recorded_edge:
             # the resolution is that of the recorded frame; a copy that was scaled down has fewer pixels per millimetre
-            found = self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_width
+            found = self.focal_mm * self.pixels_per_mm * max(width, height) / self.recorded_edge
         low, high = FOCAL
         return found if found is not None and low <= found / max(width, height) <= high else None
 
@@ -108,14 +110,15 @@ def read_exif(data: bytes) -> Exif:
     unit = _UNIT_MM.get(int(_number(tags, PLANE_UNIT) or 2))
     resolution = _number(tags, PLANE_X_RESOLUTION)
     orientation = int(_number(tags, ORIENTATION) or 1)
-    width = _number(tags, PIXEL_X)
+    # the longer edge: of a portrait photo that is stored upright, X is the shorter one
+    edge = max(_number(tags, PIXEL_X) or 0, _number(tags, PIXEL_Y) or 0)
     return Exif(
         orientation=orientation if 1 <= orientation <= 8 else 1,
         body=" ".join(t for t in (_text(tags, MAKE), _text(tags, MODEL), _text(tags, LENS)) if t),
         focal_mm=_number(tags, FOCAL_MM),
         focal_35mm=_number(tags, FOCAL_35MM),
         pixels_per_mm=resolution / unit if resolution and unit else None,
-        recorded_width=int(width) if width else None,
+        recorded_edge=int(edge) or None,
         exposure=_exposure(tags),
         white_balance=WHITE_BALANCES.get(_values_of(tags, WHITE_BALANCE)[:1], ""),
         flash=_fired(_values_of(tags, FLASH)),

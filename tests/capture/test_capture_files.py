@@ -137,9 +137,22 @@ def test_exif_of_a_jpeg_in_both_byte_orders(order: str) -> None:
 
 def test_focal_length_from_the_sensor_s_resolution() -> None:
     # 85 mm, 4000 / 3 pixels per cm = 133.33 per mm, recorded 4000 wide, and the copy is 1000 wide
-    exif = Exif(focal_mm=85, pixels_per_mm=4000 / 30, recorded_width=4000)
+    exif = Exif(focal_mm=85, pixels_per_mm=4000 / 30, recorded_edge=4000)
     assert exif.focal_px(1000, 750) == pytest.approx(85 * 4000 / 30 / 4)
     assert Exif(focal_mm=85).focal_px(1000, 750) is None
+
+
+@pytest.mark.parametrize(("x", "y"), [(4000, 6000), (6000, 4000), (6000, None), (None, 6000)])
+def test_focal_length_of_a_portrait_photo_that_is_stored_upright(x: int | None, y: int | None) -> None:
+    """A 36 x 24 mm sensor with 6000 pixels along its longer edge: 50 mm are 8333 pixels whichever way it was held."""
+    rational = struct.Struct("<II").pack
+    edges = [(tag, 4, 1, struct.pack("<I", n)) for tag, n in ((0xA002, x), (0xA003, y)) if n is not None]
+    sensor = [(0xA20E, 5, 1, rational(60000, 36)), (0xA210, 3, 1, struct.pack("<H", 3))]
+    block = tiff_block("<", [], [(0x920A, 5, 1, rational(50, 1)), *edges, *sensor])
+    exif = read_exif(exif_jpeg(block))
+    for size in ((4000, 6000), (6000, 4000)):
+        assert exif.focal_px(*size) == pytest.approx(50 * 6000 / 36, rel=1e-5)
+    assert exif.focal_px(1000, 1500) == pytest.approx(50 * 1500 / 36, rel=1e-5)
 
 
 def test_exif_of_png_and_tiff() -> None:
