@@ -56,14 +56,15 @@ def region(camera: Camera, roi_radius: float) -> Disc | None:
     return Disc(float(uv[0, 0]), float(uv[0, 1]), float(roi_radius * np.sqrt(K[0, 0] * K[1, 1]) / z[0]), roll)
 
 
-def eight_bit(image: npt.NDArray[np.generic]) -> U8:
-    """(H, W, 3) 8-bit sRGB of a decoded file: 1, 3 or 4 channels, 8 or 16 bit sRGB, or linear float."""
+def eight_bit(image: npt.NDArray[np.generic], white: float = 1.0) -> U8:
+    """(H, W, 3) 8-bit sRGB of a decoded file: 1, 3 or 4 channels, 8 or 16 bit sRGB, or linear float. white: the linear
+    value that becomes 255 in float files, which have no white of their own."""
     rgb = np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image[..., :3]
     if rgb.dtype == np.uint8:
         return np.ascontiguousarray(rgb)
     if np.issubdtype(rgb.dtype, np.integer):
         return np.asarray(np.round(rgb.astype(np.float32) * (255 / np.iinfo(rgb.dtype).max)), np.uint8)
-    encoded = srgb_from_linear(np.nan_to_num(rgb.astype(np.float32)).clip(0, 1))
+    encoded = srgb_from_linear((np.nan_to_num(rgb.astype(np.float32)) / np.float32(white)).clip(0, 1))
     return np.asarray(np.round(encoded * 255), np.uint8)
 
 

@@ -89,7 +89,8 @@ def segment(
 ) -> MaskSet:  # fmt: skip
     """Masks of all registered views: the whole stage. See stages.masks.stage.run."""
     poses = located.artifact
-    pairs, threads = photos_of(capture, poses), at_once(capture.artifact.views, os.cpu_count() or 1)
+    pairs = photos_of(capture, poses, context.check)
+    threads = at_once(capture.artifact.views, os.cpu_count() or 1)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
                lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
