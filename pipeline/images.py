@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,9 +101,32 @@ def _decoded(path: Path) -> npt.NDArray[Any] | None:
         planes, names = read_exr(path)
     except (RuntimeError, OSError, ValueError, TypeError, KeyError, MemoryError):  # what OpenEXR raises when damaged
         return None
-    colour = [n for n in "BGRA" if n in names]
-    wanted = colour if len(colour) >= 3 else list(names[:1])
+    wanted = _shown(names)
+    if wanted is None:
+        raise StageError(
+            "the image's pixel format is not supported",
+            where=path.name,
+            value="the channels " + ascii(", ".join(names))[1:-1][:200],
+            limit="R, G and B, with A or without; those of one layer (diffuse.R, ...); or one channel alone, such as Y",
+            remedy="export the image again with the channels R, G and B",
+        )
     return planes[..., [names.index(n) for n in wanted]]
+
+
+def _shown(names: Sequence[str]) -> list[str] | None:
+    """The channels of an EXR that are its picture, in OpenCV's order: the plain colours, or those of the only layer
+    that has any; else luminance, or the only channel. None if that leaves several to choose from."""
+    of_layer: dict[str, dict[str, str]] = {}
+    for name in names:
+        layer, dot, channel = name.rpartition(".")
+        of_layer.setdefault(layer + dot, {}).setdefault(channel.upper(), name)
+    coloured = {layer: own for layer, own in of_layer.items() if {"R", "G", "B"} <= own.keys()}
+    own = coloured.get("") or (next(iter(coloured.values())) if len(coloured) == 1 else None)
+    if own is not None:
+        return [own[c] for c in "BGRA" if c in own]
+    if coloured:
+        return None
+    return ["Y"] if "Y" in names else list(names) if len(names) == 1 else None
 
 
 def read_linear(path: Path) -> F32:

@@ -141,4 +141,4 @@ def _enough(fitted: int, held: int, left_out: list[str], limit: int) -> None:
                          limit=f"at least {limit} views", remedy="hold out fewer views, or add photos")  # fmt: skip
 
 
-STAGE = Stage(name="capture", version=17, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)
+STAGE = Stage(name="capture", version=18, inputs=Inputs, config=Config, output=Capture, run=run, any_threads=True)

@@ -131,8 +131,35 @@ def test_an_exr_photo_with_more_channels_gives_its_colour(tmp_path: Path) -> Non
     data = np.random.default_rng(4).uniform(0, 1, (4, 3, 5)).astype(np.float32)
     images.write_exr(tmp_path / "a.exr", data, ("R", "G", "B", "A", "depth"))
     assert np.array_equal(images.read_encoded(tmp_path / "a.exr"), data[..., :4])
-    images.write_exr(tmp_path / "b.exr", data, ("Z", "depth", "id", "x", "y"))
-    assert images.read_encoded(tmp_path / "b.exr").shape == (4, 3, 1)
+
+
+@pytest.mark.parametrize(("names", "taken"), [
+    (("R", "G", "B", "beauty.B", "beauty.G", "beauty.R"), "R G B"),  # the plain ones before those of a layer
+    (("beauty.B", "beauty.G", "beauty.R", "Z"), "beauty.R beauty.G beauty.B"),
+    (("Z", "a.A", "a.B", "a.G", "a.R"), "a.R a.G a.B a.A"),
+    (("A", "b", "g", "r"), "r g b A"),
+    (("left.beauty.b", "left.beauty.g", "left.beauty.r"), "left.beauty.r left.beauty.g left.beauty.b"),
+    (("Y", "A"), "Y"),
+    (("A", "Y", "Z"), "Y"),
+    (("A",), "A"),
+    (("depth.V",), "depth.V"),
+])  # fmt: skip
+def test_which_channels_of_an_exr_are_its_picture(tmp_path: Path, names: tuple[str, ...], taken: str) -> None:
+    data = np.random.default_rng(5).uniform(0, 1, (4, 3, len(names))).astype(np.float32)
+    images.write_exr(tmp_path / "a.exr", data, names)
+    found = images.read_encoded(tmp_path / "a.exr")
+    assert np.array_equal(found, data[..., [names.index(n) for n in taken.split()]])
+
+
+@pytest.mark.parametrize("names", [
+    ("Z", "depth", "id", "x", "y"), ("A", "Z"), ("G", "B", "A"), ("R", "G"),
+    ("a.R", "a.G", "a.B", "b.R", "b.G", "b.B"),
+])  # fmt: skip
+def test_channels_of_an_exr_that_are_no_picture_are_named(tmp_path: Path, names: tuple[str, ...]) -> None:
+    images.write_exr(tmp_path / "a.exr", np.ones((4, 3, len(names)), np.float32), names)
+    with pytest.raises(StageError, match="pixel format is not supported") as e:
+        images.read_encoded(tmp_path / "a.exr")
+    assert all(n in str(e.value.value) for n in names) and "diffuse.R" in str(e.value.limit)
 
 
 def test_wrong_number_of_channel_names(tmp_path: Path) -> None:
