@@ -94,6 +94,8 @@ OF_FIT = (
              "test_a_light_that_is_dark_where_nothing_faces_is_corrected_all_the_same"),
     Mutation("stages/inverse_rendering/skin_light.py", "free + solve_triangular(root, -left[:-1] / left[-1])", "free",
              "tests/inverse_rendering/test_skin_light.py::test_the_limited_solution_is_that_of_a_general_solver"),
+    Mutation("stages/inverse_rendering/skin_light.py", "if then >= now:", "if then < 0:",
+             "tests/inverse_rendering/test_skin_light.py::test_what_leaves_the_skin_as_uneven_as_it_was_is_left_out"),
     Mutation("stages/inverse_rendering/skin_light.py", "weight = PATCHES / len(y) / noise**2",
              "weight = 1 / noise**2",
              "tests/inverse_rendering/test_skin_light.py::test_noise_counts_as_that_of_fifty_places"),

@@ -267,11 +267,12 @@ class Trainer(TrialLoop):
         rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
         known = None if explained is None else float(explained)
         found = correct_light(self.model, self.views, rays, known, self.device)
-        if found is None:
+        if found is not None:
+            self.choices = replace(choices, facts=choices.facts | {"light": light | found.facts})
+        if found is None or not found.changed:
             self.trials.withdraw(SKIN)
         else:
             self.skin_tells = True
-            self.choices = replace(choices, facts=choices.facts | {"light": light | found})
             self.restart(self.model.light, self.model.spatial)
 
     def ask_second(self) -> None:

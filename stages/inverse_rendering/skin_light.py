@@ -12,6 +12,9 @@ The corrected light must leave some irradiance in every direction, also in those
 kappa E_min(d), linear in the unknowns, at directions d all around; E_min is DARKEST of the mean, or the irradiance
 before where that is less. Such a quadratic problem is a least distance problem [Lawson and Hanson 1974, ch. 23].
 
+What makes the luminance of the skin no more even is no error of the light, and is left out: on a person between
+white walls the sheen of the cheeks' sides was taken for light, and the albedo got pale patches.
+
 Prior: b ~ N(0, std^2). A face is nearly mirror-symmetric, so that light from the side can't be mistaken for its
 colours: the terms odd in x have ODD_STD. The others, from above or from the front, also fit the skin's own pattern:
 their standard deviation is small where the lobe determined the light (light_estimate.py).
@@ -32,6 +35,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 from torch import Tensor
 
+from pipeline.colour import LUMA
 from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
@@ -69,6 +73,14 @@ class SkinLight:
 
     change: F64
     explained: F64
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """facts: for the report; changed: whether the light was corrected."""
+
+    facts: Fact
+    changed: bool
 
 
 def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tuple[Tensor, Tensor]:
@@ -130,6 +142,12 @@ def least_irradiance(irradiance: F64) -> F64:
     return np.minimum(irradiance, DARKEST * float(irradiance.mean()))
 
 
+def unevenness(albedo: F64) -> float:
+    """Robust standard deviation of the logarithm of the luminance of an albedo (N, 3) above 0."""
+    log = np.log(np.maximum(albedo @ LUMA, 1e-9))
+    return 1.4826 * float(np.median(np.abs(log - np.median(log))))
+
+
 def irradiance_basis(n: F64) -> F64:
     """A_l Y_lm (N, 9) at unit normals n (N, 3): E = irradiance_basis @ coefficients. [NeuFace eq. 14]"""
     d = torch.from_numpy(np.asarray(n, np.float64))
@@ -173,9 +191,9 @@ def limited(gram: F64, g: F64, limits: F64) -> F64:
 
 def correct_light(
     model: FaceModel, views: Sequence[PhotoView], rays: Rays, explained: float | None, device: str
-) -> Fact | None:
-    """Correct the light of a model by the skin in its photos, and its reflectance so that the photos stay as they are;
-    the facts for the report, None if nothing is changed.
+) -> Asked | None:
+    """Correct the light of a model by the skin in its photos, and its reflectance so that the photos stay as they are,
+    if that makes the skin more even; None if there is nothing to correct or no skin.
 
     rays: towards the whole subject. explained: share of the view-dependent variance that the light's estimate explains,
     None without an estimate.
@@ -195,9 +213,15 @@ def correct_light(
         found = correction(a, e, normals, even, limits)
     if found is None:
         return None
+    corrected = e + irradiance_basis(normals) @ found.change
+    now, then = unevenness(a), unevenness(a * e / np.maximum(corrected, 1e-9))
+    facts: Fact = {"skin_uneven": round(now, 4), "skin_uneven_corrected": round(then, 4)}
+    if then >= now:
+        return Asked(facts, False)
     x, facing = surface_points(model.geometry, rays)
     error = change_light(model, spatial, x, facing, lambda: _apply(light, found, n, irradiance))
-    return {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
+    facts |= {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
+    return Asked(facts, True)
 
 
 def _apply(light: ShLight, found: SkinLight, n: Tensor, irradiance: Tensor) -> None:

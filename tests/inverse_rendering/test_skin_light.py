@@ -28,6 +28,7 @@ from stages.inverse_rendering.skin_light import (
     least_irradiance,
     limited,
     skin_points,
+    unevenness,
 )
 from tests.support.small_ball import fit_of_the_ball
 from tests.support.spread import made_once
@@ -212,12 +213,36 @@ def test_the_photos_stay_when_the_light_changes(ball: Trainer) -> None:
         albedo = model.spatial(x)[0].mean(-1)
     assert float(albedo[n[:, 1] > 0.5].mean() / albedo[n[:, 1] < -0.5].mean()) > 1.3
     lit = light.irradiance(n).detach().mean()
-    facts = correct_light(model, [replace(v, skin=v.alpha > 0.99) for v in views], rays, None, "cpu")
+    asked = correct_light(model, [replace(v, skin=v.alpha > 0.99) for v in views], rays, None, "cpu")
     found = light().detach().mean(-1)
-    assert facts is not None and float(facts["skin_explains"]) > 0.8
+    assert asked is not None and asked.changed and float(asked.facts["skin_explains"]) > 0.8
+    assert float(asked.facts["skin_uneven_corrected"]) < 0.5 * float(asked.facts["skin_uneven"])
     assert float(found[1] / found[0]) == pytest.approx(0.371, abs=0.06)
     assert float((look() / seen - 1).abs().mean()) < 0.03
     assert float(light.irradiance(n).detach().mean()) == pytest.approx(float(lit), rel=0.02)  # hence the albedo's level
+
+
+def test_what_leaves_the_skin_as_uneven_as_it_was_is_left_out(ball: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A correction of colours alone, or one that makes an even skin uneven: the light stays, and the report says why."""
+    views, rays = [replace(v, skin=v.alpha > 0.99) for v in ball.views], ball.pixels.draw(2_000, 0.0, 3).rays
+    before = ball.model.light().detach().clone()
+    change = np.zeros((9, 3))
+    change[3] = 0.8
+    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even, around: SkinLight(change, np.ones(3)))
+    asked = correct_light(ball.model, views, rays, None, "cpu")
+    assert asked is not None and not asked.changed and "skin_explains" not in asked.facts
+    assert float(asked.facts["skin_uneven_corrected"]) > float(asked.facts["skin_uneven"])
+    np.testing.assert_array_equal(ball.model.light().detach(), before)
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1.0, 1e3])
+def test_unevenness_is_the_spread_of_the_logarithm_and_ignores_lips(gain: float) -> None:
+    rng = np.random.default_rng(2)
+    skin = gain * np.exp(0.2 * rng.normal(size=(4000, 1))) * KAPPA
+    assert unevenness(skin) == pytest.approx(0.2, rel=0.05)
+    skin[:200] *= 0.01
+    assert unevenness(skin) == pytest.approx(0.2, rel=0.15)
+    assert unevenness(np.tile(KAPPA, (9, 1))) == 0 and np.isfinite(unevenness(np.zeros((9, 3))))
 
 
 @pytest.mark.parametrize(("explained", "wanted"), [(0.45, 0.02), (0.25, 0.29), (0.1, 0.3), (None, 0.3)])
