@@ -4,8 +4,8 @@
 
 TRUTH has relit/STEM.exr (linear, premultiplied), relit/light.exr, cameras.json and labels
 (workflows/evaluation/rendered_person.py). The asset is placed in the head's frame by its cameras and the closest
-points of the skin, as for the other figures; the light is turned with it. PSNR of sRGB-encoded skin pixels: as it is, after one
-gain for all pictures, and after a matrix of colours for each.
+points of the skin, as for the other figures, and the light is turned with it. PSNR of sRGB-encoded skin pixels: as it
+is, after one gain for all pictures, and after a matrix of colours for each.
 """
 
 from __future__ import annotations

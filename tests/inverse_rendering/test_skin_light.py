@@ -223,7 +223,7 @@ def test_the_photos_stay_when_the_light_changes(ball: Trainer) -> None:
 
 
 def test_what_leaves_the_skin_as_uneven_as_it_was_is_left_out(ball: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A correction of colours alone, or one that makes an even skin uneven: the light stays, and the report says why."""
+    """A correction that makes an even skin uneven: the light stays, and the report says why."""
     views, rays = [replace(v, skin=v.alpha > 0.99) for v in ball.views], ball.pixels.draw(2_000, 0.0, 3).rays
     before = ball.model.light().detach().clone()
     change = np.zeros((9, 3))
