@@ -9,7 +9,9 @@ known light, the radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99
 3 % (docs/model.md); a fit that starts from a uniform light reaches 0.6 to 0.8.
 
 The ratio of band 0 to the others changes least with the view, so it is the least accurate. The bands from 1 on are
-scaled by the factor that makes the albedo pi D_p / E(n_p) most uniform; their shape and band 0 are unchanged.
+scaled by the factor that makes the albedo pi D_p / E(n_p) most uniform; their shape and band 0 are unchanged. Uniform:
+with the least product of its unevenness over all points and over the skin of the face. Dark hair above and a shirt
+below look like light from below, skin alone is a small part of the directions.
 
 Polarised pairs show the lobe alone: s_pv = w(n . wo) sum_lm A_l L_lm Y_lm(w_r). Then no D_p is eliminated, and band 0
 is as accurate as the others.
@@ -38,7 +40,8 @@ RIDGE = 1e-3  # of the mean eigenvalue
 MIN_VIEWS = 3  # of a point
 MIN_POINTS = 200
 MIN_EXPLAINED = 0.2  # smallest explained share of the view-dependent variance; at .165 an albedo lost 4 dB
-SCALES = np.geomspace(0.4, 2.5, 61)  # of the bands from 1 on
+SCALES = np.geomspace(0.25, 4.0, 91)  # of the bands from 1 on
+MIN_SKIN = 50  # points of skin from which on it counts
 DARKEST = 0.02  # of the mean irradiance: lower limit on all sides of the head
 LIT_SHARE = 0.9  # smallest share of points above that limit and with a positive D
 
@@ -51,6 +54,11 @@ class LightEstimate:
     coefficients: F64
     explained: float
     scale: float
+
+    @property
+    def at_limit(self) -> bool:
+        """Whether the scale is the first or last that was tried: the albedo did not tell it."""
+        return self.scale in (SCALES[0], SCALES[-1])
 
 
 def reflectance(cosine: F64) -> F64:
@@ -119,21 +127,28 @@ def light_from_mirror(seen: Observations, order: int, gain: F64, attenuation: st
 def _evenest(
     seen: Observations, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]
 ) -> float | None:
-    """The scale with the least spread of ln albedo. b: ((L + 1)^2,) coefficients. total, glow, even (P,): means over
+    """The scale with the most even albedo. b: ((L + 1)^2,) coefficients. total, glow, even (P,): means over
     the views of the colour, of the lobe's bands from 1 on, and of its band 0 per unit of L_00. often: (P,) used
     points."""
     light = np.zeros((len(b), 3))
     light[1:] = b[1:, None]
     sides = sh.irradiance(torch.from_numpy(light), seen.n.detach().cpu().double()).numpy()[:, 0]
     mean = float(np.pi * b[0] / np.sqrt(4 * np.pi))
-    best, found = np.inf, None
+    best, found, skin = np.inf, None, seen.on_skin
     for scale in SCALES:
         e, d = mean + scale * sides, total - scale * glow - even * b[0]
         good = often & (e > DARKEST * mean) & (d > 0)
         if good.sum() < LIT_SHARE * often.sum():
             continue
-        log = np.log(d[good] / e[good])
-        spread = float(np.abs(log - np.median(log)).mean())
+        spread = _unevenness(d[good] / e[good])
+        if (good & skin).sum() >= MIN_SKIN:
+            spread *= _unevenness(d[good & skin] / e[good & skin])
         if spread < best:
             best, found = spread, float(scale)
     return found
+
+
+def _unevenness(albedo: F64) -> float:
+    """Mean absolute deviation of ln albedo (N,) from its median."""
+    log = np.log(albedo)
+    return float(np.abs(log - np.median(log)).mean())

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -25,6 +26,7 @@ from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView, Rays, factor
 F32 = npt.NDArray[np.float32]
 F64 = npt.NDArray[np.float64]
 I64 = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
 MIN_COSINE = 0.35  # at grazing angles a pixel covers too much surface
 CLEARANCE_CELLS = 2.5  # tolerance of the occlusion test
 SIDE = 256  # pixels: coarse enough for a surface with an error of a millimetre
@@ -32,17 +34,20 @@ SIDE = 256  # pixels: coarse enough for a surface with an error of a millimetre
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A photo reduced by `factor`: rgb (h, w, 3) linear, alpha (h, w). view: photo and camera at the original size."""
+    """A photo reduced by `factor`: rgb (h, w, 3) linear, alpha (h, w). view: photo and camera at the original size.
+    skin (h, w): the face's skin without its border, None without labels."""
 
     view: PhotoView
     factor: int
     rgb: F32
     alpha: F32
+    skin: Mask | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """x, n: (P, 3) points and normals. point, view: (M,) indices of point and view. colour, wo: (M, 3)."""
+    """x, n: (P, 3) points and normals. point, view: (M,) indices of point and view. colour, wo: (M, 3). skin: (M,)
+    whether the photo shows the face's skin there, None if nothing is known."""
 
     x: Tensor
     n: Tensor
@@ -50,11 +55,20 @@ class Observations:
     view: I64
     colour: F64
     wo: F64
+    skin: Mask | None = None
 
     @property
     def normal(self) -> F64:
         """n of each observation (M, 3)."""
         return np.asarray(self.n.double().cpu().numpy()[self.point], np.float64)
+
+    @property
+    def on_skin(self) -> Mask:
+        """(P,) points that most of the photos that see them show as the face's skin."""
+        if self.skin is None:
+            return np.zeros(len(self.x), np.bool_)
+        seen, as_skin = (np.bincount(self.point, w, len(self.x)) for w in (None, self.skin.astype(np.float64)))
+        return np.asarray(as_skin > seen / 2)
 
     @property
     def cosine(self) -> F64:
@@ -86,8 +100,16 @@ def pictures(views: list[PhotoView], side: int = SIDE) -> list[Picture]:
     out = []
     for view in views:
         f = factor_for(view.size, side)
-        out.append(Picture(view, f, shrink_whole(view.rgb, f), shrink_whole(view.alpha, f)))
+        out.append(Picture(view, f, shrink_whole(view.rgb, f), shrink_whole(view.alpha, f), skin_inside(view, f)))
     return out
+
+
+def skin_inside(view: PhotoView, factor: int) -> Mask | None:
+    """(h, w) the face's skin in a photo reduced by `factor`, without the pixels at its border; None without labels."""
+    if view.skin is None:
+        return None
+    whole = (shrink_whole(view.skin.astype(np.float32), factor) == 1).astype(np.uint8)
+    return np.asarray(cv2.erode(whole, np.ones((3, 3), np.uint8)) > 0)
 
 
 def surface_points(geometry: Geometry, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -112,12 +134,13 @@ def observe(geometry: Geometry, shots: list[Picture], x: Tensor, n: Tensor) -> O
     points, normals = (a.detach().cpu().double().numpy() for a in (x, n))
     parts = [_seen_by(geometry, shot, points, normals, x) for shot in shots]
     view = np.concatenate([np.full(len(p[0]), i, np.int64) for i, p in enumerate(parts)])
-    point, colour, wo = (np.concatenate([p[k] for p in parts]) for k in range(3))
-    return Observations(x, n, point.astype(np.int64), view, colour, wo)
+    point, colour, wo, skin = (np.concatenate([p[k] for p in parts]) for k in range(4))
+    return Observations(x, n, point.astype(np.int64), view, colour, wo, skin.astype(np.bool_))
 
 
-def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Tensor) -> tuple[I64, F64, F64]:
-    """Indices of the points that one photo sees, their colours there and the directions to the camera."""
+def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Tensor) -> tuple[I64, F64, F64, Mask]:
+    """Indices of the points that one photo sees, their colours there, the directions to the camera, and whether they
+    are skin."""
     view = shot.view
     centre = view.world_from_cam[:3, 3]
     away = centre - points
@@ -131,7 +154,9 @@ def _seen_by(geometry: Geometry, shot: Picture, points: F64, normals: F64, x: Te
     value, least = _look_up(shot, at[chosen])
     chosen, value = chosen[least > WHOLE], value[least > WHOLE]
     free = unoccluded(geometry, centre, wo[chosen], distance[chosen], x)
-    return chosen[free], value[free], wo[chosen[free]]
+    column, row = np.round(at[chosen[free]]).astype(np.int64).T
+    skin = np.zeros(len(row), np.bool_) if shot.skin is None else shot.skin[row, column]
+    return chosen[free], value[free], wo[chosen[free]], skin
 
 
 def _look_up(shot: Picture, at: F64) -> tuple[F64, F64]:

@@ -27,7 +27,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -40,10 +39,9 @@ from pipeline.fields.appearance import SpatialField
 from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from pipeline.fields.shadowing import fibonacci
-from pipeline.images import shrink_whole
 from pipeline.maths import sh
 from stages.inverse_rendering.albedo_level import lobe_std
-from stages.inverse_rendering.observations import surface_hits, surface_points
+from stages.inverse_rendering.observations import skin_inside, surface_hits, surface_points
 from stages.inverse_rendering.ray_sampling import PhotoView, Rays, factor_for, image_rays
 from stages.inverse_rendering.relight_model import change_light
 
@@ -89,11 +87,11 @@ def skin_points(model: FaceModel, views: Sequence[PhotoView], device: str) -> tu
     each = max(POINTS // max(len(views), 1), 1)
     found = [(torch.zeros(0, 3, device=device), torch.zeros(0, 3, device=device))]
     for view in views:
-        if view.skin is None:
-            continue
         factor = factor_for(view.size, SIDE)
-        skin = (shrink_whole(view.skin.astype(np.float32), factor) == 1).astype(np.uint8)
-        pixels = np.flatnonzero(cv2.erode(skin, np.ones((3, 3), np.uint8)))
+        inside = skin_inside(view, factor)
+        if inside is None:
+            continue
+        pixels = np.flatnonzero(inside)
         chosen = torch.from_numpy(generator.permutation(pixels)[:each]).to(device)
         rays = image_rays(view, factor, device)
         x, n, _ = surface_hits(model.geometry, rays[chosen], chosen)

@@ -214,7 +214,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=42,
+    version=43,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -7,6 +7,7 @@ under test. tests/inverse_rendering/test_fit.py has it inside a fit.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from stages.inverse_rendering.footprint import footprint, supported
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.initialise import new_trainer
 from stages.inverse_rendering.model_selection import Choices, restored, select_model, validation_views
-from stages.inverse_rendering.observations import observe, pictures, surface_points
+from stages.inverse_rendering.observations import observe, pictures, skin_inside, surface_points
 from stages.inverse_rendering.paper.config import PaperConfig
 from tests.support.balls import FOCAL, RADIUS, Ball, gloss, start, texture
 
@@ -275,6 +276,20 @@ def test_sightings_show_the_ball() -> None:
     assert seen.cosine.min() > 0.35
     per_view = np.bincount(seen.view, minlength=24)
     assert per_view.min() > 100
+    assert not seen.on_skin.any()  # no photo has labels
+    upper = [replace(v, skin=np.arange(v.size[1])[:, None] < v.size[1] * np.ones(v.size[0]) / 2) for v in t.views]
+    labelled = observe(t.model.geometry, pictures(upper), x, n)
+    assert 0.2 < labelled.on_skin.mean() < 0.8
+    assert labelled.normal[labelled.skin, 1].mean() > labelled.normal[~labelled.skin, 1].mean() + 0.5
+
+
+def test_the_border_of_the_skin_does_not_count() -> None:
+    view = trainer(Ball()).views[0]
+    skin = np.zeros(view.size[::-1], np.bool_)
+    skin[8:24, 8:24] = True
+    inside = skin_inside(replace(view, skin=skin), 1)
+    assert inside is not None and inside.sum() == 14 * 14 and inside[9, 9] and not inside[8, 8]
+    assert skin_inside(replace(view, skin=None), 1) is None
 
 
 def test_the_lobe_is_a_least_squares_fit() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -216,6 +217,40 @@ def test_the_scale_is_that_which_makes_the_albedo_even(index: int) -> None:
     total = lit + scale * glow + even * light[0]
     found = lamp_module._evenest(seen, light, total, glow, even, np.ones(400, bool))
     assert (lit > 0.05 * lit.mean()).all() and found == pytest.approx(scale, rel=1e-9)
+
+
+def test_dark_hair_above_is_not_taken_for_a_dark_sky() -> None:
+    """A light from above on a head with dark hair on top: all points alone say that there is hardly any light from
+    above. With the skin of the front the scale is right."""
+    rng = np.random.default_rng(5)
+    n = unit(rng.normal(size=(1500, 3)))
+    light = np.zeros(16)
+    light[[0, 1, 2]] = 3.0, 0.9, 0.3  # above, and a little in front
+    hair, skin = n[:, 1] > 0.3, (n[:, 1] < 0.3) & (n[:, 2] > 0.4)
+    albedo = np.where(hair, 0.05, np.where(skin, 0.4, 0.25)) * np.exp(rng.normal(0, 0.1, 1500))
+    lambdas = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4, 0], [1, 3, 5, 7])
+    lit = albedo / np.pi * (harmonics(n, ORDER) @ (lambdas * light))
+    every, views = np.arange(1500), np.zeros(1500, np.int64)
+    flat = np.zeros((1500, 3))
+    found = []
+    for shown in (None, skin):
+        seen = Observations(torch.zeros(1500, 3), torch.from_numpy(n), every, views, flat, flat, shown)
+        found.append(lamp_module._evenest(seen, light, lit, np.zeros(1500), np.zeros(1500), np.ones(1500, bool)))
+    assert found[0] is not None and found[1] is not None
+    assert found[0] < 0.6 and found[1] == pytest.approx(1.0, rel=0.25)
+    assert lamp_module.LightEstimate(light, 0.5, lamp_module.SCALES[0]).at_limit
+    assert lamp_module.LightEstimate(light, 0.5, lamp_module.SCALES[-1]).at_limit
+    assert not lamp_module.LightEstimate(light, 0.5, found[1]).at_limit
+
+
+def test_skin_is_what_most_photos_show_as_skin() -> None:
+    point = np.array([0, 0, 0, 1, 1, 2])
+    seen = Observations(
+        torch.zeros(4, 3), torch.zeros(4, 3), point, point, np.zeros((6, 3)), np.zeros((6, 3)),
+        np.array([True, True, False, True, False, True]),
+    )  # fmt: skip
+    assert seen.on_skin.tolist() == [True, False, True, False]
+    assert not replace(seen, skin=None).on_skin.any()
 
 
 def mirrors_alone(light: F64, noise: float = 0.0) -> Observations:

@@ -122,6 +122,19 @@ def test_the_dome_is_positive_and_lights_surfaces_as_the_raw_light_does() -> Non
     assert image.max() < 1.3 * raw.max()
 
 
+def test_a_light_that_no_picture_can_have_keeps_its_irradiance() -> None:
+    """A window fitted with bands 3 and 4 that no positive picture has: those go, and surfaces are lit as they were."""
+    light = np.zeros((121, 3), np.float32)
+    light[[0, 3, 8]] = np.array([1.0, 0.9, 0.4])[:, None]  # from +x
+    light[[15, 24]] = np.array([-0.6, 0.9])[:, None]
+    image = environment(light, 128)
+    figures = environment_figures(light, image)
+    assert figures["light_negative_share"] > 0.15 and image.min() >= 0
+    assert figures["light_irradiance_error"] < 0.1  # .47 if all bands count alike
+    kept = light_from_environment(image)
+    np.testing.assert_allclose(kept[:9], light[:9], atol=0.06)
+
+
 def test_the_figures_of_a_light_by_hand() -> None:
     """L = 1 + 1.2 z: the energies above and below 0 are as 2.2^2 to 0.2^2, the peak is 2.2, and E(n) > 0 everywhere."""
     z = latlong_directions(256, 128)[..., 1:2]
