@@ -263,7 +263,7 @@ class Trainer(TrialLoop):
     def ask_skin(self, choices: Choices) -> None:
         """Correct the light by the skin, if photos show a face."""
         light = choices.facts.get("light", {})
-        explained = light.get("explained") if choices.light_known and "scaled_at_limit" not in light else None
+        explained = light.get("explained") if choices.light_known else None
         rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
         known = None if explained is None else float(explained)
         found = correct_light(self.model, self.views, rays, known, self.device)

@@ -11,7 +11,9 @@ known light, the radiance over the sphere, bands 1 to 4, correlates 0.97 to 0.99
 The ratio of band 0 to the others changes least with the view, so it is the least accurate. The bands from 1 on are
 scaled by the factor that makes the albedo pi D_p / E(n_p) most uniform; their shape and band 0 are unchanged. Uniform:
 with the least product of its unevenness over all points and over the skin of the face. Dark hair above and a shirt
-below look like light from below, skin alone is a small part of the directions.
+below look like light from below, skin alone is a small part of the directions. Where the albedo gets more even up
+to the largest factor, there is no estimate: on a man beside a window that one gave a light that was negative on his
+face. The least factor stays: a light that is too even does no such harm.
 
 Polarised pairs show the lobe alone: s_pv = w(n . wo) sum_lm A_l L_lm Y_lm(w_r). Then no D_p is eliminated, and band 0
 is as accurate as the others.
@@ -54,11 +56,6 @@ class LightEstimate:
     coefficients: F64
     explained: float
     scale: float
-
-    @property
-    def at_limit(self) -> bool:
-        """Whether the scale is the first or last that was tried: the albedo did not tell it."""
-        return self.scale in (SCALES[0], SCALES[-1])
 
 
 def reflectance(cosine: F64) -> F64:
@@ -127,14 +124,14 @@ def light_from_mirror(seen: Observations, order: int, gain: F64, attenuation: st
 def _evenest(
     seen: Observations, b: F64, total: F64, glow: F64, even: F64, often: npt.NDArray[np.bool_]
 ) -> float | None:
-    """The scale with the most even albedo. b: ((L + 1)^2,) coefficients. total, glow, even (P,): means over
-    the views of the colour, of the lobe's bands from 1 on, and of its band 0 per unit of L_00. often: (P,) used
-    points."""
+    """The scale with the most even albedo of those that light all sides, None if that is the largest. b:
+    ((L + 1)^2,) coefficients. total, glow, even (P,): means over the views of the colour, of the lobe's bands from 1
+    on, and of its band 0 per unit of L_00. often: (P,) used points."""
     light = np.zeros((len(b), 3))
     light[1:] = b[1:, None]
     sides = sh.irradiance(torch.from_numpy(light), seen.n.detach().cpu().double()).numpy()[:, 0]
     mean = float(np.pi * b[0] / np.sqrt(4 * np.pi))
-    best, found, skin = np.inf, None, seen.on_skin
+    tried, skin = list[tuple[float, float]](), seen.on_skin
     for scale in SCALES:
         e, d = mean + scale * sides, total - scale * glow - even * b[0]
         good = often & (e > DARKEST * mean) & (d > 0)
@@ -143,9 +140,10 @@ def _evenest(
         spread = _unevenness(d[good] / e[good])
         if (good & skin).sum() >= MIN_SKIN:
             spread *= _unevenness(d[good & skin] / e[good & skin])
-        if spread < best:
-            best, found = spread, float(scale)
-    return found
+        tried.append((spread, float(scale)))
+    if not tried or min(tried)[1] == SCALES[-1]:
+        return None
+    return min(tried)[1]
 
 
 def _unevenness(albedo: F64) -> float:

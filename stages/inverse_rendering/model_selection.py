@@ -179,8 +179,6 @@ def _with_light_source(c: Choices, estimate: LightEstimate | None, paired: bool 
     if estimate is not None:
         figures = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
         light = {"from": "polarised pairs" if paired else "view-dependent residuals", **figures}
-        if estimate.at_limit:
-            light["scaled_at_limit"] = True
     return replace(c, light_known=estimate is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
 
 

@@ -214,7 +214,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=43,
+    version=44,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

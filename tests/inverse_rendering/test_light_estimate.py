@@ -236,11 +236,23 @@ def test_dark_hair_above_is_not_taken_for_a_dark_sky() -> None:
     for shown in (None, skin):
         seen = Observations(torch.zeros(1500, 3), torch.from_numpy(n), every, views, flat, flat, shown)
         found.append(lamp_module._evenest(seen, light, lit, np.zeros(1500), np.zeros(1500), np.ones(1500, bool)))
-    assert found[0] is not None and found[1] is not None
-    assert found[0] < 0.6 and found[1] == pytest.approx(1.0, rel=0.25)
-    assert lamp_module.LightEstimate(light, 0.5, lamp_module.SCALES[0]).at_limit
-    assert lamp_module.LightEstimate(light, 0.5, lamp_module.SCALES[-1]).at_limit
-    assert not lamp_module.LightEstimate(light, 0.5, found[1]).at_limit
+    assert found[1] == pytest.approx(1.0, rel=0.25)
+    assert found[0] is not None and found[0] < 0.6
+
+
+def test_the_largest_scale_is_none() -> None:
+    """An albedo that follows the light gets more even up to the last scale; one against it up to the least, which
+    stays: a light that is too even does no harm."""
+    n = unit(np.random.default_rng(6).normal(size=(900, 3)))
+    light = np.array([3.0, 0.0, 0.3, *[0.0] * 13])
+    none = np.zeros(0, np.int64)
+    seen = Observations(torch.zeros(900, 3), torch.from_numpy(n), none, none, np.zeros((0, 3)), np.zeros((0, 3)))
+    lambdas = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4, 0], [1, 3, 5, 7])
+    for times, wanted in ((9.0, None), (1.0, 1.0), (-1.0, lamp_module.SCALES[0])):
+        lit = 0.3 / np.pi * (harmonics(n, ORDER) @ (lambdas * light * np.array([1.0, *[times] * 15])))
+        zero = np.zeros(900)
+        found = lamp_module._evenest(seen, light, lit, zero, zero, np.ones(900, bool))
+        assert found is None if wanted is None else found == pytest.approx(wanted, rel=0.05)
 
 
 def test_skin_is_what_most_photos_show_as_skin() -> None:
