@@ -16,7 +16,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import trimesh
 
 from benchmarks.compare_views import compare
 from pipeline.camera import PinholeCamera
@@ -28,27 +27,7 @@ from stages.usd.render.exported import load_exported
 from stages.usd.render.render import Renderer
 from stages.usd.render.standard_light import StandardLight
 from workflows.bench.captures_figures import Run
-from workflows.evaluation import geometry
-from workflows.evaluation.rendered_person import (
-    POINTS,
-    SEEN_BY,
-    SKIN,
-    head_from_asset,
-    refined,
-    sight_of,
-    true_cameras,
-)
-
-
-def placed(run: Run, truth: Path, cameras: dict[str, PinholeCamera]) -> F64:
-    """4x4 similarity from the asset to the head's frame."""
-    by_cameras = head_from_asset(run, cameras)
-    assert by_cameras is not None, "too few cameras in common"
-    asset, _ = geometry.asset_mesh(run.out / run.record["asset"], by_cameras)
-    skin = trimesh.load(truth / "skin.obj", process=False, force="mesh")
-    points, normals = geometry.spread(skin, POINTS)
-    seen = sight_of(skin, points, normals, cameras, truth).sum(1) >= SEEN_BY
-    return np.asarray(refined(asset, points[seen]) @ by_cameras, np.float64)
+from workflows.evaluation.rendered_person import SKIN, placed_on_skin, read_labels, true_cameras
 
 
 def seen_from(camera: PinholeCamera, head_from_asset: F64) -> PinholeCamera:
@@ -78,7 +57,10 @@ def main() -> None:
     options = p.parse_args()
     run = Run(options.out, json.loads((options.out / "run.json").read_text()), {})
     cameras = true_cameras(options.truth)
-    at = placed(run, options.truth, cameras)
+    placed = placed_on_skin(run, options.truth, cameras)
+    if placed is None:
+        raise SystemExit(f"{options.out} has too few cameras in common with {options.truth}")
+    at = placed.head_from_asset
     renderer = Renderer(load_exported(run.out / run.record["asset"]))
     light = turned(read_exr(options.truth / "relit/light.exr")[0][..., :3], at)
     lit = StandardLight(renderer, light, "light.exr")
@@ -89,7 +71,7 @@ def main() -> None:
         true = read_exr(path)[0]
         height, width = true.shape[:2]
         picture = renderer.render(seen_from(cameras[path.stem], at).scaled(width), light=lit)
-        labels = cv2.imread(str(options.truth / "labels" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
+        labels = read_labels(options.truth / "labels" / f"{path.stem}.png")
         skin = cv2.resize((labels == SKIN).astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         both = (skin > 0.99) & (picture[..., 3] > 0.99) & (true[..., 3] > 0.99)
         a, b = picture[..., :3], true[..., :3]

@@ -134,7 +134,7 @@ class Baker:
                 self._known.albedo, region,
             )  # fmt: skip
             if fitted.plausible:
-                fitted = fitted if eyes is None else _with_eyes(fitted, eyes, field, mesh, self._known)
+                fitted = fitted if eyes is None else _corrected_at_eyes(fitted, eyes, field, mesh, self._known)
                 self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
@@ -223,7 +223,7 @@ def _known(
     return Known(around, unseen, replaced.astype(np.float32), albedo.astype(np.float32))
 
 
-def _with_eyes(fitted: Fitted, eyes: Eyes, field: Field, mesh: Mesh, known: Known) -> Fitted:
+def _corrected_at_eyes(fitted: Fitted, eyes: Eyes, field: Field, mesh: Mesh, known: Known) -> Fitted:
     """The fitted material with the correction of the eyes: their albedo is not the field's."""
     ratio = np.asarray(field.irradiance_ratio(mesh.vertices), np.float32)
     lit = shade(field.light, meshes.unit(mesh.normals), ratio).astype(np.float64)

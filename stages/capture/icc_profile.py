@@ -12,12 +12,11 @@ import zlib
 
 from pipeline.colour import REC709
 from pipeline.picture_size import exr_attribute
-from stages.capture.exif import UNCALIBRATED, first_ifd, is_tiff, jpeg_segments, png_chunks
+from stages.capture.exif import ICC_PROFILE, UNCALIBRATED, first_ifd, is_tiff, jpeg_segments, png_chunks
 
 HEADER, MAX_BYTES = 128, 8_000_000
 OTHER_PRIMARIES = "other primaries"  # of an EXR; no profile has this name
 ALIKE = 0.01  # largest difference of chromaticities: programs round them, and write white as .3127 or .313
-TIFF_PROFILE = 34675
 _MARK = b"ICC_PROFILE\0"
 
 
@@ -81,7 +80,7 @@ def _profile(data: bytes) -> bytes | None:
                 except zlib.error:
                     return None
     if is_tiff(data):
-        block = first_ifd(data).get(TIFF_PROFILE, ())
+        block = first_ifd(data).get(ICC_PROFILE, ())
         return bytes(int(v) & 0xFF for v in block) if isinstance(block, tuple) else None
     return None
 

@@ -15,6 +15,7 @@ from pipeline.images import F32, read_alpha, read_linear
 from stages.capture import hdr
 from stages.capture.candidates import Candidate
 from stages.capture.import_photo import ImportedPhoto, import_photo
+from stages.capture.readers.values import some_of
 
 BRIGHTER = 1.01  # of the parallel photo's mean: a cross-polarised one that is brighter is not what it is said to be
 ALIKE = 0.99  # of it: above, the filters do not differ, or nothing shines
@@ -60,11 +61,12 @@ def with_pairs(
             "parallel_clipped": None if other.clipped is None else FileRef.of(context.workdir, other.clipped),
         }))  # fmt: skip
     if moved:
-        warnings.append(f"the camera moved between the photos of {len(moved)} polarised pairs ({_some(moved)}); their "
-                        "parallel-polarised photos are not used; use a tripod")  # fmt: skip
+        warnings.append(f"the camera moved between the photos of {len(moved)} polarised pairs "
+                        f"({some_of(moved, NAMED)}); their parallel-polarised photos are not used; "
+                        "use a tripod")  # fmt: skip
     if alike:
-        warnings.append(f"the photos of {len(alike)} polarised pairs hardly differ ({_some(alike)}): the filters are "
-                        "not crossed, or nothing shines")  # fmt: skip
+        warnings.append(f"the photos of {len(alike)} polarised pairs hardly differ "
+                        f"({some_of(alike, NAMED)}): the filters are not crossed, or nothing shines")  # fmt: skip
     return out
 
 
@@ -117,7 +119,3 @@ def _brighter(candidate: Candidate, share: float) -> StageError:
         remedy="exchange the two if their names are the wrong way round; take both at one exposure, or with EXIF; or "
         "set capture.polarised=off",
     )
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")

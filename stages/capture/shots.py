@@ -22,7 +22,7 @@ from pipeline.artifacts import FileRef
 from pipeline.capture_artifacts import Bracket, PolarisedPair
 from pipeline.errors import StageError
 from stages.capture.readers.described import natural_key, read_json
-from stages.capture.readers.values import printable
+from stages.capture.readers.values import printable, some_of
 
 CROSS, PARALLEL, BRACKETS, LIST = "cross", "parallel", "brackets", "brackets.json"
 NAMED = 5  # names in an error
@@ -229,7 +229,7 @@ def _pairs(
 def _all_paired(folder: Path, pairs: Sequence[tuple[Path, Path | None]], lonely: Sequence[Path]) -> None:
     alone = [c.name for c, p in pairs if p is None] + [f"{p.parent.name}/{p.name}" for p in lonely]
     if alone:
-        some = ", ".join(printable(n) for n in alone[:NAMED]) + (", ..." if len(alone) > NAMED else "")
+        some = some_of([printable(n) for n in alone], NAMED)
         raise StageError(
             "polarised photos do not pair",
             where=folder,

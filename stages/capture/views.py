@@ -17,6 +17,7 @@ from stages.capture.exif import metres_from
 from stages.capture.icc_profile import foreign, is_srgb
 from stages.capture.import_photo import ImportedPhoto, import_mask, import_photo
 from stages.capture.photometry import exposures
+from stages.capture.readers.values import some_of
 
 NAMED = 20  # file names in one warning
 
@@ -75,7 +76,7 @@ def contradicting_flash(views: Sequence[CaptureView]) -> list[str]:
         return []
     on = len(fired[True]) <= len(fired[False])
     few = fired[on]
-    some = ", ".join(few[:NAMED]) + (", ..." if len(few) > NAMED else "")
+    some = some_of(few, NAMED)
     return [f"the flash fired in {len(fired[True])} photos and not in {len(fired[False])}, by their EXIF: "
             f"{some} {'with' if on else 'without'} flash; one light is fitted to all photos, so take these out, or "
             "photograph all with or all without flash"]  # fmt: skip
@@ -171,7 +172,7 @@ def not_read(names: Sequence[str]) -> list[str]:
     """A warning about pictures in the folder whose format is not supported."""
     if not names:
         return []
-    some = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    some = some_of(names, NAMED)
     return [f"{len(names)} pictures are not used, because their format is not supported: {some}; convert them to JPEG, "
             "PNG, TIFF or EXR, or move them out of the folder"]  # fmt: skip
 
@@ -180,7 +181,7 @@ def twins(names: Sequence[str]) -> list[str]:
     """A warning about files that are one of the photos in another format."""
     if not names:
         return []
-    some = ", ".join(names[:NAMED]) + (", ..." if len(names) > NAMED else "")
+    some = some_of(names, NAMED)
     return [f"{len(names)} files are not used, because a photo of the same name is taken in their place: {some}; to "
             "use them, move the others out of the folder"]  # fmt: skip
 

@@ -20,6 +20,7 @@ not the right depth.
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -49,19 +50,13 @@ LARGEST_MOVE, LARGEST_GROWTH = 0.01, 0.03  # metres; of the scale
 
 def measure(run: Run, truth: Path) -> tuple[Figures, Labels]:
     """All of it; figures without an aligned asset are left out."""
-    import trimesh
-
     cameras = true_cameras(truth)
     labels = by_label(run, truth)
-    placed = head_from_asset(run, cameras)
+    placed = placed_on_skin(run, truth, cameras)
     if placed is None:
         return {}, labels
-    asset, st = geometry.asset_mesh(run.out / run.record["asset"], placed)
-    skin = trimesh.load(truth / "skin.obj", process=False, force="mesh")
-    points, normals = geometry.spread(skin, POINTS)
-    sight = sight_of(skin, points, normals, cameras, truth)
+    asset, st, points, normals, sight = placed.asset, placed.st, placed.points, placed.normals, placed.sight
     seen = sight.sum(1) >= SEEN_BY
-    asset = asset.copy().apply_transform(refined(asset, points[seen]))
     face = seen & near_face(truth, points, normals)
     off = 1000 * geometry.distances(asset, points[seen])
     eyes = np.array([c.eye for c in cameras.values()])
@@ -75,6 +70,34 @@ def measure(run: Run, truth: Path) -> tuple[Figures, Labels]:
 
 
 # ------------------------------------------------------------------ where things are
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """asset: the mesh in the head's frame, head_from_asset (4, 4) the similarity that brought it there; st (F, 3, 2) of
+    its corners. points, normals (N, 3) of the true skin; sight (N, cameras): see sight_of."""
+
+    asset: Any
+    st: F64
+    head_from_asset: F64
+    points: F64
+    normals: F64
+    sight: Mask
+
+
+def placed_on_skin(run: Run, truth: Path, cameras: dict[str, PinholeCamera]) -> Placed | None:
+    """The asset in the head's frame, by the cameras and then by the skin; None with too few cameras in common."""
+    import trimesh
+
+    by_cameras = head_from_asset(run, cameras)
+    if by_cameras is None:
+        return None
+    asset, st = geometry.asset_mesh(run.out / run.record["asset"], by_cameras)
+    skin = trimesh.load(truth / "skin.obj", process=False, force="mesh")
+    points, normals = geometry.spread(skin, POINTS)
+    sight = sight_of(skin, points, normals, cameras, truth)
+    closer = refined(asset, points[sight.sum(1) >= SEEN_BY])
+    return Placed(asset.copy().apply_transform(closer), st, closer @ by_cameras, points, normals, sight)
+
+
 def true_cameras(truth: Path) -> dict[str, PinholeCamera]:
     """By the photo's stem, in the head's frame."""
     out = {}
@@ -110,7 +133,7 @@ def sight_of(skin: Any, points: F64, normals: F64, cameras: dict[str, PinholeCam
     for column, (stem, camera) in enumerate(cameras.items()):
         path = truth / "labels" / f"{stem}.png"
         if path.is_file():
-            is_skin = (_read_labels(path) == SKIN).astype(np.float32)
+            is_skin = (read_labels(path) == SKIN).astype(np.float32)
             out[:, column] = geometry.visible(skin, points, normals, camera, SQUARE, is_skin)
     return out
 
@@ -200,7 +223,7 @@ def by_label(run: Run, truth: Path) -> Labels:
             factor = max(1, photo.shape[0] // got.shape[0])
             h, w = got.shape[:2]
             want = shrink_whole(photo, factor)[:h, :w]
-            label = _read_labels(labels)[factor // 2 :: factor, factor // 2 :: factor][:h, :w]
+            label = read_labels(labels)[factor // 2 :: factor, factor // 2 :: factor][:h, :w]
             error = ((geometry.as_seen(got) - geometry.as_seen(want)) ** 2).mean(2)
             for part, mask in _parts(label).items():
                 before = total.get(part, (0.0, 0))
@@ -232,7 +255,7 @@ def _shares(total: dict[str, tuple[float, int]]) -> dict[str, dict[str, float]]:
     }
 
 
-def _read_labels(path: Path) -> npt.NDArray[np.uint8]:
+def read_labels(path: Path) -> npt.NDArray[np.uint8]:
     from pipeline.images import read_encoded
 
     return np.asarray(read_encoded(path)[..., 0], np.uint8)

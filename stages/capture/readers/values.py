@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,11 @@ def printable(name: str) -> str:
     """A name from a file in printable form: what is not Unicode is escaped, long names are shortened."""
     clean = name[:MAX_LETTERS].encode("utf-8", "backslashreplace").decode()
     return clean if len(clean) <= 120 else f"{clean[:80]}...{clean[-20:]}"
+
+
+def some_of(names: Sequence[str], most: int) -> str:
+    """The first `most` names for a message, with dots where there are more."""
+    return ", ".join(names[:most]) + (", ..." if len(names) > most else "")
 
 
 def number(value: object, where: str, remedy: str = PLAIN) -> float:
