@@ -40,7 +40,8 @@ def standard_material(
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
     thin = thinned(len(mesh.vertices), mesh.faces)
     observations, view, face = _observed(field, mesh, normals, albedo, views, skin_code, found)
-    skin = skin_of(face, albedo if look is None else look.astype(np.float64), region)
+    skin, telling = skin_of(mesh, face, albedo if look is None else look.astype(np.float64), region)
+    asked = telling | ~skin if thin is None else (telling | ~skin) & thin.chosen
     moving = field.moving_light
     at: standard_fit.Lit | Arrivals
     if moving is None:
@@ -49,9 +50,7 @@ def standard_material(
     else:
         poses = [matrix(v.camera.world_from_cam) for v in views]
         at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
-    out = standard_fit.fit(
-        mesh, normals, at, albedo, observations, skin, check, hair, None if thin is None else thin.chosen
-    )
+    out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check, hair, asked)
     correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
     return replace(out, correction=correction)
 
