@@ -182,7 +182,7 @@ OF_FIT = (
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "cosine >= least_cosine", "cosine >= 0", "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "pixels / max(small.shape)", "pixels", "tests/bake/test_bake_unseen.py"),
-    Mutation("stages/bake/unseen.py", "[names[nearest]] * head.scale", "[names[nearest]]",
+    Mutation("pipeline/registration/head_regions.py", "[names[nearest]] * head.scale", "[names[nearest]]",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", 'REGIONS.index("face"), region)', 'REGIONS.index("neck"), region)',
              "tests/bake/test_bake_unseen.py"),

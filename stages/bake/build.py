@@ -107,7 +107,7 @@ class Baker:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
         `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
-        vertex (unseen.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
+        vertex (head_regions.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
         is the last tile, with the label `hair_code`. `measured`: what a light stage says, of the first tile."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)

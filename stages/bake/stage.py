@@ -169,9 +169,9 @@ def _regions(masks: Located[MaskSet], mesh: Mesh) -> Indices | None:
     """(V,) region of the head of each vertex, by the head template placed on the face's landmarks; None without a
     face."""
     from pipeline.faces.landmarks3d import load_landmarks
+    from pipeline.registration.head_regions import region_of
     from pipeline.registration.identity_fit import placed_on_face
     from pipeline.template.load import load_template
-    from stages.bake.unseen import region_of
 
     found = masks.artifact.landmarks
     if found is None:

@@ -13,24 +13,15 @@ Symbols: V vertices; cosine between a normal and the direction to the camera.
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from pipeline.meshes import F64, Indices, Mask
-from pipeline.registration.identity_fit import PlacedHead
-from pipeline.template.model import Template
+from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS
 
 GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, from the second on it is kept
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
-# Metres from the head template within which a vertex belongs to its region: hair is thick; so is a collar.
-NEAR = {"scalp": 0.04, "neck": 0.06, "ears": 0.02, "face": 0.02}
-REGIONS = tuple(NEAR)
-NECK = REGIONS.index("neck")
-REST = len(REGIONS)
-HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
-FIRST_BAND, BANDS, BAND_HEIGHT = HAIR + 1, 32, 0.012  # codes of the neck's bands, the lowest first; metres of each
 
 
 def replaced_share(cosine: F64) -> F64:
@@ -38,21 +29,6 @@ def replaced_share(cosine: F64) -> F64:
     for none."""
     share = ((cosine - GRAZING) / (CLEAR - GRAZING)).clip(0, 1)
     return np.asarray(1 - share * share * (3 - 2 * share), np.float64)
-
-
-def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
-    """(V,) index into REGIONS of the nearest region of the placed template, for the neck the code of its band; REST far
-    from the head and in all other regions (lids, lips), which photos of a face show."""
-    quads = {name: template.quads[template.regions[name]] for name in REGIONS if name in template.regions}
-    points = np.concatenate([head.vertices[q].mean(1) for q in quads.values()])
-    names = np.concatenate([np.full(len(q), REGIONS.index(name)) for name, q in quads.items()])
-    distance, nearest = cKDTree(points).query(vertices)
-    reach = np.array(list(NEAR.values()))[names[nearest]] * head.scale
-    found = np.where(distance <= reach, names[nearest], REST).astype(np.int64)
-    up = head.world_from_template[:3, 1] / head.scale**2  # height in metres of the template
-    lowest = float((points[names == NECK] @ up).min()) if NECK in names else 0.0
-    band = np.floor((vertices @ up - lowest) / BAND_HEIGHT).clip(0, BANDS - 1).astype(np.int64)
-    return np.where(found == NECK, FIRST_BAND + band, found)
 
 
 def with_hair(region: Indices, hair: Mask) -> Indices:

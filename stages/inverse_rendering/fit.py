@@ -12,6 +12,7 @@ from pipeline.artifacts import RefinedCamera
 from pipeline.fields.geometry import GridSdf, grid_of
 from pipeline.fields.parts import Part
 from pipeline.maths.light_frame import WORLD
+from pipeline.registration.head_regions import Near
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.depth_from_flow import FOLLOW_AT, follow_flow
 from stages.inverse_rendering.initial_geometry import Start
@@ -80,6 +81,7 @@ class Trainer(TrialLoop):
     flowed: float = 0.0  # asset units, by which 95 % of it moved at most
     smoothings: int = 0  # of surface that the photos hardly determine
     smoothed: float = 0.0  # share of the surface that the last of them reached
+    near_head: Near | None = None  # the placed head, where unlabelled skin may be
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     known_of_second: dict[str, str | float | bool] = field(default_factory=dict)  # of the second capture's light
@@ -239,6 +241,10 @@ class Trainer(TrialLoop):
         if self.settings.weigh_photos:
             self.robust.know_labels(labels, names)
 
+    def know_head(self, near: Near) -> None:
+        """Unlabelled skin near the placed head tells about the light as well."""
+        self.near_head = near
+
     def photo_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the photos were weighed."""
         return self.robust.facts()
@@ -266,7 +272,7 @@ class Trainer(TrialLoop):
         explained = light.get("explained") if choices.light_known else None
         rays = self.pixels.draw(SKIN_RAYS, 0.0, self.settings.seed).rays
         known = None if explained is None else float(explained)
-        found = correct_light(self.model, self.views, rays, known, self.device)
+        found = correct_light(self.model, self.views, rays, known, self.device, self.near_head)
         if found is not None:
             self.choices = replace(choices, facts=choices.facts | {"light": light | found.facts})
         if found is None or not found.changed:

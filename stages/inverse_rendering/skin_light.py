@@ -2,11 +2,14 @@
 
     a(x) E(n) = kappa E'(n) + noise,   E' = E + E_0 sum_{lm} b_lm A_l Y_lm(n),   l = 1, 2
 
-for each colour, with a the fitted albedo of the face, E the irradiance of the fitted light, E_0 its mean over the face.
+for each colour, with a the fitted albedo of the skin, E the irradiance of the fitted light, E_0 its mean over the skin.
 kappa and kappa b are a linear least-squares problem, divided by E, with Huber weights (lips, brows, stubble). E' is the
 irradiance of the light with coefficients L_lm + E_0 b_lm, whose mean radiance over the sphere stays white. All of it is
 then scaled so that the mean irradiance of the face, and with it the level of its albedo, stays as it was.
 Without this, light of two colours, of a window and a lamp, colours the two sides of the albedo.
+
+The skin is what photos label as the face, and of the placed head what lies near it and has the face's colour: ears,
+neck and a bare scalp face sides from which a face alone tells no light.
 
 The corrected light must leave some irradiance in every direction, also in those that no skin faces: kappa E' >=
 kappa E_min(d), linear in the unknowns, at directions d all around; E_min is DARKEST of the mean, or the irradiance
@@ -40,6 +43,8 @@ from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from pipeline.fields.shadowing import fibonacci
 from pipeline.maths import sh
+from pipeline.registration.head_regions import Near
+from pipeline.skin_colour import ALIKE, against_face
 from stages.inverse_rendering.albedo_level import lobe_std
 from stages.inverse_rendering.observations import skin_inside, surface_hits, surface_points
 from stages.inverse_rendering.ray_sampling import PhotoView, Rays, factor_for, image_rays
@@ -187,28 +192,58 @@ def limited(gram: F64, g: F64, limits: F64) -> F64:
     return free if abs(left[-1]) < FEASIBLE else free + solve_triangular(root, -left[:-1] / left[-1])
 
 
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """x and unit n (N, 3) on the skin; irradiance (N, 3) of the light there, albedo (N, 3)."""
+
+    x: Tensor
+    n: Tensor
+    irradiance: Tensor
+    albedo: Tensor
+
+    @classmethod
+    def of(cls, light: ShLight, spatial: SpatialField, x: Tensor, n: Tensor) -> Skin:
+        """What the fit has at these points."""
+        with torch.no_grad():
+            return cls(x, n, light.irradiance(n), spatial(x)[0])
+
+    def with_bare(self, other: Skin, near: Near | None) -> Skin:
+        """Skin all over the head: of other points of the surface, those near the head that have this face's colour; the
+        face alone if these are fewer."""
+        if near is None or not len(self.x):
+            return self
+        alike = against_face(_array(self.albedo), _array(other.albedo))[1] < ALIKE
+        own = torch.from_numpy(np.flatnonzero(alike & near(_array(other.x)))).to(other.x.device)
+        if len(own) < MIN_POINTS:
+            return self
+        return Skin(other.x[own], other.n[own], other.irradiance[own], other.albedo[own])
+
+
 def correct_light(
-    model: FaceModel, views: Sequence[PhotoView], rays: Rays, explained: float | None, device: str
+    model: FaceModel,
+    views: Sequence[PhotoView],
+    rays: Rays,
+    explained: float | None,
+    device: str,
+    near: Near | None = None,
 ) -> Asked | None:
     """Correct the light of a model by the skin in its photos, and its reflectance so that the photos stay as they are,
     if that makes the skin more even; None if there is nothing to correct or no skin.
 
     rays: towards the whole subject. explained: share of the view-dependent variance that the light's estimate explains,
-    None without an estimate.
+    None without an estimate. near: the placed head; None without one, and then the labelled face is all skin.
     """
     light, spatial = model.light, model.spatial
     if not isinstance(light, ShLight) or not isinstance(spatial, SpatialField) or len(light.coefficients) < 9:
         return None
-    skin, n = skin_points(model, views, device)
+    face = Skin.of(light, spatial, *skin_points(model, views, device))
+    x, facing = surface_points(model.geometry, rays)
+    skin = face.with_bare(Skin.of(light, spatial, x, facing), near)
     with torch.no_grad():
-        albedo = spatial(skin)[0] if len(skin) else skin
-        irradiance = light.irradiance(n)
-        even = EVEN_STD if explained is None else min(TRUSTED * lobe_std(explained) ** 2, EVEN_STD)
-        around = light.irradiance(torch.from_numpy(directions()).to(light.coefficients))
-        a, e, normals, limits = (
-            np.asarray(t.double().cpu().numpy(), np.float64) for t in (albedo, irradiance, n, around)
-        )
-        found = correction(a, e, normals, even, limits)
+        around = _array(light.irradiance(torch.from_numpy(directions()).to(light.coefficients)))
+    a, e, normals = (_array(t) for t in (skin.albedo, skin.irradiance, skin.n))
+    even = EVEN_STD if explained is None else min(TRUSTED * lobe_std(explained) ** 2, EVEN_STD)
+    found = correction(a, e, normals, even, around)
     if found is None:
         return None
     corrected = e + irradiance_basis(normals) @ found.change
@@ -216,15 +251,18 @@ def correct_light(
     facts: Fact = {"skin_uneven": round(now, 4), "skin_uneven_corrected": round(then, 4)}
     if then >= now:
         return Asked(facts, False)
-    x, facing = surface_points(model.geometry, rays)
-    error = change_light(model, spatial, x, facing, lambda: _apply(light, found, n, irradiance))
+    error = change_light(model, spatial, x, facing, lambda: _apply(light, found, face.n, face.irradiance))
     facts |= {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
     return Asked(facts, True)
 
 
 def _apply(light: ShLight, found: SkinLight, n: Tensor, irradiance: Tensor) -> None:
-    """Add the correction to a light, with the irradiance (N, 3) of skin with normals n (N, 3) before."""
+    """Add the correction to a light, with the irradiance (N, 3) of the face with normals n (N, 3) before."""
     with torch.no_grad():
         light.coefficients[: len(found.change)] += torch.from_numpy(found.change).to(light.coefficients)
         # the level of the face's albedo stays what other sources say (albedo_level.py)
         light.coefficients.mul_(float(irradiance.mean()) / float(light.irradiance(n).mean()))
+
+
+def _array(t: Tensor) -> F64:
+    return np.asarray(t.double().cpu().numpy(), np.float64)

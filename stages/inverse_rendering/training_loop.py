@@ -20,6 +20,7 @@ import torch
 from pipeline.artifacts import RefinedCamera
 from pipeline.errors import Cancelled, StageError
 from pipeline.fields.face import FaceModel
+from pipeline.registration.head_regions import Near
 from stages.inverse_rendering.config import Config
 from stages.inverse_rendering.guard import Guard, cause_of, gradients_are_finite
 from stages.inverse_rendering.model_selection import Choices
@@ -120,6 +121,9 @@ class TrainingLoop(ABC):
 
     def know_labels(self, labels: Sequence[U8 | None], names: Sequence[str]) -> None:  # noqa: B027
         """Take note of the photos' labels. labels: (H, W) codes of each view, or None; names: of the codes."""
+
+    def know_head(self, near: Near) -> None:  # noqa: B027
+        """Take note of the placed head."""
 
     def photo_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the photos were weighed."""

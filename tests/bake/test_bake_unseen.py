@@ -10,25 +10,13 @@ import pytest
 
 from pipeline.images import write_png
 from pipeline.meshes import Mesh
+from pipeline.registration.head_regions import BAND_HEIGHT, FIRST_BAND, HAIR, REGIONS, REST, near_head, region_of
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.smoothing import continued
 from pipeline.template.load import load_template
 from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.outline_depth import outline_depth
-from stages.bake.unseen import (
-    BAND_HEIGHT,
-    CLEAR,
-    FIRST_BAND,
-    GRAZING,
-    HAIR,
-    LENGTH,
-    REGIONS,
-    REST,
-    region_colours,
-    region_of,
-    replaced_share,
-    with_hair,
-)
+from stages.bake.unseen import CLEAR, GRAZING, LENGTH, region_colours, replaced_share, with_hair
 from tests.support.field_artifacts import camera
 
 TEMPLATE = load_template()
@@ -75,7 +63,11 @@ def test_regions_are_those_of_the_placed_template(scale: float) -> None:
     for name in ("scalp", "ears"):
         middle = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions[name]]].mean(1)
         assert (region_of(middle * scale, TEMPLATE, placed(scale)) == REGIONS.index(name)).all()
-    assert (region_of(np.array([[0.0, -0.5, 0.0]]) * scale, TEMPLATE, placed(scale)) == REST).all()
+    far = np.array([[0.0, -0.5, 0.0]]) * scale
+    assert (region_of(far, TEMPLATE, placed(scale)) == REST).all()
+    ears = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions["ears"]]].mean(1) * scale
+    near = near_head(TEMPLATE, placed(scale))
+    assert near(ears).all() and not near(far).any() and near(ears[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.meshes import Mesh
+from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS, REST
 from stages.bake.skin import MIN_FACE, skin_of
-from stages.bake.unseen import FIRST_BAND, HAIR, REGIONS, REST
 
 TONES = {"fair": (0.55, 0.34, 0.25), "brown": (0.22, 0.11, 0.07), "dark": (0.06, 0.035, 0.025)}
 FACE, EARS, SCALP = (REGIONS.index(n) for n in ("face", "ears", "scalp"))

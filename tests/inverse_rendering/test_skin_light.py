@@ -10,6 +10,7 @@ import torch
 from scipy.optimize import minimize
 
 from pipeline.fields.appearance import SpatialField
+from pipeline.fields.face import FaceModel
 from pipeline.fields.light import ShLight
 from pipeline.meshes import F64
 from stages.inverse_rendering import skin_light
@@ -20,6 +21,7 @@ from stages.inverse_rendering.skin_light import (
     DARKEST,
     EVEN_STD,
     MIN_POINTS,
+    Skin,
     SkinLight,
     correct_light,
     correction,
@@ -233,6 +235,44 @@ def test_what_leaves_the_skin_as_uneven_as_it_was_is_left_out(ball: Trainer, mon
     assert asked is not None and not asked.changed and "skin_explains" not in asked.facts
     assert float(asked.facts["skin_uneven_corrected"]) > float(asked.facts["skin_uneven"])
     np.testing.assert_array_equal(ball.model.light().detach(), before)
+
+
+def points(model: FaceModel, n: F64, albedo: F64) -> Skin:
+    """Points on the unit sphere with these normals and colours (N, 3), under the model's light."""
+    x = torch.from_numpy(n).float()
+    with torch.no_grad():
+        return Skin(x, x, model.light.irradiance(x), torch.from_numpy(albedo).float())
+
+
+def test_skin_of_the_face_s_colour_counts_wherever_it_is_near_the_head(ball: Trainer) -> None:
+    """A face around +z, and all around a neck in its colour, hair and a sheer collar; no neck is far from the head."""
+    n = np.random.default_rng(3).normal(size=(9000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    kinds = np.arange(len(n)) % 3
+    colour = np.array([0.8 * KAPPA, 0.05 * KAPPA, [0.5, 0.2, 0.3]])[kinds]
+    front = n[n[:, 2] > 0.5]
+    face_alone, others = points(ball.model, front, np.tile(KAPPA, (len(front), 1))), points(ball.model, n, colour)
+    skin = face_alone.with_bare(others, lambda x: x[:, 1] < 0.5)
+    expected = n[(kinds == 0) & (n[:, 1] < 0.5)]
+    np.testing.assert_allclose(skin.n, expected, atol=1e-6)
+    np.testing.assert_allclose(skin.albedo, np.tile(0.8 * KAPPA, (len(expected), 1)), rtol=1e-6)
+    np.testing.assert_allclose(skin.irradiance, others.irradiance[(kinds == 0) & (n[:, 1] < 0.5)])
+    for near in (None, lambda x: np.arange(len(x)) < MIN_POINTS - 1):
+        assert face_alone.with_bare(others, near) is face_alone
+    empty = points(ball.model, np.zeros((0, 3)), np.zeros((0, 3)))
+    assert empty.with_bare(others, lambda x: x[:, 1] < 0.5) is empty
+
+
+def test_light_from_behind_is_told_by_the_neck(ball: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One photo labels its side of the ball as the face; the other side is skin that no photo labels. Where the head is
+    known, the normals of both enter the correction, and without it that side alone."""
+    asked: list[F64] = []
+    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even, around: asked.append(n))
+    view, rays = ball.views[0], ball.pixels.draw(8_000, 0.0, 3).rays
+    to_camera = view.world_from_cam[:3, 3] / np.linalg.norm(view.world_from_cam[:3, 3])
+    for near in (None, lambda x: np.full(len(x), True)):
+        assert correct_light(ball.model, [replace(view, skin=view.alpha > 0.99)], rays, None, "cpu", near) is None
+    assert (asked[0] @ to_camera).min() > 0 and (asked[1] @ to_camera).min() < -0.9
 
 
 @pytest.mark.parametrize("gain", [1e-3, 1.0, 1e3])

@@ -1,0 +1,42 @@
+"""Regions of a person, by the nearest region of the head template that was placed on the photos' face."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from pipeline.meshes import F64, Indices, Mask
+from pipeline.registration.identity_fit import PlacedHead
+from pipeline.template.model import Template
+
+Near = Callable[[F64], Mask]  # (N,) of points (N, 3): on the head, or as close as its regions reach
+
+# Metres from the head template within which a vertex belongs to its region: hair is thick; so is a collar.
+NEAR = {"scalp": 0.04, "neck": 0.06, "ears": 0.02, "face": 0.02}
+REGIONS = tuple(NEAR)
+NECK = REGIONS.index("neck")
+REST = len(REGIONS)
+HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
+FIRST_BAND, BANDS, BAND_HEIGHT = HAIR + 1, 32, 0.012  # codes of the neck's bands, the lowest first; metres of each
+
+
+def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
+    """(V,) index into REGIONS of the nearest region of the placed template, for the neck the code of its band; REST far
+    from the head and in all other regions (lids, lips), which photos of a face show."""
+    quads = {name: template.quads[template.regions[name]] for name in REGIONS if name in template.regions}
+    points = np.concatenate([head.vertices[q].mean(1) for q in quads.values()])
+    names = np.concatenate([np.full(len(q), REGIONS.index(name)) for name, q in quads.items()])
+    distance, nearest = cKDTree(points).query(vertices)
+    reach = np.array(list(NEAR.values()))[names[nearest]] * head.scale
+    found = np.where(distance <= reach, names[nearest], REST).astype(np.int64)
+    up = head.world_from_template[:3, 1] / head.scale**2  # height in metres of the template
+    lowest = float((points[names == NECK] @ up).min()) if NECK in names else 0.0
+    band = np.floor((vertices @ up - lowest) / BAND_HEIGHT).clip(0, BANDS - 1).astype(np.int64)
+    return np.where(found == NECK, FIRST_BAND + band, found)
+
+
+def near_head(template: Template, head: PlacedHead) -> Near:
+    """The function that tells which points (N, 3) lie in any region of the placed template, as (N,)."""
+    return lambda x: np.asarray(region_of(x, template, head) != REST, np.bool_)
