@@ -5,9 +5,9 @@
 So g comes from what else is known. Each source gives ln g with a standard deviation; they are averaged by their
 weights 1 / sigma^2:
 
-lobe     g = 1. The light was estimated from view-dependent residuals for skin's F0 (light_estimate.py). Where they
-         explain the share e of the view-dependent variance, sigma = LOBE_STD ((1 - e) / e)^1.5. Truth: e = 0.47, error
-         1 % (head_a); e = 0.23, error 26 % (person_e).
+lobe     g = 1. The light was estimated from view-dependent residuals for skin's F0 (light_estimate.py). Where it
+         explains the share e of the view-dependent variance of skin (or of all points, if that is more), sigma =
+         LOBE_STD ((1 - e) / e)^1.5. Truth: e = 0.47, error 1 % (head_a); e = 0.23, error 26 % (person_e).
 start    g = 1. Without that estimate the level is that of the initial albedo, a middle tone: it says next to nothing.
 eyes     g = SCLERA / (luminance of the whites of the eyes). Sclera is nearly the same for everyone, of any skin tone.
          Left out for closed or hidden eyes.
@@ -91,7 +91,7 @@ def set_level(
     if not isinstance(model.spatial, SpatialField) or not isinstance(model.light, ShLight) or wanted == "fitted":
         return {"gain": 1.0, "why": "setting"}
     seen = labelled_albedos(model, table, views, labels, names)
-    explained = light.get("explained")
+    explained = light.get("explained_on_skin", light.get("explained"))
     given, known = (None if v is None or v == AUTO else float(v) for v in (wanted, explained))
     found = decide(seen, given, known, corrected="skin_explains" in light)
     apply_gain(model.spatial, model.light, found.gain)
@@ -159,8 +159,8 @@ def decide(
     """The level from all sources.
 
     wanted: luminance of the face's albedo that was measured, None to decide. explained: share of the view-dependent
-    variance that the light's estimate explains, in (0, 1), None without an estimate. corrected: whether the light was
-    corrected by the skin.
+    variance that the light's estimate explains, on skin or everywhere, in (0, 1), None without. corrected: whether the
+    light was corrected by the skin.
     """
     skin = float(np.median(seen.face @ LUMA)) if len(seen.face) >= MIN_PIXELS else None
     if wanted is not None:

@@ -15,6 +15,10 @@ below look like light from below, skin alone is a small part of the directions. 
 to the largest factor, there is no estimate: on a man beside a window that one gave a light that was negative on his
 face. The least factor stays: a light that is too even does no such harm.
 
+w is known of skin alone. Matt cloth and hair reflect less, so that all points together take the light for too dim, and
+the albedo for too bright. So where skin tells the level better than all points do, it comes from skin
+(`level_by_skin`).
+
 Polarised pairs show the lobe alone: s_pv = w(n . wo) sum_lm A_l L_lm Y_lm(w_r). Then no D_p is eliminated, and band 0
 is as accurate as the others.
 
@@ -35,6 +39,7 @@ from pipeline.maths.ggx_width import gauge_alpha
 from pipeline.maths.microfacet import SKIN_F0
 from pipeline.maths.split_sum import environment_brdf
 from pipeline.maths.vmf import ATTENUATIONS
+from stages.inverse_rendering.albedo_level import lobe_std
 from stages.inverse_rendering.observations import Observations, lobe_basis, point_means
 
 F64 = npt.NDArray[np.float64]
@@ -51,11 +56,14 @@ LIT_SHARE = 0.9  # smallest share of points above that limit and with a positive
 @dataclass(frozen=True, slots=True)
 class LightEstimate:
     """coefficients: ((L + 1)^2,) SH of a white light in the photos' units. explained: share of the view-dependent
-    variance that it explains. scale: factor of the bands from 1 on."""
+    variance that it explains. scale: factor of the bands from 1 on. level: factor of all of it by the skin.
+    explained_on_skin: the larger of `explained` and the same share on the skin alone."""
 
     coefficients: F64
     explained: float
     scale: float
+    level: float = 1.0
+    explained_on_skin: float = 0.0
 
 
 def reflectance(cosine: F64) -> F64:
@@ -96,7 +104,32 @@ def light_from_lobe(seen: Observations, order: int, gain: F64, attenuation: str)
     scale = _evenest(seen, b, mean(colour), mean(f[:, 1:] @ b[1:]), mean(f[:, 0]), often)
     if scale is None:
         return None
-    return LightEstimate(np.concatenate([b[:1], scale * b[1:]]), explained, scale)
+    skin = seen.on_skin
+    level, best = 1.0, explained
+    if (skin & often).sum() >= MIN_SKIN:
+        on_skin = skin[point]
+        level, best = level_by_skin(inside[on_skin] @ b, y[on_skin], explained)
+    return LightEstimate(level * np.concatenate([b[:1], scale * b[1:]]), explained, scale, level, best)
+
+
+def level_by_skin(lobe: F64, seen: F64, explained: float) -> tuple[float, float]:
+    """Factor g of the light's level by what changes with the view on skin, and the larger share explained.
+
+    lobe, seen (M,): predicted by the light of all points, and seen, each without its mean over the views; radiance.
+    explained: share of the variance over all points that the light explains, in (0, 1).
+
+        g = s^(1 - (sigma_s / sigma)^2),    s = lobe . seen / lobe . lobe
+
+    s is the best factor on skin. sigma_s and sigma are the standard deviations of ln g that belong to the shares that
+    skin (with s) and all points explain (albedo_level.lobe_std). g is 1 where skin explains no more than all points.
+    """
+    both = float(lobe @ seen)
+    size = float(lobe @ lobe)
+    if both <= 0 or size <= 0:
+        return 1.0, explained
+    share = both**2 / (size * float(seen @ seen))
+    doubt = lobe_std(share) / lobe_std(explained)
+    return float((both / size) ** max(0.0, 1 - doubt**2)), max(share, explained)
 
 
 def light_from_mirror(seen: Observations, order: int, gain: F64, attenuation: str) -> LightEstimate | None:
@@ -118,7 +151,7 @@ def light_from_mirror(seen: Observations, order: int, gain: F64, attenuation: st
     explained = 1 - float((left * left).sum() / max(((y - y.mean()) ** 2).sum(), 1e-300))
     if explained < MIN_EXPLAINED or b[0] <= 0:
         return None
-    return LightEstimate(b, explained, 1.0)
+    return LightEstimate(b, explained, 1.0, 1.0, explained)
 
 
 def _evenest(

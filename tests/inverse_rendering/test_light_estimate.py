@@ -16,7 +16,13 @@ from pipeline.maths import sh
 from pipeline.maths.ggx_width import gauge_alpha
 from pipeline.maths.microfacet import SKIN_F0
 from stages.inverse_rendering import light_estimate as lamp_module
-from stages.inverse_rendering.light_estimate import MIN_EXPLAINED, light_from_lobe, light_from_mirror, reflectance
+from stages.inverse_rendering.light_estimate import (
+    MIN_EXPLAINED,
+    level_by_skin,
+    light_from_lobe,
+    light_from_mirror,
+    reflectance,
+)
 from stages.inverse_rendering.observations import MIN_COSINE, Observations
 
 F64 = npt.NDArray[np.float64]
@@ -110,6 +116,39 @@ def test_a_light_without_a_first_band_is_not_blown_up() -> None:
     light[0], light[5] = 1.5, 0.5
     found = solved(observations(light, noise=0.002))
     assert np.allclose(found.coefficients, light, atol=0.15)
+
+
+def test_matt_cloth_does_not_dim_the_light() -> None:
+    """Three quarters of the points reflect a fifth of what skin does: all together tell half of the light."""
+    light = true_light()
+    shiny, matt = observations(light), observations(light, lobe=0.2, noise=0.005)
+    skin = shiny.point < POINTS // 4
+    seen = replace(shiny, colour=np.where(skin[:, None], shiny.colour, matt.colour), skin=skin)
+    found, blind = solved(seen), solved(replace(seen, skin=None))
+    assert blind.coefficients[0] < 0.6 * light[0] and blind.level == 1.0
+    assert found.coefficients[0] == pytest.approx(light[0], rel=0.1)
+    assert found.explained_on_skin > found.explained == blind.explained
+    assert found.level == pytest.approx(found.coefficients[0] / blind.coefficients[0])
+
+
+def test_the_level_of_skin_like_all_else_stays() -> None:
+    light = true_light()
+    seen = observations(light, noise=0.01)
+    found = solved(replace(seen, skin=seen.point < POINTS // 2))
+    assert found.level == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_level_by_skin_counts_by_its_certainty() -> None:
+    """Skin asks for twice the light. Its share is the squared correlation, .64; ln g is known to .06 ((1 - e) / e)^1.5.
+    With .25 over all points its weight is 1 - ((.36 / .64) / 3)^3; with no more than all points it is 0."""
+    lobe, off = np.array([1.0, -1.0, 1.0, -1.0]), np.array([1.0, 1.0, -1.0, -1.0])
+    seen = 2 * lobe + 1.5 * off
+    level, share = level_by_skin(lobe, seen, 0.25)
+    assert share == pytest.approx(0.64)
+    assert level == pytest.approx(2 ** (1 - (0.5625 / 3) ** 3))
+    assert level_by_skin(lobe, seen, 0.7) == (1.0, 0.7)
+    assert level_by_skin(-lobe, seen, 0.25) == (1.0, 0.25)
+    assert level_by_skin(0 * lobe, seen, 0.25) == (1.0, 0.25)
 
 
 def test_nothing_is_made_of_noise() -> None:
