@@ -124,7 +124,7 @@ class Config(StageConfig):
     )
     skin_light: bool = Field(
         default=True,
-        description="correct the low bands of the light during the fit so that the albedo of the face does not depend "
+        description="correct the low bands of the light during the fit so that the albedo of the skin does not depend "
         "on the direction that it faces",
     )
     albedo_level: Annotated[float, Field(ge=0.01, le=0.95)] | Literal["auto", "fitted"] = Field(
