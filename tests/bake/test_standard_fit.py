@@ -85,6 +85,18 @@ def test_a_third_of_the_vertices_tells_f0_and_all_tell_the_albedo() -> None:
     assert np.corrcoef(some.correction[:, 0], wave[:, 0])[0, 1] > 0.95
 
 
+def test_the_albedo_of_skin_keeps_a_part_of_the_fit_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos that are 1.5 times too bright for the exported light: other things follow them, skin three quarters."""
+    mesh, at, albedo, seen = scene(0.0, 0.45, scale=1.5)
+    skin, n = mesh.vertices[:, 0] > 0, mesh.normals.astype(np.float64)
+    found = fits.fit(mesh, n, at, albedo, seen, skin).correction
+    monkeypatch.setattr(fits, "FIELD", 0.0)
+    photos = fits.fit(mesh, n, at, albedo, seen, skin).correction
+    assert np.median(photos[skin]) > 1.3
+    np.testing.assert_allclose(found[skin] - 1, 0.75 * (photos[skin] - 1), atol=1e-5)
+    np.testing.assert_array_equal(found[~skin], photos[~skin])
+
+
 def test_black_is_corrected_as_much_as_white() -> None:
     """Without a pull that follows the albedo, black hair beside skin kept the error of the field."""
     mesh, at, albedo, seen = scene(0.0, 0.45, scale=1.5)
