@@ -15,8 +15,8 @@ The corrected light must leave some irradiance in every direction, also in those
 kappa E_min(d), linear in the unknowns, at directions d all around; E_min is DARKEST of the mean, or the irradiance
 before where that is less. Such a quadratic problem is a least distance problem [Lawson and Hanson 1974, ch. 23].
 
-What makes the luminance of the skin no more even is no error of the light, and is left out: on a person between
-white walls the sheen of the cheeks' sides was taken for light, and the albedo got pale patches.
+What makes the luminance of the skin, or of the face alone, no more even is no error of the light, and is left out: on
+a person between white walls the sheen of the cheeks' sides was taken for light, and the albedo got pale patches.
 
 Prior: b ~ N(0, std^2). A face is nearly mirror-symmetric, so that light from the side can't be mistaken for its
 colours: the terms odd in x have ODD_STD. The others, from above or from the front, also fit the skin's own pattern:
@@ -246,14 +246,23 @@ def correct_light(
     found = correction(a, e, normals, even, around)
     if found is None:
         return None
-    corrected = e + irradiance_basis(normals) @ found.change
-    now, then = unevenness(a), unevenness(a * e / np.maximum(corrected, 1e-9))
+    now, then = _uneven(skin, found)
+    on_face = _uneven(face, found)
     facts: Fact = {"skin_uneven": round(now, 4), "skin_uneven_corrected": round(then, 4)}
-    if then >= now:
+    if skin is not face:
+        facts |= {"face_uneven": round(on_face[0], 4), "face_uneven_corrected": round(on_face[1], 4)}
+    if then >= now or on_face[1] >= on_face[0]:
         return Asked(facts, False)
     error = change_light(model, spatial, x, facing, lambda: _apply(light, found, face.n, face.irradiance))
     facts |= {"skin_explains": round(float(found.explained.mean()), 3), "relearned_within": round(error, 5)}
     return Asked(facts, True)
+
+
+def _uneven(skin: Skin, found: SkinLight) -> tuple[float, float]:
+    """Unevenness of the skin before and after a correction of the light."""
+    albedo, e = _array(skin.albedo), _array(skin.irradiance)
+    corrected = e + irradiance_basis(_array(skin.n)) @ found.change
+    return unevenness(albedo), unevenness(albedo * e / np.maximum(corrected, 1e-9))
 
 
 def _apply(light: ShLight, found: SkinLight, n: Tensor, irradiance: Tensor) -> None:

@@ -218,7 +218,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=46,
+    version=47,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

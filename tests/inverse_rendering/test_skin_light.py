@@ -275,6 +275,27 @@ def test_light_from_behind_is_told_by_the_neck(ball: Trainer, monkeypatch: pytes
     assert (asked[0] @ to_camera).min() > 0 and (asked[1] @ to_camera).min() < -0.9
 
 
+def test_what_evens_the_neck_but_not_the_face_is_left_out(ball: Trainer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All skin has a slope that the correction evens; the face is even, and would get one."""
+    n = np.random.default_rng(4).normal(size=(6000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    change = np.zeros((9, 3))
+    change[1] = 0.5  # from above
+    model = ball.model
+    with torch.no_grad():
+        before = model.light.irradiance(torch.from_numpy(n).float()).double().numpy()
+    sloped = KAPPA * (before + irradiance_basis(n) @ change) / before
+    face_alone, others = points(model, n[:2000], np.tile(KAPPA, (2000, 1))), points(model, n, sloped)
+    views, rays = [replace(v, skin=v.alpha > 0.99) for v in ball.views], ball.pixels.draw(100, 0.0, 3).rays
+    monkeypatch.setattr(skin_light, "correction", lambda a, e, n, even, around: SkinLight(change, np.ones(3)))
+    monkeypatch.setattr(Skin, "of", classmethod(lambda cls, *given: face_alone))
+    monkeypatch.setattr(Skin, "with_bare", lambda self, other, near: others)
+    asked = correct_light(model, views, rays, None, "cpu", lambda x: np.full(len(x), True))
+    assert asked is not None and not asked.changed
+    assert float(asked.facts["skin_uneven_corrected"]) < 0.1 * float(asked.facts["skin_uneven"])
+    assert float(asked.facts["face_uneven_corrected"]) > float(asked.facts["face_uneven"])
+
+
 @pytest.mark.parametrize("gain", [1e-3, 1.0, 1e3])
 def test_unevenness_is_the_spread_of_the_logarithm_and_ignores_lips(gain: float) -> None:
     rng = np.random.default_rng(2)
