@@ -66,9 +66,7 @@ OUTLIER = 2.5  # robust standard deviations of the field's residual from which t
 CORRECTION = (0.4, 2.5)  # limits of r
 ASSUMED_F0 = 0.04  # of bone, stone, paint: index 1.5
 FREE = 0.02  # largest share of the view-dependent variance that an assumed layer may cost
-FIELD = (
-    1 / 3
-)  # weight of the field's own albedo of skin, where r = 1, beside that of the photos under the exported light
+FIELD = 1 / 3  # weight of the fit's own albedo of skin, r = 1, beside that of the photos under the exported light
 DIELECTRIC = 0.17  # F0 of diamond, the largest of a dielectric that is common
 TYPICAL_F0 = 0.03  # for R while F0 is estimated: R's part with F0 is 3 % of the base
 
@@ -376,7 +374,8 @@ def _lowest(x: F64, cost: F64) -> float:
 def _correction(
     smooth: Smoother, normals: F64, albedo: F64, seen: Seen, w: F64, lit: Lit, f0: F64, roughness: F64, pull: F64
 ) -> F64:
-    """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R), drawn to 1 by pull (V,) >= 0."""
+    """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R), drawn to 1 by pull (V,) >= 0;
+    1 where nothing is seen."""
     v = seen.vertex
     alpha = roughness**2
     cosine = (normals[v] * seen.wo).sum(1)

@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.errors import StageError
 from pipeline.meshes import F64
-from pipeline.registration.identity_fit import PlacedHead, placed_on_face
+from pipeline.registration.head_regions import Near, near_head
+from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
 from stages.inverse_rendering.config import AUTO, PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
@@ -29,12 +30,12 @@ from stages.inverse_rendering.template_start import (
 @dataclass(frozen=True, slots=True)
 class ChosenStart:
     """start: after stereo; prior: before it, with which refined geometry is compared. facts: for the report, of the
-    geometry and of stereo. head: the template that was placed on the face, if it was."""
+    geometry and of stereo. near_head: of the template that was placed on the face, if it was."""
 
     start: Start
     prior: Start
     facts: dict[str, Facts]
-    head: PlacedHead | None = None
+    near_head: Near | None = None
 
     @property
     def cut_by_template(self) -> bool:
@@ -84,13 +85,13 @@ def choose_start(
         known["landmarks_off_mm"] = round(1e3 * off, 3)
         if off <= FAR:
             why = "the face landmarks lie on the hull's surface after stereo"
-            return ChosenStart(start, near, _facts("hull", why, known, stereo), head)
+            return ChosenStart(start, near, _facts("hull", why, known, stereo), near_head(template, head))
     cut = carved_by_template(hull, template, head, views, check)
     # on smooth skin, longer sweeps find depths at random, and remove hair
     start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])
     known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)
     why = "setting" if settings.prior == "template" else "the hull's surface does not have the face"
-    return ChosenStart(start, cut, _facts("template", why, known, stereo), head)
+    return ChosenStart(start, cut, _facts("template", why, known, stereo), near_head(template, head))
 
 
 def _after_stereo(

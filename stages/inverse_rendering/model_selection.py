@@ -177,11 +177,9 @@ def _with_light_source(c: Choices, estimate: LightEstimate | None, paired: bool 
     """The choices with the source of the light."""
     light: dict[str, str | float | bool] = {"from": "uniform albedo"}
     if estimate is not None:
-        figures = {"explained": round(estimate.explained, 4), "bands_scaled_by": round(estimate.scale, 3)}
-        figures |= {
-            "explained_on_skin": round(estimate.explained_on_skin, 4),
-            "level_by_skin": round(estimate.level, 4),
-        }
+        told = {"explained": estimate.explained, "explained_on_skin": estimate.explained_on_skin}
+        figures = {k: round(v, 4) for k, v in (told | {"level_by_skin": estimate.level}).items()}
+        figures["bands_scaled_by"] = round(estimate.scale, 3)
         light = {"from": "polarised pairs" if paired else "view-dependent residuals", **figures}
     return replace(c, light_known=estimate is not None, facts={**c.facts, "light": {**c.facts["light"], **light}})
 

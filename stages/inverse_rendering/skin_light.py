@@ -228,7 +228,7 @@ def correct_light(
     near: Near | None = None,
 ) -> Asked | None:
     """Correct the light of a model by the skin in its photos, and its reflectance so that the photos stay as they are,
-    if that makes the skin more even; None if there is nothing to correct or no skin.
+    if that makes the skin and the face more even; None if there is nothing to correct or no skin.
 
     rays: towards the whole subject. explained: share of the view-dependent variance that the light's estimate explains,
     None without an estimate. near: the placed head; None without one, and then the labelled face is all skin.
@@ -237,6 +237,8 @@ def correct_light(
     if not isinstance(light, ShLight) or not isinstance(spatial, SpatialField) or len(light.coefficients) < 9:
         return None
     face = Skin.of(light, spatial, *skin_points(model, views, device))
+    if not len(face.x):
+        return None
     x, facing = surface_points(model.geometry, rays)
     skin = face.with_bare(Skin.of(light, spatial, x, facing), near)
     with torch.no_grad():
@@ -247,7 +249,7 @@ def correct_light(
     if found is None:
         return None
     now, then = _uneven(skin, found)
-    on_face = _uneven(face, found)
+    on_face = (now, then) if skin is face else _uneven(face, found)
     facts: Fact = {"skin_uneven": round(now, 4), "skin_uneven_corrected": round(then, 4)}
     if skin is not face:
         facts |= {"face_uneven": round(on_face[0], 4), "face_uneven_corrected": round(on_face[1], 4)}

@@ -64,8 +64,6 @@ def run_both(inputs: BothInputs, config: Config, context: Context) -> FittedFace
 def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -> FittedFace:
     """Fit the field to a capture, or to two of one subject, and predict the held-out views."""
     from pipeline.faces.landmarks3d import load_landmarks
-    from pipeline.registration.head_regions import near_head
-    from pipeline.template.load import load_template
     from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import DRIFT, exposures_differ
@@ -145,8 +143,8 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     trainer = trainer_for(views, start, settings, own_colours, context.device, chosen.prior, known, lit, second)
     labels = read_labels(inputs.masks, usable) + (second.labels if second else [])
     trainer.know_labels(labels, names)
-    if chosen.head is not None:
-        trainer.know_head(near_head(load_template(), chosen.head))
+    if chosen.near_head is not None:
+        trainer.know_head(chosen.near_head)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
