@@ -158,12 +158,12 @@ def kill(name: str, signs: Path) -> Point:
     return Point(name, signs, "kill")
 
 
-def wait_for(condition: Callable[[], Any], seconds: float = PATIENCE) -> None:
-    """Until something is true; the limit is for what never happens."""
+def wait_for(condition: Callable[[], Any], seconds: float = PATIENCE, every: float = 0.02) -> None:
+    """Until something is true, looked at `every` so many seconds; the limit is for what never happens."""
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "did not happen in time"
-        time.sleep(0.02)
+        time.sleep(every)
 
 
 def read_until(stream: Any, words: str) -> str:

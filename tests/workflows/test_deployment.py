@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ import pytest
 from pipeline.images import write_png
 from tests.support.facescape_tree import write_tree
 from tests.support.points import PATIENCE, wait_for
-from tests.support.servers import LOGIN, ask, descendants, free_port, guarded, login_headers, wait_healthy
+from tests.support.servers import ASKED_EVERY, LOGIN, ask, descendants, free_port, guarded, login_headers, wait_healthy
 from workflows.batch.request import BatchRequest
 from workflows.run.request import RunRequest
 
@@ -205,7 +204,7 @@ def test_serve_starts_a_server_for_this_machine_alone_and_ends_it(
         login = (home / "login").read_text().strip()
         assert (home / "login").stat().st_mode & 0o777 == 0o600 and home.stat().st_mode & 0o777 == 0o700
         assert login not in (home / "server.log").read_text() and login not in (tmp_path / "log").read_text()
-        wait_for(lambda: served(url, login, child) == 2)
+        wait_for(lambda: served(url, login, child) == 2, every=ASKED_EVERY)
         answers_no_stranger(url, login)
         sockets = [line.split() for f in ("tcp", "tcp6") for line in Path(f"/proc/net/{f}").read_text().splitlines()]
         listening = [s[1] for s in sockets if s[1].endswith(f":{port:04X}") and s[3] == "0A"]
@@ -245,7 +244,7 @@ def test_the_server_of_serve_ends_with_it(
     try:
         wait_healthy(url)
         login = (tmp_path / "home/login").read_text().strip()
-        wait_for(lambda: served(url, login, child) == 2)
+        wait_for(lambda: served(url, login, child) == 2, every=ASKED_EVERY)
         servers = descendants(child.pid)
         child.send_signal(number)
         # 0 where Prefect's own handler was there already: it calls that a regular end
@@ -271,7 +270,6 @@ def served(url: str, login: str, child: subprocess.Popen[bytes]) -> int:
         raise
     except OSError as e:
         print(f"no answer: {e}")
-        time.sleep(0.5)
         return 0
 
 

@@ -20,7 +20,7 @@ import pytest
 from tests.support.browser import installed, tab
 from tests.support.facescape_tree import write_tree
 from tests.support.points import hold, wait_for
-from tests.support.servers import PREFECT, Process, ask, free_port, wait_healthy
+from tests.support.servers import ASKED_EVERY, PREFECT, Process, ask, free_port, wait_healthy
 
 CLOSED = json.loads((Path(__file__).resolve().parents[2] / "workflows/pools/process.json").read_text())
 
@@ -183,13 +183,13 @@ def test_the_run_of_a_killed_worker_is_marked_and_its_slot_free_within_two_minut
         assert ours.ask(f"/flow_runs/{first}")["state_type"] == "RUNNING"
         worker.kill()
         killed = time.monotonic()
-        wait_for(lambda: ours.ask(f"/flow_runs/{first}")["state_type"] == "CRASHED", 120)
+        wait_for(lambda: ours.ask(f"/flow_runs/{first}")["state_type"] == "CRASHED", 120, ASKED_EVERY)
         assert time.monotonic() - killed < 120
         assert "no sign of life" in ours.ask(f"/flow_runs/{first}")["state"]["message"]
         point.release()
         worker.start()
         second = ours.ask(start, {"parameters": asked})["id"]
-        wait_for(lambda: ours.ask(f"/flow_runs/{second}")["state_type"] == "COMPLETED")
+        wait_for(lambda: ours.ask(f"/flow_runs/{second}")["state_type"] == "COMPLETED", every=ASKED_EVERY)
     assert (tmp_path / "out/run.json").is_file()
     finished = [line.split()[0] for line in tally.read_text().splitlines()]
     assert sorted(finished) == ["capture", "usd", "work"], "finished stages were kept"
