@@ -1,13 +1,14 @@
 """The same photos by a worse camera: fewer pixels, noise, JPEG. Two captures become comparable that way.
 
     python benchmarks/degrade_capture.py CAPTURE OUT [--side 640] [--noise 0.0275] [--quality 95]
-                                         [--background skin|white|colours] [--every 1]
+                                         [--background skin|white|colours|plain] [--every 1]
 
 CAPTURE is a FaceScape folder (`params.json`, I.png or I.jpg), with its `truth/` if it has one. Photos and the truth's
 alpha are averaged down by area in linear light; cameras follow (pixel centres at integers); noise is Gaussian in the
 encoded values, the same for dark and bright, of one seed. A background that is black stays without noise. With
---background, photos before black get another one behind the truth's alpha: a skin-coloured wall, a white one, or smooth
-colours at random in many sizes.
+--background, photos before black get another one behind the truth's alpha: a skin-coloured wall, a white one, smooth
+colours at random in many sizes, or a plain one, all of it in the middle colour of the first photo's subject, as before
+a backdrop that a highlight or cloth resembles.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from pipeline.colour import srgb_from_linear
 from pipeline.images import read_alpha, read_linear, write_png
 
 BLACK = 0.02  # encoded: below it lies the background
+INSIDE = 0.95  # alpha of the subject alone
 Params = dict[str, Any]
 
 
@@ -66,6 +68,11 @@ def behind(kind: str, height: int, width: int, rng: np.random.Generator) -> npt.
     return np.asarray(np.clip(out, 0.02, 1), np.float32)
 
 
+def middle(linear: npt.NDArray[np.float32], alpha: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """(3,) median of the subject's linear colours. linear: (H, W, 3) before black, alpha (H, W)."""
+    return np.asarray(np.median(linear[alpha > INSIDE], axis=0), np.float32)
+
+
 def main() -> None:
     """Write the worse capture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -74,19 +81,22 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=640, help="longest side of the new photos (%(default)s)")
     parser.add_argument("--noise", type=float, default=0.0275, help="standard deviation, white = 1 (%(default)s)")
     parser.add_argument("--quality", type=int, default=95, help="of the JPEG (%(default)s)")
-    parser.add_argument("--background", choices=("skin", "white", "colours"))
+    parser.add_argument("--background", choices=("skin", "white", "colours", "plain"))
     parser.add_argument("--every", type=int, default=1, help="take every so many photos (%(default)s)")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     params = json.loads((args.capture / "params.json").read_text())
     (args.out / "params.json").write_text(json.dumps(smaller(params, args.side)))
-    rng = np.random.default_rng(0)
+    rng, plain = np.random.default_rng(0), None
     photos = (p for p in args.capture.iterdir() if p.stem.isdigit() and p.suffix.lower() in (".png", ".jpg", ".jpeg"))
     for photo in sorted(photos, key=lambda p: int(p.stem))[:: args.every]:
         linear = resized(read_linear(photo)[..., :3], args.side)
         if args.background:
             alpha = resized(read_alpha(args.capture / "truth" / "alpha" / f"{photo.stem}.png"), args.side)
-            linear = linear + (1 - alpha[..., None]) * behind(args.background, *alpha.shape, rng)
+            if args.background == "plain":
+                plain = middle(linear, alpha) if plain is None else plain
+            back = behind(args.background, alpha.shape[0], alpha.shape[1], rng) if plain is None else plain
+            linear = linear + (1 - alpha[..., None]) * back
         shown = srgb_from_linear(linear)
         shown = shown + args.noise * rng.normal(size=shown.shape) * (shown > BLACK)
         pixels = np.round(255 * np.clip(shown, 0, 1)).astype(np.uint8)[..., ::-1]

@@ -66,8 +66,12 @@ def find_background(borders: Sequence[U8]) -> Background | None:
 
 def key_out(image: U8, background: Background) -> F32:
     """Alpha (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
-    away = _farthest(image, lambda k: np.float32(background.colour[k]))
-    return soft_edge(image, _inside(away, background.tolerance), EDGE)
+    return soft_edge(image, keyed(image, background), EDGE)
+
+
+def keyed(image: U8, background: Background) -> Bool:
+    """Hard mask (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
+    return _inside(_farthest(image, lambda k: np.float32(background.colour[k])), background.tolerance)
 
 
 def key_out_plate(image: U8, plate: U8) -> F32:

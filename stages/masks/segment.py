@@ -37,7 +37,7 @@ from stages.masks.landmarks import agreed, save_landmarks
 from stages.masks.photos import at_once, photos_of
 from stages.masks.region import F32, Bool, resized, working_size
 from stages.masks.segment_person import of_subject, settled
-from stages.masks.sources import PhotoToMask, Plan, inverted, mask, plan, to_full_size
+from stages.masks.sources import KEY_AND_PERSON, PhotoToMask, Plan, inverted, mask, plan, to_full_size
 from stages.masks.support_object import SupportedObject, distinct, find_supported_object
 from stages.masks.user_model import UserModel, hair_model, user_model
 
@@ -52,6 +52,7 @@ HOLE = 0.001  # the same for a hole: one in a single mask makes a tunnel through
 FEWEST = 3  # views that must remain
 INVERTED = "given, inverted"
 BY_HULL = "+hull"  # appended to the method of a mask that was corrected by the hull
+KEYED = ("key", KEY_AND_PERSON)
 LEARNED = ("model", "person")  # methods with a network's contour
 COMPUTED = ("plate", "model", "person", "object", "grabcut")  # methods whose masks the hull may contradict
 Labelled = tuple[Path, tuple[str, ...]]
@@ -92,7 +93,7 @@ def segment(
     pairs = photos_of(capture, poses, context.check)
     threads = at_once(capture.artifact.views, os.cpu_count() or 1)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
-               lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
+               poses.roi_radius, lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, threads, context, "masking")
     warnings = [f"view {m.view.index} ({m.view.name}): its mask is black on the subject and was inverted; save it "
@@ -247,7 +248,7 @@ def _segment_again(made: Masked, opinion: Opinion, bad: bool, config: Config, co
     an outlier, or held out and wrong. Of a held-out view only that counts, and the hull is its limit, not its shape:
     the hull is carved without it, and wrong by what fitted masks lack."""
     inside, filled = made.small >= 0.5, bad and not made.view.holdout
-    if made.source in ("given", INVERTED) or (made.source == "key" and made.useless):
+    if made.source in ("given", INVERTED) or (made.source in KEYED and made.useless):
         return made  # a photo of background only has no subject to segment
     share = lacking(inside, opinion) if made.view.holdout else contradiction(inside, opinion, filled=filled)
     doubtful = made.source in COMPUTED and (

@@ -13,7 +13,9 @@ from pipeline.errors import StageError, UsageError
 from stages.masks.config import Method
 from stages.masks.grabcut import INNER, OUTER, cut_by_region
 from stages.masks.hull_consistency import opinions
-from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate
+from stages.masks.key_person import BETTER as KEY_BETTER
+from stages.masks.key_person import Network, both, key_with_person, loses_a_person
+from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate, keyed
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
 from stages.masks.segment_person import person_mask
@@ -26,6 +28,7 @@ PERSON_VIEWS = 0.9  # smallest share of such views: the network takes a statue f
 BETTER = 0.05  # of IoU with the hull: an object's masks must agree by so much better than the network's
 CHOICE_SIZE, CHOICE_CELLS = 320, 64  # pixels and voxels for the choice
 MIN_AROUND, WRONG_SIDE = 0.02, 0.3  # smallest share of the photo around the region; mean alpha of a nearly empty area
+KEY_AND_PERSON = "key+person"
 SOFT = 2  # pixels of the working size: accuracy of a segmented contour
 
 
@@ -52,20 +55,22 @@ class PhotoToMask:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The segmentation method for views without a given mask, with its data."""
+    """The segmentation method for views without a given mask, with its data. person: the network gives back what the
+    key takes from a person."""
 
     method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
+    person: bool = False
     solid: SupportedObject | None = None
     model: UserModel | None = None
 
 
 def plan(
-    views: Sequence[PhotoToMask], method: Method, threshold: float, longest: int, seed: int,
+    views: Sequence[PhotoToMask], method: Method, threshold: float, longest: int, seed: int, roi_radius: float,
     solid: Callable[[], SupportedObject | None] = lambda: None, model: UserModel | None = None,
 ) -> Plan:  # fmt: skip
-    """Choose the method from a few of the fitted views. solid: finds the object among the sparse points. model: the
-    user's network; `auto` prefers it to the methods from key on.
+    """Choose the method from a few of the fitted views. roi_radius: asset units. solid: finds the object among the
+    sparse points. model: the user's network; `auto` prefers it to the methods from key on.
 
     Raises:
         UsageError: `method` needs masks or clean plates that are missing. StageError: `method` is key or object, and
@@ -90,7 +95,8 @@ def plan(
     colours, small = _looked_at(some, min(longest, CHOICE_SIZE))
     background = find_background(colours)
     if background is not None:
-        return Plan("key", background)
+        network = Network(threshold, CHOICE_SIZE, seed)
+        return Plan("key", background, method == "auto" and _person_helps(some, small, background, network, roi_radius))
     if method == "key":
         raise StageError("the background is not of one colour", where="masks.method=key",
                          value="the photos' borders differ in colour", limit="one colour around the subject, the "
@@ -107,6 +113,19 @@ def _looked_at(views: Sequence[PhotoToMask], longest: int) -> tuple[list[U8], li
         colours.append(border_colours(image))
         small.append(np.asarray(resized(image, *working_size(image.shape[1], image.shape[0], longest)), np.uint8))
     return colours, small
+
+
+def _person_helps(
+    views: Sequence[PhotoToMask], images: Sequence[U8], background: Background, network: Network, roi_radius: float
+) -> bool:
+    """Whether the key takes parts of a person in reduced photos (h, w, 3), and the masks agree better with them. An
+    object that the network takes for a person loses nothing to a key of another colour."""
+    discs = [v.disc.scaled(i.shape[1] / v.camera.width) for i, v in zip(images, views, strict=True)]
+    if not loses_a_person(images, discs, background):
+        return False
+    alone = [keyed(i, background) for i in images]
+    helped = [both(i, d, background, network) for i, d in zip(images, discs, strict=True)]
+    return _mean_iou(views, helped, roi_radius) > _mean_iou(views, alone, roi_radius) + KEY_BETTER
 
 
 def _person_or_object(
@@ -178,6 +197,9 @@ def mask(view: PhotoToMask, how: Plan, threshold: float, longest: int, seed: int
     if view.plate is not None:
         return key_out_plate(image, view.plate()), "plate"
     if how.method == "key" and how.background is not None:
+        if how.person:
+            network = Network(threshold, longest, seed)
+            return key_with_person(image, view.disc, how.background, network), KEY_AND_PERSON
         return key_out(image, how.background), "key"
     if how.method == "model" and how.model is not None:
         inside = mask_by_model(image, view.disc, how.model, threshold, longest, seed)

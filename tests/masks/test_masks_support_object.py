@@ -173,7 +173,7 @@ def test_a_statue_is_no_person(
     views = [PhotoToMask(i, str(i), camera, Disc(16, 16, 8, 0.0), False, lambda: noise, None) for i in range(12)]
     solid = find_supported_object(points(), cameras(), ROI, 0) if points_at_hand else None
     assert solid is not None or not points_at_hand
-    assert sources.plan(views, "auto", 0.5, 64, 0, lambda: solid).method == wanted
+    assert sources.plan(views, "auto", 0.5, 64, 0, 1.0, lambda: solid).method == wanted
 
 
 @pytest.mark.parametrize(
@@ -203,4 +203,4 @@ def test_masks_that_contradict_each_other_are_no_person(
     assert solid is not None
     views = [PhotoToMask(c.index, c.name, c, Disc(80, 60, 60, 0.0), False, partial(np.copy, p), None)
              for c, p in zip(cameras(), pictures, strict=True)]  # fmt: skip
-    assert sources.plan(views, "auto", 0.5, 160, 0, lambda: solid).method == wanted
+    assert sources.plan(views, "auto", 0.5, 160, 0, 1.0, lambda: solid).method == wanted
