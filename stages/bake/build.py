@@ -22,6 +22,7 @@ from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
 from stages.bake.detail import shade
 from stages.bake.dilate import HALO, nearest_rows
+from stages.bake.even_skin import Even
 from stages.bake.eyes import OPEN, Eyes, usual_behind_lids
 from stages.bake.lit import Measured
 from stages.bake.lut import basis_lut
@@ -103,12 +104,14 @@ class Baker:
         hair: Mask | None = None,
         hair_code: int = -1,
         measured: Measured | None = None,
+        even: Even | None = None,
     ) -> None:
         """`photos`: adds their fine detail to the albedo. `scratch`: folder for arrays that do not fit in memory.
         `skin_code`: label of skin in the photos. `fit_standard`: fit the standard shaders to the photos, if given.
         `eyes`: the fitted eyes of the template; `mouth`: the inside of its mouth. `region` (V,): of the head, of each
         vertex (head_regions.region_of); None: one region. `hair` (V,): vertices of the mesh of hair, which
-        is the last tile, with the label `hair_code`. `measured`: what a light stage says, of the first tile."""
+        is the last tile, with the label `hair_code`. `measured`: what a light stage says, of the first tile.
+        `even`: takes errors of the light out of the base colour of skin (even_skin.py)."""
         self.tiles = tiles.count(charts)
         self.lut, self.residual = basis_lut(field)
         self._field, self._whole, self._views, self._size = field, (mesh, charts), views, size
@@ -131,7 +134,7 @@ class Baker:
             seen = self._known.unseen < 0.5
             fitted = standard_material(
                 field, mesh, views, skin_code, seen, self._found, lambda: step(0, 1, "standard material"), hair,
-                self._known.albedo, region,
+                self._known.albedo, region, even,
             )  # fmt: skip
             if fitted.plausible:
                 fitted = fitted if eyes is None else _corrected_at_eyes(fitted, eyes, field, mesh, self._known)

@@ -16,7 +16,7 @@ from pipeline.capture_artifacts import Capture
 from pipeline.contract import Context, Stage, StageConfig
 from pipeline.fields.protocol import Field as FittedField
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import Indices, Mask, Mesh
+from pipeline.meshes import Mask, Mesh
 from pipeline.reflectance_artifacts import ReflectanceField
 from pipeline.units import Texels
 
@@ -54,6 +54,11 @@ class Config(StageConfig):
         description="fit base colour, F0 and roughness of standard shaders to the photos; off, or without detail: "
         "convert NeuFace's lobe",
     )
+    even_skin: float = Field(
+        0.5, ge=0, le=1,
+        description="part of the slow variation of the skin's colour that is taken for an error of the light, by what "
+        "the two sides of the face differ, and taken out; 0: the base colour is what the photos have in their light",
+    )  # fmt: skip
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:
@@ -87,6 +92,7 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     from stages.bake.delighting import figures_of, shown
     from stages.bake.deviation import zero_set_rms
     from stages.bake.eyes import painted_eyes
+    from stages.bake.head import on_head
     from stages.bake.judge import chosen, judge
     from stages.bake.judge import together as texels_of_all
     from stages.bake.lit import measured_of
@@ -113,13 +119,13 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     skin = labels.index("face") if "face" in labels else -1
     eyes = painted_eyes(inputs.template, field, mesh, views, response) if uv.artifact.of_template else None
     mouth = inside_of(inputs.template, mesh) if uv.artifact.of_template else None
-    region, hair = _regions(inputs.masks, mesh), hair_of(mesh, uv.artifact.hair_faces)
+    (region, even), hair = on_head(inputs.masks, mesh, config.even_skin), hair_of(mesh, uv.artifact.hair_faces)
     if region is not None and hair is not None:
         region = with_hair(region, hair)
     baker = Baker(
         field, mesh, charts, views, config.size, step, photos, context.scratch, skin, config.fit_standard, eyes, mouth,
         region, hair, labels.index("hair") if "hair" in labels else -1,
-        measured_of(inputs.reflectance, config.size),
+        measured_of(inputs.reflectance, config.size), even,
     )  # fmt: skip
     parts, sides, counted, judged, shades, areas = [], [], [], [], [], Counter[int]()
     for number in range(baker.tiles):
@@ -165,22 +171,6 @@ def _baked(inputs: Inputs, config: Config, context: Context) -> TextureSet:
     )
 
 
-def _regions(masks: Located[MaskSet], mesh: Mesh) -> Indices | None:
-    """(V,) region of the head of each vertex, by the head template placed on the face's landmarks; None without a
-    face."""
-    from pipeline.faces.landmarks3d import load_landmarks
-    from pipeline.registration.head_regions import region_of
-    from pipeline.registration.identity_fit import placed_on_face
-    from pipeline.template.load import load_template
-
-    found = masks.artifact.landmarks
-    if found is None:
-        return None
-    template = load_template()
-    head = placed_on_face(template, load_landmarks(masks.path(found)))
-    return None if head is None else region_of(mesh.vertices.astype(np.float64), template, head)
-
-
 def hair_of(mesh: Mesh, faces: int) -> Mask | None:
     """(V,) vertices of a mesh whose last faces are hair; None without any."""
     if not faces:
@@ -210,4 +200,4 @@ def responses(field: FittedField, exposures: Sequence[float]) -> F64:
     return np.asarray(e * (np.eye(3) if fitted is None else fitted), np.float64)
 
 
-STAGE = Stage(name="bake", version=32, inputs=Inputs, config=Config, output=TextureSet, run=run)
+STAGE = Stage(name="bake", version=33, inputs=Inputs, config=Config, output=TextureSet, run=run)

@@ -23,6 +23,7 @@ from stages.bake import detail_kernels as kernels
 from stages.bake import standard_fit
 from stages.bake.detail import Detail, shade
 from stages.bake.detail_views import Photos
+from stages.bake.even_skin import Even
 from stages.bake.regions import Poll
 from stages.bake.skin import skin_of
 
@@ -33,9 +34,11 @@ MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradi
 def standard_material(
     field: Field, mesh: Mesh, views: Sequence[FittedPhoto], skin_code: int, seen: Mask, found: Detail,
     check: Callable[[], None], hair: Mask | None = None, look: F32 | None = None, region: Indices | None = None,
+    even: Even | None = None,
 ) -> standard_fit.Fitted:  # fmt: skip
     """The fitted material at the vertices. skin_code: label of the face in the photos, -1 for none; seen, hair (V,);
-    look (V, 3): the albedo with what photos do not show filled, region (V,): of the head (skin.skin_of)."""
+    look (V, 3): the albedo with what photos do not show filled, region (V,): of the head (skin.skin_of); even: takes
+    errors of the light out of the base colour (V, 3) of seen skin (V,) (even_skin.py)."""
     normals = field_normals(field, mesh)
     albedo = field.material(mesh.vertices).albedo.astype(np.float64)
     thin = thinned(len(mesh.vertices), mesh.faces)
@@ -51,8 +54,13 @@ def standard_material(
         poses = [matrix(v.camera.world_from_cam) for v in views]
         at = carried(moving, field.light, mesh, normals, observations, view, poses, check)
     out = standard_fit.fit(mesh, normals, at, albedo, observations, skin, check, hair, asked)
-    correction = continued(mesh, out.correction.astype(np.float64), seen).astype(np.float32)
-    return replace(out, correction=correction)
+    correction = continued(mesh, out.correction.astype(np.float64), seen)
+    if even is None:
+        return replace(out, correction=correction.astype(np.float32))
+    evened = even(skin & seen, albedo * correction)
+    return replace(
+        out, correction=(correction * evened.factor).astype(np.float32), figures=out.figures | evened.figures
+    )
 
 
 def carried(
