@@ -22,6 +22,9 @@ WORST = Limits(6.0, 15.0, lower=False)
 # dB lost from the fitted field to the asset: 0 to .4 on good scans, .3 to .9 on heads made from the template, whose
 # facets of 1.3 mm smooth the outline; 1.9 with hundreds of charts.
 LOST = Limits(1.0, 3.0, lower=False)
+# An asset that shows its photos that well is no broken one, whatever the model does better: ears and a hidden nape of
+# a head seen by eight cameras cost 3.1 dB of 32.2.
+LOST_OF_GOOD = Limits(LOST.good, np.inf, lower=False)
 
 
 class Row(Protocol):
@@ -85,13 +88,14 @@ def judge(rows: Sequence[Row], names: Mapping[int, str]) -> tuple[Finding, ...]:
 
 def _lost(rows: Sequence[Row]) -> list[Finding]:
     """The finding on PSNR that is lost from the fitted model to the asset."""
-    both = [r.model.psnr - r.asset.psnr for r in rows if r.held_out and r.model is not None and r.asset is not None]
+    both = [(r.model, r.asset) for r in rows if r.held_out and r.model is not None and r.asset is not None]
     if not both:
         return []
-    value = max(float(np.mean(both)), 0.0)
+    value = max(float(np.mean([model.psnr - asset.psnr for model, asset in both])), 0.0)
+    good = float(np.mean([asset.psnr_matched for _, asset in both])) >= PSNR.good
     message = f"PSNR of the exported asset is {value:.1f} dB below that of the fitted model in the same views"
     remedy = "mesh or texture is too coarse or broken: check charts and handles; more texels (bake.size) may help"
-    return [judged("asset_against_model", value, LOST, message, remedy, unit="dB")]
+    return [judged("asset_against_model", value, LOST_OF_GOOD if good else LOST, message, remedy, unit="dB")]
 
 
 def _named(scored: Sequence[tuple[int, Scores]], names: Mapping[int, str]) -> tuple[str, ...]:

@@ -68,7 +68,13 @@ def test_one_view_far_below_the_others(below: float, level: str) -> None:
 
 @pytest.mark.parametrize(("lost", "level"), [(0.3, "good"), (1.9, "usable"), (5.0, "unusable"), (-1.0, "good")])
 def test_what_the_export_costs(lost: float, level: str) -> None:
-    made = [Row(i, replace(SOUND, psnr=SOUND.psnr - lost)) for i in range(3)]
+    made = [Row(i, replace(SOUND, psnr=SOUND.psnr - lost, psnr_matched=27.0)) for i in range(3)]
+    assert by_name(made)["asset_against_model"].level == level
+
+
+@pytest.mark.parametrize(("matched", "level"), [(28.1, "usable"), (27.9, "unusable")])
+def test_an_asset_that_shows_its_photos_is_not_broken(matched: float, level: str) -> None:
+    made = [Row(i, replace(SOUND, psnr=SOUND.psnr - 4, psnr_matched=matched)) for i in range(3)]
     assert by_name(made)["asset_against_model"].level == level
 
 
