@@ -7,7 +7,7 @@ that is nearly the same on both sides of a face, and a light from a side is not.
 tells how large the error is, and as large an error is assumed in what both sides share.
 
 Symbols: u slow part of the log luminance, or of the chromaticity, of the base colour: its mean within WIDTH; x' the
-place of x on the other side (pipeline/registration/mirrored.py);
+place of x on the other side (pipeline/registration/other_side.py);
 
     a = (u(x) - u(x')) / 2      s = (u(x) + u(x')) / 2 - mean
     A, S                        area-weighted means of a^2 and s^2 over skin that is seen on both sides
@@ -29,7 +29,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.colour import LUMA
 from pipeline.meshes import F64, Indices, Mask, Mesh, areas
-from pipeline.registration.mirrored import OtherSide
+from pipeline.registration.other_side import OtherSide
 from pipeline.smoothing import Smoother
 
 WIDTH = 0.006  # metres: standard deviation of the mean

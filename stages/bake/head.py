@@ -11,7 +11,7 @@ from pipeline.faces.landmarks3d import load_landmarks
 from pipeline.meshes import Indices, Mesh
 from pipeline.registration.head_regions import region_of
 from pipeline.registration.identity_fit import placed_on_face
-from pipeline.registration.mirrored import other_side
+from pipeline.registration.other_side import other_side
 from pipeline.template.load import load_template
 from stages.bake.even_skin import Even, evening
 

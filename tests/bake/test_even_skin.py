@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.colour import LUMA
 from pipeline.meshes import F64, Mask, Mesh
-from pipeline.registration.mirrored import OtherSide
+from pipeline.registration.other_side import OtherSide
 from stages.bake.even_skin import MIN_SHARE, USUAL, evening, shares
 
 SIDE, STEP = 61, 0.0025  # vertices along an edge, metres between them

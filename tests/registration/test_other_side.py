@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pipeline.registration.identity_fit import PlacedHead
-from pipeline.registration.mirrored import FAR, other_side
+from pipeline.registration.other_side import FAR, other_side
 from pipeline.template.load import load_template
 from pipeline.transforms import apply, similarity
 
