@@ -216,7 +216,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=47,
+    version=48,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -10,20 +10,33 @@ import pytest
 import torch
 
 from pipeline.fields.geometry import GridSdf
+from stages.inverse_rendering import fit
+from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.weakly_seen import NOISE, information, lengths, outlines, outside, smooth_weakly_seen
+from stages.inverse_rendering.weakly_seen import (
+    NOISE,
+    RIPPLE,
+    information,
+    lengths,
+    outlines,
+    outside,
+    smooth_weakly_seen,
+)
+from tests.support.small_ball import SMALL, trainer
 
 F64 = npt.NDArray[np.float64]
 SIDE = 320
 
 
-def ball(radius: float, height: float = 0.0, cells: int = 64) -> GridSdf:
-    """A ball with ripples of a height around its z axis."""
+def ball(radius: float, height: float = 0.0, cells: int = 64, count: int = 16) -> GridSdf:
+    """A ball with so many ripples of a height around its z axis."""
     cell = 3 * radius / cells
     axis = (torch.arange(cells + 1) - cells / 2) * cell
     x = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1)
     r = x.norm(dim=-1)
-    ripples = height * torch.sin(16 * torch.atan2(x[..., 1], x[..., 0])) * (x[..., :2].norm(dim=-1) / r.clamp(min=cell))
+    ripples = (
+        height * torch.sin(count * torch.atan2(x[..., 1], x[..., 0])) * (x[..., :2].norm(dim=-1) / r.clamp(min=cell))
+    )
     return GridSdf(r - radius - ripples, torch.full((3,), -1.5 * radius), cell)
 
 
@@ -214,8 +227,34 @@ def test_the_side_that_no_view_determines_is_smoothed(scale: float) -> None:
     assert float(after[1].mean()) == pytest.approx(1, abs=0.02)
 
 
+@pytest.mark.parametrize(("count", "least", "most"), [(8, 0.95, 1.02), (16, 0.88, 1.0), (40, 0.2, 0.55)])
+def test_at_last_only_ripples_of_a_few_cells_go(count: int, least: float, most: float) -> None:
+    """16.8, 8.4 and 3.4 cells long, where nobody looks: 1 / (1 + (RIPPLE k)^4) of a plane's, k in radians per cell, is
+    1.00, .96 and .44."""
+    grid = ball(0.1, 0.002, count=count)
+    views = around(list(np.linspace(-50, 50, 40)), 0.6)
+    back = torch.linspace(2.4, 3.9, 400)
+    before = radii(grid, back, 0.1)
+    smooth_weakly_seen(grid, views, SIDE, 0.02, RIPPLE)
+    assert least < float(radii(grid, back, 0.1).std() / before.std()) < most
+
+
 def test_without_views_nothing_changes() -> None:
     grid = ball(0.1, 0.003)
     before = grid.values.detach().clone()
     assert smooth_weakly_seen(grid, [], SIDE, 0.01) == 0
     assert torch.equal(before, grid.values.detach())
+
+
+def test_the_last_smoothing_of_a_fit_is_of_ripples_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    t, asked = trainer(SMALL), list[float]()
+
+    def smoothed(grid: GridSdf, views: object, side: int, longest: float, most: float = np.inf) -> float:
+        asked.append(most)
+        return 0.5
+
+    monkeypatch.setattr(fit, "smooth_weakly_seen", smoothed)
+    for share in (0.2, 0.36, 0.37, 0.6, 0.92, 0.94, 0.99):
+        monkeypatch.setattr(Trainer, "share", lambda _, now=share: now)
+        t.smooth()
+    assert asked == [np.inf, np.inf, RIPPLE]
