@@ -93,8 +93,8 @@ def main() -> None:
         linear = resized(read_linear(photo)[..., :3], args.side)
         if args.background:
             alpha = resized(read_alpha(args.capture / "truth" / "alpha" / f"{photo.stem}.png"), args.side)
-            if args.background == "plain":
-                plain = middle(linear, alpha) if plain is None else plain
+            if args.background == "plain" and plain is None:
+                plain = middle(linear, alpha)
             back = behind(args.background, alpha.shape[0], alpha.shape[1], rng) if plain is None else plain
             linear = linear + (1 - alpha[..., None]) * back
         shown = srgb_from_linear(linear)

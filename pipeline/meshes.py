@@ -115,6 +115,11 @@ def volume(vertices: npt.NDArray[np.floating], faces: Faces) -> float:
     return float((a * area_vectors(vertices, faces)).sum() / 3)
 
 
+def vertex_areas(vertices: npt.NDArray[np.floating], faces: Faces) -> F64:
+    """(V,) a third of the triangles around each vertex."""
+    return np.asarray(np.bincount(faces.ravel(), np.repeat(areas(vertices, faces) / 3, 3), len(vertices)), np.float64)
+
+
 def vertex_normals(vertices: npt.NDArray[np.floating], faces: Faces) -> F32:
     """(V, 3) unit normals, faces weighted by area. A vertex without faces gets +y."""
     weighted = area_vectors(vertices, faces)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from pipeline.meshes import F64, Mask, Mesh
+from pipeline.meshes import F64, Mask, Mesh, vertex_areas
 
 COTANGENTS = (1e-3, 1e3)
 STIFF = 1e8  # 1/m^2: known vertices keep their values
@@ -23,8 +23,7 @@ FAR = 10.0  # metres: unknown vertices follow their neighbours only
 def laplacian(mesh: Mesh) -> tuple[F64, Any]:
     """M (V,) and K (V, V), sparse: K u = 0 for constant u, positive semidefinite."""
     x, count = mesh.vertices.astype(np.float64)[mesh.faces], len(mesh.vertices)
-    area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
-    mass = np.maximum(np.bincount(mesh.faces.ravel(), np.repeat(area / 3, 3), count), 1e-14)
+    mass = np.maximum(vertex_areas(mesh.vertices, mesh.faces), 1e-14)
     rows, columns, values = [], [], []
     for i in range(3):
         a, b = x[:, (i + 1) % 3] - x[:, i], x[:, (i + 2) % 3] - x[:, i]

@@ -1,6 +1,6 @@
 """Slow variation of the colour of skin that belongs to the light and not to the skin.
 
-What arrives at skin is never known quite: near lamps, shadows that the fit lacks, light that a cheek sends to a neck.
+The light that arrives at skin is not known exactly: near lamps, shadows that the fit lacks, light from cheek to neck.
 The error varies slowly along the surface, and the base colour takes it in: in the photos' own light nobody sees it,
 under any other light one cheek is pale and the other dark. Real skin varies slowly as well: stubble, a red nose. But
 that is nearly the same on both sides of a face, and a light from a side is not. So the difference of the two sides
@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.colour import LUMA
-from pipeline.meshes import F64, Indices, Mask, Mesh, areas
+from pipeline.meshes import F64, Indices, Mask, Mesh, vertex_areas
 from pipeline.registration.other_side import OtherSide
 from pipeline.smoothing import Smoother
 
@@ -55,8 +55,9 @@ def evening(mesh: Mesh, skin: Mask, albedo: F64, *, other: OtherSide, part: floa
     """skin (V,): seen skin; albedo (V, 3) linear; other: of the mesh's vertices; part in [0, 1]."""
     unchanged = Evened(np.ones((len(skin), 3)), {})
     own = skin & other.plain
-    each = np.repeat(areas(mesh.vertices, mesh.faces) / 3, 3)
-    area = np.asarray(np.bincount(mesh.faces.ravel(), each, len(skin)) * own, np.float64)
+    if not own.any():
+        return unchanged
+    area = vertex_areas(mesh.vertices, mesh.faces) * own
     twin, both = _twins(mesh, own, other)
     if area[both].sum() <= MIN_SHARE * area.sum():
         return unchanged
@@ -79,8 +80,6 @@ def evening(mesh: Mesh, skin: Mask, albedo: F64, *, other: OtherSide, part: floa
 def _twins(mesh: Mesh, own: Mask, other: OtherSide) -> tuple[Indices, Mask]:
     """(V,) the vertex of skin that is nearest to the other side of each, and (V,) which of the skin is seen there."""
     skin = np.flatnonzero(own)
-    if not len(skin):
-        return np.zeros(len(own), np.int64), own
     distance, nearest = cKDTree(mesh.vertices[skin]).query(other.where)
     return skin[nearest], own & other.on_head & (distance <= CLOSE)
 
@@ -100,10 +99,9 @@ def _error(u: F64, twin: Indices, both: Mask, area: F64, usual: float) -> _Found
     weight = area * both
     across, along = (u - u[twin]) / 2, (u + u[twin]) / 2 - mean
     a, s = (float(np.average((z * z).sum(1), weights=weight)) for z in (across, along))
-    level = max(a - usual**2, 0.0)
     of_a, of_s = shares(a, s, usual)
     error = np.where(both[:, None], of_a * across + of_s * along, of_s * (u - mean))
-    return _Found(error, float(np.sqrt(a)), float(np.sqrt(level)))
+    return _Found(error, float(np.sqrt(a)), float(np.sqrt(of_a * a)))
 
 
 def shares(across: float, along: float, usual: float) -> tuple[float, float]:

@@ -23,7 +23,7 @@ the surface is held (`HELD`) where S > 0 and it went back by more than `BACK` pi
 of the masks by more than `EDGE` pixels, and the smoothing is repeated.
 
 The fit goes on then, and its noise makes ripples of two or three cells in the same places, which no photo contradicts:
-scales on a jaw that photos from the front show at grazing angles. Shortly before its end they are smoothed once more,
+bumps on a jaw that photos from the front show at grazing angles. Shortly before its end they are smoothed once more,
 with q of at most `RIPPLE` cells, which moves no outline.
 """
 

@@ -32,20 +32,19 @@ class Network:
     seed: int
 
 
-def loses_a_person(images: Sequence[U8], discs: Sequence[Disc], background: Background) -> bool:
+def loses_a_person(images: Sequence[U8], discs: Sequence[Disc], own: Sequence[Bool]) -> bool:
     """Whether in any photo the key takes parts of what the network is sure to be a person. images: (h, w, 3) 8-bit
-    sRGB. discs: region of interest in each."""
-    return any(_lost(i, d, background) > LOST for i, d in zip(images, discs, strict=True))
+    sRGB. discs: region of interest in each. own: the key's hard masks (h, w)."""
+    return any(_lost(i, d, o) > LOST for i, d, o in zip(images, discs, own, strict=True))
 
 
-def _lost(image: U8, disc: Disc, background: Background) -> float:
+def _lost(image: U8, disc: Disc, own: Bool) -> float:
     sure = person_probability(image, disc)[0] >= SURE
-    return float((sure & ~keyed(image, background)).sum() / max(int(sure.sum()), 1))
+    return float((sure & ~own).sum() / max(int(sure.sum()), 1))
 
 
-def both(image: U8, disc: Disc, background: Background, how: Network) -> Bool:
-    """Hard mask (H, W) of the key and of the person's parts that it lacks. image: (H, W, 3) 8-bit sRGB."""
-    own = keyed(image, background)
+def both(image: U8, disc: Disc, own: Bool, how: Network) -> Bool:
+    """Hard mask (H, W) of the key, own (H, W), and of the person's parts that it lacks. image: (H, W, 3) 8-bit sRGB."""
     small = person_mask(image, disc, how.threshold, how.longest, how.seed)
     person = np.asarray(resized(small.astype(np.float32), own.shape[1], own.shape[0])) >= 0.5
     radius = max(1, round(THIN * own.shape[1] / small.shape[1]))
@@ -60,4 +59,4 @@ def _thick(missing: Bool, radius: int) -> Bool:
 
 def key_with_person(image: U8, disc: Disc, background: Background, how: Network) -> F32:
     """Alpha (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
-    return soft_edge(image, both(image, disc, background, how), EDGE)
+    return soft_edge(image, both(image, disc, keyed(image, background), how), EDGE)

@@ -121,10 +121,10 @@ def _person_helps(
     """Whether the key takes parts of a person in reduced photos (h, w, 3), and the masks agree better with them. An
     object that the network takes for a person loses nothing to a key of another colour."""
     discs = [v.disc.scaled(i.shape[1] / v.camera.width) for i, v in zip(images, views, strict=True)]
-    if not loses_a_person(images, discs, background):
-        return False
     alone = [keyed(i, background) for i in images]
-    helped = [both(i, d, background, network) for i, d in zip(images, discs, strict=True)]
+    if not loses_a_person(images, discs, alone):
+        return False
+    helped = [both(i, d, o, network) for i, d, o in zip(images, discs, alone, strict=True)]
     return _mean_iou(views, helped, roi_radius) > _mean_iou(views, alone, roi_radius) + KEY_BETTER
 
 

@@ -78,7 +78,7 @@ def _evened(mesh: Mesh, seen: Mask) -> F64:
 
 def _tidied(mesh: Mesh, s: F64) -> F64:
     """s (V,) with small holes, then small components, moved to the other side of 1/2."""
-    area = np.bincount(mesh.faces.ravel(), np.repeat(meshes.areas(mesh.vertices, mesh.faces) / 3, 3), len(s))
+    area = meshes.vertex_areas(mesh.vertices, mesh.faces)
     for side in (False, True):  # holes first: they must not split components
         piece = _pieces(mesh.faces, s >= 0.5)
         small = np.bincount(piece, area) < SMALL * area.sum()
