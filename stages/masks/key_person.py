@@ -20,6 +20,7 @@ from stages.masks.segment_person import of_subject, person_mask, person_probabil
 SURE = 0.9  # probability from which the network is sure of a person
 LOST = 0.01  # share of that in any photo which the key takes: below it the network is not asked further
 BETTER = 0.001  # of mean IoU with the hull, by which the masks with the person must agree better than the key's own
+AGREED = 0.9  # mean IoU that they must reach at least: see agree_better
 THIN = 2  # pixels of the working size: what the key lacks and is thinner is a difference of two contours
 
 
@@ -36,6 +37,12 @@ def loses_a_person(images: Sequence[U8], discs: Sequence[Disc], own: Sequence[Bo
     """Whether in any photo the key takes parts of what the network is sure to be a person. images: (h, w, 3) 8-bit
     sRGB. discs: region of interest in each. own: the key's hard masks (h, w)."""
     return any(_lost(i, d, o) > LOST for i, d, o in zip(images, discs, own, strict=True))
+
+
+def agree_better(helped: float, alone: float) -> bool:
+    """Whether the key's masks with the person (mean IoU with their hull) agree well, and better than those alone. Masks
+    that contradict each other even so come from wrong cameras: then no agreement tells which are right."""
+    return helped >= AGREED and helped > alone + BETTER
 
 
 def _lost(image: U8, disc: Disc, own: Bool) -> float:

@@ -13,8 +13,7 @@ from pipeline.errors import StageError, UsageError
 from stages.masks.config import Method
 from stages.masks.grabcut import INNER, OUTER, cut_by_region
 from stages.masks.hull_consistency import opinions
-from stages.masks.key_person import BETTER as KEY_BETTER
-from stages.masks.key_person import Network, both, key_with_person, loses_a_person
+from stages.masks.key_person import Network, agree_better, both, key_with_person, loses_a_person
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate, keyed
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
@@ -125,7 +124,7 @@ def _person_helps(
     if not loses_a_person(images, discs, alone):
         return False
     helped = [both(i, d, o, network) for i, d, o in zip(images, discs, alone, strict=True)]
-    return _mean_iou(views, helped, roi_radius) > _mean_iou(views, alone, roi_radius) + KEY_BETTER
+    return agree_better(*(_mean_iou(views, m, roi_radius) for m in (helped, alone)))
 
 
 def _person_or_object(

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from stages.masks import key_person, sources
-from stages.masks.key_person import Network, both, key_with_person
+from stages.masks.key_person import Network, agree_better, both, key_with_person
 from stages.masks.keying import Background, key_out, keyed
 from stages.masks.region import Disc
 from tests.masks.test_masks_stage import ROI, SIZE, Scene, ball_alpha, build, camera, iou, paint, run
@@ -114,6 +114,15 @@ def test_the_keys_contour_stays_where_it_loses_nothing(monkeypatch: pytest.Monke
     whole = both(holed, disc, own, how)
     assert (inside & ~own).sum() > 600 and not (inside & ~whole).any()
     assert (whole & ~own & ~inside).sum() < 40  # the part's own edge; all around it would be 250
+
+
+@pytest.mark.parametrize(
+    ("helped", "alone", "better"),
+    [(0.96, 0.95, True), (0.95, 0.95, False), (0.95, 0.96, False), (0.82, 0.80, False), (0.90, 0.10, True)],
+)
+def test_masks_that_contradict_each_other_choose_nothing(helped: float, alone: float, better: bool) -> None:
+    """Photos under the wrong cameras: the larger of two masks agrees a little better, and says nothing."""
+    assert agree_better(helped, alone) == better
 
 
 def test_radius_of_the_region_counts(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
