@@ -5,7 +5,9 @@ colours, and continuing them gives smears; and a mean over the whole head makes 
 Hence only well seen vertices are kept, and others are drawn, over the length L, to the median of the seen albedo of
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
 divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
-count that photos show farthest inside of the silhouette: at the outline the wall shines through loose hair.
+count that photos show farthest inside of the silhouette, and that are farthest from what they show of other regions: at
+the outline the wall shines through loose hair, and a fringe shows the forehead. Hair that lies near the outline in every
+photo has the wall's colour too; it is replaced as what is seen at a grazing angle.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
@@ -21,14 +23,29 @@ GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, fr
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
+WALL, INNER = (
+    0.01,
+    0.02,
+)  # depths inside of the outline (outline_depth.py): hair is replaced up to the first, kept from the second
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 
 
-def replaced_share(cosine: F64) -> F64:
-    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex; 0
-    for none."""
-    share = ((cosine - GRAZING) / (CLEAR - GRAZING)).clip(0, 1)
-    return np.asarray(1 - share * share * (3 - 2 * share), np.float64)
+def replaced_share(cosine: F64, region: Indices, depth: F64) -> F64:
+    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex, 0
+    for none; and for hair by the depth (V,) inside of the silhouettes."""
+    kept = _risen(cosine, GRAZING, CLEAR)
+    return np.where(region == HAIR, 1 - kept * _risen(depth, WALL, INNER), 1 - kept)
+
+
+def well_seen(cosine: F64, region: Indices, depth: F64) -> Mask:
+    """(V,) vertices whose albedo is not replaced at all."""
+    return np.asarray((cosine >= CLEAR) & ((region != HAIR) | (depth >= INNER)), np.bool_)
+
+
+def _risen(x: F64, low: float, high: float) -> F64:
+    """A smooth step from 0 at `low` to 1 at `high`."""
+    share = ((x - low) / (high - low)).clip(0, 1)
+    return np.asarray(share * share * (3 - 2 * share), np.float64)
 
 
 def with_hair(region: Indices, hair: Mask) -> Indices:
@@ -37,15 +54,17 @@ def with_hair(region: Indices, hair: Mask) -> Indices:
     return np.where(hair, HAIR, bare)
 
 
-def region_colours(albedo: F64, region: Indices, cosine: F64, depth: F64) -> F64:
-    """(V, 3) for each vertex the median albedo (V, 3) of the best seen vertices of its region (V,): the upper BEST of
-    all that are seen well by the cosine (V,), or of LOOSE regions by the depth (V,) inside of the silhouettes. A band
-    that is not seen takes the nearest band's colour, other regions that of the whole head."""
+def region_colours(points: F64, albedo: F64, region: Indices, cosine: F64, depth: F64) -> F64:
+    """(V, 3) for each vertex, at points (V, 3), the median albedo (V, 3) of the best seen vertices of its region (V,):
+    the upper BEST of all that are seen well by the cosine (V,), or of LOOSE regions by how far inside they are: by the
+    depth (V,) inside of the silhouettes and the distance to other regions. A band that is not seen takes the nearest
+    band's colour, other regions that of the whole head."""
     seen, known = cosine >= CLEAR, {}
     for code in np.unique(region):
         mine = region == code
         if (mine & seen).sum() >= max(MIN_SHARE * mine.sum(), 1):
-            known[int(code)] = _median(albedo, depth if code in LOOSE else cosine, mine & seen)
+            rank = _inside(points, depth, mine & seen, seen & ~mine) if code in LOOSE else cosine
+            known[int(code)] = _median(albedo, rank, mine & seen)
     whole, bands = _median(albedo, cosine, seen), [c for c in known if c >= FIRST_BAND]
     out = np.broadcast_to(whole, albedo.shape).copy()
     for code in map(int, np.unique(region)):
@@ -53,6 +72,18 @@ def region_colours(albedo: F64, region: Indices, cosine: F64, depth: F64) -> F64
             out[region == code] = known[min(bands, key=lambda b: abs(b - code))]
         elif code in known:
             out[region == code] = known[code]
+    return out
+
+
+def _inside(points: F64, depth: F64, own: Mask, others: Mask) -> F64:
+    """(V,) for the vertices own (V,) the lower of their ranks by depth (V,) and by distance to the others (V,)."""
+    from scipy.spatial import cKDTree
+    from scipy.stats import rankdata
+
+    out = np.zeros(len(depth))
+    out[own] = rankdata(depth[own])
+    if others.any():
+        out[own] = np.minimum(out[own], rankdata(cKDTree(points[others]).query(points[own])[0]))
     return out
 
 

@@ -31,6 +31,7 @@ MARGIN = 1.0  # voxels by which the lenient hull may be too thick
 MISSING = (
     0.02  # of the silhouette: a single view may correctly carve a concavity, 1 % at a shoulder (head scan, measured)
 )
+MIN_VIEWS = 3  # that must see a voxel of a subject without extent; an extent ends what few photos show
 MARGIN_CELLS = 4  # cells around the hull for the narrow band and the spline's border
 
 
@@ -104,7 +105,7 @@ def hull_start(
     """SDF samples of the hull, whose cell after `levels` - 1 halvings is 1 / `cells` of the hull's longest side.
 
     alphas: (H, W) each. extent: the part of the hull that is fitted, kept with a margin, so that the fit has no border
-    where the mesh ends.
+    where the mesh ends. Within it a single photo is enough: shoulders that most frames cut off belong to the bust.
 
     Raises StageError if the hull is empty.
     """
@@ -113,10 +114,11 @@ def hull_start(
         return hull if extent is None else within(hull, extent, GROWN * extent.head)
 
     reach = None if extent is None else bounds(extent, GROWN * extent.head)
-    lo, hi = hull_bounds(cameras, alphas, roi_radius, keep=kept, reach=reach)
+    least = MIN_VIEWS if extent is None else 1
+    lo, hi = hull_bounds(cameras, alphas, roi_radius, keep=kept, reach=reach, min_views=least)
     cell = float((hi - lo).max()) / cells * 2 ** (levels - 1)
     lo, hi = lo - MARGIN_CELLS * cell, hi + MARGIN_CELLS * cell
-    hull = kept(visual_hull(cameras, alphas, lo, hi, cell))
+    hull = kept(visual_hull(cameras, alphas, lo, hi, cell, min_views=least))
     if not hull.occupied.any():
         raise StageError(
             "the visual hull of the masks is empty",

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
-from pipeline.decimation import is_crowded, largest_part, simplified, unit_box
+from pipeline.decimation import is_crowded, part_of_face, simplified, unit_box
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Indices, Mesh, split_apart
 
@@ -68,13 +68,23 @@ def decimated(dense: Mesh, target: int) -> Mesh:
 
 
 def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
-    """Cut along crowded edges and keep the part with most faces, until none is crowded. Inputs (V, 3), (F, 3)."""
+    """Cut along crowded edges and keep of each piece the part with most faces, until none is crowded. Inputs (V, 3),
+    (F, 3)."""
     for _ in range(ROUNDS):
         if not is_crowded(faces, len(vertices)):
             break
-        faces = filled(largest_part(faces, len(vertices)))
+        faces = filled(_largest_parts(faces, len(vertices)))
     v, f, _ = meshes.compact(vertices, faces)
     return np.asarray(v, np.float64), f
+
+
+def _largest_parts(faces: Faces, count: int) -> Faces:
+    """The faces (F', 3) of the largest part of each connected piece. `count`: vertices."""
+    part, piece = part_of_face(faces, count), meshes.component_of_face(faces, count)
+    size = np.bincount(part)[part]
+    order = np.lexsort((part, -size, piece))
+    first = order[np.r_[True, piece[order][1:] != piece[order][:-1]]]  # a face of each piece's largest part
+    return np.asarray(faces[np.isin(part, part[first])])
 
 
 def filled(faces: Faces) -> Faces:

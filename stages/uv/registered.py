@@ -23,9 +23,10 @@ from stages.uv.chart_quality import Quality, measure
 from stages.uv.config import Config
 from stages.uv.decimate import Deviation
 from stages.uv.density import face_share
-from stages.uv.hair import hair_faces, hair_mesh
+from stages.uv.hair import hair_faces, parted
 from stages.uv.judge import judge
-from stages.uv.remainder import beside_head, left_over
+from stages.uv.remainder import beside_head, cut_out, left_over
+from stages.uv.tuck import tucked
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
@@ -73,17 +74,29 @@ def _others(
 ) -> tuple[list[tuple[Mesh, Charts]], int]:
     """What the scan shows beside the head, and hair last, each on the next tile; and the number of hair's faces."""
     vertices, faces, rows = meshes.compact(mesh.vertices, mesh.faces[shown])
-    beside = beside_head(dense, Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces), ears, hair)
-    own = None if hair is None else hair_faces(dense, hair, beside)
+    skin = Mesh(np.asarray(vertices, np.float32), mesh.normals[rows], faces)
+    beside = beside_head(dense, skin, ears, hair)
+    own = np.zeros(len(dense.faces), np.bool_) if hair is None else hair_faces(dense, hair, beside)
+    rest = left_over(dense, beside, own)
     out, tile, hairs = list[tuple[Mesh, Charts]](), tiles.count(charts), 0
-    for part in (left_over(dense, beside, own), None if own is None else hair_mesh(dense, own)):
+    for part in _parts(dense, rest, own, skin, config.target_faces // SHARE):
         hairs = 0
         if part is not None:
-            part = decimate.decimated(part, config.target_faces // SHARE)
             laid = unwrap(part, config.changed(tiles=1, remesh="adaptive"))  # triangles
             out.append((part, Charts(laid.uvs + np.array([tile, 0], np.float32), laid.faces)))
             tile, hairs = tile + 1, len(part.faces)
     return out, hairs
+
+
+def _parts(dense: Mesh, rest: Mask, hair: Mask, skin: Mesh, target: int) -> tuple[Mesh | None, Mesh | None]:
+    """The rest and hair, given as faces (F,) of the dense mesh, with `target` faces each and rims beneath the skin."""
+    if not (rest.any() or hair.any()):
+        return None, None
+    rimmed = tucked(dense, rest | hair, skin)
+    both = decimate.decimated(
+        cut_out(rimmed.mesh, dense.faces[rimmed.faces]), target * (int(rest.any()) + int(hair.any()))
+    )
+    return parted(both, dense, rest, hair)
 
 
 def _displaced(head: Head) -> tuple[F64, F64]:

@@ -23,12 +23,10 @@ SMALL = 0.01  # of the dense mesh's area: a piece up to this size that touches h
 CRUMB = 0.002  # of the same: smaller pieces are dropped; a fringe that stands off has .003
 
 
-def left_over(dense: Mesh, beside: Mask, without: Mask | None = None) -> Mesh | None:
-    """The part of the dense mesh with vertices beside (V,) the head; None if there is none. without (F,): its faces
-    that are another mesh's."""
-    keep = np.asarray(beside[dense.faces].any(1), np.bool_)
-    faces = _large(dense, keep if without is None else keep & ~without)
-    return cut_out(dense, faces) if len(faces) else None
+def left_over(dense: Mesh, beside: Mask, hair: Mask) -> Mask:
+    """(F,) faces of the dense mesh with vertices beside (V,) the head, in large pieces. hair (F,): faces that are no
+    part of it."""
+    return _large(dense, np.asarray(beside[dense.faces].any(1) & ~hair, np.bool_))
 
 
 def cut_out(dense: Mesh, faces: meshes.Faces) -> Mesh:
@@ -78,12 +76,12 @@ def _border(mesh: Mesh) -> Mask:
     return out
 
 
-def _large(dense: Mesh, keep: Mask) -> meshes.Faces:
-    """(F', 3) faces of the connected pieces that are large enough."""
-    faces = dense.faces[keep]
-    if not len(faces):
-        return faces
-    piece = meshes.component_of_face(faces, len(dense.vertices))
-    area = np.bincount(piece, meshes.areas(dense.vertices, faces))
-    whole = float(meshes.areas(dense.vertices, dense.faces).sum())
-    return np.asarray(faces[area[piece] > CRUMB * whole], np.int32)
+def _large(dense: Mesh, keep: Mask) -> Mask:
+    """The faces keep (F,) whose connected piece is large enough."""
+    out = keep.copy()
+    if keep.any():
+        faces = dense.faces[keep]
+        piece = meshes.component_of_face(faces, len(dense.vertices))
+        area = np.bincount(piece, meshes.areas(dense.vertices, faces))
+        out[keep] = area[piece] > CRUMB * float(meshes.areas(dense.vertices, dense.faces).sum())
+    return out

@@ -16,7 +16,7 @@ from pipeline.smoothing import continued
 from pipeline.template.load import load_template
 from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.outline_depth import outline_depth
-from stages.bake.unseen import CLEAR, GRAZING, LENGTH, region_colours, replaced_share, with_hair
+from stages.bake.unseen import CLEAR, GRAZING, INNER, LENGTH, WALL, region_colours, replaced_share, well_seen, with_hair
 from tests.support.field_artifacts import camera
 
 TEMPLATE = load_template()
@@ -38,9 +38,21 @@ def placed(scale: float) -> PlacedHead:
 
 
 def test_what_photos_show_well_is_kept_and_what_they_do_not_is_replaced() -> None:
-    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]))
+    face, deep = np.zeros(5, int), np.ones(5)
+    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]), face, deep)
     np.testing.assert_allclose(share, [1, 1, 0.5, 0, 0], atol=1e-12)
-    assert (np.diff(replaced_share(np.linspace(0, 1, 50))) <= 0).all()
+    assert (np.diff(replaced_share(np.linspace(0, 1, 50), np.zeros(50, int), np.ones(50))) <= 0).all()
+
+
+def test_hair_at_the_outline_of_every_photo_is_replaced_and_skin_there_is_kept() -> None:
+    depth = np.array([0.0, WALL, 0.5 * (WALL + INNER), INNER, 0.1])
+    cosine, hair, face = np.ones(5), np.full(5, HAIR), np.full(5, REGIONS.index("face"))
+    np.testing.assert_allclose(replaced_share(cosine, hair, depth), [1, 1, 0.5, 0, 0], atol=1e-12)
+    assert not replaced_share(cosine, face, depth).any()
+    assert well_seen(cosine, hair, depth).tolist() == [False, False, False, True, True]
+    assert well_seen(cosine, face, depth).all() and not well_seen(0.99 * CLEAR * cosine, hair, 1 + depth).any()
+    both = replaced_share(np.full(5, 0.5 * (GRAZING + CLEAR)), hair, depth)
+    np.testing.assert_allclose(both, [1, 1, 0.75, 0.5, 0.5], atol=1e-12)
 
 
 def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
@@ -53,9 +65,24 @@ def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
     cosine, depth = np.where(seen, 0.9, 0.0), np.where(seen, 0.2, 0.0)
     # at the outline the wall shines through, on more than half of what is seen, and straight before a camera
     cosine[:18], depth[:18], albedo[:18] = 0.95, 0.01, 0.8
-    found = region_colours(albedo, region, cosine, depth)
+    found = region_colours(np.zeros((450, 3)), albedo, region, cosine, depth)
     np.testing.assert_allclose(found[region == 0], 0.02)
     np.testing.assert_allclose(found[region != 0], 0.6)
+
+
+def test_a_fringe_before_the_forehead_does_not_decide_the_colour_of_hair() -> None:
+    """It is farthest inside of the silhouettes, but the skin beside it shines through; at the outline the wall does."""
+    height = np.linspace(0, 0.2, 201)  # metres above the fringe's end, where the forehead begins
+    points = np.stack([np.zeros(301), np.r_[height, np.linspace(-0.1, -0.001, 100)], np.zeros(301)], 1)
+    hair = np.arange(301) < 201
+    region = np.where(hair, HAIR, REGIONS.index("face"))
+    depth = np.where(hair, 0.25 - points[:, 1], 0.3)  # the outline is above
+    albedo = np.where(hair, 0.02, 0.6)
+    albedo[:80] = 0.3  # over more than the third that lies deepest
+    albedo[180:201] = 0.8
+    found = region_colours(points, albedo[:, None] * np.ones(3), region, np.ones(301), depth)
+    np.testing.assert_allclose(found[hair], 0.02)
+    np.testing.assert_allclose(found[~hair], 0.6)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
@@ -94,7 +121,7 @@ def test_a_band_that_is_not_seen_takes_the_nearest_bands_colour() -> None:
     cosine = np.where(np.isin(region - FIRST_BAND, [0, 3]), 0.9, 0.0)
     albedo = np.where((region == FIRST_BAND)[:, None], 0.1, 0.6) * np.ones((200, 3))
     albedo[cosine == 0] = 9.0
-    found = region_colours(albedo, region, cosine, cosine)[:, 0]
+    found = region_colours(np.zeros((200, 3)), albedo, region, cosine, cosine)[:, 0]
     np.testing.assert_allclose(found, np.repeat([0.1, 0.6, 0.6, 0.6], 50))
 
 
@@ -125,7 +152,8 @@ def test_depth_is_the_distance_from_the_outline_of_the_best_photo(tmp_path: Path
     assert (some[7:] == 0).all()
     grazing = replace(wall, normals=np.tile(np.float32([0.98, 0, 0.19]), (len(vertices), 1)))
     assert not outline_depth(grazing, every[820:860], [view], Occluder(wall), CLEAR).any()
-    assert not outline_depth(wall, every, [replace(view, mask=None)], Occluder(wall), CLEAR).any()
+    unknown = outline_depth(wall, every[:7], [replace(view, mask=None)], Occluder(wall), CLEAR)
+    assert (unknown[:7] == 1).all() and not unknown[7:].any()
 
 
 def test_the_seen_rim_fades_over_the_length() -> None:
@@ -154,6 +182,6 @@ def test_the_scalp_under_hair_goes_on_in_the_colour_of_the_face() -> None:
     cosine = np.where(region == scalp, 0.0, 0.9)
     cosine[300:350] = 0.9
     albedo = np.where(hair, 0.02, 0.6)[:, None] * np.ones((400, 3))
-    colours = region_colours(albedo, found, cosine, cosine)
+    colours = region_colours(np.zeros((400, 3)), albedo, found, cosine, cosine)
     np.testing.assert_allclose(colours[:200], 0.6)
     np.testing.assert_allclose(colours[300:], 0.02)

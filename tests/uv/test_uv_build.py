@@ -152,6 +152,10 @@ def test_bubble_is_cut_off() -> None:
     assert meshes.topology(faces, len(vertices)).crowded_edges == 3
     kept_vertices, kept = decimate.without_bubbles(vertices, faces)
     assert meshes.topology(kept, len(kept_vertices)).manifold and len(kept) == len(mesh.faces)
+    beside = surface_build(AnalyticField(sphere()), 12, quiet).mesh  # a smaller piece is no bubble
+    vertices = np.concatenate([vertices, beside.vertices + np.float32(5)])
+    faces = np.concatenate([faces, beside.faces + tip + 1])
+    assert len(decimate.without_bubbles(vertices, faces)[1]) == len(mesh.faces) + len(beside.faces)
 
 
 @pytest.mark.slow

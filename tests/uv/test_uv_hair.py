@@ -11,9 +11,12 @@ from support.ball_head import RADIUS, ball_scan, no_head
 from pipeline import meshes
 from pipeline.artifacts import FileRef, Located
 from pipeline.head_artifacts import RegisteredHead
-from pipeline.meshes import Mesh
-from stages.uv.hair import hair_faces, hair_mesh, hair_vertices
-from stages.uv.remainder import OVERLAP, beside_head, left_over
+from pipeline.meshes import Charts, Mesh, joined
+from stages.uv.decimate import decimated
+from stages.uv.hair import hair_faces, hair_vertices, parted
+from stages.uv.remainder import OVERLAP, beside_head, cut_out, left_over
+
+NONE = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
 
 
 def scan(thick: float = 0.015) -> tuple[Mesh, np.ndarray]:
@@ -33,11 +36,48 @@ def test_the_cap_and_the_skin_at_its_rim_are_cut_out() -> None:
     dense, cap = scan()
     own = hair_faces(dense, cap, beside(dense))
     assert (own == cap[dense.faces].any(1)).all()
-    hair = hair_mesh(dense, own)
-    assert hair is not None and meshes.topology(hair.faces, len(hair.vertices)).sound
+    none = np.zeros(len(dense.faces), bool)
+    assert not left_over(dense, beside(dense), own).any() and left_over(dense, beside(dense), none).any()
+    rest, hair = parted(cut_out(dense, dense.faces[own]), dense, none, own)
+    assert rest is None and hair is not None and meshes.topology(hair.faces, len(hair.vertices)).sound
     assert len(hair.faces) == own.sum() and (hair.normals * meshes.unit(hair.vertices)).sum(1).min() > 0.9
-    assert left_over(dense, beside(dense), own) is None and left_over(dense, beside(dense)) is not None
-    assert hair_mesh(dense, np.zeros(len(dense.faces), bool)) is None
+
+
+def border(mesh: Mesh) -> np.ndarray:
+    e = meshes.edges(mesh.faces)
+    count = len(mesh.vertices)
+    return np.unique(e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])])
+
+
+def test_hair_and_rest_end_at_the_same_vertices_after_decimation() -> None:
+    """A ball that is half hair, half cloth, decimated: no slit between the halves."""
+    dense = ball_scan(RADIUS, 60)
+    hair = dense.vertices[dense.faces].mean(1)[:, 1] > 0.003
+    both = decimated(dense, 3000)
+    rest, locks = parted(both, dense, ~hair, hair)
+    assert rest is not None and locks is not None and len(rest.faces) + len(locks.faces) == len(both.faces)
+    ends = [np.unique(m.vertices[border(m)], axis=0) for m in (rest, locks)]
+    assert len(ends[0]) > 30 and np.array_equal(*ends)
+    assert np.abs(ends[0][:, 1] - 0.003).max() < 0.01
+    assert locks.vertices[:, 1].min() > -0.01 and rest.vertices[:, 1].max() < 0.016
+
+
+def test_crumbs_beyond_the_border_change_sides_and_loose_pieces_do_not() -> None:
+    dense = ball_scan(RADIUS, 60)
+    centre = dense.vertices[dense.faces].mean(1)
+    hair = centre[:, 1] > 0.003
+    speck = np.argsort(np.linalg.norm(centre - [0, -RADIUS, 0], axis=1))[:4]
+    hair[speck] = True  # told wrongly, amid the cloth
+    hair[np.argsort(np.linalg.norm(centre - [0, RADIUS, 0], axis=1))[:4]] = False
+    rest, locks = parted(dense, dense, ~hair, hair)
+    assert rest is not None and locks is not None
+    assert locks.vertices[:, 1].min() > -0.01 and rest.vertices[:, 1].max() < 0.016
+    small = ball_scan(0.002, 1, (0, -0.15, 0))  # twelve faces would be enough; its eight touch nothing
+    small = Mesh(small.vertices, small.normals, small.faces[:8])
+    alone, _ = joined([(dense, NONE), (small, NONE)])
+    told = np.concatenate([hair, np.ones(8, bool)])
+    locks = parted(alone, alone, ~told, told)[1]
+    assert locks is not None and locks.vertices[:, 1].min() < -0.14
 
 
 def test_a_small_piece_that_touches_hair_belongs_to_it() -> None:
