@@ -6,8 +6,8 @@ Hence only well seen vertices are kept, and others are drawn, over the length L,
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
 divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
 count that photos show farthest inside of the silhouette, and that are farthest from what they show of other regions: at
-the outline the wall shines through loose hair, and a fringe shows the forehead. Hair that lies near the outline in every
-photo has the wall's colour too; it is replaced as what is seen at a grazing angle.
+the outline the wall shines through loose hair, and a fringe shows the forehead. Hair near the outline of every photo
+has the wall's colour too, and is replaced as what is seen at a grazing angle.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
