@@ -13,7 +13,7 @@ from pipeline.artifacts import FileRef, Located
 from pipeline.head_artifacts import RegisteredHead
 from pipeline.meshes import Charts, Mesh, joined
 from stages.uv.decimate import decimated
-from stages.uv.hair import hair_faces, hair_vertices, parted
+from stages.uv.hair import NEAREST, cut_at_zero, hair_faces, hair_vertices, parted
 from stages.uv.remainder import OVERLAP, beside_head, cut_out, left_over
 
 NONE = Charts(np.zeros((1, 2), np.float32), np.zeros((0, 3), np.int32))
@@ -55,11 +55,33 @@ def test_hair_and_rest_end_at_the_same_vertices_after_decimation() -> None:
     hair = dense.vertices[dense.faces].mean(1)[:, 1] > 0.003
     both = decimated(dense, 3000)
     rest, locks = parted(both, dense, ~hair, hair)
-    assert rest is not None and locks is not None and len(rest.faces) + len(locks.faces) == len(both.faces)
+    assert rest is not None and locks is not None
     ends = [np.unique(m.vertices[border(m)], axis=0) for m in (rest, locks)]
     assert len(ends[0]) > 30 and np.array_equal(*ends)
-    assert np.abs(ends[0][:, 1] - 0.003).max() < 0.01
-    assert locks.vertices[:, 1].min() > -0.01 and rest.vertices[:, 1].max() < 0.016
+    assert np.abs(ends[0][:, 1] - 0.003).max() < 0.003  # though triangles have edges of 9 mm
+    areas = [float(meshes.areas(m.vertices, m.faces).sum()) for m in (both, rest, locks)]
+    assert areas[0] == pytest.approx(areas[1] + areas[2], rel=1e-6)
+    for part in (rest, locks):
+        assert meshes.topology(part.faces, len(part.vertices)).sound
+        assert (meshes.area_vectors(part.vertices, part.faces) * part.vertices[part.faces[:, 0]]).sum(1).min() > 0
+    assert parted(both, dense, hair | ~hair, hair & ~hair) == (both, None)
+    assert parted(both, dense, hair & ~hair, hair | ~hair) == (None, both)
+
+
+def test_a_triangle_is_cut_where_the_value_is_zero() -> None:
+    """By hand: the corner of the value 1 is cut off at a half and at a quarter of its edges."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    triangle = Mesh(corners, np.tile(np.float32([0, 0, 1]), (3, 1)), np.array([[0, 1, 2]], np.int32))
+    for sign in (1.0, -1.0):
+        found, positive = cut_at_zero(triangle, sign * np.array([1.0, -1.0, -3.0]))
+        np.testing.assert_allclose(found.vertices[3:], [[0.5, 0, 0], [0, 0.25, 0]])
+        area = meshes.area_vectors(found.vertices, found.faces)[:, 2]
+        assert area[positive == (sign > 0)] == pytest.approx(0.5 * 0.125) and area.sum() == pytest.approx(0.5)
+        assert (area > 0).all() and len(area) == 3
+    near = cut_at_zero(triangle, np.array([1e-9, -1.0, -1.0]))[0]
+    np.testing.assert_allclose(near.vertices[3:], [[NEAREST, 0, 0], [0, NEAREST, 0]])
+    whole, positive = cut_at_zero(triangle, np.ones(3))
+    assert np.array_equal(whole.faces, triangle.faces) and positive.all()
 
 
 def test_crumbs_beyond_the_border_change_sides_and_loose_pieces_do_not() -> None:
