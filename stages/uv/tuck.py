@@ -20,8 +20,8 @@ from pipeline import meshes
 from pipeline.meshes import F64, Mask, Mesh
 from stages.uv.remainder import AWAY
 
-RIM = 0.004  # metres of the dense mesh that are added
-FALL = 0.002  # metres over which the rim falls to its depth
+RIM = 0.008  # metres of the dense mesh that are added
+FALL = 0.006  # metres over which the rim falls to its depth
 SINK = 0.001  # metres below the skin: more than the decimated skin or rim is off
 NEAR = 1.5 * AWAY  # what is further from the skin is not laid under it: a web behind an ear
 

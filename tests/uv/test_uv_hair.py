@@ -59,6 +59,7 @@ def test_hair_and_rest_end_at_the_same_vertices_after_decimation() -> None:
     ends = [np.unique(m.vertices[border(m)], axis=0) for m in (rest, locks)]
     assert len(ends[0]) > 30 and np.array_equal(*ends)
     assert np.abs(ends[0][:, 1] - 0.003).max() < 0.003  # though triangles have edges of 9 mm
+    assert locks.vertices[:, 1].min() > -0.001 and rest.vertices[:, 1].max() < 0.007
     areas = [float(meshes.areas(m.vertices, m.faces).sum()) for m in (both, rest, locks)]
     assert areas[0] == pytest.approx(areas[1] + areas[2], rel=1e-6)
     for part in (rest, locks):
