@@ -23,10 +23,7 @@ GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, fr
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
-WALL, INNER = (
-    0.01,
-    0.02,
-)  # depths inside of the outline (outline_depth.py): hair is replaced up to the first, kept from the second
+WALL, INNER = 0.01, 0.02  # depths (outline_depth.py): up to the first hair is replaced, from the second on kept
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 
 
