@@ -36,7 +36,7 @@ from stages.bake.standard_fit import CORRECTION, Fitted
 from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
-from stages.bake.unseen import CLEAR, LENGTH, LOOSE, region_colours, replaced_share, well_seen
+from stages.bake.unseen import CLEAR, LENGTH, LOOSE, region_colours, replaced_share
 
 log = logging.getLogger("neuface.bake")
 
@@ -215,11 +215,11 @@ def _known(
     """around (V,): ambient occlusion."""
     points = mesh.vertices.astype(np.float64)
     cosine = best_cosine(points, meshes.unit(mesh.normals), views, occluder)
-    region = np.zeros(len(points), np.int64) if region is None else region
-    depth = outline_depth(mesh, np.flatnonzero(np.isin(region, LOOSE)), views, occluder, CLEAR)
-    replaced, well = replaced_share(cosine, region, depth), well_seen(cosine, region, depth)
-    albedo = field.material(mesh.vertices).albedo.astype(np.float64)
+    replaced = replaced_share(cosine)
+    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), cosine >= CLEAR
     if well.any():
+        region = np.zeros(len(well), np.int64) if region is None else region
+        depth = outline_depth(mesh, np.flatnonzero(np.isin(region, LOOSE)), views, occluder, CLEAR)
         albedo = continued(mesh, albedo, well, region_colours(points, albedo, region, cosine, depth), LENGTH)
     if mouth is not None:
         albedo = mouth.in_place_of(albedo, cosine == 0)

@@ -22,12 +22,11 @@ SIDE = 256  # pixels of the masks' longest side: finer than what is asked
 def outline_depth(
     mesh: Mesh, of: Indices, views: Sequence[FittedPhoto], occluder: Occluder, least_cosine: float
 ) -> F64:
-    """(V,) the depth of the vertices `of`, 0 for others and for those that no photo sees at `least_cosine` or more;
-    without masks 1, because no outline is known."""
+    """(V,) the depth of the vertices `of`, 0 for others, for those that no photo sees at `least_cosine` or more, and
+    without masks."""
     out = np.zeros(len(mesh.vertices))
     with_mask = [v for v in views if v.mask is not None]
     if not len(of) or not with_mask:
-        out[of] = 1
         return out
     points, normals = mesh.vertices[of].astype(np.float64), unit(mesh.normals)[of].astype(np.float64)
     every = -(-len(with_mask) // MOST_PHOTOS)

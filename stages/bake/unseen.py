@@ -6,8 +6,7 @@ Hence only well seen vertices are kept, and others are drawn, over the length L,
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
 divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
 count that photos show farthest inside of the silhouette, and that are farthest from what they show of other regions: at
-the outline the wall shines through loose hair, and a fringe shows the forehead. Hair near the outline of every photo
-has the wall's colour too, and is replaced as what is seen at a grazing angle.
+the outline the wall shines through loose hair, and a fringe shows the forehead.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
@@ -23,26 +22,14 @@ GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, fr
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
-WALL, INNER = 0.01, 0.02  # depths (outline_depth.py): up to the first hair is replaced, from the second on kept
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 
 
-def replaced_share(cosine: F64, region: Indices, depth: F64) -> F64:
-    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex, 0
-    for none; and for hair by the depth (V,) inside of the silhouettes."""
-    kept = _risen(cosine, GRAZING, CLEAR)
-    return np.where(region == HAIR, 1 - kept * _risen(depth, WALL, INNER), 1 - kept)
-
-
-def well_seen(cosine: F64, region: Indices, depth: F64) -> Mask:
-    """(V,) vertices whose albedo is not replaced at all."""
-    return np.asarray((cosine >= CLEAR) & ((region != HAIR) | (depth >= INNER)), np.bool_)
-
-
-def _risen(x: F64, low: float, high: float) -> F64:
-    """A smooth step from 0 at `low` to 1 at `high`."""
-    share = ((x - low) / (high - low)).clip(0, 1)
-    return np.asarray(share * share * (3 - 2 * share), np.float64)
+def replaced_share(cosine: F64) -> F64:
+    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex; 0
+    for none."""
+    share = ((cosine - GRAZING) / (CLEAR - GRAZING)).clip(0, 1)
+    return np.asarray(1 - share * share * (3 - 2 * share), np.float64)
 
 
 def with_hair(region: Indices, hair: Mask) -> Indices:

@@ -16,7 +16,7 @@ from pipeline.smoothing import continued
 from pipeline.template.load import load_template
 from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.outline_depth import outline_depth
-from stages.bake.unseen import CLEAR, GRAZING, INNER, LENGTH, WALL, region_colours, replaced_share, well_seen, with_hair
+from stages.bake.unseen import CLEAR, GRAZING, LENGTH, region_colours, replaced_share, with_hair
 from tests.support.field_artifacts import camera
 
 TEMPLATE = load_template()
@@ -38,21 +38,9 @@ def placed(scale: float) -> PlacedHead:
 
 
 def test_what_photos_show_well_is_kept_and_what_they_do_not_is_replaced() -> None:
-    face, deep = np.zeros(5, int), np.ones(5)
-    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]), face, deep)
+    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]))
     np.testing.assert_allclose(share, [1, 1, 0.5, 0, 0], atol=1e-12)
-    assert (np.diff(replaced_share(np.linspace(0, 1, 50), np.zeros(50, int), np.ones(50))) <= 0).all()
-
-
-def test_hair_at_the_outline_of_every_photo_is_replaced_and_skin_there_is_kept() -> None:
-    depth = np.array([0.0, WALL, 0.5 * (WALL + INNER), INNER, 0.1])
-    cosine, hair, face = np.ones(5), np.full(5, HAIR), np.full(5, REGIONS.index("face"))
-    np.testing.assert_allclose(replaced_share(cosine, hair, depth), [1, 1, 0.5, 0, 0], atol=1e-12)
-    assert not replaced_share(cosine, face, depth).any()
-    assert well_seen(cosine, hair, depth).tolist() == [False, False, False, True, True]
-    assert well_seen(cosine, face, depth).all() and not well_seen(0.99 * CLEAR * cosine, hair, 1 + depth).any()
-    both = replaced_share(np.full(5, 0.5 * (GRAZING + CLEAR)), hair, depth)
-    np.testing.assert_allclose(both, [1, 1, 0.75, 0.5, 0.5], atol=1e-12)
+    assert (np.diff(replaced_share(np.linspace(0, 1, 50))) <= 0).all()
 
 
 def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
@@ -152,8 +140,7 @@ def test_depth_is_the_distance_from_the_outline_of_the_best_photo(tmp_path: Path
     assert (some[7:] == 0).all()
     grazing = replace(wall, normals=np.tile(np.float32([0.98, 0, 0.19]), (len(vertices), 1)))
     assert not outline_depth(grazing, every[820:860], [view], Occluder(wall), CLEAR).any()
-    unknown = outline_depth(wall, every[:7], [replace(view, mask=None)], Occluder(wall), CLEAR)
-    assert (unknown[:7] == 1).all() and not unknown[7:].any()
+    assert not outline_depth(wall, every, [replace(view, mask=None)], Occluder(wall), CLEAR).any()
 
 
 def test_the_seen_rim_fades_over_the_length() -> None:
