@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from pipeline.artifacts import CameraSet, FittedFace, Located, MaskSet, Surface, TextureMap, TextureSet, UvMesh
 from pipeline.capture_artifacts import Capture
@@ -59,6 +59,12 @@ class Config(StageConfig):
         description="part of the slow variation of the skin's colour that is taken for an error of the light, by what "
         "the two sides of the face differ, and taken out; 0: the base colour is what the photos have in their light",
     )  # fmt: skip
+
+    @field_validator("beside", mode="before")
+    @classmethod
+    def _number(cls, value: object) -> object:
+        """A command line gives text, of which pydantic makes a number, but not one of a choice of numbers."""
+        return int(value) if isinstance(value, str) and value.isdecimal() else value
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> TextureSet:

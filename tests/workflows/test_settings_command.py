@@ -11,6 +11,7 @@ import pytest
 from stages.presets import PRESETS
 from stages.registry import REGISTRY
 from stages.settings import all_settings
+from stages.together.stage import STAGE as TOGETHER
 from workflows.cli.main import main
 
 
@@ -37,6 +38,20 @@ def test_every_setting_says_what_it_means_and_what_it_may_be() -> None:
     for s in all_settings():
         assert len(s.meaning) > 10 and s.allowed, s.key
         assert set(s.presets) == ({"paper"} if s.only else set(PRESETS)), s.key
+
+
+def test_what_is_shown_can_be_set_on_a_command_line() -> None:
+    """`--set` gives text: of each default and each value of a preset it must make that value."""
+    configs = {stage.name: stage.config for stage in (*REGISTRY, TOGETHER)}
+    tried = 0
+    for s in (s for s in all_settings() if not s.only):  # the paper's model has another config
+        config = configs[s.stage]
+        for value in (s.default, *s.presets.values()):
+            if isinstance(value, (bool, int, float)):
+                text = str(value).lower() if isinstance(value, bool) else str(value)
+                assert getattr(config.model_validate({s.name: text}), s.name) == value, s.key
+                tried += 1
+    assert tried > 100
 
 
 def test_those_of_the_papers_model_are_listed_apart(capsys: pytest.CaptureFixture[str]) -> None:
