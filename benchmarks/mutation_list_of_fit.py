@@ -188,7 +188,7 @@ OF_FIT = (
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", "np.quantile(rank[of], 1 - BEST)", "np.quantile(rank[of], BEST)",
              "tests/bake/test_bake_unseen.py"),
-    Mutation("stages/bake/unseen.py", "depth if code in LOOSE else cosine", "cosine",
+    Mutation("stages/bake/unseen.py", "if code in LOOSE else cosine", "if False else cosine",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "cosine >= least_cosine", "cosine >= 0", "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "pixels / max(small.shape)", "pixels", "tests/bake/test_bake_unseen.py"),
