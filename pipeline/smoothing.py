@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import coo_array, diags_array
 
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import F64, Mask, Mesh, vertex_areas
 
 COTANGENTS = (1e-3, 1e3)
@@ -35,12 +35,6 @@ def laplacian(mesh: Mesh) -> tuple[F64, Any]:
     half = coo_array((np.concatenate(values), where), shape=(count, count))
     off = (half + half.T).tocsc()
     return mass, diags_array(off.sum(0)) - off
-
-
-def factorised(matrix: Any) -> Any:
-    """SuperLU's factors of a sparse symmetric positive definite matrix (V, V)."""
-    options = {"SymmetricMode": True}
-    return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 class Smoother:

@@ -39,6 +39,7 @@ BOUNCES = 3
 COUNT = 384  # lamps of a captured dome: GGX radiance within 3 % of quadrature at roughness .5, 5 % at .35 (tests)
 SIDE = 64  # entries of the table of R over n.v and over roughness
 LEAST_ALPHA = 0.01
+BLOCK = 4096  # vertices
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +64,17 @@ def arrivals(
         own = np.flatnonzero(thin.chosen)
         flux, total = _traced(vertices, n, faces, lit, albedo, own, thin.spread, BESIDE, check)
         flux = thin.spread(flux)
-        total = np.einsum("vn,vnc->vc", _cosines(n, lit), flux)
+        total = _received(n, lit, flux)
     return Arrivals(flux, table(lit), total)
+
+
+def _received(normals: F64, lit: Lamps, flux: F32) -> F32:
+    """(V, 3) irradiance of the flux (V, N, 3), in blocks: all cosines at once take as much memory as the flux."""
+    out = np.empty((len(normals), 3), np.float32)
+    for i in range(0, len(normals), BLOCK):
+        some = slice(i, i + BLOCK)
+        out[some] = np.einsum("vn,vnc->vc", _cosines(normals[some], lit), flux[some])
+    return out
 
 
 def _traced(

@@ -31,8 +31,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import splu
 
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.followers import BENDING, rigid_motion
 from pipeline.registration.lids import BLINK, GAP, facing
@@ -156,13 +156,13 @@ def _on_skin(
     mean = float(own.diagonal().mean())
     own = csr_array(own + RIDGE * mean * diags_array(np.ones(len(free))))
     right = (after.gradient.T @ goal)[free] + RIDGE * mean * wanted[free]
-    out[free] = splu(own.tocsc()).solve(right)
+    out[free] = factorised(own).solve(right)
     if meeting is not None and meeting[0].shape[0]:
         margins, person = meeting
         pull = csr_array(margins[:, free])
         own = csr_array(own + CONTACT * mean * (pull.T @ pull))
         up = right[:, 1] + CONTACT * mean * (pull.T @ (GAP - (margins @ person)[:, 1]))
-        out[free, 1] = splu(own.tocsc()).solve(up)
+        out[free, 1] = factorised(own).solve(up)
     return out
 
 

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.sparse import csc_array, csr_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import csr_array, diags_array
 
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.followers import BENDING, ROUND
 from pipeline.registration.head import Head
@@ -160,7 +160,7 @@ def faded(head: Head, rest: F64, seen: F64, skin: Mask, unit: float) -> F64:
     mass = np.bincount(ends.ravel(), np.repeat(length, 2), count) * mean / (2 * REACH) ** 2
     known = seen / (1 - seen + HARD)
     system = diags_array(known + np.asarray(both.sum(1)) + mass * (1 - seen) + ~skin) - both
-    return np.asarray(splu(csc_array(system)).solve(known[:, None] * np.where(skin[:, None], rest, 0.0)), np.float64)
+    return np.asarray(factorised(system).solve(known[:, None] * np.where(skin[:, None], rest, 0.0)), np.float64)
 
 
 def dense(shapes: Expressions, count: int) -> F64:

@@ -22,9 +22,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import block_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
+from scipy.sparse import block_array, diags_array
 
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import F64, Mask, Mesh
 from pipeline.smoothing import laplacian
 
@@ -70,7 +70,7 @@ def departures(mesh: Mesh, own: Mask, sums: Slopes, f0: float, spread: Spread) -
     seen = ((sums.xx, sums.xz), (sums.xz, sums.zz))
     rows = [[diags_array(o * seen[i][j]) + precision[i, j] * prior for j in (0, 1)] for i in (0, 1)]
     told = np.concatenate([o * (sums.xy - f0 * sums.xx), o * (sums.zy - f0 * sums.xz)])
-    found = splu(csc_array(block_array(rows))).solve(told)
+    found = factorised(block_array(rows)).solve(told)
     return found[:count], found[count:]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.images import F32
+from pipeline.maths.sparse import factorised
 from pipeline.transforms import F64
 
 NEIGHBOURS = 8
@@ -20,8 +21,7 @@ NEIGHBOURS = 8
 def harmonic(values: F32, known: npt.NDArray[np.bool_], position: F64) -> F32:
     """(T, C) values with those of unknown texels continued from the known. position (T, 3). With nothing known: as
     they are."""
-    from scipy.sparse import coo_array, csc_array
-    from scipy.sparse.linalg import splu
+    from scipy.sparse import coo_array
     from scipy.spatial import cKDTree
 
     if known.all() or not known.any():
@@ -40,5 +40,5 @@ def harmonic(values: F32, known: npt.NDArray[np.bool_], position: F64) -> F32:
     system = coo_array((own + tie, (np.arange(len(unknown)),) * 2), shape=inner.shape).tocsc() - inner.tocsc()
     right = graph[unknown][:, np.flatnonzero(known)] @ values[known].astype(np.float64) + tie[:, None] * mean
     out = values.copy()
-    out[unknown] = splu(csc_array(system)).solve(np.asarray(right, np.float64)).astype(np.float32)
+    out[unknown] = factorised(system).solve(np.asarray(right, np.float64)).astype(np.float32)
     return out

@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import Faces, Indices, Mesh, unique_edges, unit, vertex_normals
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64, inverse_rigid, pixel_centres, project
@@ -85,13 +86,8 @@ class _System:
 
     def solved(self) -> F64:
         """(size,) the solution."""
-        from scipy.sparse import csc_array
-        from scipy.sparse.linalg import splu
-
-        whole = csc_array(sum(self.parts[1:], self.parts[0]))
-        factors = splu(whole, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                       options={"SymmetricMode": True})  # fmt: skip
-        return np.asarray(factors.solve(np.asarray(self.right)), np.float64)
+        whole = sum(self.parts[1:], self.parts[0])
+        return np.asarray(factorised(whole).solve(np.asarray(self.right)), np.float64)
 
 
 def reshaped(

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.sparse.linalg import SuperLU, splu
 
+from pipeline.maths.sparse import factorised
 from pipeline.meshes import F64, Faces, Indices, Mask
 from stages.uv.segment import Dual
 
@@ -229,13 +229,6 @@ def rigid(points: F64, faces: Indices, start: F64, steps: int = RIGID_STEPS) -> 
         )
         uv = solver.solve(right)
     return np.asarray(uv, np.float64)
-
-
-def factorised(matrix: csc_array) -> SuperLU:
-    """LU factors of a positive definite matrix, symmetric or Hermitian. The ordering gives ten times less fill-in than
-    the default."""
-    options = {"SymmetricMode": True}
-    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
 
 def _cotangents(frame: F64) -> F64:
