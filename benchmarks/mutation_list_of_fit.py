@@ -188,6 +188,9 @@ OF_FIT = (
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", "np.quantile(rank[of], 1 - BEST)", "np.quantile(rank[of], BEST)",
              "tests/bake/test_bake_unseen.py"),
+    Mutation("stages/inverse_rendering/initial_geometry.py", "MIN_VIEWS if extent is None else 1", "MIN_VIEWS",
+             "tests/inverse_rendering/test_initial_geometry.py::"
+             "test_within_an_extent_a_part_that_two_frames_show_belongs_to_the_subject"),
     Mutation("stages/bake/unseen.py", "if code in LOOSE else cosine", "if False else cosine",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/outline_depth.py", "cosine >= least_cosine", "cosine >= 0", "tests/bake/test_bake_unseen.py"),

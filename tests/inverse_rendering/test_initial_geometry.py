@@ -13,7 +13,7 @@ from pipeline.artifacts import Cut, Extent
 from pipeline.extent import GROWN
 from stages.inverse_rendering.initial_geometry import agreed, hull_start
 from stages.inverse_rendering.ray_sampling import PhotoView, PixelTable
-from tests.support.two_balls import BOTTOM, FOCAL, HEAD, TORSO, WIDTH, bust_alpha, cropped_bust, ring_camera
+from tests.support.two_balls import BOTTOM, FOCAL, HEAD, TORSO, WIDTH, bust_alpha, camera_at, cropped_bust, ring_camera
 
 F32 = npt.NDArray[np.float32]
 RADIUS = 0.18
@@ -112,6 +112,18 @@ def test_an_extent_larger_than_the_region_of_interest_is_fitted_as_a_whole() -> 
     (_, middle, _), radius = HEAD
     assert y.max() == pytest.approx(middle + radius, abs=2 * start.cell)
     assert y.min() == pytest.approx(-0.15 - GROWN * 0.1, abs=2 * start.cell)
+
+
+def test_within_an_extent_a_part_that_two_frames_show_belongs_to_the_subject() -> None:
+    """All other frames end at the neck. Without an extent nothing would end what two silhouettes leave open."""
+    around, _ = cropped_bust()
+    cameras = [*around[:24], camera_at(0.0, 0.0, 24), camera_at(np.pi / 2, 0.0, 25)]
+    alphas = [bust_alpha(c) for c in cameras]
+    ball = Extent(centre=(0, 0, 0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1)), radii=(0.2,) * 3, cuts=(), head=0.1)
+    bounded, free = (hull_start(cameras, alphas, RADIUS, 40, 1, e) for e in (ball, None))
+    lowest = [float((s.lo + s.cell * np.argwhere(s.values < 0))[:, 1].min()) for s in (bounded, free)]
+    assert lowest[0] == pytest.approx(-0.2 - GROWN * 0.1, abs=2 * bounded.cell)
+    assert lowest[1] > -0.12
 
 
 def test_pixels_beyond_the_extent_are_not_drawn() -> None:
