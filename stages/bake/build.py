@@ -215,10 +215,10 @@ def _known(
     """around (V,): ambient occlusion."""
     points = mesh.vertices.astype(np.float64)
     cosine = best_cosine(points, meshes.unit(mesh.normals), views, occluder)
-    replaced = replaced_share(cosine)
-    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), cosine >= CLEAR
+    region = np.zeros(len(points), np.int64) if region is None else region
+    replaced = replaced_share(cosine, region)
+    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), replaced == 0
     if well.any():
-        region = np.zeros(len(well), np.int64) if region is None else region
         depth = outline_depth(mesh, np.flatnonzero(np.isin(region, LOOSE)), views, occluder, CLEAR)
         albedo = continued(mesh, albedo, well, region_colours(points, albedo, region, cosine, depth), LENGTH)
     if mouth is not None:

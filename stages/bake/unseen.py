@@ -6,7 +6,8 @@ Hence only well seen vertices are kept, and others are drawn, over the length L,
 their region of the head template (scalp, ears, face, bands of the neck; the rest): smoothing.continued. The neck is
 divided by height, because a collar or long hair ends at about one height all around it. Of hair and scalp the vertices
 count that photos show farthest inside of the silhouette, and that are farthest from what they show of other regions: at
-the outline the wall shines through loose hair, and a fringe shows the forehead.
+the outline the wall shines through loose hair, and a fringe shows the forehead. So it does where hair is seen at a
+slant, and hair is kept from a larger cosine on than a solid.
 
 Symbols: V vertices; cosine between a normal and the direction to the camera.
 """
@@ -19,16 +20,18 @@ from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS
 
 GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, from the second on it is kept
+HAIR_GRAZING, HAIR_CLEAR = 0.3, 0.5  # the same for hair
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices
 MIN_SHARE = 0.02  # of a region's vertices that must be seen for its own median; else that of the whole head
 LOOSE = (REGIONS.index("scalp"), HAIR)  # whose outline is not that of a solid
 
 
-def replaced_share(cosine: F64) -> F64:
-    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex; 0
-    for none."""
-    share = ((cosine - GRAZING) / (CLEAR - GRAZING)).clip(0, 1)
+def replaced_share(cosine: F64, region: Indices) -> F64:
+    """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex, 0
+    for none, and its region (V,)."""
+    low, high = np.where(region == HAIR, HAIR_GRAZING, GRAZING), np.where(region == HAIR, HAIR_CLEAR, CLEAR)
+    share = ((cosine - low) / (high - low)).clip(0, 1)
     return np.asarray(1 - share * share * (3 - 2 * share), np.float64)
 
 

@@ -16,7 +16,16 @@ from pipeline.smoothing import continued
 from pipeline.template.load import load_template
 from pipeline.visibility import FittedPhoto, Occluder, view_cosines
 from stages.bake.outline_depth import outline_depth
-from stages.bake.unseen import CLEAR, GRAZING, LENGTH, region_colours, replaced_share, with_hair
+from stages.bake.unseen import (
+    CLEAR,
+    GRAZING,
+    HAIR_CLEAR,
+    HAIR_GRAZING,
+    LENGTH,
+    region_colours,
+    replaced_share,
+    with_hair,
+)
 from tests.support.field_artifacts import camera
 
 TEMPLATE = load_template()
@@ -38,9 +47,13 @@ def placed(scale: float) -> PlacedHead:
 
 
 def test_what_photos_show_well_is_kept_and_what_they_do_not_is_replaced() -> None:
-    share = replaced_share(np.array([0.0, GRAZING, 0.5 * (GRAZING + CLEAR), CLEAR, 1.0]))
-    np.testing.assert_allclose(share, [1, 1, 0.5, 0, 0], atol=1e-12)
-    assert (np.diff(replaced_share(np.linspace(0, 1, 50))) <= 0).all()
+    for code, low, high in ((REGIONS.index("face"), GRAZING, CLEAR), (HAIR, HAIR_GRAZING, HAIR_CLEAR)):
+        share = replaced_share(np.array([0.0, low, 0.5 * (low + high), high, 1.0]), np.full(5, code))
+        np.testing.assert_allclose(share, [1, 1, 0.5, 0, 0], atol=1e-12)
+        assert (np.diff(replaced_share(np.linspace(0, 1, 50), np.full(50, code))) <= 0).all()
+    at_a_slant = np.full(2, 0.4)  # a solid is kept there, hair is replaced by half
+    solid, hair = replaced_share(at_a_slant, np.array([REGIONS.index("face"), HAIR]))
+    assert solid == 0 and hair == pytest.approx(0.5)
 
 
 def test_an_unseen_region_goes_on_in_its_own_colour() -> None:
