@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline import meshes
-from pipeline.camera import PinholeCamera, rays
+from pipeline.camera import PinholeCamera
 from pipeline.meshes import F64
 from pipeline.ray_casting import RayCaster
+from pipeline.transforms import pixel_centres
 from stages.usd.render.exported import load_exported, read_cameras
 
 SIDE = 512  # pixels, about
@@ -25,10 +26,8 @@ SIDE = 512  # pixels, about
 def counted(caster: RayCaster, facing: F64, view: PinholeCamera) -> tuple[int, int]:
     """Pixels that the asset covers, and those of them in which it shows its inside. facing (F, 3): normals of faces,
     of any length."""
-    step = max(1, round(max(view.width, view.height) / SIDE))
-    y, x = np.mgrid[: view.height : step, : view.width : step]
-    pixels = np.stack([x.ravel(), y.ravel()], 1).astype(np.float64)
-    origin, directions = rays(view.K, view.world_from_cam, view.distortion, pixels)
+    small = view.scaled(view.width // max(1, round(max(view.width, view.height) / SIDE)))
+    origin, directions = small.rays(pixel_centres(small.width, small.height))
     face = caster.first_faces(np.broadcast_to(origin, directions.shape), directions)
     hit = face >= 0
     return int(hit.sum()), int(((facing[face[hit]] * directions[hit]).sum(1) > 0).sum())

@@ -51,3 +51,12 @@ def largest_part(faces: Faces, count: int) -> Faces:
     """The faces of the part that has most."""
     part = part_of_face(faces, count)
     return np.asarray(faces[part == np.bincount(part).argmax()])
+
+
+def largest_parts(faces: Faces, count: int) -> Faces:
+    """The faces (F', 3) of the largest part of each connected piece. `count`: vertices."""
+    part, piece = part_of_face(faces, count), meshes.component_of_face(faces, count)
+    size = np.bincount(part)[part]
+    order = np.lexsort((part, -size, piece))
+    first = order[np.r_[True, piece[order][1:] != piece[order][:-1]]]  # a face of each piece's largest part
+    return np.asarray(faces[np.isin(part, part[first])])

@@ -179,10 +179,16 @@ def split_at_seams(faces: Faces, uv_faces: Faces) -> tuple[Indices, Indices, Ind
     return pairs // most, pairs % most, np.asarray(index.reshape(faces.shape), np.int64)
 
 
-def edges(faces: Faces) -> Indices:
+def edges(faces: npt.NDArray[np.integer]) -> Indices:
     """(3 F, 2) directed edges, in the order of the faces' sides 0-1, 1-2, 2-0 (all first sides first)."""
     f = np.asarray(faces, np.int64)
     return np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]])
+
+
+def open_edges(faces: npt.NDArray[np.integer], count: int) -> Indices:
+    """(B, 2) the `edges` along borders, in their order: those without an opposite one. `count`: vertices."""
+    e = edges(faces)
+    return np.asarray(e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])])
 
 
 def unique_edges(faces: Faces) -> Indices:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline import meshes
-from pipeline.decimation import is_crowded, part_of_face, simplified, unit_box
+from pipeline.decimation import is_crowded, largest_parts, simplified, unit_box
 from pipeline.errors import StageError
 from pipeline.meshes import F64, Faces, Indices, Mesh, split_apart
 
@@ -73,25 +73,14 @@ def without_bubbles(vertices: F64, faces: Faces) -> tuple[F64, Faces]:
     for _ in range(ROUNDS):
         if not is_crowded(faces, len(vertices)):
             break
-        faces = filled(_largest_parts(faces, len(vertices)))
+        faces = filled(largest_parts(faces, len(vertices)))
     v, f, _ = meshes.compact(vertices, faces)
     return np.asarray(v, np.float64), f
 
 
-def _largest_parts(faces: Faces, count: int) -> Faces:
-    """The faces (F', 3) of the largest part of each connected piece. `count`: vertices."""
-    part, piece = part_of_face(faces, count), meshes.component_of_face(faces, count)
-    size = np.bincount(part)[part]
-    order = np.lexsort((part, -size, piece))
-    first = order[np.r_[True, piece[order][1:] != piece[order][:-1]]]  # a face of each piece's largest part
-    return np.asarray(faces[np.isin(part, part[first])])
-
-
 def filled(faces: Faces) -> Faces:
     """Faces (F', 3) with holes of up to LOOP edges closed by fans: the ring around a bubble may be a hole."""
-    e = meshes.edges(faces)
-    count = int(faces.max()) + 1
-    open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
+    open_edges = meshes.open_edges(faces, int(faces.max()) + 1)
     after = {int(b): int(a) for a, b in open_edges}  # a hole's border is opposite to its neighbours' edges
     added = []
     while after:

@@ -1,6 +1,6 @@
 """Hair as a mesh of its own: the outer shell of the fitted surface where the template stage tells hair.
 
-Its faces are cut from the dense mesh along the told vertices; where they meet the skin they go on beneath it (tuck.py).
+Its faces are cut from the dense mesh along the told vertices; where they meet the skin they go on beneath it (rim.py).
 Small pieces beside the head that touch the hair belong to it. Hair and rest are decimated as one mesh and parted then.
 """
 

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from pipeline.meshes import F32, F64, Faces, Indices, Mask
+from pipeline.meshes import F32, F64, Faces, Indices, Mask, open_edges
 
 Spectrum = npt.NDArray[np.complexfloating]
 G = 256
@@ -131,9 +131,7 @@ def _charts(uvs: F64, faces: Faces, label: Indices) -> list[Chart]:
 
 def outline(faces: Indices) -> list[Indices]:
     """The border loops (vertices in order) of a chart with faces (m, 3), outer and inner ones."""
-    e = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    n = int(faces.max()) + 1
-    border = e[~np.isin(e[:, 0] * n + e[:, 1], e[:, 1] * n + e[:, 0])]
+    border = open_edges(faces, int(faces.max()) + 1)
     after: dict[int, list[int]] = {}
     for start, end in border[::-1].tolist():
         after.setdefault(start, []).append(end)

@@ -26,7 +26,7 @@ from stages.uv.density import face_share
 from stages.uv.hair import hair_faces, parted
 from stages.uv.judge import judge
 from stages.uv.remainder import beside_head, cut_out, left_over
-from stages.uv.tuck import tucked
+from stages.uv.rim import with_rim
 from stages.uv.unwrap import unwrap
 
 SAMPLES = 20_000
@@ -92,7 +92,7 @@ def _parts(dense: Mesh, rest: Mask, hair: Mask, skin: Mesh, target: int) -> tupl
     """The rest and hair, given as faces (F,) of the dense mesh, with `target` faces each and rims beneath the skin."""
     if not (rest.any() or hair.any()):
         return None, None
-    rimmed = tucked(dense, rest | hair, skin)
+    rimmed = with_rim(dense, rest | hair, skin)
     both = decimate.decimated(
         cut_out(rimmed.mesh, dense.faces[rimmed.faces]), target * (int(rest.any()) + int(hair.any()))
     )

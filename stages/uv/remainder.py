@@ -59,9 +59,8 @@ def beside_head(dense: Mesh, skin: Mesh, ears: F32 | None = None, hair: Mask | N
 
 def _border(mesh: Mesh) -> Mask:
     """(V,) vertices of the longest border: the neck's end, not those of eyes and mouth."""
-    e = meshes.edges(mesh.faces)
     count = len(mesh.vertices)
-    open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
+    open_edges = meshes.open_edges(mesh.faces, count)
     out = np.zeros(count, np.bool_)
     if not len(open_edges):
         return out

@@ -32,3 +32,10 @@ def test_pairs_are_those_of_a_search(faces: list[list[int]], most: int) -> None:
     assert found == most
     order = np.sort(sides[first], axis=1).tolist()
     assert order == sorted(order)
+
+
+def test_open_edges_are_those_along_borders() -> None:
+    """By hand: a square of two triangles, whose diagonal is shared; a closed tetrahedron has none."""
+    square = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    assert meshes.open_edges(square, 4).tolist() == [[0, 1], [1, 2], [2, 3], [3, 0]]
+    assert not len(meshes.open_edges(np.array(TETRAHEDRON, np.int32), 4))

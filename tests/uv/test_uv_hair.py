@@ -44,9 +44,7 @@ def test_the_cap_and_the_skin_at_its_rim_are_cut_out() -> None:
 
 
 def border(mesh: Mesh) -> np.ndarray:
-    e = meshes.edges(mesh.faces)
-    count = len(mesh.vertices)
-    return np.unique(e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])])
+    return np.unique(meshes.open_edges(mesh.faces, len(mesh.vertices)))
 
 
 def test_hair_and_rest_end_at_the_same_vertices_after_decimation() -> None:

@@ -27,14 +27,14 @@ NEAR = 1.5 * AWAY  # what is further from the skin is not laid under it: a web b
 
 
 @dataclass(frozen=True, slots=True)
-class Tucked:
+class Rimmed:
     """The dense mesh with the rim in its place, and the faces (F,) of the part with its rim."""
 
     mesh: Mesh
     faces: Mask
 
 
-def tucked(dense: Mesh, part: Mask, skin: Mesh) -> Tucked:
+def with_rim(dense: Mesh, part: Mask, skin: Mesh) -> Rimmed:
     """Add the rim to the faces part (F,) of the dense mesh, metres."""
     from scipy.spatial import cKDTree
 
@@ -42,7 +42,7 @@ def tucked(dense: Mesh, part: Mask, skin: Mesh) -> Tucked:
     own = np.zeros(len(points), np.bool_)
     own[dense.faces[part]] = True
     if not own.any():
-        return Tucked(dense, part)
+        return Rimmed(dense, part)
     r = cKDTree(points[own]).query(points, distance_upper_bound=RIM)[0]
     away, nearest = cKDTree(skin.vertices.astype(np.float64)).query(points, distance_upper_bound=NEAR)
     rim = _reached(dense, own, np.isfinite(r) & np.isfinite(away) & ~own)
@@ -51,7 +51,7 @@ def tucked(dense: Mesh, part: Mask, skin: Mesh) -> Tucked:
     moved = points.copy()
     moved[rim] -= np.minimum(r[rim, None] / FALL, 1.0) * (height + SINK) * n
     faces = part | (own | rim)[dense.faces].all(1)
-    return Tucked(Mesh(moved.astype(np.float32), dense.normals, dense.faces), np.asarray(faces, np.bool_))
+    return Rimmed(Mesh(moved.astype(np.float32), dense.normals, dense.faces), np.asarray(faces, np.bool_))
 
 
 def _reached(dense: Mesh, own: Mask, near: Mask) -> Mask:

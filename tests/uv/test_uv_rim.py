@@ -11,7 +11,7 @@ from support.ball_head import RADIUS, ball_scan
 from pipeline import meshes
 from pipeline.meshes import Mesh
 from stages.uv.remainder import AWAY, beside_head, cut_out
-from stages.uv.tuck import FALL, RIM, SINK, tucked
+from stages.uv.rim import FALL, RIM, SINK, with_rim
 
 CELL = 0.0015
 
@@ -40,10 +40,7 @@ def height(points: np.ndarray) -> np.ndarray:
 
 def border(mesh: Mesh) -> np.ndarray:
     """Positions of the vertices on open edges."""
-    e = meshes.edges(mesh.faces)
-    count = len(mesh.vertices)
-    open_edges = e[~np.isin(e[:, 0] * count + e[:, 1], e[:, 1] * count + e[:, 0])]
-    return mesh.vertices[np.unique(open_edges)].astype(np.float64)
+    return mesh.vertices[np.unique(meshes.open_edges(mesh.faces, len(mesh.vertices)))].astype(np.float64)
 
 
 def test_the_border_ends_beneath_the_skin_and_the_part_stays(capped: Mesh, skin: Mesh) -> None:
@@ -51,7 +48,7 @@ def test_the_border_ends_beneath_the_skin_and_the_part_stays(capped: Mesh, skin:
     part = beside[capped.faces].any(1)
     before = cut_out(capped, capped.faces[part])
     assert np.median(height(border(before))) > 0.5 * AWAY  # a slit all around
-    found = tucked(capped, part, skin)
+    found = with_rim(capped, part, skin)
     after = cut_out(found.mesh, capped.faces[found.faces])
     ends = height(border(after))
     assert ends.max() < -0.4 * SINK and ends.min() > -2 * SINK
@@ -63,7 +60,7 @@ def test_the_border_ends_beneath_the_skin_and_the_part_stays(capped: Mesh, skin:
 
 def test_it_falls_from_the_parts_own_height_to_its_depth(capped: Mesh, skin: Mesh) -> None:
     part = beside_head(capped, skin)[capped.faces].any(1)
-    found = tucked(capped, part, skin)
+    found = with_rim(capped, part, skin)
     own = np.zeros(len(capped.vertices), bool)
     own[capped.faces[part]] = True
     rim = np.flatnonzero((found.mesh.vertices != capped.vertices).any(1))
@@ -84,11 +81,11 @@ def test_another_sheet_close_by_is_not_taken(capped: Mesh, skin: Mesh) -> None:
         np.concatenate([capped.normals, crumb.normals]),
         np.concatenate([capped.faces, crumb.faces + count]),
     )
-    found = tucked(both, np.r_[part, np.zeros(len(crumb.faces), bool)], skin)
+    found = with_rim(both, np.r_[part, np.zeros(len(crumb.faces), bool)], skin)
     assert not found.faces[len(part) :].any() and np.array_equal(found.mesh.vertices[count:], crumb.vertices)
 
 
 def test_nothing_beside_the_head(capped: Mesh, skin: Mesh) -> None:
     none = np.zeros(len(capped.faces), bool)
-    found = tucked(capped, none, skin)
+    found = with_rim(capped, none, skin)
     assert not found.faces.any() and found.mesh is capped
