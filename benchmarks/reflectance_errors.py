@@ -28,7 +28,7 @@ from pipeline.images import F32, read_linear
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import apply, matrix, pixel_centres
 from stages.reflectance.field import Field, Lamp, load
-from stages.reflectance.relight import look_up, picture
+from stages.reflectance.relight import lit_by, look_up, picture
 from stages.reflectance.rig import Rig
 from stages.reflectance.score import COVERED, camera_at, encoded
 from stages.reflectance.texels import arriving
@@ -86,7 +86,7 @@ def measured(
         for n in cameras:
             view = camera_at(rig, n, i)
             table, image = look_up(field, view), encoded(read_linear(single[n, i]), GAIN)
-            made, other = (picture(view, table, field.radiance(lamp, view.eye, v)) for v in (arrives, traced))
+            made, other = (picture(view, table, lit_by(field, view, lamp, v)) for v in (arrives, traced))
             shown = np.asarray(table @ (arrives * above)).reshape(view.height, view.width)
             lit, _ = true_light(caster, normal, view, lamp)
             kind = kinds_of(labels_of(capture, rig.cameras[n].index), made[..., 3], lit, shown)

@@ -26,7 +26,7 @@ from pipeline.transforms import F64, apply, matrix, scale_of
 from stages.capture.readers.olat import pictures_of, read_lights
 from stages.reflectance.field import Field, load
 from stages.reflectance.openpbr import OpenPbr
-from stages.reflectance.relight import barycentric, look_up, picture, under_lamps
+from stages.reflectance.relight import barycentric, lit_by, look_up, picture, under_lamps
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.score import COVERED, blended, camera_at, decibels, encoded, score
 from stages.reflectance.texels import points_of
@@ -148,7 +148,7 @@ def beside(field: Field, rig: Rig, pictures: dict, fitted: list[int], camera: in
     positions, axes = rig.lamps()
     lamp = Lamp(positions[light], axes[light], rig.strength[light])
     view = camera_at(rig, camera, light)
-    made = picture(view, look_up(field, view), field.radiance(lamp, view.eye, field.arrives(lamp)))[..., :3]
+    made = picture(view, look_up(field, view), lit_by(field, view, lamp, field.arrives(lamp)))[..., :3]
     truth, blend = read_linear(pictures[camera, light]), blended(rig, pictures, fitted, camera, light)[0]
     shown = [encoded(p, GAIN) for p in (truth, made, blend)]
     write_png(path, np.hstack([*shown, np.abs(shown[1] - shown[0]) * 4]).clip(0, 1))
@@ -180,9 +180,9 @@ def environments(field: Field, run: Path, capture: Path, rig: Rig, out: Path | N
     views = {i: v for i, v in given_cameras(capture / "params.json", run).items() if i in (0, 2, 4)}
     found = under_lamps(field, list(views.values()), lamps, lambda d, n: None)
     rows = {}
-    for (i, view), radiance in zip(views.items(), found, strict=True):
+    for (i, view), lit in zip(views.items(), found, strict=True):
         truth, label = read_linear(capture / f"truth/relit/soft/{i}.exr"), labels_of(capture, i)
-        made = picture(view, look_up(field, view), radiance)
+        made = picture(view, look_up(field, view), lit)
         made, covered = made[..., :3], made[..., 3] > COVERED
         plain = plain_sum(capture, i)
         errors = {

@@ -20,7 +20,7 @@ from pipeline.images import F32, read_linear, write_png
 from pipeline.transforms import F64
 from stages.reflectance.field import Field, Lamp, load
 from stages.reflectance.openpbr import OpenPbr
-from stages.reflectance.relight import look_up, picture, under_lamps
+from stages.reflectance.relight import lit_by, look_up, picture, under_lamps
 from stages.reflectance.rig import Rig
 from stages.reflectance.score import camera_at, encoded
 from workflows.cli.relight import environment
@@ -36,7 +36,7 @@ def predicted(field: Field, rig: Rig, camera: int, light: int) -> F32:
     """(H, W, 4) picture of a light as the camera saw it."""
     positions, axes = rig.lamps()
     lamp, view = Lamp(positions[light], axes[light], rig.strength[light]), camera_at(rig, camera, light)
-    return picture(view, look_up(field, view, 3), field.radiance(lamp, view.eye, field.arrives(lamp)))
+    return picture(view, look_up(field, view, 3), lit_by(field, view, lamp, field.arrives(lamp)))
 
 
 def brightest(single: dict, lights: list[int], camera: int) -> list[int]:
@@ -141,7 +141,7 @@ def main() -> None:
     for name in ENVIRONMENTS:
         lamps = environment(name, capture_from_asset_of(options.run), quick=True)
         made = under_lamps(field, views, lamps, lambda d, n: None)
-        relit.append([picture(v, look_up(field, v), r)[..., :3] for v, r in zip(views, made, strict=True)])
+        relit.append([picture(v, look_up(field, v), lit)[..., :3] for v, lit in zip(views, made, strict=True)])
     top = [SOFT_GAIN * 0.8 / max(float(np.quantile(row[0].max(2), 0.98)), 1e-9) for row in relit]
     beside = [encoded(image, gain) for row, gain in zip(relit, top, strict=True) for image in row]
     write_png(options.out / "reflectance_environments.png", np.hstack(beside))

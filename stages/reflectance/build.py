@@ -15,6 +15,7 @@ from pipeline.artifacts import (
     Camera,
     CameraSet,
     Located,
+    MaskSet,
     UvMesh,
 )
 from pipeline.capture_artifacts import Capture, LightStage
@@ -30,6 +31,7 @@ from stages.reflectance.deform import REST, write_rest
 from stages.reflectance.evidence import FOLDER as SHOWN
 from stages.reflectance.evidence import fewer_lamps, listed, write_pictures
 from stages.reflectance.field import Field, centre_of, save
+from stages.reflectance.find_corneas import find_corneas, lids_of
 from stages.reflectance.judge import judge
 from stages.reflectance.layer import standard_of
 from stages.reflectance.openpbr import NAME as OPENPBR
@@ -62,7 +64,12 @@ class _Predicted:
 
 
 def build(
-    capture: Located[Capture], poses: Located[CameraSet], uv: Located[UvMesh], config: Config, context: Context
+    capture: Located[Capture],
+    poses: Located[CameraSet],
+    masks: Located[MaskSet],
+    uv: Located[UvMesh],
+    config: Config,
+    context: Context,
 ) -> ReflectanceField:
     """The field of a light stage's capture, written below the work folder."""
     stage = capture.artifact.stage
@@ -96,11 +103,13 @@ def build(
     field, parts = fitted_field(
         mesh, charts, points, pairs, rig, pictures, config, context.scratch, context.check, step
     )
+    field = field.with_corneas(find_corneas(field, rig, pictures, lids_of(masks, rig), step))
     motion = {str(f): rows(m.round(9)) for f, m in sorted(at.items())}
     record = {"lights": rig.index, "left_out": [whole.index[i] for i in left_out], "motion": motion}
     save(field, context.workdir / FOLDER, record | write_sidecar(field, context.workdir / FOLDER))
     write_rest(context.workdir / FOLDER / REST, mesh, charts)
     figures = _figures(field, parts, points, pairs, six) | {"moved_mm": _moved(given, mesh)}
+    figures |= {"corneas": float(len(field.corneas))}
     shots = _pictures(capture, stage, whole)
     unseen = [n for n, c in enumerate(cameras) if c.index in kept_out]
     found = _predicted(field, whole, shots, fitted, left_out, step)

@@ -8,8 +8,8 @@ Symbols
     e1, e2, n    two edges and the unit normal of a triangle at rest; primed: deformed
     R            of a vertex the mean over its triangles, weighted by area; of a texel that of its triangle's corners
     l            direction towards the light
-Traced shadows are those of the deformed mesh. Albedo and lobes stay: skin that is stretched keeps its colour here, and
-has no new wrinkles but those of the mesh.
+Traced shadows are those of the deformed mesh. A cornea moves with the texels beside it as a rigid body. Albedo and
+lobes stay: skin that is stretched keeps its colour here, and has no new wrinkles but those of the mesh.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.errors import StageError
+from pipeline.eyes.mirror import Cornea
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64
-from stages.reflectance.field import Field
+from stages.reflectance.field import BESIDE, Field
 from stages.reflectance.texels import known_surface
 
 REST = "rest.obj"
@@ -75,7 +76,20 @@ def moved(field: Field, vertices: F64) -> Field:
     out.turn = turn if field.turn is None else turn @ field.turn
     out.whole = RayCaster(mesh.vertices, faces)
     out.blocker = RayCaster(mesh.vertices, known_surface(mesh, out.points, field.known))
+    out.forget()
+    out.corneas = tuple(_carried(c, p.position, position) for c in field.corneas)
     return out
+
+
+def _carried(cornea: Cornea, before: F64, after: F64) -> Cornea:
+    """A cornea moved as the texels beside it from before (T, 3) to after (T, 3); as it was with too few of them."""
+    own = np.linalg.norm(before - cornea.centre, axis=1) < cornea.radius + BESIDE
+    if own.sum() < 3:
+        return cornea
+    a, b = before[own], after[own]
+    turn = nearest_rotations(((b - b.mean(0)).T @ (a - a.mean(0)))[None])[0]
+    centre = b.mean(0) + turn @ (cornea.centre - a.mean(0))
+    return replace(cornea, centre=centre, normals=cornea.normals @ turn.T)
 
 
 def vertex_rotations(rest: npt.NDArray[np.floating], vertices: F64, faces: meshes.Faces) -> F64:

@@ -15,7 +15,7 @@ from pipeline.images import F32, read_linear, write_png
 from pipeline.maths import studio_lights
 from pipeline.reflectance_artifacts import LeftOutPicture
 from stages.reflectance.field import Field, Lamp
-from stages.reflectance.relight import FULL, QUICK, lamps_of, look_up, picture
+from stages.reflectance.relight import FULL, QUICK, lamps_of, lit_by, look_up, picture
 from stages.reflectance.rig import Rig
 from stages.reflectance.score import Score, camera_at, decibels, encoded
 
@@ -51,7 +51,7 @@ def write_pictures(
     out = []
     for name, s in chosen(found).items():
         lamp, view = Lamp(positions[s.light], axes[s.light], rig.strength[s.light]), camera_at(rig, s.camera, s.light)
-        made = picture(view, look_up(field, view), field.radiance(lamp, view.eye, field.arrives(lamp)))
+        made = picture(view, look_up(field, view), lit_by(field, view, lamp, field.arrives(lamp)))
         truth = read_linear(pictures[s.camera, s.light]) * made[..., 3:]
         path = folder / f"{name}_{rig.cameras[s.camera].index}_{rig.index[s.light]}.png"
         write_png(path, np.hstack([encoded(truth, gain), encoded(made[..., :3], gain)]))

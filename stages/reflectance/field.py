@@ -9,7 +9,7 @@
     trust.exr      c00 c01 ...     how far that is known, 0 to 1
     coverage.exr   Y               1 where a camera saw the texel, 0 where it was filled
     mesh.npz       the mesh with its charts (the maps' surface, and what throws shadows)
-    basis.json     lights, widths of the lobes, order of the harmonics, kernel of the shadows
+    basis.json     lights, widths of the lobes, order of the harmonics, kernel of the shadows, corneas
 
 sidecar.py writes more files, for shaders elsewhere; docs/field_look.md says how to evaluate the field.
 """
@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.errors import StageError
+from pipeline.eyes.mirror import Cornea, from_stored, stored
 from pipeline.images import F32, read_exr, write_exr
 from pipeline.nearest import nearest_known
 from pipeline.ray_casting import RayCaster
@@ -38,6 +39,7 @@ from stages.reflectance.texels import Points, arriving, known_surface, points_of
 BASIS, MESH = "basis.json", "mesh.npz"
 KERNEL = 18.0  # degrees: width of the kernel that carries shadows from the stage's lights to others
 UNKNOWN = 0.02  # weight of "as traced" in it
+BESIDE = 0.004  # metres outside of a cornea to which texels belong to it
 FAR = 1e4  # asset units: distance of a distant lamp
 
 
@@ -60,7 +62,7 @@ def distant_lamp(towards: F64, irradiance: F64) -> Lamp:
 class Field:
     """A reflectance field in memory. Arrays over the T covered texels as in `split.Fitted`; known (T,): seen by a
     camera; towards (L, 3): directions of the stage's lights; centre (3,): of the stage. turn (T, 3, 3): rotation of the
-    surface at each texel since the pictures were taken, None at rest (deform.py)."""
+    surface at each texel since the pictures were taken, None at rest (deform.py). corneas: of its eyes."""
 
     def __init__(
         self,
@@ -80,6 +82,7 @@ class Field:
         self.normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
         self.known = arrays["coverage"][:, 0] > 0.5
         self.turn: F64 | None = None
+        self.corneas: tuple[Cornea, ...] = ()
         self.order = int(np.sqrt(arrays["rest"].shape[1] // 3)) - 1
         self.whole = RayCaster(mesh.vertices, mesh.faces)
         self.blocker = RayCaster(mesh.vertices, known_surface(mesh, points, self.known))
@@ -92,11 +95,33 @@ class Field:
         number[texel] = np.arange(len(texel))
         return np.asarray(number[nearest_known((number >= 0).reshape(size, size)).ravel()], np.int64)
 
+    def with_corneas(self, corneas: tuple[Cornea, ...]) -> Field:
+        """The same field with these corneas."""
+        out = copy(self)
+        out.forget()
+        out.corneas = corneas
+        return out
+
+    @cached_property
+    def mirrors(self) -> list[tuple[Cornea, Field]]:
+        """Each cornea, and the field of the texels beside it."""
+        return [(c, self.beside(c.centre, c.radius)) for c in self.corneas]
+
+    def beside(self, centre: F64, radius: float) -> Field:
+        """The field of the texels in or just outside of a sphere around a centre (3,)."""
+        away = np.linalg.norm(self.points.position - centre, axis=1)
+        return self.part(np.flatnonzero(away < radius + BESIDE))
+
+    def forget(self) -> None:
+        """Drop what was computed for other texels or another shape."""
+        for name in ("nearest", "mirrors"):
+            self.__dict__.pop(name, None)
+
     def part(self, texels: npt.NDArray[np.int64]) -> Field:
         """The field of some of its texels, given by their place, lit as they are in the whole: shadows are those of the
         whole surface. Its texels alone can't be looked up in a picture."""
         out = copy(self)
-        out.__dict__.pop("nearest", None)
+        out.forget()
         p = self.points
         out.points = replace(p, texel=p.texel[texels], face=p.face[texels], weights=p.weights[texels],
                              position=p.position[texels], normal=p.normal[texels])  # fmt: skip
@@ -170,7 +195,8 @@ def save(field: Field, folder: Path, basis: dict[str, Any]) -> list[str]:
     content = {
         "size": field.points.size, "alphas": list(field.alphas), "harmonics_order": field.order,
         "kernel_degrees": KERNEL, "unknown": UNKNOWN,
-        "centre": field.centre.tolist(), "towards": field.towards.tolist(), **basis,
+        "centre": field.centre.tolist(), "towards": field.towards.tolist(),
+        "corneas": stored(field.corneas), **basis,
         "channels": channels_of,
     }  # fmt: skip
     (folder / BASIS).write_text(json.dumps(content, indent=1) + "\n")
@@ -195,7 +221,8 @@ def load(folder: Path) -> Field:
             picture, _ = read_exr(folder / f"{name}.exr")
             arrays[name] = picture.reshape(size * size, -1)[points.texel]
         towards, centre = np.array(basis["towards"], np.float64), np.array(basis["centre"], np.float64)
-        return Field(mesh, charts, points, arrays, tuple(basis["alphas"]), towards, centre)
+        field = Field(mesh, charts, points, arrays, tuple(basis["alphas"]), towards, centre)
+        return field.with_corneas(from_stored(basis.get("corneas", ())))  # not in fields of older versions
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as e:
         raise StageError(
             "the reflectance field can't be read",

@@ -1,11 +1,13 @@
 """Pictures of a reflectance field: lamps, several of them, and environments.
 
 Texels are shaded once for a camera; pixels are means of texels. `look_up` finds which, by rays through each pixel.
+Glints of corneas are narrower than texels and are added to the picture (glints.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,24 @@ from pipeline.camera import PinholeCamera
 from pipeline.images import F32
 from pipeline.transforms import F64, pixel_centres
 from stages.reflectance.field import Field, Lamp, distant_lamp
+from stages.reflectance.glints import glints
 
 SAMPLES = 2  # rays along each side of a pixel
 BAND = 1_000_000  # rays that are traced at a time
 QUICK, FULL = 64, 384  # lamps of an environment
+
+
+@dataclass(frozen=True, slots=True)
+class Lit:
+    """What a camera sees of a field: radiance (T, 3) of its texels, glints (H, W, 3) of its corneas in the picture."""
+
+    radiance: F32
+    glints: F32
+
+
+def lit_by(field: Field, camera: PinholeCamera, lamp: Lamp, arrives: F32) -> Lit:
+    """Under one lamp. arrives (T,): of `field.arrives`."""
+    return Lit(field.radiance(lamp, camera.eye, arrives), glints(field, camera, lamp))
 
 
 def look_up(field: Field, camera: PinholeCamera, samples: int = SAMPLES) -> Any:
@@ -71,11 +87,11 @@ def barycentric(corners: F64, at: F64) -> F64:
     return np.stack([1 - s - t, s, t], 1)
 
 
-def picture(camera: PinholeCamera, table: Any, radiance: F32) -> F32:
-    """(H, W, 4) linear RGBA, premultiplied, of texels' radiance (T, 3). table: of `look_up`."""
-    rgb = np.asarray(table @ radiance, np.float32)
-    alpha = np.asarray(table.sum(axis=1), np.float32).reshape(-1, 1)
-    return np.concatenate([rgb, alpha], 1).reshape(camera.height, camera.width, 4)
+def picture(camera: PinholeCamera, table: Any, lit: Lit) -> F32:
+    """(H, W, 4) linear RGBA, premultiplied. table: of `look_up`."""
+    rgb = np.asarray(table @ lit.radiance, np.float32).reshape(camera.height, camera.width, 3) + lit.glints
+    alpha = np.asarray(table.sum(axis=1), np.float32).reshape(camera.height, camera.width, 1)
+    return np.concatenate([rgb, alpha], 2)
 
 
 def under_lamps(
@@ -84,14 +100,17 @@ def under_lamps(
     lamps: Sequence[Lamp],
     tick: Callable[[int, int], None],
     rays: int = 3,
-) -> list[F32]:
-    """Radiance (T, 3) towards each camera under all lamps together. tick: lamps done, of all."""
-    total = [np.zeros((len(field.known), 3), np.float32) for _ in cameras]
+) -> list[Lit]:
+    """Of each camera, under all lamps together. tick: lamps done, of all."""
+    total = [Lit(np.zeros((len(field.known), 3), np.float32), np.zeros((c.height, c.width, 3), np.float32))
+             for c in cameras]  # fmt: skip
     for done, lamp in enumerate(lamps):
         tick(done, len(lamps))
         arrives = field.arrives(lamp, rays)
-        for sum_, camera in zip(total, cameras, strict=True):
-            sum_ += field.radiance(lamp, camera.eye, arrives)
+        for whole, camera in zip(total, cameras, strict=True):
+            one = lit_by(field, camera, lamp, arrives)
+            np.add(whole.radiance, one.radiance, out=whole.radiance)
+            np.add(whole.glints, one.glints, out=whole.glints)
     return total
 
 

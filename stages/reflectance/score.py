@@ -14,7 +14,7 @@ from pipeline.colour import srgb_from_linear
 from pipeline.images import F32, read_linear
 from pipeline.transforms import F64
 from stages.reflectance.field import Field, Lamp
-from stages.reflectance.relight import look_up, picture
+from stages.reflectance.relight import lit_by, look_up, picture
 from stages.reflectance.rig import Rig, moved_camera
 
 COVERED = 0.99  # of a pixel: those at the silhouette are not scored
@@ -80,7 +80,7 @@ def score(
         camera = camera_at(rig, c, i)
         table = look_up(field, camera)
         made, *other = (
-            picture(camera, table, f.radiance(lamp, camera.eye, a)) for f, a in zip(fields, arrives[i], strict=True)
+            picture(camera, table, lit_by(f, camera, lamp, a)) for f, a in zip(fields, arrives[i], strict=True)
         )
         truth = encoded(read_linear(pictures[c, i]), gain)
         counted = made[..., 3] > COVERED if mask is None else mask[c]

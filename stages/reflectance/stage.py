@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pipeline.artifacts import (
     CameraSet,
     Located,
+    MaskSet,
     UvMesh,
 )
 from pipeline.capture_artifacts import Capture
@@ -17,15 +18,16 @@ from stages.reflectance.config import Config
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """The pictures and lights, the cameras, and the mesh with its charts."""
+    """The pictures and lights, the cameras, where eyes are, and the mesh with its charts."""
 
     capture: Located[Capture]
     poses: Located[CameraSet]
+    masks: Located[MaskSet]
     uv: Located[UvMesh]
 
 
 def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
-    """Measure the motion, mend the surface, sample and split the pictures, fill what no camera saw, score the field.
+    """Measure the motion, mend the surface, split the pictures, fill what no camera saw, find the corneas, score all.
 
     Raises:
         StageError: too few lights or cameras are left for the fit, or the head moved too far.
@@ -34,7 +36,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
         return ReflectanceField(present=False)
     from stages.reflectance.build import build
 
-    return build(inputs.capture, inputs.poses, inputs.uv, config, context)
+    return build(inputs.capture, inputs.poses, inputs.masks, inputs.uv, config, context)
 
 
-STAGE = Stage(name="reflectance", version=8, inputs=Inputs, config=Config, output=ReflectanceField, run=run)
+STAGE = Stage(name="reflectance", version=9, inputs=Inputs, config=Config, output=ReflectanceField, run=run)

@@ -22,7 +22,7 @@ from stages.reflectance import relight, stage
 from stages.reflectance.evidence import fewer_lamps
 from stages.reflectance.field import Field, Lamp, centre_of, distant_lamp, load, save
 from stages.reflectance.fill import harmonic
-from stages.reflectance.relight import lamps_of, look_up, picture, under_lamps
+from stages.reflectance.relight import lamps_of, lit_by, look_up, picture, under_lamps
 from stages.reflectance.score import decibels
 from stages.reflectance.texels import arriving, points_of
 from tests.reflectance.test_rig_and_motion import cameras_of
@@ -93,7 +93,7 @@ def test_a_matt_ball_is_lamberts() -> None:
     field = field_of(np.array([0.5, 0.4, 0.3]))
     lamp = Lamp(np.array([0.3, 0.4, 1.2]), -np.array([0.3, 0.4, 1.2]) / 1.3, np.array([4.0, 4, 2]))
     view = camera()
-    made = picture(view, look_up(field, view), field.radiance(lamp, view.eye, field.arrives(lamp)))
+    made = picture(view, look_up(field, view), lit_by(field, view, lamp, field.arrives(lamp)))
     origin, rays = view.rays(np.array([[SIZE / 2, SIZE / 2]]))
     b = rays[0] @ origin
     point = origin + (-b - np.sqrt(b * b - (origin @ origin - RADIUS**2))) * rays[0]
@@ -120,8 +120,8 @@ def test_lamps_add_up_and_far_lamps_are_distant_ones() -> None:
     near = [
         Lamp(np.array(p), -np.array(p) / np.linalg.norm(p), np.full(3, 4.0)) for p in ([0, 0, 1.3], [1.0, 0.5, 0.5])
     ]
-    both = under_lamps(field, [view], near, lambda d, n: None)[0]
-    each = [under_lamps(field, [view], [lamp], lambda d, n: None)[0] for lamp in near]
+    both = under_lamps(field, [view], near, lambda d, n: None)[0].radiance
+    each = [under_lamps(field, [view], [lamp], lambda d, n: None)[0].radiance for lamp in near]
     np.testing.assert_allclose(both, each[0] + each[1], rtol=1e-5, atol=1e-7)
     direction = np.array([0.6, 0.0, 0.8])
     far = Lamp(500 * direction, -direction, np.full(3, 500.0**2))
@@ -134,7 +134,7 @@ def test_a_white_environment_lights_a_matt_ball_with_its_albedo() -> None:
     """Oracle: radiance 1 from everywhere gives a Lambertian convex body the radiance a."""
     field, view = field_of(np.array([0.6, 0.3, 0.1])), camera()
     lamps = lamps_of(np.ones((32, 64, 3), np.float32), "white", quick=True)
-    made = under_lamps(field, [view], lamps, lambda d, n: None)[0]
+    made = under_lamps(field, [view], lamps, lambda d, n: None)[0].radiance
     np.testing.assert_allclose(np.median(made, 0), [0.6, 0.3, 0.1], rtol=0.05)
 
 
@@ -228,7 +228,7 @@ def test_the_stage_on_a_ball(ball: stage.Inputs, tmp_path: Path) -> None:
     view = PinholeCamera(K, made.poses[1], SIZE, SIZE)
     n = found.left_out[1]
     lamp = Lamp(made.positions[n], -made.positions[n] / DISTANCE, made.intensities[n])
-    shown = picture(view, look_up(field, view), field.radiance(lamp, view.eye, field.arrives(lamp)))
+    shown = picture(view, look_up(field, view), lit_by(field, view, lamp, field.arrives(lamp)))
     truth = photograph(made, 1, n, 0.03)
     inside = shown[..., 3] > 0.99
     assert np.sqrt(np.mean((shown[..., :3] - truth)[inside] ** 2)) < 0.025  # .0202; the highlight is no GGX lobe

@@ -58,8 +58,8 @@ def relit_pictures(
         lamps += environment(request.light, capture_from_asset, quick=quick)
     shown = [v.scaled(request.width) if request.width else v for v in views.values()]
     made = under_lamps(field, shown, lamps, lambda done, total: None)
-    for name, view, radiance in zip(views, shown, made, strict=True):
-        rgba = picture(view, look_up(field, view, max(2, request.samples)), radiance)
+    for name, view, lit in zip(views, shown, made, strict=True):
+        rgba = picture(view, look_up(field, view, max(2, request.samples)), lit)
         yield put_picture(request.out, name, rgba, notify), time.perf_counter() - start
         start = time.perf_counter()
 
