@@ -31,6 +31,9 @@ from pipeline.transforms import F64
 
 NEAR = 5.0  # degrees
 UNKNOWN = 0.1  # weight of "no glint": far from what was seen there is none
+BESIDE = 0.004  # metres beside a cornea to which a surface belongs to it: between lids it is not fitted better
+FACING = 0.5  # least cosine between the normals of such a surface and of the cornea
+DRY, WET = 0.3, 0.7  # shares between which the surface becomes a cornea
 ROUNDS = 8  # of the reflected point; each brings it nearer by the radius over the distance
 
 
@@ -49,6 +52,15 @@ class Cornea:
         """(N,) s at unit normals (N, 3)."""
         near = np.exp((normals @ self.normals.T - 1) / (1 - np.cos(np.radians(NEAR))))
         return np.asarray(near @ self.seen / (near.sum(1) + UNKNOWN), np.float64)
+
+    def covers(self, position: F64, normal: F64) -> tuple[F64, F64]:
+        """(N,) how far a surface at (N, 3) with unit normals (N, 3) is cornea, 0 to 1, and (N, 3) the cornea's unit
+        normals there."""
+        away = position - self.centre
+        n, apart = unit(away), np.abs(np.linalg.norm(away, axis=1) - self.radius)
+        s = ((self.share(n) - DRY) / (WET - DRY)).clip(0, 1)
+        s = np.where((apart < BESIDE) & ((n * normal).sum(1) > FACING), s * s * (3 - 2 * s), 0.0)
+        return np.asarray(s, np.float64), n
 
 
 def reflected(centre: F64, radius: float, eye: F64, lamp: F64) -> tuple[F64, F64]:

@@ -23,10 +23,10 @@ import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.errors import StageError
-from pipeline.eyes.mirror import Cornea
+from pipeline.eyes.mirror import BESIDE, Cornea
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import F64
-from stages.reflectance.field import BESIDE, Field
+from stages.reflectance.field import Field
 from stages.reflectance.texels import known_surface
 
 REST = "rest.obj"

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from pipeline import meshes
 from pipeline.errors import StageError
-from pipeline.eyes.mirror import Cornea, from_stored, stored
+from pipeline.eyes.mirror import BESIDE, Cornea, from_stored, stored
 from pipeline.images import F32, read_exr, write_exr
 from pipeline.nearest import nearest_known
 from pipeline.ray_casting import RayCaster
@@ -39,7 +39,6 @@ from stages.reflectance.texels import Points, arriving, known_surface, points_of
 BASIS, MESH = "basis.json", "mesh.npz"
 KERNEL = 18.0  # degrees: width of the kernel that carries shadows from the stage's lights to others
 UNKNOWN = 0.02  # weight of "as traced" in it
-BESIDE = 0.004  # metres outside of a cornea to which texels belong to it
 FAR = 1e4  # asset units: distance of a distant lamp
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import pytest
 
 from pipeline.artifacts import FileRef, Located
 from pipeline.contract import Context
+from pipeline.eyes.mirror import Cornea, stored
 from pipeline.images import read_exr, write_exr
+from pipeline.meshes import unit
 from pipeline.reflectance_artifacts import ReflectanceField
-from stages.bake.lit import Measured, measured_of
+from stages.bake.lit import Measured, measured_of, with_corneas
 from stages.bake.stage import Config, Inputs, run
 from tests.bake.test_bake_stage import inputs  # noqa: F401  (a fixture)
 from tests.support.ball_head import no_field
@@ -41,6 +44,46 @@ def test_values_between_texels_are_bilinear(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.at(texel)[:, 0], 0.2 + 0.5 * place, atol=1e-3)
     rows = Measured(np.arange(SIDE, dtype=np.float32)[:, None, None] * np.ones((1, SIDE, 9), np.float32), SIDE)
     np.testing.assert_allclose(rows.at(np.array([0, 5 * SIDE, SIDE * SIDE - 1]))[:, 0], [0, 5, SIDE - 1])
+
+
+def test_corneas_reflect_as_spheres(tmp_path: Path) -> None:
+    """Oracle: on a sphere's front half the normals are those of the sphere; elsewhere nothing changes."""
+    side, centre, radius = 64, np.array([0.03, 0, 0.08]), 0.0078
+    x, y = np.meshgrid(*[(np.arange(side) + 0.5) / side * 0.03 - 0.015] * 2)
+    flat = np.stack([x + 0.03, -y, np.full_like(x, 0.08 + 0.007)], 2)  # a plane that cuts through the cornea's front
+    surface = np.concatenate([flat, np.broadcast_to([0.0, 0, 1], flat.shape)], 2).astype(np.float32)
+    values = np.concatenate([np.full((side, side, 3), 0.4), np.full((side, side, 1), 0.02),
+                             np.full((side, side, 1), 0.5), surface[..., 3:], np.ones((side, side, 1))], 2)  # fmt: skip
+    rng = np.random.default_rng(0)
+    normals = unit(rng.normal(size=(20_000, 3)) * 0.4 + [0, 0, 1])
+    cornea = Cornea(centre, radius, 0.035, normals, (normals[:, 2] > 0.8).astype(float))
+    found = with_corneas(values.astype(np.float32), surface, [cornea])
+    away = flat - centre
+    n = away / np.linalg.norm(away, axis=2, keepdims=True)
+    wet, dry = n[..., 2] > 0.9, (n[..., 2] < 0.65)
+    assert wet.sum() > 100 and dry.sum() > 100
+    np.testing.assert_allclose(found[wet][:, 5:8], n[wet], atol=2e-3)
+    np.testing.assert_allclose(found[wet][:, 3:5], np.broadcast_to([0.035, 0.1], (wet.sum(), 2)), rtol=1e-3)
+    np.testing.assert_allclose(found[dry], values[dry], atol=1e-6)
+    np.testing.assert_array_equal(found[..., :3], values[..., :3].astype(np.float32))
+    behind = surface * np.array([1, 1, 1, -1, -1, -1], np.float32)  # the back of a thin sheet is none
+    np.testing.assert_allclose(with_corneas(values.astype(np.float32), behind, [cornea]), values, atol=1e-6)
+    far = surface + np.array([0, 0, 0.02, 0, 0, 0], np.float32)
+    np.testing.assert_allclose(with_corneas(values.astype(np.float32), far, [cornea]), values, atol=1e-6)
+    np.testing.assert_allclose(with_corneas(values.astype(np.float32), surface, []), values, atol=1e-6)
+
+
+def test_corneas_are_read_with_the_maps(tmp_path: Path) -> None:
+    field = field_of(tmp_path)
+    surface = np.zeros((SIDE, SIDE, 6), np.float32)
+    surface[..., 2], surface[..., 5] = 0.0078, 1
+    write_exr(tmp_path / "reflectance/surface.exr", surface, tuple(f"c{i}" for i in range(6)))
+    cornea = Cornea(np.zeros(3), 0.0078, 0.035, np.array([[0.0, 0, 1]]), np.ones(1))
+    (tmp_path / "reflectance/basis.json").write_text(json.dumps({"corneas": stored([cornea])}))
+    more = tuple(FileRef.of(tmp_path, f"reflectance/{n}") for n in ("surface.exr", "basis.json"))
+    both = field.artifact.model_copy(update={"files": field.artifact.files + more})
+    found = measured_of(Located(both, tmp_path), 64)
+    assert found is not None and found.values[..., 3].min() == pytest.approx(0.035, rel=1e-3)
 
 
 def test_other_captures_have_none(tmp_path: Path) -> None:

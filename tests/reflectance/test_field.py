@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline import meshes
-from pipeline.artifacts import CameraSet, Located, UvMesh
+from pipeline.artifacts import CameraSet, Located, MaskSet, UvMesh
 from pipeline.camera import PinholeCamera
 from pipeline.contract import Context
 from pipeline.errors import StageError
@@ -199,7 +199,8 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> stage.Inputs:
     place = Context(folder, folder)
     uv = UvMesh(mesh=place.file("mesh.npz"), vertices=len(mesh.vertices), faces=len(mesh.faces), charts=1,
                 utilisation=1, stretch=1, overlap=0, deviation_mm=0)  # fmt: skip
-    return stage.Inputs(Located(read, work), Located(cameras, folder), Located(uv, folder))
+    masks = MaskSet(masks=())
+    return stage.Inputs(Located(read, work), Located(cameras, folder), Located(masks, folder), Located(uv, folder))
 
 
 def test_the_stage_on_a_ball(ball: stage.Inputs, tmp_path: Path) -> None:
@@ -242,7 +243,7 @@ def test_a_held_out_camera_is_no_part_of_the_field(ball: stage.Inputs, tmp_path:
     shutil.copytree(ball.capture.folder, copy)
     found, texels = [], []
     for name in ("as it is", "black"):
-        inputs = stage.Inputs(Located(held, copy), ball.poses, ball.uv)
+        inputs = stage.Inputs(Located(held, copy), ball.poses, ball.masks, ball.uv)
         work = tmp_path / name
         work.mkdir()
         found.append(stage.run(inputs, stage.Config(size=64), Context(work, work / "scratch")))
@@ -277,7 +278,7 @@ def test_two_runs_are_equal(ball: stage.Inputs, tmp_path: Path) -> None:
 
 def test_other_captures_pass_through(ball: stage.Inputs, tmp_path: Path) -> None:
     plain = Located(ball.capture.artifact.model_copy(update={"stage": None}), ball.capture.folder)
-    found = stage.run(stage.Inputs(plain, ball.poses, ball.uv), stage.Config(), Context(tmp_path, tmp_path))
+    found = stage.run(stage.Inputs(plain, ball.poses, ball.masks, ball.uv), stage.Config(), Context(tmp_path, tmp_path))
     assert not found.present and not found.files and not list(tmp_path.iterdir())
 
 
@@ -293,5 +294,6 @@ def test_a_picture_that_vanishes_is_told(ball: stage.Inputs, tmp_path: Path) -> 
     (copy / frame.image.path).unlink()
     gone = Located(ball.capture.artifact, copy)
     with pytest.raises((StageError, OSError)):
-        stage.run(stage.Inputs(gone, ball.poses, ball.uv), stage.Config(size=64), Context(tmp_path, tmp_path / "s"))
+        inputs = stage.Inputs(gone, ball.poses, ball.masks, ball.uv)
+        stage.run(inputs, stage.Config(size=64), Context(tmp_path, tmp_path / "s"))
     assert read_linear(ball.capture.path(frame.image)).shape == (SIZE, SIZE, 3)
