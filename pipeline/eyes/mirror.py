@@ -34,6 +34,7 @@ UNKNOWN = 0.1  # weight of "no glint": far from what was seen there is none
 BESIDE = 0.004  # metres beside a cornea to which a surface belongs to it: between lids it is not fitted better
 FACING = 0.5  # least cosine between the normals of such a surface and of the cornea
 DRY, WET = 0.3, 0.7  # shares between which the surface becomes a cornea
+RIM, INNER = 40.0, 25.0  # degrees from the middle between which it does: the rim mirrors what is beside the head
 ROUNDS = 8  # of the reflected point; each brings it nearer by the radius over the distance
 
 
@@ -58,9 +59,16 @@ class Cornea:
         normals there."""
         away = position - self.centre
         n, apart = unit(away), np.abs(np.linalg.norm(away, axis=1) - self.radius)
-        s = ((self.share(n) - DRY) / (WET - DRY)).clip(0, 1)
-        s = np.where((apart < BESIDE) & ((n * normal).sum(1) > FACING), s * s * (3 - 2 * s), 0.0)
-        return np.asarray(s, np.float64), n
+        middle = unit((self.seen @ self.normals)[None])[0]
+        rim, inner = np.cos(np.radians([RIM, INNER]))
+        s = _risen(self.share(n), DRY, WET) * _risen(n @ middle, rim, inner)
+        return np.where((apart < BESIDE) & ((n * normal).sum(1) > FACING), s, 0.0), n
+
+
+def _risen(x: F64, low: float, high: float) -> F64:
+    """0 below low, 1 above high, smooth between."""
+    t = ((x - low) / (high - low)).clip(0, 1)
+    return np.asarray(t * t * (3 - 2 * t), np.float64)
 
 
 def reflected(centre: F64, radius: float, eye: F64, lamp: F64) -> tuple[F64, F64]:

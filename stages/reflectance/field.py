@@ -45,17 +45,19 @@ FAR = 1e4  # asset units: distance of a distant lamp
 @dataclass(frozen=True, slots=True)
 class Lamp:
     """A lamp in asset coordinates. position (3,); axis (3,) unit, along which it shines; strength (3,) radiant
-    intensity. distant: position is only a direction, and shadows are traced along it."""
+    intensity. distant: position is only a direction, and shadows are traced along it. spread: standard deviation of
+    directions towards it, radians, if it stands for a part of an environment; only its glints are as wide."""
 
     position: F64
     axis: F64
     strength: F64
     distant: bool = False
+    spread: float = 0.0
 
 
-def distant_lamp(towards: F64, irradiance: F64) -> Lamp:
+def distant_lamp(towards: F64, irradiance: F64, spread: float = 0.0) -> Lamp:
     """A lamp at infinity: unit direction (3,) towards it, irradiance (3,) on a surface that faces it."""
-    return Lamp(FAR * towards, -towards, irradiance * FAR**2, distant=True)
+    return Lamp(FAR * towards, -towards, irradiance * FAR**2, distant=True, spread=spread)
 
 
 class Field:

@@ -1,7 +1,8 @@
 """Pictures of a field's glints: reflections of lamps on its corneas (pipeline/eyes/mirror.py), spread over pixels as by
 optics.
 
-How much of a lamp's light arrives at a cornea is what arrives at the field's texels beside the reflection.
+How much of a lamp's light arrives at a cornea is what arrives at the field's texels beside the reflection. A mirror of
+radius R turns by a / 2 for a lamp that is a radians aside, so that a lamp of that spread is R a / 2 wide on it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pipeline.transforms import F64, inverse_rigid, project
 from stages.reflectance.field import Field, Lamp
 
 BLUR = 0.5  # pixels: standard deviation of optics and demosaicing
-REACH = 3  # pixels to each side that a glint is spread over
+REACH = 4.0  # standard deviations to each side that a glint is spread over, and half a pixel
 CLEAR = 0.005  # metres above the cornea at which rays start: the fitted surface is that far off between the lids
 AROUND = 0.0015  # metres: texels around a reflection
 LEAST = 1e-3  # share of the light below which there is no glint
@@ -37,8 +38,9 @@ def glints(field: Field, camera: PinholeCamera, lamp: Lamp) -> F32:
         if share < LEAST:
             continue
         total = share * intensity(cornea.radius, cornea.f0, x, place, strength)[0] * summed(camera, x)[0]
-        uv, _ = project(camera.K, inverse_rigid(camera.world_from_cam), camera.distortion, x)
-        _spread(out, uv[0], total)
+        uv, depth = project(camera.K, inverse_rigid(camera.world_from_cam), camera.distortion, x)
+        width = cornea.radius * lamp.spread / 2 * camera.K[0, 0] / depth[0]
+        _spread(out, uv[0], total, float(np.hypot(BLUR, width)))
     return out.astype(np.float32)
 
 
@@ -61,16 +63,17 @@ def arriving_at(texels: Field, lamp: Lamp, x: F64) -> F64:
     return np.asarray(near @ found / near.sum(1))
 
 
-def _spread(out: F64, place: F64, value: F64) -> None:
-    """Add value (3,) around a place (x, y; the first pixel's corner is 0) of a picture (H, W, 3), by a Gaussian."""
+def _spread(out: F64, place: F64, value: F64, width: float) -> None:
+    """Add value (3,) around a place (x, y; the first pixel's corner is 0) of a picture (H, W, 3), by a Gaussian of this
+    standard deviation in pixels."""
     if not np.isfinite(place).all():
         return
-    parts, spans = [], []
+    reach, parts, spans = int(np.ceil(REACH * width + 0.5)), [], []
     for centre, size in ((place[1], out.shape[0]), (place[0], out.shape[1])):
-        middle = int(np.floor(np.clip(centre, -REACH - 1, size + REACH + 1)))
-        first, last = max(middle - REACH, 0), min(middle + REACH + 1, size)
+        middle = int(np.floor(np.clip(centre, -reach - 1, size + reach + 1)))
+        first, last = max(middle - reach, 0), min(middle + reach + 1, size)
         if first >= last:
             return
-        parts.append(np.diff(erf((np.arange(first, last + 1) - centre) / (np.sqrt(2) * BLUR))) / 2)
+        parts.append(np.diff(erf((np.arange(first, last + 1) - centre) / (np.sqrt(2) * width))) / 2)
         spans.append(slice(first, last))
     out[spans[0], spans[1]] += parts[0][:, None, None] * parts[1][:, None] * value

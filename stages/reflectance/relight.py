@@ -120,5 +120,5 @@ def lamps_of(environment: F32, name: str, *, quick: bool) -> list[Lamp]:
     from pipeline.lighting.median_cut import lamps as cut
 
     found = cut(checked_environment(environment, name), QUICK if quick else FULL)
-    return [distant_lamp(d.astype(np.float64), f.astype(np.float64))
-            for d, f in zip(found.directions, found.flux, strict=True)]  # fmt: skip
+    return [distant_lamp(d.astype(np.float64), f.astype(np.float64), float(np.sqrt(s)))
+            for d, f, s in zip(found.directions, found.flux, found.spread, strict=True)]  # fmt: skip

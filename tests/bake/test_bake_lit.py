@@ -60,7 +60,7 @@ def test_corneas_reflect_as_spheres(tmp_path: Path) -> None:
     found = with_corneas(values.astype(np.float32), surface, [cornea])
     away = flat - centre
     n = away / np.linalg.norm(away, axis=2, keepdims=True)
-    wet, dry = n[..., 2] > 0.9, (n[..., 2] < 0.65)
+    wet, dry = n[..., 2] > 0.92, n[..., 2] < 0.65
     assert wet.sum() > 100 and dry.sum() > 100
     np.testing.assert_allclose(found[wet][:, 5:8], n[wet], atol=2e-3)
     np.testing.assert_allclose(found[wet][:, 3:5], np.broadcast_to([0.035, 0.1], (wet.sum(), 2)), rtol=1e-3)

@@ -74,7 +74,7 @@ def test_radiance_summed_over_pixels() -> None:
     camera = PinholeCamera(
         np.array([[900.0, 0, 40], [0, 1100.0, 30], [0, 0, 1]]), rigid(np.eye(3), np.zeros(3)), 80, 60
     )
-    at = np.array([[0.03, -0.02, 1.0]])
+    at = np.array([[0.025, -0.015, 0.8]])
     side = 20
     rows, columns = np.mgrid[: 60 * side, : 80 * side]
     uv = (np.stack([columns.ravel(), rows.ravel()], 1) + 0.5) / side
@@ -91,7 +91,8 @@ def test_radiance_summed_over_pixels() -> None:
 def test_a_glint_is_shared_as_the_lamps_around_show_it() -> None:
     normals = unit(np.array([[0.0, 0, 1], [0.1, 0, 1], [0, 0.5, 1]]))
     cornea = Cornea(CENTRE, RADIUS, 0.03, normals, np.array([1.0, 1, 0]))
-    share = cornea.share(unit(np.array([[0.05, 0, 1.0], [0, 0.5, 1], [-1, 0, 0.1]])))
+    share = cornea.share(unit(np.array([[0.05, 0, 1.0], [0, 0.5, 1], [-1, 0, 0.1], [-0.36, 0, 1]])))
+    assert share[3] < 0.01  # 20 degrees from the nearest
     assert share[0] > 0.9 and share[1] < 0.05 and share[2] == pytest.approx(0, abs=1e-6)
     assert Cornea(CENTRE, RADIUS, 0.03, np.zeros((0, 3)), np.zeros(0)).share(normals).tolist() == [0, 0, 0]
 

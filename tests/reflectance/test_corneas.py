@@ -189,6 +189,24 @@ def test_a_distant_lamp_glints_as_a_far_one(field: Field) -> None:
     np.testing.assert_allclose(distant, near, rtol=0.02, atol=1e-4 * distant.max())
 
 
+def test_a_part_of_an_environment_is_as_wide_as_it_is(field: Field) -> None:
+    """Oracle: many distant lamps around a direction, as far spread: the same picture."""
+    view = PinholeCamera(K, camera_on_orbit(5, 8, 0.9, FRONT), SIDE, SIDE)
+    towards = unit(LAMP.position[None])[0]
+    one = glints(field, view, distant_lamp(towards, np.ones(3), 0.3))
+    across = np.linalg.svd(towards[None])[2][1:]
+    offsets = np.random.default_rng(2).normal(size=(1500, 2)) * 0.3
+    many = sum(glints(field, view, distant_lamp(unit((towards + np.tan(o) @ across)[None])[0], np.ones(3) / 1500))
+               for o in offsets)  # fmt: skip
+    assert many.max() < 0.7 * glints(field, view, distant_lamp(towards, np.ones(3))).max()
+    y, x = np.mgrid[:SIDE, :SIDE] + 0.5
+    widths = []
+    for image in (one, many):
+        w = image[..., 0] / image[..., 0].sum()
+        widths.append(np.sqrt((w * (x - (w * x).sum()) ** 2).sum()))
+    assert widths[0] == pytest.approx(widths[1], rel=0.15) and widths[0] > 1.0
+
+
 def test_a_moved_head_takes_its_cornea_along(field: Field) -> None:
     """Oracle: head, lamp and camera turned together: the same picture."""
     turn = Rotation.from_euler("xyz", [10, 25, -5], degrees=True).as_matrix()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,7 +102,6 @@ def environment(name: str, capture_from_asset: F64, *, quick: bool) -> list[Lamp
     """Distant lamps of --env: a made light or a file, as it stands in the capture's world."""
     from pipeline.maths import studio_lights
     from pipeline.transforms import scale_of
-    from stages.reflectance.field import Lamp
     from stages.reflectance.relight import lamps_of
 
     picture = light_picture(name)
@@ -115,9 +115,7 @@ def environment(name: str, capture_from_asset: F64, *, quick: bool) -> list[Lamp
         )
     turn = np.linalg.inv(capture_from_asset)[:3, :3]
     turn *= scale_of(capture_from_asset)
-    return [
-        Lamp(turn @ p.position, turn @ p.axis, p.strength, distant=True) for p in lamps_of(picture, name, quick=quick)
-    ]
+    return [replace(p, position=turn @ p.position, axis=turn @ p.axis) for p in lamps_of(picture, name, quick=quick)]
 
 
 def _views(request: RenderRequest) -> dict[str, PinholeCamera]:
