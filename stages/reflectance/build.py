@@ -37,6 +37,7 @@ from stages.reflectance.layer import standard_of
 from stages.reflectance.openpbr import NAME as OPENPBR
 from stages.reflectance.openpbr import OpenPbr
 from stages.reflectance.paint import marked, read_masks, replaced
+from stages.reflectance.pooled import Pooled
 from stages.reflectance.reshape import reshaped
 from stages.reflectance.rig import Rig, rig_of
 from stages.reflectance.samples import Step, gather
@@ -211,9 +212,12 @@ def fitted_field(
     alphas = chosen_widths(points, pairs, table, rig, arrives, config.normal_prior, step)
     parts = split(points, pairs, table, rig, arrives, alphas, config.normal_prior, config.order, step)
     step(0, 1, "filling what no camera saw")
+    pooled = Pooled(points, pairs, parts.albedo.astype(np.float64))
+    parts = replace(parts, lobes=pooled(parts.lobes), rest=pooled(parts.rest))
     flat = parts.rest.reshape(len(parts.rest), -1)
     marks = marked(read_masks(Path(config.paint)), points) if config.paint else np.zeros(len(flat), np.bool_)
     standard = standard_of(parts.layers, points.position)
+    standard[:, 3:] = pooled(standard[:, 3:])
     fitted = np.concatenate([parts.albedo, parts.lobes, standard, flat], 1)
     filled = replaced(fitted, marks, pairs.sure, points.position)
     # the field keeps what explains its own grazing pixels; in an asset that is a dark or white rim
