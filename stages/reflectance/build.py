@@ -220,12 +220,9 @@ def fitted_field(
     standard[:, 3:] = pooled(standard[:, 3:])
     fitted = np.concatenate([parts.albedo, parts.lobes, standard, flat], 1)
     filled = replaced(fitted, marks, pairs.sure, points.position)
-    # the field keeps what explains its own grazing pixels; in an asset that is a dark or white rim
-    own = pairs.seen & ~marks
-    field_of = np.where(own[:, None], fitted, filled)
     parts = _unmarked(parts, marks, points)
     arrays: dict[str, npt.NDArray[Any]] = {
-        "albedo": field_of[:, :3], "lobes": field_of[:, 3:6], "normal": parts.normal, "rest": field_of[:, 11:],
+        "albedo": filled[:, :3], "lobes": filled[:, 3:6], "normal": parts.normal, "rest": filled[:, 11:],
         OPENPBR: filled[:, 6:11],
         "shadow": parts.shadow, "trust": parts.trust, "coverage": pairs.seen[:, None].astype(np.float32),
     }  # fmt: skip

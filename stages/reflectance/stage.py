@@ -39,4 +39,4 @@ def run(inputs: Inputs, config: Config, context: Context) -> ReflectanceField:
     return build(inputs.capture, inputs.poses, inputs.masks, inputs.uv, config, context)
 
 
-STAGE = Stage(name="reflectance", version=10, inputs=Inputs, config=Config, output=ReflectanceField, run=run)
+STAGE = Stage(name="reflectance", version=11, inputs=Inputs, config=Config, output=ReflectanceField, run=run)

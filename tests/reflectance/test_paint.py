@@ -106,7 +106,8 @@ def test_the_stage_replaces_what_is_painted(ball: stage.Inputs, tmp_path: Path) 
     assert 10 < marks.sum() < 0.1 * len(marks)
     for name in ("albedo", "lobes", "normal", "rest"):
         a, b = plain.arrays[name], painted.arrays[name]
-        np.testing.assert_array_equal(a[~marks & plain.known], b[~marks & plain.known])
+        # the last bit of a half float: the rim is continued by the same system
+        np.testing.assert_allclose(a[~marks & plain.known], b[~marks & plain.known], rtol=1e-3, atol=1e-6)
         assert (np.abs(a - b)[marks].max(1) > 1e-4).mean() > 0.5
     np.testing.assert_array_equal(plain.known, painted.known)  # it still throws shadows
     np.testing.assert_allclose(painted.normal[marks], plain.points.normal[marks], atol=2e-3)
