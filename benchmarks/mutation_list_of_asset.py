@@ -233,7 +233,7 @@ OF_ASSET = (
     Mutation("stages/inverse_rendering/weakly_seen.py", "np.minimum(length[nearest[weak]], most)",
              "length[nearest[weak]]",
              "tests/inverse_rendering/test_weakly_seen.py::test_at_last_only_ripples_of_a_few_cells_go"),
-    Mutation("stages/inverse_rendering/fit.py", "if due > len(SMOOTH_AT):", "if due >= len(SMOOTH_AT):",
+    Mutation("stages/inverse_rendering/fit.py", "if due > len(shares):", "if due >= len(shares):",
              "tests/inverse_rendering/test_weakly_seen.py::test_the_last_smoothing_of_a_fit_is_of_ripples_alone"),
     Mutation("stages/bake/even_skin.py", "of_s * (u - mean)", "of_a * (u - mean)",
              "tests/bake/test_even_skin.py::test_skin_without_another_side_has_the_share_of_both"),

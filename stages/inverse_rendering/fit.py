@@ -49,7 +49,7 @@ from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
 from stages.inverse_rendering.trials import LENGTH, SELECTION, SHADOWS, SKIN, SMOOTHING, Trials
-from stages.inverse_rendering.weakly_seen import RIPPLE, RIPPLES_AT, SMOOTH_AT, smooth_weakly_seen
+from stages.inverse_rendering.weakly_seen import RIPPLE, RIPPLES_AT, smooth_weakly_seen, smoothing_shares
 
 BAND_EVERY = 250  # steps after which the narrow band is found again
 SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
@@ -221,11 +221,11 @@ class Trainer(TrialLoop):
 
     def smooth(self) -> None:
         """Smooth the surface where the photos hardly determine it, when it is due; at last its ripples alone."""
-        due = sum(self.share() >= s for s in (*SMOOTH_AT, RIPPLES_AT))
-        longest = self.settings.unseen_smoothing
+        shares, longest = smoothing_shares(self.settings.steps), self.settings.unseen_smoothing
+        due = sum(self.share() >= s for s in (*shares, RIPPLES_AT))
         if longest <= 0 or self.smoothings >= due or self.geometry_frozen:
             return
-        if due > len(SMOOTH_AT):
+        if due > len(shares):
             smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest, RIPPLE)
         elif self.trials.allows(self, SMOOTHING):
             self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)

@@ -18,6 +18,7 @@ OPEN_UNTIL = 0.5  # share of the fit after which all levels are active
 UNIFORM_LIGHT_ORDER = 3  # diffuse skin determines hardly more of a light
 UNIFORM_LIGHT_RATE = 10.0  # factor of the light's rate in the light-only phase
 KNOWN_LIGHT_RATE = 0.1  # factor of the light's rate if the light is known from the lobe
+DRIFT_STEPS = 1300  # of a draft: in a longer fit, a light that nothing tells moves no farther than there
 SETTLING = 0.03  # share of the fit after the light-only phase in which the surface is frozen
 SHADOWS_AT = (0.3, 0.5, 0.7)  # shares of the fit at which shadows are solved again
 SKIN_AT = 0.8  # share of the fit at which the light is corrected by the skin: the albedo is that of the light before
@@ -87,7 +88,8 @@ def set_rates(fit: Scheduled) -> float:
     frozen together with the surface, and the reflectance adapts to it; later it has a low rate. A given light is
     frozen throughout. If the lobe does not determine the light, everything except the light is frozen, and the
     albedo is uniform: the light, which was uniform at the start, explains the shading that was in the albedo
-    before. Earlier, the surface is still wrong.
+    before. Earlier, the surface is still wrong. From there on its rate falls with the steps of the fit: photos hardly
+    tell such a light from the albedo, so that it would go the farther the longer the fit lasts.
     """
     s, p = fit.settings, fit.share()
     decay: float = 0.1 ** max((p - 0.3) / 0.7, 0.0)
@@ -95,16 +97,19 @@ def set_rates(fit: Scheduled) -> float:
     interlude = UNIFORM_FROM <= p < s.uniform_albedo_until and not fit.light_moves
     light_known = fit.light_given != "" or (fit.choices is not None and fit.choices.light_known)
     fit.model.uniform_albedo = interlude and not light_known
+    drift = min(DRIFT_STEPS / s.steps, 1.0)
     second = None if fit.model.second is None else next(fit.model.second.light.parameters())
     for group in fit.optimiser.param_groups:
         other = group["params"][0] is second
         light = other or group["params"][0] is next(fit.model.light.parameters())
         group["lr"] = group["start"] * decay * warm
         if interlude and not light_known:
-            group["lr"] *= UNIFORM_LIGHT_RATE if light else 0.0
+            group["lr"] *= UNIFORM_LIGHT_RATE * drift if light else 0.0
         elif light and (light_known or fit.light_told):
             frozen = interlude or (fit.light_given and not other)
             group["lr"] *= 0.0 if frozen else KNOWN_LIGHT_RATE
+        elif light and p >= UNIFORM_FROM and not fit.light_moves:
+            group["lr"] *= drift
     finest = fit.model.geometry.cell / 2 ** (len(LEVEL_STARTS[s.levels]) - 1 - fit.level)
     start, end = 0.5 * finest * 2 ** (len(LEVEL_STARTS[s.levels]) - 1), s.beta_end * finest
     fit.model.beta.fill_(start * (end / start) ** min(p / 0.8, 1.0))

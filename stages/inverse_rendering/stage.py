@@ -216,7 +216,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=49,
+    version=50,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

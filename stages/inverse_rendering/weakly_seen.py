@@ -49,6 +49,7 @@ from stages.inverse_rendering.smoothest import laplacian, solved
 F64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]
 SMOOTH_AT = (0.35, 0.55)  # shares of the fit: then the colours follow, and the photos correct the outline
+AGAIN_UNTIL, AGAIN_EACH, AGAIN = 0.9, 700, 8  # long fits make the noise anew: until then, each so many steps, at most
 RIPPLES_AT = 0.93  # the same for the last smoothing
 RIPPLE = 0.6  # cells: a ripple of 3.8 cells is halved, of 8 cells 4 % lower
 NOISE = 1.5  # pixels that noise may move the surface for I = 1
@@ -60,6 +61,13 @@ BAND = 6.0  # cells around the zero set that are solved for
 LEAST, MOST = 0.7, 3.0  # cells; a longer q takes far more iterations
 ITERATIONS = 120
 TINY = 1e-9
+
+
+def smoothing_shares(steps: int) -> tuple[float, ...]:
+    """Shares of a fit of so many steps at which the surface is smoothed."""
+    last = SMOOTH_AT[-1]
+    count = min(int((AGAIN_UNTIL - last) * steps / AGAIN_EACH), AGAIN)
+    return (*SMOOTH_AT, *(last + (AGAIN_UNTIL - last) * (k + 1) / count for k in range(count)))
 
 
 def smooth_weakly_seen(

@@ -16,11 +16,14 @@ from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.weakly_seen import (
     NOISE,
     RIPPLE,
+    RIPPLES_AT,
+    SMOOTH_AT,
     information,
     lengths,
     outlines,
     outside,
     smooth_weakly_seen,
+    smoothing_shares,
 )
 from tests.support.small_ball import SMALL, trainer
 
@@ -244,6 +247,15 @@ def test_without_views_nothing_changes() -> None:
     before = grid.values.detach().clone()
     assert smooth_weakly_seen(grid, [], SIDE, 0.01) == 0
     assert torch.equal(before, grid.values.detach())
+
+
+def test_long_fits_are_smoothed_again() -> None:
+    assert smoothing_shares(1300) == smoothing_shares(1) == SMOOTH_AT  # a draft
+    for steps, count in ((2200, 1), (8000, 4), (12_000, 6), (10**7, 8)):
+        shares = smoothing_shares(steps)
+        assert len(shares) == 2 + count and shares[:2] == SMOOTH_AT
+        assert list(shares) == sorted(shares) and shares[-1] == pytest.approx(0.9) and shares[-1] < RIPPLES_AT
+        assert np.diff(shares[1:]).min() * steps > 699
 
 
 def test_the_last_smoothing_of_a_fit_is_of_ripples_alone(monkeypatch: pytest.MonkeyPatch) -> None:
