@@ -6,6 +6,12 @@ from benchmarks.mutation import Mutation
 
 OF_FIT = (
     # ---------------------------------------------------------------- the outline's level
+    Mutation("stages/inverse_rendering/schedule.py", "group[\"lr\"] *= drift", "group[\"lr\"] *= 1.0",
+             "tests/inverse_rendering/test_schedule.py"),
+    Mutation("stages/inverse_rendering/schedule.py", "UNIFORM_LIGHT_RATE * drift if light", "UNIFORM_LIGHT_RATE if light",
+             "tests/inverse_rendering/test_schedule.py"),
+    Mutation("stages/inverse_rendering/weakly_seen.py", "* steps / AGAIN_EACH), AGAIN)", "* steps / AGAIN_EACH), 0)",
+             "tests/inverse_rendering/test_weakly_seen.py"),
     Mutation("stages/inverse_rendering/outline_level.py", "np.quantile(least[rows], share)",
              "np.quantile(least[rows], 1 - share)",
              "tests/inverse_rendering/test_outline_level.py::test_the_level_is_that_of_the_masks"),
