@@ -8,8 +8,8 @@ OF_FIT = (
     # ---------------------------------------------------------------- the outline's level
     Mutation("stages/inverse_rendering/schedule.py", "group[\"lr\"] *= drift", "group[\"lr\"] *= 1.0",
              "tests/inverse_rendering/test_schedule.py"),
-    Mutation("stages/inverse_rendering/schedule.py", "UNIFORM_LIGHT_RATE * drift if light", "UNIFORM_LIGHT_RATE if light",
-             "tests/inverse_rendering/test_schedule.py"),
+    Mutation("stages/inverse_rendering/schedule.py", "UNIFORM_LIGHT_RATE * drift if light",
+             "UNIFORM_LIGHT_RATE if light", "tests/inverse_rendering/test_schedule.py"),
     Mutation("stages/inverse_rendering/weakly_seen.py", "* steps / AGAIN_EACH), AGAIN)", "* steps / AGAIN_EACH), 0)",
              "tests/inverse_rendering/test_weakly_seen.py"),
     Mutation("stages/inverse_rendering/outline_level.py", "np.quantile(least[rows], share)",
