@@ -190,7 +190,7 @@ OF_FIT = (
              "tests/bake/test_standard_fit.py::test_photos_at_grazing_angles_do_not_tell_the_albedo"),
     Mutation("stages/bake/standard_fit.py", "if mean[k] > prior.most:", "if mean[k] > 10 * prior.most:",
              "tests/bake/test_standard_fit.py::test_an_object_of_no_dielectric_is_refused"),
-    Mutation("stages/bake/unseen.py", "1 - share * share * (3 - 2 * share)", "share * share * (3 - 2 * share)",
+    Mutation("stages/bake/unseen.py", "1 - smoothstep(cosine, low, high)", "smoothstep(cosine, low, high)",
              "tests/bake/test_bake_unseen.py"),
     Mutation("stages/bake/unseen.py", "np.quantile(rank[of], 1 - BEST)", "np.quantile(rank[of], BEST)",
              "tests/bake/test_bake_unseen.py"),

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.camera import PinholeCamera
+from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import unit
 from pipeline.transforms import F64
 
@@ -61,14 +62,8 @@ class Cornea:
         n, apart = unit(away), np.abs(np.linalg.norm(away, axis=1) - self.radius)
         middle = unit((self.seen @ self.normals)[None])[0]
         rim, inner = np.cos(np.radians([RIM, INNER]))
-        s = _risen(self.share(n), DRY, WET) * _risen(n @ middle, rim, inner)
+        s = smoothstep(self.share(n), DRY, WET) * smoothstep(n @ middle, rim, inner)
         return np.where((apart < BESIDE) & ((n * normal).sum(1) > FACING), s, 0.0), n
-
-
-def _risen(x: F64, low: float, high: float) -> F64:
-    """0 below low, 1 above high, smooth between."""
-    t = ((x - low) / (high - low)).clip(0, 1)
-    return np.asarray(t * t * (3 - 2 * t), np.float64)
 
 
 def reflected(centre: F64, radius: float, eye: F64, lamp: F64) -> tuple[F64, F64]:

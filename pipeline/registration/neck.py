@@ -18,6 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
+from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Indices, Mask, triangles_of, vertex_normals
 from pipeline.registration.scan import Scan
 from pipeline.registration.subdivision import Edges, edges_of
@@ -38,12 +39,12 @@ def neck_share(template: Template, covered: Mask | None = None) -> F64:
     if covered is None or not covered.any():
         return share
     away = _along(template.vertices, edges_of(skin, len(template.vertices)), np.flatnonzero(covered))
-    return np.asarray(np.minimum(share, _step(away, HELD_COVERED, FREE_COVERED)))
+    return np.asarray(np.minimum(share, smoothstep(away, HELD_COVERED, FREE_COVERED)))
 
 
 def share_of(vertices: F64, skin: Indices, neck: Indices) -> F64:
     """The same for vertices (V, 3) in metres of the template, with quads (Q, 4) of the skin and of the neck."""
-    return _step(_away(vertices, skin, neck), HELD, FREE)
+    return smoothstep(_away(vertices, skin, neck), HELD, FREE)
 
 
 def covered_neck(template: Template, vertices: F64, scan: Scan, unit: float) -> Mask:
@@ -58,12 +59,6 @@ def covered_neck(template: Template, vertices: F64, scan: Scan, unit: float) -> 
     return out
 
 
-def _step(x: F64, low: float, high: float) -> F64:
-    """(N,) 0 up to low, 1 from high on, smooth between."""
-    t = np.clip((x - low) / (high - low), 0, 1)
-    return np.asarray(t * t * (3 - 2 * t))
-
-
 def from_border(template: Template) -> F64:
     """(V,) metres along edges of the skin from the neck's border; infinite without a border, and beside the skin."""
     return _away(template.vertices, template.quads[template.parts[SKIN]], _neck_quads(template))
@@ -72,7 +67,7 @@ def from_border(template: Template) -> F64:
 def sunk(template: Template) -> F64:
     """(V,) metres of the template by which the skin lies beneath the surface near the neck's border; 0 elsewhere."""
     away = from_border(template)
-    return np.asarray(SUNK * (1 - _step(np.minimum(away, LEVEL), OVERLAPPED, LEVEL)))
+    return np.asarray(SUNK * (1 - smoothstep(np.minimum(away, LEVEL), OVERLAPPED, LEVEL)))
 
 
 def neck_border(template: Template) -> Indices:

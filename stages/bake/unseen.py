@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS
 
@@ -31,8 +32,7 @@ def replaced_share(cosine: F64, region: Indices) -> F64:
     """(V,) how far the albedo is replaced, in [0, 1], by the best cosine (V,) towards a photo that sees the vertex, 0
     for none, and its region (V,)."""
     low, high = np.where(region == HAIR, HAIR_GRAZING, GRAZING), np.where(region == HAIR, HAIR_CLEAR, CLEAR)
-    share = ((cosine - low) / (high - low)).clip(0, 1)
-    return np.asarray(1 - share * share * (3 - 2 * share), np.float64)
+    return 1 - smoothstep(cosine, low, high)
 
 
 def with_hair(region: Indices, hair: Mask) -> Indices:

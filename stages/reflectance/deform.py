@@ -76,9 +76,7 @@ def moved(field: Field, vertices: F64) -> Field:
     out.turn = turn if field.turn is None else turn @ field.turn
     out.whole = RayCaster(mesh.vertices, faces)
     out.blocker = RayCaster(mesh.vertices, known_surface(mesh, out.points, field.known))
-    out.forget()
-    out.corneas = tuple(_carried(c, p.position, position) for c in field.corneas)
-    return out
+    return out.with_corneas(tuple(_carried(c, p.position, position) for c in field.corneas))
 
 
 def _carried(cornea: Cornea, before: F64, after: F64) -> Cornea:

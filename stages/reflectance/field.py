@@ -99,7 +99,7 @@ class Field:
     def with_corneas(self, corneas: tuple[Cornea, ...]) -> Field:
         """The same field with these corneas."""
         out = copy(self)
-        out.forget()
+        out.__dict__.pop("mirrors", None)
         out.corneas = corneas
         return out
 
@@ -113,16 +113,12 @@ class Field:
         away = np.linalg.norm(self.points.position - centre, axis=1)
         return self.part(np.flatnonzero(away < radius + BESIDE))
 
-    def forget(self) -> None:
-        """Drop what was computed for other texels or another shape."""
-        for name in ("nearest", "mirrors"):
-            self.__dict__.pop(name, None)
-
     def part(self, texels: npt.NDArray[np.int64]) -> Field:
         """The field of some of its texels, given by their place, lit as they are in the whole: shadows are those of the
         whole surface. Its texels alone can't be looked up in a picture."""
         out = copy(self)
-        out.forget()
+        for name in ("nearest", "mirrors"):  # of the whole
+            out.__dict__.pop(name, None)
         p = self.points
         out.points = replace(p, texel=p.texel[texels], face=p.face[texels], weights=p.weights[texels],
                              position=p.position[texels], normal=p.normal[texels])  # fmt: skip

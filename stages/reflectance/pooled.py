@@ -67,7 +67,8 @@ class Pooled:
 def _cells(position: F64, normal: F64) -> tuple[Any, int]:
     """(N,) cell of each point, and their number: cubes of CELL, two of them where surfaces face apart."""
     place = np.floor(position / CELL).astype(np.int64)
-    side = np.abs(normal).argmax(1) * 2 + (normal[np.arange(len(normal)), np.abs(normal).argmax(1)] > 0)
+    axis = np.abs(normal).argmax(1)
+    side = 2 * axis + (normal[np.arange(len(normal)), axis] > 0)
     _, cell = np.unique(np.concatenate([place, side[:, None]], 1), axis=0, return_inverse=True)
     cell = cell.ravel()
     return cell, int(cell.max()) + 1 if len(cell) else 0

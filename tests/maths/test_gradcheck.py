@@ -125,6 +125,7 @@ NUMPY = {  # nothing is differentiated there by torch
     "microfacet",
     "rigid_motion",
     "sh_monomials",
+    "smoothstep",
     "sparse",
     "student",
     "studio_lights",
