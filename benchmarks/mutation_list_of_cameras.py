@@ -9,6 +9,7 @@ WEAK, KEPT = "tests/inverse_rendering/test_weakly_seen.py", "tests/inverse_rende
 ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/test_steering.py"
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
+PARTS, COMPLETE = "tests/pipeline/test_needed_parts.py", "tests/masks/test_complete_mask.py"
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
 FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
 BEYOND, SPOTS = "tests/masks/test_beyond_hull.py", "tests/usd/test_usd_judge.py"
@@ -24,6 +25,18 @@ OF_CAMERAS = (
              f"{NEEDS}::test_a_mask_that_lacks_the_part_does_not_need_it"),
     Mutation("pipeline/hull_needs.py", "(w / camera.width, h / camera.height))", "(1, 1))",
              f"{NEEDS}::test_voxels_at_pixels_by_the_camera_matrix"),
+    Mutation("pipeline/needed_parts.py", ">= max(MASKS, lack + 1)", ">= 0",
+             f"{PARTS}::test_a_gap_that_few_masks_rightly_have_is_no_part"),
+    Mutation("pipeline/needed_parts.py", "sum(voters[k] not in missing", "sum(voters[k] in missing",
+             f"{PARTS}::test_what_a_few_masks_lack_and_the_others_need_is_found"),
+    Mutation("pipeline/needed_parts.py", "compress(alphas, votes)", "compress(alphas, [True] * len(alphas))",
+             f"{PARTS}::test_a_view_without_a_vote_is_told_as_well_and_does_not_vote"),
+    Mutation("stages/masks/complete_mask.py", "return new if kept and (new & part)", "return new if (new | part)",
+             f"{COMPLETE}::test_a_part_of_the_walls_colour_is_not_guessed"),
+    Mutation("stages/masks/segment.py", "np.where(self.doubtful, np.float32(1), self.small)", "self.small",
+             f"{COMPLETE}::test_masks_without_a_part_of_the_subject_do_not_cut_the_others"),
+    Mutation("stages/inverse_rendering/initial_geometry.py", "[needed[i]] if i in needed else []", "[]",
+             "tests/inverse_rendering/test_initial_geometry.py::test_masks_that_lack_a_part_cut_nothing_off"),
     Mutation("stages/masks/extent.py", "roi_radius) <= BUST", "roi_radius) > BUST",
              f"{EXTENT}::test_a_bust_is_kept_whole"),
     Mutation("stages/inverse_rendering/initial_geometry.py", "if is_subject(", "if not is_subject(",

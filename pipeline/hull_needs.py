@@ -97,3 +97,12 @@ def regions(mask: Bool, least: float) -> list[Bool]:
     """The connected regions (h, w) of a mask with more than `least` pixels."""
     count, label, facts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     return [np.asarray(label == k) for k in range(1, count) if facts[k, cv2.CC_STAT_AREA] > least]
+
+
+def clearly_lacking(shown: Bool, inside: Bool, margin: int, least: float) -> list[Bool]:
+    """The regions (h, w) that a hull's silhouette clearly shows and a mask clearly lacks, each up to the mask's edge.
+
+    shown, inside: (h, w). margin: pixels by which either may be wrong. least: share of the silhouette."""
+    clear = ~grown(~shown, margin) & ~grown(inside, margin)
+    large = regions(clear, least * max(int(shown.sum()), 1))
+    return [np.asarray(grown(region, 2 * margin) & shown & ~inside) for region in large]

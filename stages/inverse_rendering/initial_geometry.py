@@ -2,7 +2,8 @@
 
 In a plain hull one wrong mask is enough: if it lacks the shirt, the body ends at the collar. So first a lenient hull is
 carved, which tolerates a few wrong views. Where a mask clearly lacks what it shows, and that part is the subject
-(pipeline.hull_needs), the mask is ignored. Everywhere else all masks carve, because a lenient hull is too thick.
+(pipeline.hull_needs; pipeline.needed_parts where more masks lack it), the mask is ignored. Everywhere else all masks
+carve, because a lenient hull is too thick.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from pipeline.errors import StageError
 from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, visual_hull
-from pipeline.hull_needs import grown, is_subject, margin_of, regions, voxels_at
+from pipeline.hull_needs import clearly_lacking, is_subject, margin_of, voxels_at
+from pipeline.needed_parts import needed_parts
 
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
@@ -69,9 +71,11 @@ def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agree
     lenient = visual_hull(cameras, small, [-edge] * 3, [edge] * 3, cell, max_outside=WRONG, outside_share=WRONG_SHARE)
     points = cloud(lenient)
     out, doubtful = list(alphas), {}
+    needed = needed_parts(cameras, small, [True] * len(small), roi_radius).parts
     for i, (camera, alpha) in enumerate(zip(cameras, small, strict=True)):
         lacks = [r for r in _lacks(points, camera, alpha, cell)
                  if is_subject(lenient, voxels_at(lenient, camera, r), cameras, small)]  # fmt: skip
+        lacks += [needed[i]] if i in needed else []
         if lacks:
             h, w = alphas[i].shape
             wrong = np.logical_or.reduce(lacks).astype(np.uint8)
@@ -93,10 +97,7 @@ def _lacks(lenient: Cloud, camera: Camera, alpha: F32, cell: float) -> list[Bool
     """The regions (h, w) that the lenient hull clearly shows and a mask clearly lacks."""
     h, w = alpha.shape
     shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5
-    margin = margin_of(camera, w, cell, MARGIN)
-    clear = ~grown(~shown, margin) & ~grown(inside, margin)
-    large = regions(clear, MISSING * max(int(shown.sum()), 1))
-    return [np.asarray(grown(region, 2 * margin) & shown & ~inside) for region in large]
+    return clearly_lacking(shown, inside, margin_of(camera, w, cell, MARGIN), MISSING)
 
 
 def hull_start(

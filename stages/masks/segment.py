@@ -25,8 +25,10 @@ from pipeline.faces.landmarks3d import head_frame
 from pipeline.hull import Cloud
 from pipeline.images import read_alpha, write_png
 from pipeline.meshes import F64
+from pipeline.needed_parts import needed_parts
 from pipeline.support import Support
 from stages.masks import beyond_hull
+from stages.masks.complete_mask import completed
 from stages.masks.config import Config
 from stages.masks.extent import MAX_OPEN, asked, cut_by_head, kept_whole, outline_points, whole_hull
 from stages.masks.face_labels import labels_with, subjects_face
@@ -38,7 +40,7 @@ from stages.masks.photos import at_once, photos_of
 from stages.masks.region import F32, Bool, resized, working_size
 from stages.masks.segment_person import of_subject, settled
 from stages.masks.sources import KEY_AND_PERSON, PhotoToMask, Plan, inverted, mask, plan, to_full_size
-from stages.masks.support_object import SupportedObject, distinct, find_supported_object
+from stages.masks.support_object import distinct, object_of
 from stages.masks.user_model import UserModel, hair_model, user_model
 
 WORKING_SIZE = 640  # pixels, longest edge at which people and objects are segmented
@@ -62,7 +64,8 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, slots=True)
 class Masked:
-    """A view's mask: reduced (h, w) in memory, full size in a file. coverage: mean alpha. iou: with the hull."""
+    """A view's mask: reduced (h, w) in memory, full size in a file. coverage: mean alpha. iou: with the hull.
+    doubtful: (h, w) what it lacks and the other masks need; None if nothing."""
 
     view: PhotoToMask
     camera: Camera
@@ -70,6 +73,12 @@ class Masked:
     source: str
     coverage: float
     iou: float | None = None
+    doubtful: Bool | None = None
+
+    @property
+    def carving(self) -> F32:
+        """The mask (h, w) that carves a hull: not where it lacks what the other masks need."""
+        return self.small if self.doubtful is None else np.where(self.doubtful, np.float32(1), self.small)
 
     @property
     def useless(self) -> bool:
@@ -93,7 +102,7 @@ def segment(
     pairs = photos_of(capture, poses, context.check)
     threads = at_once(capture.artifact.views, os.cpu_count() or 1)
     how = plan([v for v, _ in pairs], config.method, config.threshold, WORKING_SIZE, config.seed,
-               poses.roi_radius, lambda: _solid(located, config.seed), user_model(config))  # fmt: skip
+               poses.roi_radius, lambda: object_of(located, config.seed), user_model(config))  # fmt: skip
     context.log.info("masks: %s", how.method)
     masked = _each(lambda p: _make(p[0], p[1], how, config, context), pairs, threads, context, "masking")
     warnings = [f"view {m.view.index} ({m.view.name}): its mask is black on the subject and was inverted; save it "
@@ -101,6 +110,8 @@ def segment(
     voting = [not m.view.holdout and not m.useless for m in masked]
     _enough(sum(voting), len(masked), warnings)
     support = how.solid.support if how.solid is not None else None
+    if config.resegment:
+        masked = _with_needed_parts(masked, voting, poses.roi_radius, threads, config, context)
     found = _opinions(masked, voting, poses, config, support)
     masked = [replace(m, iou=o.iou) for m, o in zip(masked, found, strict=True)]
     first = _seen(masked, [])
@@ -214,20 +225,37 @@ def _path(index: int, context: Context) -> Path:
     return context.workdir / "masks" / f"{index}.png"
 
 
-def _solid(poses: Located[CameraSet], seed: int) -> SupportedObject | None:
-    """The object among the sparse points; None without points."""
-    ref = poses.artifact.points
-    if ref is None:
-        return None
-    with np.load(poses.path(ref), allow_pickle=False) as data:
-        points = np.asarray(data["points"], np.float64)
-    return find_supported_object(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
+def _with_needed_parts(
+    masked: list[Masked], voting: list[bool], roi_radius: float, threads: int, config: Config, context: Context
+) -> list[Masked]:
+    """The masks with the parts that they lack and most others need; where the colours do not tell, the mask stays, and
+    does not carve there."""
+    needed = needed_parts([m.camera for m in masked], [m.small for m in masked], voting, roi_radius)
+
+    def one(item: tuple[int, Masked]) -> Masked:
+        n, m = item
+        part, name = needed.parts.get(n), m.source
+        if part is None or needed.hull is None or name not in COMPUTED:
+            return m
+        image = m.view.read()
+        w, h = working_size(image.shape[1], image.shape[0], WORKING_SIZE)
+        small = np.asarray(resized(image, w, h), np.uint8)
+        inside, lost = (np.asarray(resized(x.astype(np.float32), w, h)) >= 0.5 for x in (m.small >= 0.5, part))
+        new = completed(small, inside, lost, needed.hull, m.camera, config.seed)
+        if new is None:
+            return replace(m, doubtful=part)
+        if name in LEARNED:
+            new = settled(small, new)
+        new = of_subject(new, m.view.disc.scaled(w / image.shape[1]))
+        return _keep(m.view, m.camera, to_full_size(image, new), name + BY_HULL, context)
+
+    return _each(one, list(enumerate(masked)), threads, context, "completing masks") if needed.parts else masked
 
 
 def _opinions(
     masked: list[Masked], voting: list[bool], poses: CameraSet, config: Config, support: Support | None
 ) -> list[Opinion]:
-    return opinions([m.camera for m in masked], [m.small for m in masked], voting, poses.roi_radius,
+    return opinions([m.camera for m in masked], [m.carving for m in masked], voting, poses.roi_radius,
                     config.hull_cells, support)  # fmt: skip
 
 
@@ -277,7 +305,7 @@ def _without_background(
 ) -> list[Masked]:
     """The masks without what lies beyond the hull of all and has the background's colours; see beyond_hull."""
     votes = [not m.view.holdout and not m.useless for m in masked]
-    hull = beyond_hull.strict_hull([m.camera for m in masked], [m.small for m in masked], votes, roi_radius,
+    hull = beyond_hull.strict_hull([m.camera for m in masked], [m.carving for m in masked], votes, roi_radius,
                                    FINER * config.hull_cells, support)  # fmt: skip
     return _each(partial(_cut, hull, roi_radius, context), masked, threads, context, "cutting off background")
 

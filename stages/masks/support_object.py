@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from scipy import ndimage, spatial
 
-from pipeline.artifacts import Camera
+from pipeline.artifacts import Camera, CameraSet, Located
 from pipeline.support import CLEAR, Support, find_support
 from pipeline.transforms import F64, inverse_rigid, matrix, project
 from stages.masks.grabcut import cut
@@ -41,6 +41,16 @@ class SupportedObject:
     support: Support | None
     roi_radius: float
     base: F64
+
+
+def object_of(poses: Located[CameraSet], seed: int) -> SupportedObject | None:
+    """The object among the sparse points of the cameras; None without points."""
+    ref = poses.artifact.points
+    if ref is None:
+        return None
+    with np.load(poses.path(ref), allow_pickle=False) as data:
+        points = np.asarray(data["points"], np.float64)
+    return find_supported_object(points, poses.artifact.cameras, poses.artifact.roi_radius, seed)
 
 
 def find_supported_object(

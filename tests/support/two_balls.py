@@ -33,13 +33,18 @@ def ring_camera(index: int, count: int, rows: int = WIDTH) -> Camera:
 
 
 def bust_alpha(c: Camera) -> F32:
-    """Alpha of two balls, by the angle between a pixel's ray and the way to a ball's centre."""
+    """Alpha of head and torso."""
+    return balls_alpha(c, (HEAD, TORSO))
+
+
+def balls_alpha(c: Camera, balls: tuple[tuple[tuple[float, float, float], float], ...]) -> F32:
+    """Alpha of balls (centre, radius), by the angle between a pixel's ray and the way to a ball's centre."""
     pose = np.array(c.world_from_cam)
     v, u = np.mgrid[: c.height, : c.width] + 0.5
     ray = np.stack([(u - WIDTH / 2) / FOCAL, (v - WIDTH / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3].T
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     out = np.zeros((c.height, c.width), bool)
-    for middle, radius in (HEAD, TORSO):
+    for middle, radius in balls:
         way = np.array(middle) - pose[:3, 3]
         along = ray @ way
         out |= way @ way - along**2 < radius**2
