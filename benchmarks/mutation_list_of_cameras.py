@@ -9,6 +9,7 @@ WEAK, KEPT = "tests/inverse_rendering/test_weakly_seen.py", "tests/inverse_rende
 ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/test_steering.py"
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
 PAIRS = "tests/capture/test_polarised_pairs.py"
+BEFORE = "tests/registration/test_before_face.py"
 PARTS, COMPLETE = "tests/pipeline/test_needed_parts.py", "tests/masks/test_complete_mask.py"
 NEEDS, EXTENT = "tests/pipeline/test_hull_needs.py", "tests/masks/test_masks_extent.py"
 FLOW = "tests/inverse_rendering/test_depth_from_flow.py"
@@ -152,6 +153,17 @@ OF_CAMERAS = (
     # ---------------------------------------------------------------- what lies far from a head
     Mutation("stages/inverse_rendering/template_start.py", "if not ((start.values < 0) & (space > 0)).any():",
              "if True:", "tests/inverse_rendering/test_choose_start.py"),
+    Mutation("pipeline/registration/before_face.py", "seen >= PHOTOS", "seen >= 1",
+             f"{BEFORE}::test_one_photo_tells_nothing_and_two_do"),
+    Mutation("pipeline/registration/before_face.py", "sight.world_from_cam[:3, 3], axis=1) < reach",
+             "sight.world_from_cam[:3, 3], axis=1) < 1e9 + reach", BEFORE),
+    Mutation("pipeline/registration/before_face.py", "(lit & (off < ALIKE)).reshape(h, w)", "(kind != NONE)",
+             f"{BEFORE}::test_a_bare_forehead_is_seen_and_one_under_a_fringe_is_not"),
+    Mutation("pipeline/registration/before_face.py", "margins[kind] * scale", "0 * scale", BEFORE),
+    Mutation("stages/inverse_rendering/choose_start.py", "before > FAR and from_around(views)", "before > FAR",
+             "tests/inverse_rendering/test_choose_start.py"),
+    Mutation("stages/inverse_rendering/choose_start.py", "without_cover(hull, template, head, views, showing)", "hull",
+             "tests/inverse_rendering/test_choose_start.py"),
     Mutation("pipeline/registration/carve.py", "return np.maximum(ahead - nose, behind - ahead)",
              "return ahead - nose", "tests/registration/test_carve.py"),
     Mutation("stages/masks/judge.py", "UNSEEN_HEAD if face else UNSEEN", "UNSEEN", "tests/masks/test_masks_judge.py"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,9 @@ from stages.inverse_rendering.template_start import (
     BEYOND_STEREO,
     FAR,
     carved_by_template,
+    from_around,
     landmarks_off,
+    without_cover,
     without_far_parts,
 )
 
@@ -50,10 +52,13 @@ def choose_start(
     settings: Config,
     device: str,
     check: Callable[[], None] = lambda: None,
+    showing: Collection[int] = (),
 ) -> ChosenStart:
-    """The hull after stereo, or the hull cut by the template placed on landmarks (468, 3).
+    """The hull after stereo, or the hull cut by the template placed on landmarks (468, 3). showing: indices of the
+    photos that show the face.
 
-    `prior` auto takes the template where the landmarks are far from the hull's surface after stereo.
+    `prior` auto takes the template where the landmarks are far from the hull's surface after stereo. Where cameras from
+    around leave a hull that hides the face, what lies before the face is cut away first.
 
     Raises:
         StageError: `prior` is template, and the photos show no face that the template fits.
@@ -78,8 +83,13 @@ def choose_start(
         "template_scale": round(head.scale, 4),
         "landmarks_off_hull_mm": round(1e3 * before, 3),
     }
+    open_hull = hull
+    if settings.prior == AUTO and before > FAR and from_around(views):
+        open_hull = without_cover(hull, template, head, views, showing)
+        before = landmarks_off(open_hull, landmarks, head.scale)
+        known["landmarks_off_opened_mm"] = round(1e3 * before, 3)
     if settings.prior == AUTO and before <= BEYOND_STEREO:
-        near = without_far_parts(hull, template, head, views, check)
+        near = without_far_parts(open_hull, template, head, views, check)
         start, stereo = _after_stereo(near, views, settings, device, check)
         off = landmarks_off(start, landmarks, head.scale)
         known["landmarks_off_mm"] = round(1e3 * off, 3)

@@ -63,7 +63,7 @@ def run_both(inputs: BothInputs, config: Config, context: Context) -> FittedFace
 
 def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -> FittedFace:
     """Fit the field to a capture, or to two of one subject, and predict the held-out views."""
-    from pipeline.faces.landmarks3d import load_landmarks
+    from pipeline.faces.landmarks3d import load_landmarks, photos_of_face
     from stages.inverse_rendering.albedo_level import set_level
     from stages.inverse_rendering.choose_start import choose_start
     from stages.inverse_rendering.exposure import DRIFT, exposures_differ
@@ -119,7 +119,8 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     context.progress(0, settings.steps, "initial geometry")
     ref = inputs.masks.artifact.landmarks
     landmarks = None if ref is None else load_landmarks(inputs.masks.path(ref))
-    chosen = choose_start(start, views, landmarks, settings, context.device, context.check)
+    showing = () if ref is None else photos_of_face(inputs.masks.path(ref))
+    chosen = choose_start(start, views, landmarks, settings, context.device, context.check, showing)
     start = chosen.start
     if settings.follow_flow == AUTO:
         settings = settings.changed(follow_flow="on" if chosen.cut_by_template else "off")
@@ -216,7 +217,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=50,
+    version=51,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

@@ -5,27 +5,34 @@ finds the nose in it. But the photos' face landmarks tell where the face is, and
 goes on (pipeline.registration.carve). The hull remains the outer limit; the template only carves.
 
 Few cameras all around leave a hull that has the face, but goes on behind the neck: such parts are cut off too.
+
+Long hair hides the face from cameras all around as well: it closes the hull between its curtains. There the silhouettes
+know the hair, and the template does not; so only the space through which photos see the face is cut away
+(pipeline.registration.before_face).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 import torch
 
 from pipeline.meshes import F32, F64
+from pipeline.registration.before_face import Sight, space_before_face
 from pipeline.registration.carve import possible_space, space_near_head
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.model import Template
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.keep_silhouettes import bound_with_silhouettes
-from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.stereo import distances
+from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView
+from stages.inverse_rendering.stereo import distances, reduced
 
 # Metres of the template: median distance of the landmarks from a surface that does not have the face. Measured: 1 to
 # 3 mm on surfaces that are right, 6 to 45 mm where the hull hides the face.
 FAR = 0.006
+SIGHT = 240  # pixels of a photo's longest side, in which the face is seen
+AROUND = 0.75  # largest length of the mean of the unit directions to the cameras: 0 all around, 0.64 half a circle
 BEYOND_STEREO = 0.015  # the same before stereo: no sweep goes so far. 24 mm on arcs of photos
 
 
@@ -49,6 +56,33 @@ def carved_by_template(
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
     return _cut(start, space, head, views, check)
+
+
+def from_around(views: list[PhotoView]) -> bool:
+    """Whether the cameras stand around the subject: then its silhouettes bound the hull on all sides."""
+    centres = np.stack([v.world_from_cam[:3, 3] for v in views])
+    directions = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-9)
+    return float(np.linalg.norm(directions.mean(0))) <= AROUND
+
+
+def without_cover(
+    start: Start, template: Template, head: PlacedHead, views: list[PhotoView], showing: Collection[int]
+) -> Start:
+    """The start without what lies before the face in the photos that show it. showing: indices of these photos."""
+    sights = [_sight(v) for v in views if v.index in showing]
+    lo = start.lo.astype(np.float64)
+    space = space_before_face(template, head, sights, start.values < start.cell, lo, start.cell)
+    if not (space > 0).any():
+        return start
+    return Start(distances(np.maximum(start.values, space), start.lo, start.cell), start.lo, start.cell)
+
+
+def _sight(view: PhotoView) -> Sight:
+    """A photo as the face's space asks it."""
+    K, small = reduced(view, SIGHT)
+    colour = np.stack([small(view.rgb[..., k]) for k in range(3)], -1)
+    subject = (small(view.alpha) > WHOLE) & np.isfinite(colour).all(-1)
+    return Sight(K, view.world_from_cam, np.nan_to_num(colour).astype(np.float64), subject)
 
 
 def without_far_parts(

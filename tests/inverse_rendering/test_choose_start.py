@@ -13,8 +13,9 @@ from stages.inverse_rendering.choose_start import ChosenStart, choose_start
 from stages.inverse_rendering.config import PRIORS, Config
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.ray_sampling import PhotoView
-from stages.inverse_rendering.template_start import FAR, landmarks_off
+from stages.inverse_rendering.template_start import BEYOND_STEREO, FAR, landmarks_off
 from tests.inverse_rendering.test_keep_silhouettes import met
+from tests.support.curtains import in_curtain, matrix_k, photo, pose
 
 TEMPLATE = load_template()
 CELL, SHAPE = 0.006, (56, 76, 62)
@@ -63,6 +64,28 @@ def test_a_hull_with_the_face_stays() -> None:
     found = chosen(hull, marks())
     assert found.start is hull and found.facts["geometry"]["prior"] == PRIORS["hull"] and not found.cut_by_template
     assert float(found.facts["geometry"]["landmarks_off_hull_mm"]) < 1e3 * FAR
+
+
+def test_long_hair_stays_beside_a_face_that_it_hides_from_the_silhouettes() -> None:
+    """Cameras all around, and a hull that is closed before the face by the hair on both sides of it."""
+    views = []
+    for i, angle in enumerate(np.radians([-40, -20, 0, 20, 40, 90, 140, 180, 220, 270])):
+        colour, subject = photo(pose(angle))
+        views.append(PhotoView(i, colour.astype(np.float32), subject.astype(np.float32), matrix_k(), pose(angle),
+                               np.zeros(5)))  # fmt: skip
+    node = np.stack(np.meshgrid(*(LO[a] + CELL * np.arange(SHAPE[a]) for a in range(3)), indexing="ij"), -1)
+    block = np.max(np.abs(node - [0, -0.03, 0.02]) - [0.085, 0.12, 0.12], axis=-1)
+    hull = Start(np.minimum(head().values, block).astype(np.float32), LO.astype(np.float32), CELL)
+    found = choose_start(hull, views, marks(), Config(stereo="off"), "cpu", showing=range(5))
+    facts = found.facts["geometry"]
+    assert facts["prior"] == PRIORS["hull"] and float(facts["landmarks_off_hull_mm"]) > 1e3 * BEYOND_STEREO
+    assert landmarks_off(found.start, marks(), 1.0) < 0.006
+    curtain = in_curtain(node.reshape(-1, 3)).reshape(SHAPE) & (block < -CELL)
+    assert curtain.sum() > 500 and (found.start.values[curtain] < 0).mean() > 0.97
+    hidden = choose_start(hull, views, marks(), Config(stereo="off"), "cpu")  # no photo is known to show the face
+    assert hidden.facts["geometry"]["prior"] == PRIORS["template"]
+    arc = choose_start(hull, views[:5], marks(), Config(stereo="off"), "cpu", showing=range(5))
+    assert arc.facts["geometry"]["prior"] == PRIORS["template"]  # no silhouette bounds the back of that hull
 
 
 @pytest.mark.parametrize("shown", [False, True])

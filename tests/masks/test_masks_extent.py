@@ -13,7 +13,7 @@ from pipeline.artifacts import Camera
 from pipeline.contract import execute
 from pipeline.extent import HEAD_BELOW, HEAD_RADIUS, head_extent
 from pipeline.faces.find import Face
-from pipeline.faces.landmarks3d import head_frame, load_landmarks
+from pipeline.faces.landmarks3d import head_frame, load_landmarks, photos_of_face
 from pipeline.images import read_alpha
 from pipeline.store import Store
 from pipeline.transforms import inverse_rigid, matrix, project
@@ -120,6 +120,9 @@ def test_the_stage_hands_on_face_and_extent(
     found = execute(STAGE, scene.inputs(), Config(hull_cells=32), Store(tmp_path / "store")).located
     assert found.artifact.landmarks is not None
     np.testing.assert_allclose(load_landmarks(found.path(found.artifact.landmarks)), points, atol=1e-6)
+    held = {v.index for v in scene.views if v.holdout}
+    fitted = {i for i in range(len(scene.views)) if i % 3 and i not in held | set(found.artifact.dropped)}
+    assert set(photos_of_face(found.path(found.artifact.landmarks))) == fitted
     if method == "object":
         assert found.artifact.extent is None and all(m.asked is None for m in found.artifact.masks)
         assert "extent" not in [f.check for f in found.artifact.findings]
