@@ -12,6 +12,10 @@ f are kernel densities over seeds: skin on nose and upper cheeks (no beard grows
 clearly off the scalp, other (clothes) below the chin and beside the neck. After the first cut its sides are the seeds.
 Around eyes, nose and mouth, and on chin and throat, nothing is hair.
 
+Long hair goes on below the head, beside cheeks and neck and on shoulders. There no height tells it from a collar, and
+its own colour would be a seed of the clothes. So it is told last, by colour alone, from the hair of the head on, where
+the clothes have another colour (`_with_hanging`).
+
 Is it hair at all? The skull that a face makes probable is up to 10 mm off, and the colour of stubble is as far from
 skin's as fair hair's is. But hair rises from the skin at its border, and there a skull that is wrong does not. So the
 rise from the nearest skin to what lies RISE_AT inwards of the border must be enough, with the change of colour:
@@ -76,6 +80,10 @@ PRIOR = {"scalp": 1.0, "ears": -0.5, "face": -1.0, "brows": -3.0, "lids": -9.0, 
          "nostrils": -9.0, "neck": -2.0}  # fmt: skip
 NEVER = -9.0
 ROUNDS = 3
+LIKE_HAIR = 0.05  # quantile of the hair's density in its own colours, above which a colour is like hair
+LEAST_OTHER = 0.2  # of the seen area below the head must have another colour, else nothing tells clothes from hair
+HANGING, HANGS = 0.1, -1.0  # metres off the head within which hair hangs; log-odds of its place
+BEARD = 0.045  # metres from the middle of the face and throat, where what hangs may be a beard
 UNITS = 1000  # of the cut's whole numbers
 
 
@@ -151,11 +159,20 @@ def tell_hair(patches: Patches, places: Places, albedo: F64, seen: F64) -> Hair:
         if turn == 0:
             skin = shown & ~inside & _bare(places) & (np.abs(places.height) < FLAT) | skin
     inside = _whole(patches, inside, off)
-    rise, change = _at_border(patches, places, colour, inside, shown)
-    if min(rise / LEAST_RISE, change / LEAST_CHANGE) >= 1 and rise / RISE + change / CHANGE >= LEAST_SCORE:
-        return Hair(inside, share, "", rise, change)
+    whole = _with_hanging(patches, places, seen, colour, skin, inside)
+    # where hair goes on below the head, the border of the head's own runs through hair
+    borders = [_at_border(patches, places, colour, x, shown) for x in (inside, whole)]
+    rise, change = max(borders, key=_score)
+    if _score((rise, change)) >= LEAST_SCORE:
+        return Hair(whole, share, "", rise, change)
     why = f"at its border it rises by {1000 * rise:.2g} mm and changes by {change:.2g} units of CIELAB: a shaved head"
     return Hair(none, share, why, rise, change)
+
+
+def _score(border: tuple[float, float]) -> float:
+    """How much a border's rise and change speak for hair; -inf where one of them is as good as none."""
+    rise, change = border
+    return rise / RISE + change / CHANGE if min(rise / LEAST_RISE, change / LEAST_CHANGE) >= 1 else -np.inf
 
 
 def _at_border(patches: Patches, places: Places, colour: F64, inside: Mask, shown: Mask) -> tuple[float, float]:
@@ -236,6 +253,26 @@ def _log_odds(places: Places, seen: F64, colour: F64, skin: Mask, hair: Mask, ot
     hanging = np.clip((BELOW + 0.04 - places.at[:, 1]) / 0.04, 0, 1) + np.clip(places.height / REACH - 1, 0, 4)
     odds = told + stands * step * step * (3 - 2 * step) + prior - 3 * hanging
     return np.where(_never(places), NEVER, odds)
+
+
+def _with_hanging(patches: Patches, places: Places, seen: F64, colour: F64, skin: Mask, inside: Mask) -> Mask:
+    """The hair inside (P,) of the head with what hangs from it. skin (P,): seeds."""
+    shown = seen > 0.3
+    own = colour[inside & shown]
+    told = log_density(colour, own)
+    like = told > np.quantile(told[inside & shown], LIKE_HAIR)
+    below = shown & ~inside & (places.at[:, 1] <= BELOW)
+    other = below & ~like
+    if patches.area[other].sum() < LEAST_OTHER * patches.area[below].sum():
+        return inside
+    against = np.maximum(log_density(colour, colour[skin]), log_density(colour, colour[other]))
+    odds = np.clip(COLOUR * (told - against), -COLOUR_MOST, COLOUR_MOST) * seen + HANGS
+    y, z = places.at[:, 1], places.at[:, 2]
+    beard = (y < CHEEK[1]) & (z > 0.0) & (np.abs(places.at[:, 0]) < BEARD) & (places.height < REACH)
+    never = beard | (places.height < FLAT) | (places.height > HANGING) | places.on("lids", "lips", "nose", "nostrils")
+    never |= (y > CHEEK[1]) & ~places.on("ears")  # height has told there already
+    odds = np.where(inside, -NEVER, np.where(never, NEVER, odds))
+    return _whole(patches, _cut(patches, odds, colour), inside)
 
 
 def _cut(patches: Patches, odds: F64, colour: F64) -> Mask:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 from support import persons
-from support.hairy import DARK, SKIN, hairy_head
+from support.hairy import BOB, DARK, SKIN, hairy_head
 
 from pipeline.meshes import F64, Mask, unit
 from pipeline.patches import Patches, patches_of
@@ -75,6 +75,66 @@ def test_a_beard_stays_with_the_skin(hairy: tuple[Patches, Mask, told.Places]) -
     beard = places.on("face", "neck", "lips") & (places.at[:, 1] < -0.04) & (places.at[:, 2] > 0.03)
     found = told.tell_hair(patches, places, albedo(patches, hair | beard), np.ones(len(hair)))
     assert beard.sum() > 300 and not found.inside[beard].any()
+
+
+SHIRT = (0.1, 0.2, 0.5)
+
+
+def hanging_hair(end: float = BOB) -> tuple[Patches, Mask, told.Places]:
+    mesh, share = hairy_head(THICK, hanging=0.02, end=end)
+    patches = patches_of(mesh, told.PATCH)
+    return patches, patches.mean(share) > 0.5, told.places_of(persons.template(), placed(), patches)
+
+
+@pytest.fixture(scope="module")
+def bob() -> tuple[Patches, Mask, told.Places]:
+    return hanging_hair()
+
+
+def dressed(patches: Patches, places: told.Places, hair: Mask, shirt: tuple[float, float, float]) -> F64:
+    """Albedo of a person with hair and a shirt."""
+    return np.where((places.at[:, 1] <= told.BELOW)[:, None] & ~hair[:, None], shirt, albedo(patches, hair))
+
+
+def test_hair_that_hangs_below_the_head_is_told_by_its_colour(bob: tuple[Patches, Mask, told.Places]) -> None:
+    patches, hair, places = bob
+    found = told.tell_hair(patches, places, dressed(patches, places, hair, SHIRT), np.ones(len(hair)))
+    hanging = hair & (places.at[:, 1] < told.CHEEK[1]) & (places.height > 2 * told.FLAT)
+    assert hanging.sum() > 300
+    assert patches.area[hanging & found.inside].sum() > 0.95 * patches.area[hanging].sum()
+    shirt = places.at[:, 1] <= told.BELOW
+    assert not found.inside[shirt].any()
+
+
+def test_hair_on_the_shoulders_is_no_seed_of_the_clothes() -> None:
+    patches, hair, places = hanging_hair(-0.14)
+    found = told.tell_hair(patches, places, dressed(patches, places, hair, SHIRT), np.ones(len(hair)))
+    low = hair & (places.at[:, 1] <= told.BELOW) & (places.height > 2 * told.FLAT) & (places.at[:, 2] < 0)
+    assert low.sum() > 30 and patches.area[low & found.inside].sum() > 0.9 * patches.area[low].sum()
+
+
+def test_a_thick_beard_of_the_hairs_colour_stays_with_the_skin(bob: tuple[Patches, Mask, told.Places]) -> None:
+    patches, hair, places = bob
+    beard = places.on("face", "neck") & (places.at[:, 1] < -0.03) & (places.at[:, 2] > 0.01) & ~hair
+    thick = replace(places, height=np.where(beard, 0.012, places.height))
+    found = told.tell_hair(patches, thick, dressed(patches, places, hair | beard, SHIRT), np.ones(len(hair)))
+    middle = beard & (np.abs(places.at[:, 0]) < told.BEARD - 0.005)
+    assert middle.sum() > 200 and found.inside.any() and not found.inside[middle].any()
+
+
+def test_a_shirt_of_the_hairs_colour_is_no_hair(bob: tuple[Patches, Mask, told.Places]) -> None:
+    """Nothing tells where one ends then: what hangs goes with the shirt, and the hair of the head stays."""
+    patches, hair, places = bob
+    found = told.tell_hair(patches, places, dressed(patches, places, hair, DARK), np.ones(len(hair)))
+    assert not found.inside[places.at[:, 1] <= told.BELOW].any() and found.inside.any()
+
+
+def test_hanging_hair_is_told_without_a_shirt_in_the_photos(bob: tuple[Patches, Mask, told.Places]) -> None:
+    patches, hair, places = bob
+    seen = np.where(places.at[:, 1] <= told.BELOW, 0.0, 1.0)
+    found = told.tell_hair(patches, places, dressed(patches, places, hair, SHIRT), seen)
+    hanging = hair & (places.at[:, 1] < told.CHEEK[1]) & (places.height > 2 * told.FLAT)
+    assert patches.area[hanging & found.inside].sum() > 0.95 * patches.area[hanging].sum()
 
 
 def test_what_nobody_saw_of_the_scalp_goes_with_the_hair(hairy: tuple[Patches, Mask, told.Places]) -> None:
