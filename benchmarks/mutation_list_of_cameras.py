@@ -37,7 +37,7 @@ OF_CAMERAS = (
     Mutation("stages/masks/segment.py", "np.where(self.doubtful, np.float32(1), self.small)", "self.small",
              f"{COMPLETE}::test_masks_without_a_part_of_the_subject_do_not_cut_the_others"),
     Mutation("stages/inverse_rendering/initial_geometry.py", "[needed[i]] if i in needed else []", "[]",
-             "tests/inverse_rendering/test_initial_geometry.py::test_masks_that_lack_a_part_cut_nothing_off"),
+             "tests/inverse_rendering/test_initial_geometry.py::test_three_masks_that_lack_a_part_cut_nothing_off"),
     Mutation("stages/masks/extent.py", "roi_radius) <= BUST", "roi_radius) > BUST",
              f"{EXTENT}::test_a_bust_is_kept_whole"),
     Mutation("stages/inverse_rendering/initial_geometry.py", "if is_subject(", "if not is_subject(",
