@@ -1,6 +1,6 @@
 """A woman with a bob, or with long hair, in a rig: a capture with truth, for what short hair does not show.
 
-    python -m benchmarks.made_person OUT --kit TEMPLATE_KIT --rig CAPTURE --blender PYTHON [--look bob|long]
+    python -m benchmarks.made_person OUT --kit TEMPLATE_KIT --rig CAPTURE --blender PYTHON [--look bob|long] [--alike]
 
 TEMPLATE_KIT has MakeHuman's base.obj and targets; the cameras of CAPTURE's params.json are used; PYTHON has Blender's
 module. `bob` has dark brown skin and a striped shirt, `long` light skin, fair hair and a white shirt; the backdrop is
@@ -31,6 +31,7 @@ BACKDROP, WARM = np.array([0.33, 0.33, 0.3366]), np.array([1, 0.98, 0.95])
 STRIPES = {"bob": [[0.03, 0.12, 0.10], [0.55, 0.50, 0.35]], "long": [[0.75, 0.74, 0.70], [0.70, 0.68, 0.66]]}
 IRIS = {"bob": [0.06, 0.03, 0.015], "long": [0.10, 0.14, 0.10]}
 MELANIN, EXPOSURE = {"bob": 0.95, "long": 0.28}, {"bob": 1.15, "long": 0.95}
+GAINS = ((1.03, 1.0, 0.98), (0.97, 1.0, 1.025), (1.0, 1.03, 0.99), (0.975, 0.965, 1.0))  # of four kinds of camera
 SHOWN = -0.16  # height from which the skin is part of the truth, m
 
 
@@ -96,8 +97,8 @@ def backdrop(light: F64, K: F64, R: F64, size: tuple[int, int]) -> F64:
     return np.asarray(cv2.remap(light.astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
-def develop(folder: Path, out: Path, params: dict[str, object], style: str) -> None:
-    """Photos, and the truth beside them."""
+def develop(folder: Path, out: Path, params: dict[str, object], style: str, alike: bool) -> None:
+    """Photos, and the truth beside them. alike: all cameras have the same colours."""
     light = np.load(folder / "light.npy").astype(np.float64)
     for i in names(params):
         colour, alpha, albedo, number = layers(folder / f"{i}.exr")
@@ -105,6 +106,7 @@ def develop(folder: Path, out: Path, params: dict[str, object], style: str) -> N
         behind = backdrop(light, np.array(params[f"{i}_K"]), np.array(params[f"{i}_Rt"])[:, :3], size)
         rng = np.random.default_rng(5000 + int(i))
         linear = EXPOSURE[style] * (colour + (1 - alpha) * behind)
+        linear *= 1 if alike else GAINS[int(i) % len(GAINS)]
         linear += rng.normal(size=linear.shape) * (0.002 + 0.004 * np.sqrt(linear.clip(0, 1)))
         photo = (255 * np.asarray(srgb_from_linear(linear.clip(0, 1))) + 0.5).astype(np.uint8)
         cv2.imwrite(str(out / f"{i}.jpg"), photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
@@ -135,9 +137,16 @@ def write_truth(folder: Path, out: Path, params: dict[str, object]) -> None:
     (out / "truth/skin.obj").write_text("\n".join(lines) + "\n")
     marks = {"eye_left": eyes[0].tolist(), "eye_right": eyes[1].tolist(), "mouth": [0.0, eyes[0][1] - 0.062, 0.08]}
     (out / "truth/landmarks.json").write_text(json.dumps(marks))
-    photos = [{"name": f"{i}.jpg", "K": params[f"{i}_K"], "distortion": [0.0] * 5,
-               "world_to_camera": [*params[f"{i}_Rt"], [0, 0, 0, 1]], "head_motion": np.eye(4).tolist()}
-              for i in names(params)]  # fmt: skip
+    photos = [
+        {
+            "name": f"{i}.jpg",
+            **{k: params[f"{i}_{k}"] for k in ("K", "width", "height")},
+            "distortion": [0.0] * 5,
+            "world_to_camera": [*params[f"{i}_Rt"], [0, 0, 0, 1]],
+            "head_motion": np.eye(4).tolist(),
+        }
+        for i in names(params)
+    ]
     (out / "truth/cameras.json").write_text(json.dumps({"photos": photos}))
 
 
@@ -149,6 +158,7 @@ def main() -> None:
     parser.add_argument("--rig", type=Path, required=True, help="a capture with a params.json")
     parser.add_argument("--blender", required=True, help="a Python with Blender's module")
     parser.add_argument("--look", choices=sorted(LOOKS), default="bob")
+    parser.add_argument("--alike", action="store_true", help="one kind of camera, not four with their own colours")
     parser.add_argument("--samples", type=int, default=8)
     args = parser.parse_args()
     folder = args.out / "truth/scene"
@@ -159,7 +169,7 @@ def main() -> None:
     write_scene(folder, args.kit, args.look, params)
     script = Path(__file__).with_name("blender.py")
     subprocess.run([args.blender, str(script), str(folder), str(args.samples)], check=True)
-    develop(folder, args.out, params, args.look)
+    develop(folder, args.out, params, args.look, args.alike)
 
 
 if __name__ == "__main__":

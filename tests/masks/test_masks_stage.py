@@ -212,7 +212,8 @@ def test_computed_outlier_is_mended(scene: Scene, tmp_path: Path) -> None:
 def test_nothing_is_mended_by_a_hull_that_most_masks_contradict(
     wrong: int, mended: bool, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Masks of another half of the ball in each wrong view leave a hull that is no ball."""
+    """Masks of another half of the ball in each wrong view leave a hull that is no ball: no mask becomes worse by it.
+    What a vote of the masks completes (stages.masks.complete_mask) comes before that hull."""
 
     def half(view: PhotoToMask, *_: object) -> tuple[F32, str]:
         alpha = ball_alpha(view.camera)
@@ -221,8 +222,9 @@ def test_nothing_is_mended_by_a_hull_that_most_masks_contradict(
         return alpha, "person"
 
     monkeypatch.setattr(segment, "mask", half)
-    found, _ = run(scene, tmp_path / "s", faces=False)
-    assert any(m.source == "person+hull" for m in found.masks) == mended
+    found, alphas = run(scene, tmp_path / "s", faces=False)
+    good = [iou(a, ball_alpha(c)) for a, c in zip(alphas, scene.cameras, strict=True)]
+    assert min(good[: 12 - wrong]) > 0.99 and min(good) > (0.9 if mended else 0.49)
     assert mended or {f.level for f in found.findings if f.check == "mask_agreement"} == {"unusable"}
 
 
