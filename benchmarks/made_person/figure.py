@@ -43,8 +43,8 @@ LOOKS = {
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """vertices (N, 3) of the whole base mesh in its shape; skin, scalp, brows (., 4) quads of it; colour (N, 3); shirt:
-    vertices and quads; eyes (2, 3) centres and (2,) radii. head: vertices and regions, for what is placed on it."""
+    """vertices (N, 3) of the whole base mesh in its shape; cut: the head in it; skin, scalp, brows (., 4) quads; colour
+    (N, 3) of the skin; shirt: vertices and quads; eyes: centres (2, 3) and radii (2,)."""
 
     source: Source
     cut: Cut
