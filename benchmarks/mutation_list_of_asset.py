@@ -259,7 +259,7 @@ OF_ASSET = (
              "tests/masks/test_hull_consistency.py::test_what_a_mask_lacks_of_the_core_is_the_subject"),
     Mutation("stages/masks/hull_consistency.py", "max(CORE_LEAST, round(", "min(CORE_LEAST, round(",
              "tests/masks/test_hull_consistency.py::test_the_core_is_that_of_views_all_around"),
-    Mutation("stages/masks/hull_consistency.py", "> AROUND:", "> 2 * AROUND:",
+    Mutation("pipeline/directions.py", "<= AROUND", "<= 2 * AROUND",
              "tests/masks/test_hull_consistency.py::test_the_core_is_that_of_views_all_around"),
     Mutation("stages/masks/segment.py", "share = lacking(inside, opinion) if made.view.holdout else", "share =",
              "tests/masks/test_masks_stage.py::test_a_held_out_mask_ends_where_the_hull_of_the_others_does"),

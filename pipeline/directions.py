@@ -24,6 +24,15 @@ BAND = 45.0  # degrees of elevation: above is the top, below is the underside
 FRONT = 60.0  # degrees to both sides
 
 
+AROUND = 0.75  # largest length of the mean of the unit directions to cameras all around: it is 0, of half a circle 0.64
+
+
+def from_around(centres: F64) -> bool:
+    """Whether cameras with these centres (N, 3) stand around the origin: then silhouettes bound a hull on all sides."""
+    directions = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-9)
+    return float(np.linalg.norm(directions.mean(0))) <= AROUND
+
+
 def elevations() -> F64:
     """(ROWS,) elevations of the rows' centres in degrees, from the top."""
     return 90.0 - (np.arange(ROWS) + 0.5) * 180.0 / ROWS

@@ -31,7 +31,10 @@ Bool = npt.NDArray[np.bool_]
 LEAST = 0.01  # of a mask: the largest region that it loses; noise of its outline is smaller
 MASKS = 2  # that lose so much: one may be wrong itself
 KNOWN = 0.9  # of the views: they have the part in their frames
-MARGIN = 1.0  # voxels by which a silhouette of the hull may be too small
+MARGIN = 1.0  # voxels by which a silhouette of the hull may be wrong
+# Of a silhouette: what a mask lacks is larger. One view may rightly carve a concavity: 1 % at a shoulder (head scan).
+MISSING = 0.02
+CUBE = 1.6  # half-edge of a hull's cube in radii of the region of interest
 
 
 def voxels_at(hull: Hull, camera: Camera, where: Bool) -> Bool:
@@ -50,10 +53,12 @@ def voxels_at(hull: Hull, camera: Camera, where: Bool) -> Bool:
     return out
 
 
-def masks_in_need(hull: Hull, part: Bool, cameras: Sequence[Camera], alphas: Sequence[F32]) -> Iterator[int]:
+def masks_in_need(
+    hull: Hull, part: Bool, cameras: Sequence[Camera], alphas: Sequence[F32], shown: Sequence[Bool] | None = None
+) -> Iterator[int]:
     """Positions of the masks, found one by one, that the hull covers less without a part of it: by a region that is
     larger than LEAST of the mask and lies more than MARGIN voxels beside what is left. part: (X, Y, Z). alphas:
-    (h, w) each, small."""
+    (h, w) each, small. shown: the hull's silhouettes (h, w), if they are known."""
     if not part.any():
         return
     rest = replace(
@@ -62,10 +67,10 @@ def masks_in_need(hull: Hull, part: Bool, cameras: Sequence[Camera], alphas: Seq
     whole, left = cloud(hull), cloud(rest) if (rest.level <= 0).any() else None
     for i, (camera, alpha) in enumerate(zip(cameras, alphas, strict=True)):
         (h, w), inside = alpha.shape, alpha >= 0.5
-        covered = render_silhouette(whole, camera, h, w) >= 0.5
+        covered = (render_silhouette(whole, camera, h, w) >= 0.5) if shown is None else shown[i]
         if left is not None:
             still = render_silhouette(left, camera, h, w) >= 0.5
-            covered &= ~grown(still, margin_of(camera, w, hull.cell, MARGIN))
+            covered = covered & ~grown(still, margin_of(camera, w, hull.cell, MARGIN))
         if regions(covered & inside, LEAST * inside.sum()):
             yield i
 
@@ -99,10 +104,10 @@ def regions(mask: Bool, least: float) -> list[Bool]:
     return [np.asarray(label == k) for k in range(1, count) if facts[k, cv2.CC_STAT_AREA] > least]
 
 
-def clearly_lacking(shown: Bool, inside: Bool, margin: int, least: float) -> list[Bool]:
+def clearly_lacking(shown: Bool, inside: Bool, margin: int) -> list[Bool]:
     """The regions (h, w) that a hull's silhouette clearly shows and a mask clearly lacks, each up to the mask's edge.
 
-    shown, inside: (h, w). margin: pixels by which either may be wrong. least: share of the silhouette."""
+    shown, inside: (h, w). margin: pixels by which either may be wrong."""
     clear = ~grown(~shown, margin) & ~grown(inside, margin)
-    large = regions(clear, least * max(int(shown.sum()), 1))
+    large = regions(clear, MISSING * max(int(shown.sum()), 1))
     return [np.asarray(grown(region, 2 * margin) & shown & ~inside) for region in large]

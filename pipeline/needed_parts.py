@@ -17,21 +17,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import compress
+from itertools import compress, islice
 
 import numpy as np
 import numpy.typing as npt
 
 from pipeline.artifacts import Camera
-from pipeline.hull import Cloud, Hull, cloud, render_silhouette, visual_hull
-from pipeline.hull_needs import MASKS, clearly_lacking, margin_of, masks_in_need, voxels_at
+from pipeline.hull import Cloud, cloud, render_silhouette, visual_hull
+from pipeline.hull_needs import CUBE, MARGIN, MASKS, clearly_lacking, margin_of, masks_in_need, voxels_at
 
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 CELLS = 64  # voxels along the edge of the hull's cube
 WRONG = 0.15  # share of the views of a voxel that may lack it
-MISSING = 0.02  # of the hull's silhouette: smaller parts are noise of the outline, or the hull's excess
-CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +37,7 @@ class Needed:
     """parts: by position of the view, (h, w) what its mask lacks and the others need. hull: the tolerant hull, None
     without votes."""
 
-    hull: Hull | None = None
+    hull: Cloud | None = None
     parts: dict[int, Bool] = field(default_factory=dict)
 
 
@@ -58,20 +56,18 @@ def needed_parts(
     if not (hull.level <= 0).any():
         return Needed()
     points = cloud(hull)
-    missing = {i: found for i, (c, a) in enumerate(zip(cameras, alphas, strict=True))
-               if (found := _missing(points, c, a, hull.cell)) is not None}  # fmt: skip
-    lack = sum(i in missing for i in voters)
+    shown, missing = list[Bool](), dict[int, Bool]()
+    for i, (camera, alpha) in enumerate(zip(cameras, alphas, strict=True)):
+        shown.append(render_silhouette(points, camera, *alpha.shape) >= 0.5)
+        lacks = clearly_lacking(shown[i], alpha >= 0.5, margin_of(camera, alpha.shape[1], hull.cell, MARGIN))
+        if lacks:
+            missing[i] = np.logical_or.reduce(lacks)
+    others = [i for i in voters if i not in missing]
+    asked = [cameras[i] for i in others], [alphas[i] for i in others], [shown[i] for i in others]
+    least = max(MASKS, len(voters) - len(others) + 1)
     parts = {}
     for i, part in missing.items():
-        need = masks_in_need(hull, voxels_at(hull, cameras[i], part), *carving)
-        if sum(voters[k] not in missing for k in need) >= max(MASKS, lack + 1):
+        need = masks_in_need(hull, voxels_at(hull, cameras[i], part), *asked)
+        if len(others) >= least and len(list(islice(need, least))) == least:
             parts[i] = part
-    return Needed(hull, parts)
-
-
-def _missing(points: Cloud, camera: Camera, alpha: F32, cell: float) -> Bool | None:
-    """(h, w) what the hull clearly shows and a mask clearly lacks, up to the mask; None if there is nothing."""
-    h, w = alpha.shape
-    shown, inside = render_silhouette(points, camera, h, w) >= 0.5, alpha >= 0.5
-    found = clearly_lacking(shown, inside, margin_of(camera, w, cell, 1), MISSING)
-    return np.logical_or.reduce(found) if found else None
+    return Needed(points, parts)

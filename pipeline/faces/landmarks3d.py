@@ -198,12 +198,6 @@ def load_landmarks(path: Path) -> F64:
         return np.asarray(data["xyz"], np.float64)
 
 
-def photos_that_agree(path: Path) -> int:
-    """Number of photos that agree on the face, of the file MaskSet.landmarks."""
-    with np.load(path, allow_pickle=False) as data:
-        return int(np.asarray(data["kept"], np.bool_).sum())
-
-
 def photos_of_face(path: Path) -> tuple[int, ...]:
     """Indices of the photos that agree on the face, of the file MaskSet.landmarks."""
     with np.load(path, allow_pickle=False) as data:

@@ -1,6 +1,6 @@
 """The space before a face that photos see: it is empty, whatever the silhouettes leave there.
 
-Hair that hangs beside a face closes a visual hull between its two curtains: no silhouette looks in between. But a photo
+Hair that hangs beside a face closes the visual hull in front of it: no silhouette looks in between. But a photo
 in which the face is detected looks through that space. So a template is placed on the face, and in each such photo
 
 - the middle of the face is seen (below the brows, between the outer corners of the eyes: hardly any hair hangs there);
@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from pipeline.meshes import F32, F64, Indices, Mask, area_vectors, unit
+from pipeline.meshes import F32, F64, Indices, Mask, area_vectors, triangles_of, unit
 from pipeline.ray_casting import RayCaster
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.skin_colour import ALIKE, against_face
@@ -56,10 +56,10 @@ def space_before_face(
 ) -> F32:  # fmt: skip
     """(X, Y, Z) signed distance from the space before the face, at lo + cell (i, j, k), world units: positive in it,
     -inf everywhere if there is none. inside (X, Y, Z): nodes that are asked."""
-    skin = np.repeat(_in_skin(template), 2)
-    faces = template.triangles()[skin]
+    skin = template.parts[SKIN]
+    faces = triangles_of(template.quads[skin])
     caster = RayCaster(head.vertices, faces)
-    code, normals = np.repeat(_codes(template), 2)[skin], unit(area_vectors(head.vertices, faces))
+    code, normals = np.repeat(_codes(template)[skin], 2), unit(area_vectors(head.vertices, faces))
     index = np.argwhere(inside)
     points, seen = lo + cell * index, np.zeros(len(index), np.int32)
     for sight in sights:
@@ -70,13 +70,6 @@ def space_before_face(
         return np.full(inside.shape, -np.inf, np.float32)
     signed = ndimage.distance_transform_edt(before) - ndimage.distance_transform_edt(~before)
     return np.asarray(cell * ndimage.gaussian_filter(signed, 1.0), np.float32)
-
-
-def _in_skin(template: Template) -> Mask:
-    """(Q,) quads of the skin."""
-    out = np.zeros(len(template.quads), np.bool_)
-    out[template.parts[SKIN]] = True
-    return out
 
 
 def _codes(template: Template) -> Indices:

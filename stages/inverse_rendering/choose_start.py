@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.directions import from_around
 from pipeline.errors import StageError
 from pipeline.meshes import F64
 from pipeline.registration.head_regions import Near, near_head
@@ -22,7 +23,6 @@ from stages.inverse_rendering.template_start import (
     BEYOND_STEREO,
     FAR,
     carved_by_template,
-    from_around,
     landmarks_off,
     without_cover,
     without_far_parts,
@@ -84,7 +84,8 @@ def choose_start(
         "landmarks_off_hull_mm": round(1e3 * before, 3),
     }
     open_hull = hull
-    if settings.prior == AUTO and before > FAR and from_around(views):
+    centres = np.stack([v.world_from_cam[:3, 3] for v in views])
+    if settings.prior == AUTO and before > FAR and from_around(centres):
         open_hull = without_cover(hull, template, head, views, showing)
         before = landmarks_off(open_hull, landmarks, head.scale)
         known["landmarks_off_opened_mm"] = round(1e3 * before, 3)

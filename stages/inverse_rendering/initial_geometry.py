@@ -20,19 +20,14 @@ from pipeline.errors import StageError
 from pipeline.extent import GROWN, bounds, within
 from pipeline.fields.geometry import GridSdf
 from pipeline.hull import Cloud, Hull, cloud, hull_bounds, hull_sdf, render_silhouette, visual_hull
-from pipeline.hull_needs import clearly_lacking, is_subject, margin_of, voxels_at
+from pipeline.hull_needs import CUBE, MARGIN, clearly_lacking, is_subject, margin_of, voxels_at
 from pipeline.needed_parts import needed_parts
 
 F32 = npt.NDArray[np.float32]
 Bool = npt.NDArray[np.bool_]
 CELLS = 64  # voxels along the cube in which masks are compared
-CUBE = 1.6  # its half-edge in radii of the region of interest
 WRONG, WRONG_SHARE = 2, 0.1  # views that may be wrong about a voxel, and their share of the views that see it
 SIDE = 320  # pixels: longest side at which masks are compared
-MARGIN = 1.0  # voxels by which the lenient hull may be too thick
-MISSING = (
-    0.02  # of the silhouette: a single view may correctly carve a concavity, 1 % at a shoulder (head scan, measured)
-)
 MIN_VIEWS = 3  # that must see a voxel of a subject without extent; an extent ends what few photos show
 MARGIN_CELLS = 4  # cells around the hull for the narrow band and the spline's border
 
@@ -73,7 +68,7 @@ def agreed(cameras: list[Camera], alphas: list[F32], roi_radius: float) -> Agree
     out, doubtful = list(alphas), {}
     needed = needed_parts(cameras, small, [True] * len(small), roi_radius).parts
     for i, (camera, alpha) in enumerate(zip(cameras, small, strict=True)):
-        lacks = [r for r in _lacks(points, camera, alpha, cell)
+        lacks = [r for r in _lacks(points, camera, alpha)
                  if is_subject(lenient, voxels_at(lenient, camera, r), cameras, small)]  # fmt: skip
         lacks += [needed[i]] if i in needed else []
         if lacks:
@@ -93,11 +88,11 @@ def _shrunk(alpha: F32) -> F32:
     return np.asarray(cv2.resize(alpha, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _lacks(lenient: Cloud, camera: Camera, alpha: F32, cell: float) -> list[Bool]:
+def _lacks(lenient: Cloud, camera: Camera, alpha: F32) -> list[Bool]:
     """The regions (h, w) that the lenient hull clearly shows and a mask clearly lacks."""
     h, w = alpha.shape
-    shown, inside = render_silhouette(lenient, camera, h, w) >= 0.5, alpha >= 0.5
-    return clearly_lacking(shown, inside, margin_of(camera, w, cell, MARGIN), MISSING)
+    shown = render_silhouette(lenient, camera, h, w) >= 0.5
+    return clearly_lacking(shown, alpha >= 0.5, margin_of(camera, w, lenient.cell, MARGIN))
 
 
 def hull_start(

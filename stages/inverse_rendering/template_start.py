@@ -6,7 +6,7 @@ goes on (pipeline.registration.carve). The hull remains the outer limit; the tem
 
 Few cameras all around leave a hull that has the face, but goes on behind the neck: such parts are cut off too.
 
-Long hair hides the face from cameras all around as well: it closes the hull between its curtains. There the silhouettes
+Long hair hides the face from cameras all around as well: it closes the hull in front of the face. There the silhouettes
 know the hair, and the template does not; so only the space through which photos see the face is cut away
 (pipeline.registration.before_face).
 """
@@ -32,7 +32,6 @@ from stages.inverse_rendering.stereo import distances, reduced
 # 3 mm on surfaces that are right, 6 to 45 mm where the hull hides the face.
 FAR = 0.006
 SIGHT = 240  # pixels of a photo's longest side, in which the face is seen
-AROUND = 0.75  # largest length of the mean of the unit directions to the cameras: 0 all around, 0.64 half a circle
 BEYOND_STEREO = 0.015  # the same before stereo: no sweep goes so far. 24 mm on arcs of photos
 
 
@@ -56,13 +55,6 @@ def carved_by_template(
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
     return _cut(start, space, head, views, check)
-
-
-def from_around(views: list[PhotoView]) -> bool:
-    """Whether the cameras stand around the subject: then its silhouettes bound the hull on all sides."""
-    centres = np.stack([v.world_from_cam[:3, 3] for v in views])
-    directions = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-9)
-    return float(np.linalg.norm(directions.mean(0))) <= AROUND
 
 
 def without_cover(

@@ -21,13 +21,14 @@ import numpy as np
 from scipy import ndimage
 
 from pipeline.artifacts import Camera
+from pipeline.directions import from_around
 from pipeline.hull import BAND_CELLS, Cloud, Hull, cloud, render_silhouette, visual_hull
+from pipeline.hull_needs import CUBE as CUBE
 from pipeline.hull_needs import is_subject, regions, voxels_at
 from pipeline.support import Support
 from pipeline.transforms import matrix
 from stages.masks.region import F32, Bool, dilated, eroded, region
 
-CUBE = 1.6  # half-edge of the hull's cube in radii of the region of interest
 POSSIBLE = 1.4  # radii within which empty space of the hull is trusted
 MARGIN = 1.0  # cells of tolerance for the hull
 WRONG_SHARE = 0.1  # share of the views of a voxel that may be wrong
@@ -35,7 +36,6 @@ CORE = 0.15  # depth of the core below the hull's surface, radii of the region o
 CORE_SHARE, CORE_LEAST = 0.06, 2  # share and least number of the views that may be wrong about a voxel of the core
 KNOWN = 0.5  # share of the views with a voxel of the core in their frame
 NEED = 0.002  # of a mask: smallest region that it lacks of which is asked whether it is the subject
-AROUND = 0.75  # largest length of the mean of the unit directions to the cameras: 0 all around, 0.64 half a circle
 SPREADS = 6.0  # robust standard deviations below the median for an outlier
 
 
@@ -116,8 +116,7 @@ def _core(
     """The part of the tolerant hull that is deeper than `depth` (asset units) and in the frame of most views; None if
     there is none, or if the cameras are on one side: the hull is then deep wherever no camera looks from the side."""
     centres = np.array([matrix(c.world_from_cam)[:3, 3] for c in cameras])
-    directions = centres / np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-9)
-    if float(np.linalg.norm(directions.mean(0))) > AROUND:
+    if not from_around(centres):
         return None
     wrong = max(CORE_LEAST, round(CORE_SHARE * len(cameras)))
     hull = above(support, visual_hull(cameras, alphas, [-edge] * 3, [edge] * 3, cell, max_outside=wrong,

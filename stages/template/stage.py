@@ -41,7 +41,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     if not (config.enabled or config.require):
         return RegisteredHead(registered=False, reason="not asked for (template.enabled)")
     from pipeline import meshes
-    from pipeline.faces.landmarks3d import load_landmarks, photos_that_agree
+    from pipeline.faces.landmarks3d import load_landmarks, photos_of_face
     from pipeline.fields.face import load_face
     from pipeline.registration.identity_fit import placed_on_landmarks
     from pipeline.template.load import load_template
@@ -62,7 +62,7 @@ def run(inputs: Inputs, config: Config, context: Context) -> RegisteredHead:
     why = refused_object([m.source for m in inputs.masks.artifact.masks]) if config.faultless else ""
     if why:
         return _refused(config, why)
-    why = refused_faces(photos_that_agree(inputs.masks.path(ref)), len(inputs.masks.artifact.masks))
+    why = refused_faces(len(photos_of_face(inputs.masks.path(ref))), len(inputs.masks.artifact.masks))
     if why:
         return _refused(config, why)
     template = load_template(Path(config.folder) if config.folder else None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.hull import cloud, render_silhouette
+from pipeline.hull import render_silhouette
 from pipeline.needed_parts import F32, Bool, Needed, needed_parts
 from tests.support.two_balls import BOTTOM, WIDTH, balls_alpha, bust_alpha, camera_at, ring_camera
 
@@ -50,7 +50,7 @@ def test_a_gap_that_few_masks_rightly_have_is_no_part() -> None:
     pair = [balls_alpha(c, (((-0.1, 0.0, 0.0), 0.07), ((0.1, 0.0, 0.0), 0.07))) for c in cameras]
     found = needed_parts(cameras, pair, [True] * len(cameras), ROI)
     assert found.parts == {} and found.hull is not None
-    shown = render_silhouette(cloud(found.hull), cameras[0], WIDTH, WIDTH) >= 0.5
+    shown = render_silhouette(found.hull, cameras[0], WIDTH, WIDTH) >= 0.5
     assert shown[80, 80] and pair[0][80, 80] == 0  # the tolerant hull fills the gap
 
 

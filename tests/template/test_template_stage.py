@@ -43,7 +43,7 @@ GOOD = {
 def inputs(tmp_path: Path, landmarks: np.ndarray | None = None) -> Inputs:
     ref = None
     if landmarks is not None:
-        np.savez(tmp_path / "landmarks.npz", xyz=landmarks, kept=np.ones(3, np.bool_))
+        np.savez(tmp_path / "landmarks.npz", xyz=landmarks, kept=np.ones(3, np.bool_), views=np.arange(3))
         ref = FileRef.of(tmp_path, "landmarks.npz")
     masks = Located(MaskSet(masks=(), landmarks=ref), tmp_path)
     poses = CameraSet(source="given", metric=True, capture_from_asset=((1.0,),), roi_radius=1.0, cameras=())
