@@ -192,6 +192,20 @@ except BaseException:
     assert told(child_environment, f"{caught}\n{run}") == (143, "", "stopped\n")
 
 
+@pytest.mark.parametrize("number", ALL)
+def test_a_library_that_makes_an_error_of_the_exception_hides_no_signal(
+    child_environment: dict[str, str], number: signal.Signals
+) -> None:
+    body = f"""
+try:
+    os.kill(os.getpid(), {int(number)})
+    while True: pass
+except BaseException as e:
+    raise ValueError(f"Interrupted: {{e}}")
+"""
+    assert told(child_environment, body) == (128 + number, "", "stopped\n")
+
+
 def test_the_second_signal_outside_of_a_run_ends_it_at_once(child_environment: dict[str, str]) -> None:
     body = f"""
 try:

@@ -104,7 +104,8 @@ def as_exceptions() -> Iterator[Caught]:
     """Around a whole command: a signal outside of a run raises `Interrupted`, so that folders are tidied on the way.
 
     The second signal ends the program at once. Where an exception can't be raised, such as in a `__del__`, Python drops
-    it; it is then raised again a moment later. The `Caught` tells whether one came, should a library have caught it.
+    it; it is then raised again a moment later. An error that follows from it leaves as `Interrupted` too. The `Caught`
+    tells whether one came, should a library have caught it.
     """
     _asked.number = None
     if threading.current_thread() is not threading.main_thread():
@@ -131,6 +132,10 @@ def as_exceptions() -> Iterator[Caught]:
     handlers = {n: signal.signal(n, first) for n in _heeded()} | {signal.SIGALRM: signal.signal(signal.SIGALRM, again)}
     try:
         yield _asked
+    except Exception as e:
+        if _asked.number is None:
+            raise
+        raise Interrupted(_asked.number) from e  # a library made it an error of its own: pydantic does on import
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in handlers.items():
