@@ -15,16 +15,19 @@ import argparse
 import json
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import OpenEXR
 
 from benchmarks.made_person.figure import LOOKS, make_figure, to_world
+from benchmarks.made_person.phone import developed, photos
 from benchmarks.made_person.strands import brows, hair
 from pipeline.colour import srgb_from_linear
 from pipeline.meshes import F64
 
+Views = dict[str, dict[str, Any]]  # of each photo: K, Rt, size and, for a phone, the motion of the head
 BOXES = (((0.6, 0.75, 0.6), 0.32, 5.5), ((-0.7, 0.7, 0.4), 0.34, 4.0), ((0.1, 0.75, -0.7), 0.3, 3.2),
          ((-0.05, 0.98, 0.1), 0.25, 3.0))  # direction, half angle in radians, radiance  # fmt: skip
 BACKDROP, WARM = np.array([0.33, 0.33, 0.3366]), np.array([1, 0.98, 0.95])
@@ -32,6 +35,7 @@ STRIPES = {"bob": [[0.03, 0.12, 0.10], [0.55, 0.50, 0.35]], "long": [[0.75, 0.74
 IRIS = {"bob": [0.06, 0.03, 0.015], "long": [0.10, 0.14, 0.10]}
 MELANIN, EXPOSURE = {"bob": 0.95, "long": 0.28}, {"bob": 1.15, "long": 0.95}
 GAINS = ((1.03, 1.0, 0.98), (0.97, 1.0, 1.025), (1.0, 1.03, 0.99), (0.975, 0.965, 1.0))  # of four kinds of camera
+METERED = 0.2  # linear level of a phone's middle grey
 SHOWN = -0.16  # height from which the skin is part of the truth, m
 
 
@@ -48,8 +52,8 @@ def studio() -> F64:
     return out
 
 
-def write_scene(folder: Path, kit: Path, style: str, params: dict[str, object]) -> None:
-    """What Blender needs."""
+def write_scene(folder: Path, kit: Path, style: str, views: Views) -> None:
+    """What Blender needs, but for the light."""
     look = LOOKS[style]
     rng = np.random.default_rng(look.seed)
     figure = make_figure(kit, look, rng)
@@ -61,16 +65,16 @@ def write_scene(folder: Path, kit: Path, style: str, params: dict[str, object]) 
              eyes=to_world(centres), eye_radii=0.1 * radii, hair=to_world(strand), hair_last=last,
              brows=to_world(brows(figure, rng)), iris=IRIS[style], stripes=STRIPES[style],
              melanin=MELANIN[style])  # fmt: skip
-    np.save(folder / "light.npy", studio().astype(np.float32))
-    (folder / "rig.json").write_text(json.dumps({
-        i: {"K": params[f"{i}_K"], "Rt": params[f"{i}_Rt"], "size": [params[f"{i}_width"], params[f"{i}_height"]]}
-        for i in names(params)
-    }))  # fmt: skip
+    (folder / "rig.json").write_text(json.dumps(views))
 
 
-def names(params: dict[str, object]) -> list[str]:
+def rig_views(params: dict[str, object]) -> Views:
     """The views of a params.json."""
-    return [k.removesuffix("_K") for k in params if k.endswith("_K")]
+    return {
+        i: {"K": params[k], "Rt": params[f"{i}_Rt"], "size": [params[f"{i}_width"], params[f"{i}_height"]]}
+        for k in params
+        if k.endswith("_K") and (i := k.removesuffix("_K"))
+    }
 
 
 def layers(path: Path) -> tuple[F64, F64, F64, np.ndarray]:
@@ -97,23 +101,42 @@ def backdrop(light: F64, K: F64, R: F64, size: tuple[int, int]) -> F64:
     return np.asarray(cv2.remap(light.astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
 
 
-def develop(folder: Path, out: Path, params: dict[str, object], style: str, alike: bool) -> None:
-    """Photos, and the truth beside them. alike: all cameras have the same colours."""
+def develop(folder: Path, out: Path, views: Views, style: str, alike: bool) -> None:
+    """Photos of a rig, and the truth beside them. alike: all cameras have the same colours."""
     light = np.load(folder / "light.npy").astype(np.float64)
-    for i in names(params):
+    for i, view in views.items():
         colour, alpha, albedo, number = layers(folder / f"{i}.exr")
-        size = (int(params[f"{i}_width"]), int(params[f"{i}_height"]))
-        behind = backdrop(light, np.array(params[f"{i}_K"]), np.array(params[f"{i}_Rt"])[:, :3], size)
+        behind = backdrop(light, np.array(view["K"]), np.array(view["Rt"])[:, :3], view["size"])
         rng = np.random.default_rng(5000 + int(i))
         linear = EXPOSURE[style] * (colour + (1 - alpha) * behind)
         linear *= 1 if alike else GAINS[int(i) % len(GAINS)]
         linear += rng.normal(size=linear.shape) * (0.002 + 0.004 * np.sqrt(linear.clip(0, 1)))
-        photo = (255 * np.asarray(srgb_from_linear(linear.clip(0, 1))) + 0.5).astype(np.uint8)
-        cv2.imwrite(str(out / f"{i}.jpg"), photo[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
-        cv2.imwrite(str(out / f"truth/labels/{i}.png"), np.where(alpha[..., 0] < 0.5, 0, number).astype(np.uint8))
-        if int(i) % 4 == 0:
-            write_albedo(out / f"truth/albedo/{i}.exr", albedo, (number == 1) & (alpha[..., 0] > 0.99))
-    write_truth(folder, out, params)
+        write_photo(out / f"{i}.jpg", (255 * np.asarray(srgb_from_linear(linear.clip(0, 1))) + 0.5).astype(np.uint8))
+        write_labels(out / "truth", i, np.where(alpha[..., 0] < 0.5, 0, number), albedo, alpha[..., 0] > 0.99)
+    write_truth(folder, out, views)
+
+
+def develop_phone(folder: Path, out: Path, views: Views) -> None:
+    """Photos of a phone, whose exposure follows the whole scene, and the truth beside them."""
+    brightness = [np.median(layers(folder / f"{i}.exr")[0].mean(-1)) for i in views]
+    for i in views:
+        colour, _, albedo, number = layers(folder / f"{i}.exr")
+        rng = np.random.default_rng(5000 + int(i))
+        write_photo(out / f"images/IMG_{i}.jpg", developed(METERED / np.median(brightness) * colour, rng))
+        write_labels(out / "truth", i, number, albedo, number > 0)
+    write_truth(folder, out, views)
+
+
+def write_photo(path: Path, pixels: np.ndarray) -> None:
+    """As JPEG."""
+    cv2.imwrite(str(path), pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def write_labels(folder: Path, view: str, number: np.ndarray, albedo: F64, whole: np.ndarray) -> None:
+    """The materials of a photo, and of every fourth the albedo."""
+    cv2.imwrite(str(folder / f"labels/{view}.png"), number.astype(np.uint8))
+    if int(view) % 4 == 0:
+        write_albedo(folder / f"albedo/{view}.exr", albedo, (number == 1) & whole)
 
 
 def write_albedo(path: Path, albedo: F64, skin: np.ndarray) -> None:
@@ -127,7 +150,7 @@ def write_albedo(path: Path, albedo: F64, skin: np.ndarray) -> None:
     )
 
 
-def write_truth(folder: Path, out: Path, params: dict[str, object]) -> None:
+def write_truth(folder: Path, out: Path, views: Views) -> None:
     """Skin, landmarks and cameras of the truth."""
     with np.load(folder / "skin.npz") as skin, np.load(folder / "person.npz") as person:
         vertices, faces, eyes = skin["vertices"], skin["faces"], person["eyes"]
@@ -139,13 +162,15 @@ def write_truth(folder: Path, out: Path, params: dict[str, object]) -> None:
     (out / "truth/landmarks.json").write_text(json.dumps(marks))
     photos = [
         {
-            "name": f"{i}.jpg",
-            **{k: params[f"{i}_{k}"] for k in ("K", "width", "height")},
+            "name": f"IMG_{i}.jpg" if "head" in view else f"{i}.jpg",
+            "K": view["K"],
+            "width": view["size"][0],
+            "height": view["size"][1],
             "distortion": [0.0] * 5,
-            "world_to_camera": [*params[f"{i}_Rt"], [0, 0, 0, 1]],
-            "head_motion": np.eye(4).tolist(),
+            "world_to_camera": [*view["Rt"], [0, 0, 0, 1]],
+            "head_motion": view.get("head", np.eye(4).tolist()),
         }
-        for i in names(params)
+        for i, view in views.items()
     ]
     (out / "truth/cameras.json").write_text(json.dumps({"photos": photos}))
 
@@ -155,21 +180,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kit", type=Path, required=True)
-    parser.add_argument("--rig", type=Path, required=True, help="a capture with a params.json")
+    parser.add_argument("--rig", type=Path, help="a capture with a params.json; without: photos of a phone in a room")
     parser.add_argument("--blender", required=True, help="a Python with Blender's module")
     parser.add_argument("--look", choices=sorted(LOOKS), default="bob")
     parser.add_argument("--alike", action="store_true", help="one kind of camera, not four with their own colours")
     parser.add_argument("--samples", type=int, default=8)
     args = parser.parse_args()
     folder = args.out / "truth/scene"
-    for name in ("labels", "albedo", "scene"):
-        (args.out / "truth" / name).mkdir(parents=True, exist_ok=True)
-    params = json.loads((args.rig / "params.json").read_text())
-    (args.out / "params.json").write_text(json.dumps(params))
-    write_scene(folder, args.kit, args.look, params)
+    for name in ("truth/labels", "truth/albedo", "truth/scene", *([] if args.rig else ["images"])):
+        (args.out / name).mkdir(parents=True, exist_ok=True)
+    if args.rig:
+        params = json.loads((args.rig / "params.json").read_text())
+        (args.out / "params.json").write_text(json.dumps(params))
+        views, light = rig_views(params), studio()
+    else:
+        views, light = photos(np.random.default_rng(7)), np.full((4, 8, 3), 0.02)
+    np.save(folder / "light.npy", light.astype(np.float32))
+    write_scene(folder, args.kit, args.look, views)
     script = Path(__file__).with_name("blender.py")
     subprocess.run([args.blender, str(script), str(folder), str(args.samples)], check=True)
-    develop(folder, args.out, params, args.look, args.alike)
+    if args.rig:
+        develop(folder, args.out, views, args.look, args.alike)
+    else:
+        develop_phone(folder, args.out, views)
 
 
 if __name__ == "__main__":

@@ -156,6 +156,66 @@ def light(values):
     links.new(sky.outputs[0], nodes["Background"].inputs[0])
 
 
+def box(name, low, high, colours, scale, texture="ShaderNodeTexVoronoi", glow=0.0):
+    """A box between two corners (x, height, towards the front) with a pattern of two colours, or one that shines."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    vertices = np.asarray(low) + corners * (np.asarray(high) - np.asarray(low))
+    quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    thing = mesh(name, vertices, quads)
+    for polygon in thing.data.polygons:
+        polygon.use_smooth = False
+    made, nodes, links = material(name, 0)
+    shader, place, pattern, ramp = nodes["Principled BSDF"], *(
+        nodes.new(n) for n in ("ShaderNodeTexCoord", texture, "ShaderNodeValToRGB"))  # fmt: skip
+    pattern.inputs["Scale"].default_value = scale
+    links.new(place.outputs["Object"], pattern.inputs["Vector"])
+    links.new(pattern.outputs[0], ramp.inputs[0])
+    for element, colour, at in zip(ramp.color_ramp.elements, colours, (0.3, 0.7), strict=True):
+        element.color, element.position = (*colour, 1), at
+    links.new(ramp.outputs[0], shader.inputs["Base Color"])
+    shader.inputs["Roughness"].default_value = 0.7
+    if glow:
+        links.new(ramp.outputs[0], shader.inputs["Emission Color"])
+        shader.inputs["Emission Strength"].default_value = glow
+    thing.data.materials.append(made)
+
+
+def room():
+    """A furnished room around the person, with a window at the person's right and a lamp at the ceiling."""
+    rng = np.random.default_rng(3)
+    paint, wood = ((0.62, 0.60, 0.55), (0.50, 0.49, 0.46)), ((0.30, 0.17, 0.08), (0.16, 0.08, 0.04))
+    walls = (((-1.9, -1.3, -1.6), (-1.85, 1.4, 2.2)), ((1.85, -1.3, -1.6), (1.9, 1.4, 2.2)),
+             ((-1.9, -1.3, -1.65), (1.9, 1.4, -1.6)), ((-1.9, -1.3, 2.2), (1.9, 1.4, 2.25)),
+             ((-1.9, 1.4, -1.6), (1.9, 1.45, 2.2)))  # fmt: skip
+    for k, (low, high) in enumerate(walls):
+        box(f"wall{k}", low, high, paint, 9, "ShaderNodeTexNoise")
+    box("floor", (-1.9, -1.35, -1.6), (1.9, -1.3, 2.2), wood, 14)
+    box("window", (-1.86, -0.2, -0.1), (-1.84, 1.0, 1.3), ((0.9, 0.95, 1.0), (0.9, 0.95, 1.0)), 1, glow=9.0)
+    box("lamp", (-0.3, 1.38, 0.4), (0.3, 1.4, 1.0), ((1.0, 0.86, 0.68), (1.0, 0.86, 0.68)), 1, glow=5.0)
+    box("chair", (-0.24, -0.75, -0.30), (0.24, -0.16, -0.26), wood, 20)
+    for k in range(26):  # shelves, pictures and boxes along three walls
+        wall, along, height = k % 3, rng.uniform(-1.4, 1.4), rng.uniform(-1.0, 0.9)
+        size, deep = rng.uniform(0.1, 0.32, 2), rng.uniform(0.02, 0.25)
+        colours = rng.uniform(0.03, 0.75, (2, 3))
+        low, high = np.array([along, height, -1.6]), np.array([along + size[0], height + size[1], -1.6 + deep])
+        if wall:  # at the person's left or right, but for the window
+            side = 1.85 if wall == 1 else -1.85
+            low, high = (
+                np.array([side - deep, height, along]),
+                np.array([side + deep, height + size[1], along + size[0]]),
+            )
+            if wall == 2 and -0.4 < along < 1.3 and height > -0.5:
+                continue
+        box(
+            f"thing{k}",
+            low,
+            high,
+            colours,
+            rng.uniform(10, 40),
+            "ShaderNodeTexVoronoi" if k % 2 else "ShaderNodeTexNoise",
+        )
+
+
 def prepare(samples):
     """Settings of the picture; the camera."""
     scene = bpy.context.scene
@@ -201,10 +261,18 @@ def main():
         eye(f"eye{k}", centre, radius, person["iris"])
     strands("hair", person["hair"], person["hair_last"], 0.00011, float(person["melanin"]))
     strands("brows", person["brows"], np.full(len(person["brows"]), 4), 0.00005, float(person["melanin"]))
+    person_parts = list(bpy.context.scene.collection.objects)
     light(np.load(folder / "light.npy"))
     scene = prepare(samples)
+    if "head" in next(iter(rig.values())):
+        room()
+        scene.cycles.max_bounces = 4  # light goes on for ever in a room
+    up = Matrix([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     for name in sys.argv[3:] or rig:
         aim(scene, rig[name])
+        moved = up @ Matrix(rig[name].get("head", np.eye(4).tolist())) @ up.inverted()
+        for part in person_parts:
+            part.matrix_world = moved
         scene.render.filepath = str(folder / f"{name}.exr")
         bpy.ops.render.render(write_still=True)
     surface = body.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()

@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.masks.matting import largest_parts, soft_edge
 from stages.masks.region import F32, U8, Bool
+from stages.masks.smooth_backdrop import given_back
 
 RING = 0.015  # of the shorter edge: width of the border
 NEAR = 24  # 8-bit levels: initial tolerance of background pixels
@@ -70,8 +71,10 @@ def key_out(image: U8, background: Background) -> F32:
 
 
 def keyed(image: U8, background: Background) -> Bool:
-    """Hard mask (H, W) of the subject in (H, W, 3) 8-bit sRGB."""
-    return _inside(_farthest(image, lambda k: np.float32(background.colour[k])), background.tolerance)
+    """Hard mask (H, W) of the subject in (H, W, 3) 8-bit sRGB: what differs from the background's colour, and what
+    differs from its shade in this photo."""
+    own = _inside(_farthest(image, lambda k: np.float32(background.colour[k])), background.tolerance)
+    return own | given_back(image, own, background.tolerance)
 
 
 def key_out_plate(image: U8, plate: U8) -> F32:

@@ -17,7 +17,8 @@ from stages.masks.key_person import Network, agree_better, both, key_with_person
 from stages.masks.keying import Background, border_colours, find_background, key_out, key_out_plate, keyed
 from stages.masks.matting import soft_edge
 from stages.masks.region import F32, U8, Bool, Disc, resized, working_size
-from stages.masks.segment_person import person_mask
+from stages.masks.segment_person import of_subject, person_mask
+from stages.masks.smooth_backdrop import corrected, shades
 from stages.masks.support_object import SupportedObject, cut_by_points
 from stages.masks.user_model import UserModel, mask_by_model
 
@@ -55,11 +56,12 @@ class PhotoToMask:
 @dataclass(frozen=True, slots=True)
 class Plan:
     """The segmentation method for views without a given mask, with its data. person: the network gives back what the
-    key takes from a person."""
+    key takes from a person. backdrop: a smooth one is behind the person in the photos, and corrects the network."""
 
     method: Literal["given", "plate", "key", "model", "person", "object", "grabcut"]
     background: Background | None = None
     person: bool = False
+    backdrop: bool = False
     solid: SupportedObject | None = None
     model: UserModel | None = None
 
@@ -143,10 +145,16 @@ def _person_or_object(
     found = solid()
     if np.quantile(shares, 1 - PERSON_VIEWS) >= PERSON_SHARE:
         person = found is None or not _agrees_better(found, views, images, persons, seed)
-        return Plan("person") if person else _by_points(found)
+        return Plan("person", backdrop=_before_backdrop(images, persons)) if person else _by_points(found)
     if found is not None:
         return _by_points(found)
     return Plan("person" if np.median(shares) >= PERSON_SHARE else "grabcut")
+
+
+def _before_backdrop(images: Sequence[U8], persons: Sequence[Bool]) -> bool:
+    """Whether a smooth backdrop is behind the person (h, w) in nearly all photos (h, w, 3)."""
+    found = [shades(i, p) for i, p in zip(images, persons, strict=True)]
+    return bool(np.mean([f is not None and f.is_backdrop for f in found]) >= PERSON_VIEWS)
 
 
 def _by_points(solid: SupportedObject | None) -> Plan:
@@ -206,8 +214,18 @@ def mask(view: PhotoToMask, how: Plan, threshold: float, longest: int, seed: int
     if how.method == "object" and how.solid is not None:
         return to_full_size(image, cut_by_points(image, view.camera, how.solid, longest, seed)), "object"
     if how.method == "person":
-        return to_full_size(image, person_mask(image, view.disc, threshold, longest, seed)), "person"
+        inside = person_mask(image, view.disc, threshold, longest, seed)
+        if how.backdrop:
+            inside = _against_backdrop(image, inside, view)
+        return to_full_size(image, inside), "person"
     return to_full_size(image, cut_by_region(image, view.disc, longest, seed)), "grabcut"
+
+
+def _against_backdrop(image: U8, inside: Bool, view: PhotoToMask) -> Bool:
+    """A network's mask (h, w) corrected by a smooth backdrop. image: (H, W, 3) 8-bit sRGB."""
+    h, w = inside.shape
+    small = np.asarray(resized(image, w, h), np.uint8)
+    return of_subject(corrected(small, inside), view.disc.scaled(w / image.shape[1]))
 
 
 def inverted(alpha: F32, disc: Disc) -> bool:
