@@ -7,7 +7,8 @@ edge. Where
 
     s > -min(DEEP, EDGE r)
 
-p moves along N by what is missing, over N's slope towards the skin; the surroundings follow smoothly.
+p moves along N by what is missing, over N's slope towards the skin; the surroundings follow smoothly. Where N leads out
+of the skin, as it can at the lips' edge, p stays: moving it would show it.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def beneath(
             break
         slope = (depth(at) - depth(at + CELL * unit * normals[own])) / (CELL * unit)
         step = np.zeros(len(points))
-        step[own] = lack / slope.clip(STEEPEST, 1.0)
+        step[own] = np.where(slope > 0, lack / slope.clip(STEEPEST, 1.0), 0.0)
         more = np.minimum(more + _spread(step, inner), MOST * unit)
     return np.where(own, more, 0.0)
 

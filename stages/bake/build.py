@@ -18,6 +18,7 @@ from pipeline.smoothing import continued
 from pipeline.visibility import FittedPhoto, Occluder, best_cosine
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
+from stages.bake.base_colour import CORRECTION
 from stages.bake.confidence import SIZE as SIGHT
 from stages.bake.confidence import sighted
 from stages.bake.detail import shade
@@ -32,7 +33,7 @@ from stages.bake.outline_depth import outline_depth
 from stages.bake.regions import Votes, areas, unanimous
 from stages.bake.relief import relief
 from stages.bake.sources import sources
-from stages.bake.standard_fit import CORRECTION, Fitted
+from stages.bake.standard_fit import Fitted
 from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample

@@ -43,9 +43,10 @@ import numpy.typing as npt
 from pipeline.lighting import standard
 from pipeline.meshes import F32, F64, Mask, Mesh, areas
 from pipeline.smoothing import Smoother
+from stages.bake.base_colour import correction, layers, room_for_layer
 from stages.bake.gloss_field import Slopes, Spread, departures
+from stages.bake.standard_seen import ALPHAS, Lit, Seen, under_dome
 
-ALPHAS = np.array([0.09, 0.12, 0.16, 0.20, 0.25, 0.31, 0.38, 0.47, 0.6], np.float32)
 EDGES = 0.7  # mean edges of the mesh over which the albedo's correction is pooled, and groups meet
 SKIN_RANGE = (0.02, 0.045)
 USUAL_F0 = 0.028  # of skin, index 1.40; microfacet.SKIN_F0 is the convention that the light's level assumes
@@ -63,7 +64,6 @@ MIN_EXPLAINED = 0.05  # share of the view-dependent variance that a layer must e
 MIN_VERTICES, MIN_VIEWS = 50, 4
 GRAZING, FACING = 0.2, 0.4  # cosines between which an observation's weight rises from 0 to 1
 OUTLIER = 2.5  # robust standard deviations of the field's residual from which the weight falls
-CORRECTION = (0.4, 2.5)  # limits of r
 ASSUMED_F0 = 0.04  # of bone, stone, paint: index 1.5
 FREE = 0.02  # largest share of the view-dependent variance that an assumed layer may cost
 FIELD = 1 / 3  # weight of the fit's own albedo of skin, r = 1, beside that of the photos under the exported light
@@ -97,29 +97,6 @@ SKIN = Prior(SKIN_RANGE, USUAL_F0, SKIN_ROUGHNESS, ROUGHNESS_SPREAD, inside=SKIN
 HAIR = Prior(HAIR_RANGE, 0.0, HAIR_ROUGHNESS, ROUGHNESS_SPREAD, top=HAIR_RANGE[1], varies=False)
 REST = Prior((0.0, 1.0), 0.0, SKIN_ROUGHNESS, OBJECT_SPREAD, DIELECTRIC)
 OBJECT = replace(REST, assumed=ASSUMED_F0)  # a capture without a person
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """M observations of the mesh's vertices. vertex (M,); wo (M, 3) unit; colour (M, 3) linear, without the photo's
-    colour response; predicted (M, 3) by the field. mirror (M, 3): the mirror reflection of a polarised pair, whose
-    colour shows none, NaN where it is not known; None without pairs."""
-
-    vertex: npt.NDArray[np.int64]
-    wo: F64
-    colour: F64
-    predicted: F64
-    mirror: F64 | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Lit:
-    """What arrives at M observations. lobes(rows, alphas): (m, K, 2, 3) of m of them, for F0 = 1 and the rim, for K
-    widths; shade (M, 3): S. received (V, 3): S at the vertices, of the still light or its stand-in."""
-
-    lobes: Callable[[npt.NDArray[np.int64], F32], F32]
-    shade: F64
-    received: F64
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +163,7 @@ def fit(
             varied = found.f0 * (1 + trust * (u - u[own].mean()) / found.fitted)
             f0[group] = varied[group].clip(*prior.f0).clip(0, prior.top)
             rough[group] = (found.roughness + trust * v)[group].clip(*ROUGHNESS_RANGE)
-        figures |= {f"gloss_{name}_f0": float(f0[group].mean()), f"gloss_{name}_roughness": float(rough[group].mean())}
+        figures[f"gloss_{name}_roughness"] = float(rough[group].mean())
         figures[f"gloss_{name}_explained"] = found.explained
         if found.assumed:
             figures[f"gloss_{name}_assumed"] = 1.0
@@ -196,24 +173,22 @@ def fit(
     near = Smoother(mesh, EDGES * edge)
     f0, roughness = near(np.stack([f0, rough], 1)).T
     f0 = np.where(near(layered[:, None])[:, 0] > 0.01, f0, 0.0).clip(0, 1)
-    correction = _correction(near, normals, albedo, seen, w, lit, f0, roughness, np.where(skin, FIELD, 0.0))
+    of = layers(normals, seen, lit, f0, roughness)
+    if hair.any():
+        most = room_for_layer(near, of, albedo, seen, w, lit, f0, roughness, hair)
+        f0 = near(np.where(hair, np.minimum(f0, most), f0)[:, None])[:, 0].clip(0, 1)
+    figures |= {
+        f"gloss_{name}_f0": float(f0[group].mean())
+        for name, group in (("skin", skin), ("hair", hair), ("rest", ~skin & ~hair))
+        if group.any()
+    }
+    r = correction(near, of, albedo, seen, w, lit, f0, roughness, np.where(skin, FIELD, 0.0))
     return Fitted(
-        correction.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
+        r.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),
         lit.received.astype(np.float32),
         {k: round(v, 5) for k, v in figures.items()}, bool(skin.any()) or "gloss_rest_refused_f0" not in figures,
         told.astype(np.float32),
     )  # fmt: skip
-
-
-def under_dome(at: standard.Arrivals, normals: F64, seen: Seen) -> Lit:
-    """What arrives at the observations under a still light."""
-    received = np.asarray(at.irradiance / np.pi, np.float64)
-
-    def lobes(rows: npt.NDArray[np.int64], alphas: F32) -> F32:
-        vertex = seen.vertex[rows]
-        return standard.lobes(at, vertex, normals[vertex], seen.wo[rows], alphas)
-
-    return Lit(lobes, received[seen.vertex], received)
 
 
 def _in_enough(vertex: npt.NDArray[np.int64], weights: F64, count: int) -> Mask:
@@ -369,31 +344,3 @@ def _lowest(x: F64, cost: F64) -> float:
         return float(x[k])
     a, b, _ = np.polyfit(x[k - 1 : k + 2], cost[k - 1 : k + 2], 2)
     return float(np.clip(-b / (2 * a), x[k - 1], x[k + 1]))
-
-
-def _correction(
-    smooth: Smoother, normals: F64, albedo: F64, seen: Seen, w: F64, lit: Lit, f0: F64, roughness: F64, pull: F64
-) -> F64:
-    """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R), drawn to 1 by pull (V,) >= 0;
-    1 where nothing is seen."""
-    v = seen.vertex
-    alpha = roughness**2
-    cosine = (normals[v] * seen.wo).sum(1)
-    k = np.abs(ALPHAS[None] - alpha[:, None]).argmin(1)[v]
-    specular = np.zeros((len(v), 3))
-    for one in np.unique(k):
-        rows = np.flatnonzero((k == one) & (f0[v] > 0))
-        lobes = lit.lobes(rows, ALPHAS[one : one + 1])[:, 0]
-        specular[rows] = f0[v[rows], None] * lobes[:, 0] + lobes[:, 1]
-    kept = 1 - standard.layer(cosine, f0[v], alpha[v])
-    if seen.mirror is not None:
-        specular[:] = 0  # the photos are cross-polarised
-    m = albedo[v] * lit.shade * kept[:, None]
-    above, below = (
-        np.stack([np.bincount(v, w * z[:, i], len(normals)) for i in range(3)], 1).astype(np.float64)
-        for z in (m * (seen.colour - specular), m * m)
-    )
-    dark = albedo**2 + 1e-12  # so that the pull to 1 does not depend on how dark the surface is
-    typical = 1e-3 * dark * (below / dark)[below > 0].mean() if (below > 0).any() else np.ones(1)
-    r = ((smooth(above) + typical) / (smooth(below) + typical)).clip(*CORRECTION)
-    return np.asarray((r + pull[:, None]) / (1 + pull[:, None]))

@@ -26,6 +26,7 @@ from stages.bake.detail_views import Photos
 from stages.bake.even_skin import Even
 from stages.bake.regions import Poll
 from stages.bake.skin import skin_of
+from stages.bake.standard_seen import Lit, Seen
 
 DOME_WIDTH = 256  # columns of the picture that is cut into lamps
 MIN_FACING = 0.3  # least cosine between the mesh's normal and the field's gradient
@@ -46,7 +47,7 @@ def standard_material(
     skin, telling = skin_of(mesh, face, albedo if look is None else look.astype(np.float64), region)
     asked = telling | ~skin if thin is None else (telling | ~skin) & thin.chosen
     moving = field.moving_light
-    at: standard_fit.Lit | Arrivals
+    at: Lit | Arrivals
     if moving is None:
         lit = lamps(environment(field.light, DOME_WIDTH), COUNT)
         at = arrivals(mesh.vertices, normals.astype(np.float32), mesh.faces, lit, albedo, check)
@@ -64,9 +65,9 @@ def standard_material(
 
 
 def carried(
-    light: MovingLight, stand_in: F32, mesh: Mesh, normals: F64, seen: standard_fit.Seen, view: Indices,
+    light: MovingLight, stand_in: F32, mesh: Mesh, normals: F64, seen: Seen, view: Indices,
     poses: Sequence[F64], check: Callable[[], None],
-) -> standard_fit.Lit:  # fmt: skip
+) -> Lit:  # fmt: skip
     """What arrives under a light that moves with the camera. stand_in: the still one; view (M,): number of each
     observation's photo; poses (4, 4) of the photos."""
     moving = MovingLamps(light)
@@ -87,7 +88,7 @@ def carried(
         return out
 
     still = shade(stand_in, normals, np.ones((len(normals), 3), np.float32)).astype(np.float64)
-    return standard_fit.Lit(lobes, lit, still)
+    return Lit(lobes, lit, still)
 
 
 def field_normals(field: Field, mesh: Mesh) -> F64:
@@ -99,7 +100,7 @@ def field_normals(field: Field, mesh: Mesh) -> F64:
 
 def _observed(
     field: Field, mesh: Mesh, normals: F64, albedo: F64, views: Sequence[FittedPhoto], skin_code: int, found: Detail
-) -> tuple[standard_fit.Seen, Indices, Mask]:
+) -> tuple[Seen, Indices, Mask]:
     """The observations, the number of each one's photo, and which vertices the photos label as the face."""
     photos, x = found.photos, mesh.vertices.astype(np.float64)
     colour, cosines = np.zeros((len(views), len(x), 3)), np.zeros((len(views), len(x)))
@@ -111,9 +112,7 @@ def _observed(
     own = found.relative[view, vertex] if len(found.relative) else 1.0
     predicted = base[vertex] * own + found.gloss[view, vertex]
     mirror = _mirrors(found.photos, x, normals, colour)
-    observations = standard_fit.Seen(
-        vertex, wo, colour[view, vertex], predicted, None if mirror is None else mirror[view, vertex]
-    )
+    observations = Seen(vertex, wo, colour[view, vertex], predicted, None if mirror is None else mirror[view, vertex])
     return observations, view, _face(views, x, cosines, skin_code)
 
 

@@ -165,4 +165,4 @@ def _refused(config: Config, why: str) -> RegisteredHead:
     return RegisteredHead(registered=False, reason=why)
 
 
-STAGE = Stage(name="template", version=22, inputs=Inputs, config=Config, output=RegisteredHead, run=run)
+STAGE = Stage(name="template", version=23, inputs=Inputs, config=Config, output=RegisteredHead, run=run)

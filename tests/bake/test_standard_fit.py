@@ -19,6 +19,7 @@ from pipeline.maths.light_frame import FLASH
 from pipeline.meshes import Mesh
 from pipeline.transforms import rigid
 from stages.bake import standard_fit as fits
+from stages.bake.base_colour import layers
 from stages.bake.standard_observe import carried
 
 RADIUS = 0.1
@@ -161,6 +162,43 @@ def test_skin_whose_photos_contradict_a_layer_is_as_usual() -> None:
     n, skin = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
     found = fits.fit(mesh, n, at, albedo, fits.Seen(seen.vertex, seen.wo, dark, dark), skin)
     np.testing.assert_allclose(found.f0, fits.USUAL_F0, rtol=1e-2)
+
+
+def darker(share: float) -> tuple[fits.Fitted, float]:
+    """Hair that varies with the view as a layer of keratin does, and reflects this share of what such a layer does:
+    its material, and the ratio of what it reflects to what the photos show, where they look at it straight on."""
+    mesh, at, albedo, seen = scene(0.046, 0.7)
+    bare = scene(0.0, 0.7)[3].colour
+    layer = seen.colour - bare
+    whole = np.bincount(seen.vertex, layer.mean(1)) / np.maximum(np.bincount(seen.vertex, bare.mean(1)), 1e-9)
+    dark = layer - (1 - share) * whole[seen.vertex, None] * bare
+    n, hair = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
+    colour = np.maximum(albedo * share * whole[:, None], 1e-6)  # as the field has it: all of it is albedo
+    observed = fits.Seen(seen.vertex, seen.wo, dark, dark)
+    found = fits.fit(mesh, n, at, colour, observed, ~hair, hair=hair)
+    lit = fits.under_dome(at, n, observed)
+    of = layers(n, observed, lit, found.f0.astype(float), found.roughness.astype(float))
+    base = (found.correction * colour)[seen.vertex] * lit.shade
+    shown = found.f0[seen.vertex, None] * of.mirror + of.rim + base
+    facing = (n[seen.vertex] * seen.wo).sum(1) > fits.FACING
+    return found, shown[facing].sum() / max(dark[facing].sum(), 1e-9)
+
+
+def test_black_hair_is_no_brighter_than_its_photos() -> None:
+    """What varies with the view alone gives F0 .046; with that, half of the layer would be twice as bright."""
+    f0 = []
+    for share in (0.5, 1.0, 2.0, 3.0):
+        found, ratio = darker(share)
+        assert found.figures["gloss_hair_explained"] > 0.3
+        assert np.ptp(found.f0) < 1e-3  # one for all of it
+        assert ratio == pytest.approx(1, abs=0.15)
+        f0.append(float(found.f0.mean()))
+    assert f0 == sorted(f0) and f0[0] < 0.01 and f0[-1] > 0.035
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-3])
+def test_hair_that_reflects_nothing_has_no_layer(share: float) -> None:
+    assert (darker(share)[0].f0 < 0.002).all()
 
 
 def test_an_object_of_no_dielectric_is_refused() -> None:

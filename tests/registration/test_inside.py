@@ -76,6 +76,16 @@ def test_the_template_s_own_mouth_hardly_moves() -> None:
     assert more.max() < DEEP
 
 
+def test_a_point_whose_normal_leads_out_of_the_skin_stays() -> None:
+    """At the lips' edge a normal can do so; a point that lacked .1 mm came .4 mm through the lip."""
+    h = head(1.0, PUSH)
+    points, normals, quads = h.surface()
+    flat, region = np.zeros(len(points)), np.repeat(h.region, 4)
+    into, out = (beneath(points, n, flat, quads, region, NAMES, 1.0) for n in (normals, -normals))
+    assert (into > 0.001).sum() > 20
+    assert not out[into > 0.001].any()
+
+
 def test_the_way_is_smooth() -> None:
     """No vertex moves alone: neighbours differ by less than half of the largest way."""
     h = head(1.0, PUSH)
