@@ -19,7 +19,7 @@ from stages.masks.region import F32, U8, Bool, dilated, eroded
 
 PART = 0.25  # of the largest part of the background: a smaller one may be a strip of cloth that a key has cut out
 # of the polynomial of the shade of each channel, in the place, fit after fit. What a mask lacks is part of its
-# background: a plane can't follow that, and it counts less before a cubic could
+# background: a plane can't follow that, and leaves it out before a cubic could
 DEGREES = (1, 1, 1, 1, 2, 2, 3, 3, 3)
 LONGEST = 256  # pixels: the size at which it is fitted
 LEAST = 0.05  # share of the photo that must be background
@@ -69,9 +69,9 @@ def shades(image: U8, subject: Bool) -> Shades | None:
         terms = np.stack([x**a * y**b for a in range(degree + 1) for b in range(degree + 1 - a)], -1)
         surface = terms @ np.linalg.lstsq(weight[:, None] * terms[seen], weight[:, None] * small[seen], rcond=None)[0]
         away = np.abs(small - surface).max(-1)[seen]
-        weight = 1 / np.sqrt(np.maximum(away, 1))  # least absolute differences
-    deviation = 1.4826 * float(np.median(away))
-    on = away <= max(LEAST_TOLERANCE, NOISE * deviation)
+        deviation = 1.4826 * float(np.median(away))
+        on = away <= max(LEAST_TOLERANCE, NOISE * deviation)
+        weight = on / np.sqrt(np.maximum(away, 1))  # least absolute differences, of what may be backdrop
     return Shades(surface.astype(np.float32), deviation, float(on.mean()))
 
 

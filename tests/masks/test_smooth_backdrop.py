@@ -81,6 +81,16 @@ def test_a_network_gets_what_it_lacks_and_loses_what_is_backdrop() -> None:
     assert (fixed ^ PERSON).sum() < 0.003 * PERSON.sum()
 
 
+def test_the_shade_does_not_follow_what_a_mask_lacks() -> None:
+    """A shoulder that hangs together with the background."""
+    found = shades(photo(), PERSON & ~((Y > 190) & (Y < 250) & (X < 85)))
+    assert found is not None and 0.8 < found.share < 0.95
+    assert (
+        np.abs(found.surface[:128] - BACKDROP[: H // 2][np.arange(128) * 5 // 4][:, np.arange(205) * W // 205]).max()
+        < 4
+    )
+
+
 def test_a_right_mask_is_left_alone() -> None:
     assert np.array_equal(corrected(photo(), PERSON), PERSON)
     strip = painted(photo(), STRIP, 0)  # cloth of the backdrop's colour lies between the subject and the frame
