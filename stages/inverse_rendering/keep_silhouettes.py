@@ -5,12 +5,13 @@ although the hull does not, the place on that ray that is nearest to their surfa
 
 Long hair, a hat or headphones stand further out of the template than is allowed. The space that a person with a placed
 head can fill (pipeline.registration.carve) is a guess. Where it leaves a ray of a silhouette empty although the hull
-does not, the guess is wrong, and one place on that ray is kept: within the hull, near the template, rather beside or
+does not, the guess is wrong, and a place on that ray is kept: within the hull, near the template, rather beside or
 behind it than in front, because hair hangs there. Stereo and the fit move it.
 
 Symbols: S the signed bound of the possible space, negative inside; u metres ahead of the head, along the direction that
-the face looks to; p the point of a lost ray within the hull at which S + BEHIND u is least. The bound becomes
-min(S, |x - p| - radius) over all p, smoothed.
+the face looks to; p the point of a lost ray within the hull at which S + BEHIND u is least, and the points at which it
+is at most `thick` larger: the least jumps from ray to ray, and one point on each made rags of hair that hangs beside a
+face. The bound becomes min(S, |x - p| - radius) over all p, smoothed.
 """
 
 from __future__ import annotations
@@ -59,9 +60,10 @@ def bound_with_silhouettes(
     views: list[PhotoView],
     check: Callable[[], None] = lambda: None,
     detail: Detail = HAIR,
+    thick: float = 0.0,
 ) -> F32:
     """The bound S (X, Y, Z) on the hull's grid, widened where it would empty rays of the silhouettes. front (3,): unit
-    direction that the face looks to; zero where no direction is better."""
+    direction that the face looks to; zero where no direction is better. thick: world units of S + BEHIND u."""
     cut = Start(distances(np.maximum(hull.values, bound), hull.lo, hull.cell), hull.lo, hull.cell)
     whole, left = hull.surface("cpu"), cut.surface("cpu")
     free = np.ones(bound.shape, bool)
@@ -69,7 +71,7 @@ def bound_with_silhouettes(
     cost = bound + axes[0][:, None, None] + axes[1][None, :, None] + axes[2][None, None, :]
     for i in evenly_spaced(len(views), min(detail.views, len(views))):
         check()
-        points = _lost(whole, left, hull, cost, views[i], detail)
+        points = _lost(whole, left, hull, cost, views[i], detail, thick)
         free[tuple(np.rint((points - hull.lo) / hull.cell).astype(np.intp).T)] = False
     if free.all():
         return bound
@@ -87,8 +89,11 @@ def start_with_silhouettes(
     return Start(distances(np.maximum(kept, hull.values), hull.lo, hull.cell), hull.lo, hull.cell)
 
 
-def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView, detail: Detail) -> F64:
-    """Points (N, 3) in the hull, on the rays of a view that meet `whole` but not `left`, at which `cost` is least."""
+def _lost(
+    whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView, detail: Detail, thick: float
+) -> F64:  # fmt: skip
+    """Points (N, 3) in the hull, on the rays of a view that meet `whole` but not `left`, at which `cost` is least on
+    the ray or exceeds that by at most `thick`."""
     K, shown = _silhouette(view, detail)
     rows, columns = np.nonzero(shown)
     o, d, _ = pixel_rays(K, view.world_from_cam, rows, columns)
@@ -97,15 +102,22 @@ def _lost(whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView
     o, d, near, far = (x[lost].contiguous() for x in (o, d, near, far))
     t, hit, _ = whole.trace(o, d, near, far)
     origin, direction, first, last = (x[hit].double().numpy() for x in (o, d, t, far))
-    least, place = np.full(len(first), np.inf), np.zeros((len(first), 3))
-    for at in np.arange(0.0, float((last - first).max(initial=0.0)), 0.5 * hull.cell):
+    steps = np.arange(0.0, float((last - first).max(initial=0.0)), 0.5 * hull.cell)
+
+    def on_rays(at: float) -> tuple[F64, F64]:
         x = origin + (first + at)[:, None] * direction
         node = ((x - hull.lo) / hull.cell).T
         inside = (first + at < last) & (ndimage.map_coordinates(hull.values, node, order=1, mode="nearest") < 0)
-        value = ndimage.map_coordinates(cost, node, order=1, mode="nearest")
-        better = inside & (value < least)
-        least[better], place[better] = value[better], x[better]
-    return np.asarray(place[np.isfinite(least)], np.float64)
+        return x, np.where(inside, ndimage.map_coordinates(cost, node, order=1, mode="nearest"), np.inf)
+
+    least = np.full(len(first), np.inf)
+    for at in steps:
+        least = np.minimum(least, on_rays(at)[1])
+    kept = [np.zeros((0, 3))]
+    for at in steps:
+        x, value = on_rays(at)
+        kept.append(x[np.isfinite(value) & (value <= least + thick)])
+    return np.concatenate(kept)
 
 
 def _silhouette(view: PhotoView, detail: Detail) -> tuple[F64, Bool]:

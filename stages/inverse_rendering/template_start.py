@@ -32,6 +32,7 @@ from stages.inverse_rendering.stereo import distances, reduced
 # 3 mm on surfaces that are right, 6 to 45 mm where the hull hides the face.
 FAR = 0.006
 SIGHT = 240  # pixels of a photo's longest side, in which the face is seen
+THICK = 0.012  # metres of the template: of hair that silhouettes show beyond its space
 BEYOND_STEREO = 0.015  # the same before stereo: no sweep goes so far. 24 mm on arcs of photos
 
 
@@ -54,7 +55,7 @@ def carved_by_template(
     x, y, z = start.values.shape
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
-    return _cut(start, space, head, views, check)
+    return _cut(start, space, head, views, check, THICK)
 
 
 def without_cover(
@@ -89,8 +90,11 @@ def without_far_parts(
     return _cut(start, space, head, views, check)
 
 
-def _cut(start: Start, space: F32, head: PlacedHead, views: list[PhotoView], check: Callable[[], None]) -> Start:
-    """The start within a space (X, Y, Z), negative inside, and what else the silhouettes need of it."""
+def _cut(
+    start: Start, space: F32, head: PlacedHead, views: list[PhotoView], check: Callable[[], None], thick: float = 0.0
+) -> Start:
+    """The start within a space (X, Y, Z), negative inside, and what else the silhouettes need of it. thick: metres of
+    the template, of that."""
     front = head.world_from_template[:3, 2] / head.scale
-    bound = bound_with_silhouettes(start, space, front, views, check)
+    bound = bound_with_silhouettes(start, space, front, views, check, thick=thick * head.scale)
     return Start(distances(np.maximum(start.values, bound), start.lo, start.cell), start.lo, start.cell)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths.tracing import box_interval
@@ -94,6 +95,19 @@ def test_it_is_kept_at_the_side_of_the_head_and_not_in_front_of_it() -> None:
     assert turned.mean() > 0.02  # where the face looks decides, not the cameras
     face = (NODE[..., 2] > 0) & (np.abs(NODE[..., 0]) < 0.08)
     assert np.array_equal(found[face], BOUND[face])
+
+
+@pytest.mark.parametrize("thick", [0.02, 0.05])
+def test_what_is_kept_has_a_thickness(thick: float) -> None:
+    """Along the rays, as far as S + u / 2 exceeds its least by no more than this."""
+    thin, found = (kept(bound_with_silhouettes(BOTH, BOUND, FRONT, VIEWS, thick=t)) for t in (0.0, thick))
+    assert (found | ~thin).all()
+    assert np.ptp(NODE[found][:, 2]) > np.ptp(NODE[thin][:, 2]) + thick
+    cost = BOUND + 0.5 * NODE[..., 2]
+    assert cost[found].max() < cost[thin].max() + thick + 0.5 * CELL
+    assert ndimage.label(found)[1] == 1  # no rags
+    face = (NODE[..., 2] > 0) & (np.abs(NODE[..., 0]) < 0.08)
+    assert np.array_equal(bound_with_silhouettes(BOTH, BOUND, FRONT, VIEWS, thick=thick)[face], BOUND[face])
 
 
 def test_a_bound_that_empties_no_ray_stays() -> None:
