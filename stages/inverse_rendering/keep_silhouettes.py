@@ -10,8 +10,8 @@ behind it than in front, because hair hangs there. Stereo and the fit move it.
 
 Symbols: S the signed bound of the possible space, negative inside; u metres ahead of the head, along the direction that
 the face looks to; p the point of a lost ray within the hull at which S + BEHIND u is least, and the points at which it
-is at most `thick` larger: the least jumps from ray to ray, and one point on each made rags of hair that hangs beside a
-face. The bound becomes min(S, |x - p| - radius) over all p, smoothed.
+is at most `thick` larger while S is not: the least jumps from ray to ray, and one point on each made rags of hair that
+hangs beside a face. The bound becomes min(S, |x - p| - radius) over all p, smoothed.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def bound_with_silhouettes(
     cost = bound + axes[0][:, None, None] + axes[1][None, :, None] + axes[2][None, None, :]
     for i in evenly_spaced(len(views), min(detail.views, len(views))):
         check()
-        points = _lost(whole, left, hull, cost, views[i], detail, thick)
+        points = _lost(whole, left, hull, bound, cost, views[i], detail, thick)
         free[tuple(np.rint((points - hull.lo) / hull.cell).astype(np.intp).T)] = False
     if free.all():
         return bound
@@ -90,10 +90,10 @@ def start_with_silhouettes(
 
 
 def _lost(
-    whole: GridSdf, left: GridSdf, hull: Start, cost: F64, view: PhotoView, detail: Detail, thick: float
+    whole: GridSdf, left: GridSdf, hull: Start, bound: F32, cost: F64, view: PhotoView, detail: Detail, thick: float
 ) -> F64:  # fmt: skip
     """Points (N, 3) in the hull, on the rays of a view that meet `whole` but not `left`, at which `cost` is least on
-    the ray or exceeds that by at most `thick`."""
+    the ray, or exceeds that by at most `thick` with no larger `bound`."""
     K, shown = _silhouette(view, detail)
     rows, columns = np.nonzero(shown)
     o, d, _ = pixel_rays(K, view.world_from_cam, rows, columns)
@@ -104,19 +104,22 @@ def _lost(
     origin, direction, first, last = (x[hit].double().numpy() for x in (o, d, t, far))
     steps = np.arange(0.0, float((last - first).max(initial=0.0)), 0.5 * hull.cell)
 
-    def on_rays(at: float) -> tuple[F64, F64]:
+    def on_rays(at: float) -> tuple[F64, F64, F64]:
         x = origin + (first + at)[:, None] * direction
         node = ((x - hull.lo) / hull.cell).T
         inside = (first + at < last) & (ndimage.map_coordinates(hull.values, node, order=1, mode="nearest") < 0)
-        return x, np.where(inside, ndimage.map_coordinates(cost, node, order=1, mode="nearest"), np.inf)
+        value, far = (ndimage.map_coordinates(g, node, order=1, mode="nearest") for g in (cost, bound))
+        return x, np.where(inside, value, np.inf), far
 
-    least = np.full(len(first), np.inf)
+    least, away = np.full(len(first), np.inf), np.zeros(len(first))
     for at in steps:
-        least = np.minimum(least, on_rays(at)[1])
+        _, value, far = on_rays(at)
+        away = np.where(value < least, far, away)
+        least = np.minimum(least, value)
     kept = [np.zeros((0, 3))]
     for at in steps:
-        x, value = on_rays(at)
-        kept.append(x[np.isfinite(value) & (value <= least + thick)])
+        x, value, far = on_rays(at)
+        kept.append(x[np.isfinite(value) & (value <= least + thick) & (far <= away)])
     return np.concatenate(kept)
 
 
