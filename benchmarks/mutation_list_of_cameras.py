@@ -170,6 +170,10 @@ OF_CAMERAS = (
     # ---------------------------------------------------------------- what silhouettes show is kept
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "lost = ~left.trace(o, d, near, far)[1]",
              "lost = left.trace(o, d, near, far)[1]", KEPT),
+    Mutation("stages/inverse_rendering/keep_silhouettes.py", " & (off <= away)", "",
+             f"{KEPT}::test_what_is_kept_has_a_thickness"),
+    Mutation("stages/inverse_rendering/keep_silhouettes.py", "value <= least + thick", "value <= least",
+             f"{KEPT}::test_what_is_kept_has_a_thickness"),
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "np.minimum(bound, near * hull.cell)",
              "np.maximum(bound, near * hull.cell)", KEPT),
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "axes = [BEHIND * hull.cell * f",

@@ -108,18 +108,18 @@ def _lost(
         x = origin + (first + at)[:, None] * direction
         node = ((x - hull.lo) / hull.cell).T
         inside = (first + at < last) & (ndimage.map_coordinates(hull.values, node, order=1, mode="nearest") < 0)
-        value, far = (ndimage.map_coordinates(g, node, order=1, mode="nearest") for g in (cost, bound))
-        return x, np.where(inside, value, np.inf), far
+        value, off = (ndimage.map_coordinates(g, node, order=1, mode="nearest") for g in (cost, bound))
+        return x, np.where(inside, value, np.inf), off
 
     least, away = np.full(len(first), np.inf), np.zeros(len(first))
     for at in steps:
-        _, value, far = on_rays(at)
-        away = np.where(value < least, far, away)
+        _, value, off = on_rays(at)
+        away = np.where(value < least, off, away)
         least = np.minimum(least, value)
     kept = [np.zeros((0, 3))]
     for at in steps:
-        x, value, far = on_rays(at)
-        kept.append(x[np.isfinite(value) & (value <= least + thick) & (far <= away)])
+        x, value, off = on_rays(at)
+        kept.append(x[np.isfinite(value) & (value <= least + thick) & (off <= away)])
     return np.concatenate(kept)
 
 

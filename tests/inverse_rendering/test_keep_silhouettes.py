@@ -105,6 +105,7 @@ def test_what_is_kept_has_a_thickness(thick: float) -> None:
     assert np.ptp(NODE[found][:, 2]) > np.ptp(NODE[thin][:, 2]) + thick
     cost = BOUND + 0.5 * NODE[..., 2]
     assert cost[found].max() < cost[thin].max() + thick + 0.5 * CELL
+    assert BOUND[found].max() < BOUND[thin].max() + CELL  # toward the head
     assert ndimage.label(found)[1] == 1  # no rags
     face = (NODE[..., 2] > 0) & (np.abs(NODE[..., 0]) < 0.08)
     assert np.array_equal(bound_with_silhouettes(BOTH, BOUND, FRONT, VIEWS, thick=thick)[face], BOUND[face])
