@@ -269,7 +269,7 @@ OF_ASSET = (
              "tests/masks/test_smooth_backdrop.py::test_a_backdrop_must_be_behind_nearly_all"),
     Mutation("pipeline/registration/inside.py", "np.where(slope > 0, lack", "np.where(True, lack",
              "tests/registration/test_inside.py::test_a_point_whose_normal_leads_out_of_the_skin_stays"),
-    Mutation("stages/masks/key_person.py", "2 * radius)", "64 * radius)",
+    Mutation("stages/masks/region.py", "2 * radius)", "64 * radius)",
              "tests/masks/test_key_person.py::test_the_keys_contour_stays_where_it_loses_nothing"),
     Mutation("stages/masks/key_person.py", "helped >= AGREED and", "", "tests/masks/test_key_person.py"),
     Mutation("stages/masks/key_person.py", "> LOST for", "> 100 * LOST for",

@@ -4,7 +4,8 @@
 
 TEMPLATE_KIT has MakeHuman's base.obj and targets; the cameras of CAPTURE's params.json are used; PYTHON has Blender's
 module. `bob` has dark brown skin and a striped shirt, `long` light skin, fair hair and a white shirt; the backdrop is
-grey. OUT is in FaceScape's format; OUT/truth is for scoring only. Then
+grey. OUT is in FaceScape's format; OUT/truth is for scoring only. Without --rig the photos are those of a phone in a
+room, in OUT/images. Then
 
     neuface run OUT --preset draft --holdout every:5:2 --out RUN
 """

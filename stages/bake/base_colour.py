@@ -77,7 +77,7 @@ def correction(
     """r (V, 3) = pooled sum of w m (I - specular) over that of w m^2, m = a S (1 - R), drawn to 1 by pull (V,) >= 0;
     1 where nothing is seen."""
     v, count = seen.vertex, len(f0)
-    specular = f0[v, None] * of.mirror + of.rim
+    specular = np.where(f0[v, None] > 0, f0[v, None] * of.mirror + of.rim, 0.0)  # without a layer no rim
     m = _under(seen, lit, of, albedo, f0, roughness)
     above, below = (
         np.stack([np.bincount(v, w * z[:, i], count) for i in range(3)], 1).astype(np.float64)

@@ -148,7 +148,8 @@ def fit(
     told = np.zeros((len(normals), 2))
     figures: dict[str, float] = {}
     others = REST if (skin | hair).any() else OBJECT
-    for name, group, prior in (("skin", skin, SKIN), ("hair", hair, HAIR), ("rest", ~skin & ~hair, others)):
+    groups = {"skin": skin, "hair": hair, "rest": ~skin & ~hair}
+    for (name, group), prior in zip(groups.items(), (SKIN, HAIR, others), strict=True):
         if not group.any():
             continue
         found = _group(sums, group & often, prior)
@@ -177,11 +178,7 @@ def fit(
     if hair.any():
         most = room_for_layer(near, of, albedo, seen, w, lit, f0, roughness, hair)
         f0 = near(np.where(hair, np.minimum(f0, most), f0)[:, None])[:, 0].clip(0, 1)
-    figures |= {
-        f"gloss_{name}_f0": float(f0[group].mean())
-        for name, group in (("skin", skin), ("hair", hair), ("rest", ~skin & ~hair))
-        if group.any()
-    }
+    figures |= {f"gloss_{name}_f0": float(f0[group].mean()) for name, group in groups.items() if group.any()}
     r = correction(near, of, albedo, seen, w, lit, f0, roughness, np.where(skin, FIELD, 0.0))
     return Fitted(
         r.astype(np.float32), f0.astype(np.float32), roughness.astype(np.float32),

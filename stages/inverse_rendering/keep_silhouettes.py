@@ -111,11 +111,13 @@ def _lost(
         value, off = (ndimage.map_coordinates(g, node, order=1, mode="nearest") for g in (cost, bound))
         return x, np.where(inside, value, np.inf), off
 
-    least, away = np.full(len(first), np.inf), np.zeros(len(first))
+    least, away, place = np.full(len(first), np.inf), np.zeros(len(first)), np.zeros((len(first), 3))
     for at in steps:
-        _, value, off = on_rays(at)
-        away = np.where(value < least, off, away)
-        least = np.minimum(least, value)
+        x, value, off = on_rays(at)
+        better = value < least
+        least[better], away[better], place[better] = value[better], off[better], x[better]
+    if not thick:
+        return np.asarray(place[np.isfinite(least)])
     kept = [np.zeros((0, 3))]
     for at in steps:
         x, value, off = on_rays(at)

@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.masks.keying import EDGE, Background, keyed
 from stages.masks.matting import soft_edge
-from stages.masks.region import F32, U8, Bool, Disc, dilated, eroded, resized
+from stages.masks.region import F32, U8, Bool, Disc, resized, thick
 from stages.masks.segment_person import of_subject, person_mask, person_probability
 
 SURE = 0.9  # probability from which the network is sure of a person
@@ -55,13 +55,7 @@ def both(image: U8, disc: Disc, own: Bool, how: Network) -> Bool:
     small = person_mask(image, disc, how.threshold, how.longest, how.seed)
     person = np.asarray(resized(small.astype(np.float32), own.shape[1], own.shape[0])) >= 0.5
     radius = max(1, round(THIN * own.shape[1] / small.shape[1]))
-    return of_subject(own | _thick(person & ~own, radius), disc)
-
-
-def _thick(missing: Bool, radius: int) -> Bool:
-    """What lies within twice `radius` pixels of a disc of `radius` in the mask (H, W): a rim that is thinner, beside or
-    around it, is left out."""
-    return missing & dilated(eroded(missing, radius), 2 * radius)
+    return of_subject(own | thick(person & ~own, radius), disc)
 
 
 def key_with_person(image: U8, disc: Disc, background: Background, how: Network) -> F32:

@@ -96,6 +96,12 @@ def eroded(mask: Bool, radius: int) -> Bool:
     return np.asarray(out) > 0
 
 
+def thick(parts: Bool, radius: int) -> Bool:
+    """What lies within twice `radius` pixels of a disc of `radius` in the mask (H, W): a rim that is thinner, beside or
+    around it, is left out."""
+    return parts & dilated(eroded(parts, radius), 2 * radius)
+
+
 def dilated(mask: Bool, radius: int) -> Bool:
     """(H, W) dilation by a disc of `radius` pixels."""
     return ~eroded(~mask, radius)

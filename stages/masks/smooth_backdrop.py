@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from stages.masks.matting import largest_parts
-from stages.masks.region import F32, U8, Bool, dilated, eroded
+from stages.masks.region import F32, U8, Bool, dilated, thick
 
 PART = 0.25  # of the largest part of the background: a smaller one may be a strip of cloth that a key has cut out
 # of the polynomial of the shade of each channel, in the place, fit after fit. What a mask lacks is part of its
@@ -107,8 +107,7 @@ def _away(image: U8, found: Shades) -> F32:
 
 
 def _thick(parts: Bool) -> Bool:
-    thin = max(1, round(THIN * max(parts.shape)))
-    return parts & dilated(eroded(parts, thin), 2 * thin)
+    return thick(parts, max(1, round(THIN * max(parts.shape))))
 
 
 def _lacking(away: F32, own: Bool, found: Shades) -> Bool:

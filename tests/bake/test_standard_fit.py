@@ -170,9 +170,11 @@ def darker(share: float) -> tuple[fits.Fitted, float]:
     mesh, at, albedo, seen = scene(0.046, 0.7)
     bare = scene(0.0, 0.7)[3].colour
     layer = seen.colour - bare
-    whole = np.bincount(seen.vertex, layer.mean(1)) / np.maximum(np.bincount(seen.vertex, bare.mean(1)), 1e-9)
-    dark = layer - (1 - share) * whole[seen.vertex, None] * bare
     n, hair = mesh.normals.astype(np.float64), np.ones(len(albedo), bool)
+    facing = (n[seen.vertex] * seen.wo).sum(1) > fits.FACING
+    total = [np.bincount(seen.vertex, facing * z.mean(1), len(albedo)) for z in (layer, bare)]
+    whole = total[0] / np.maximum(total[1], 1e-9)
+    dark = np.maximum(layer - (1 - share) * whole[seen.vertex, None] * bare, 0)
     colour = np.maximum(albedo * share * whole[:, None], 1e-6)  # as the field has it: all of it is albedo
     observed = fits.Seen(seen.vertex, seen.wo, dark, dark)
     found = fits.fit(mesh, n, at, colour, observed, ~hair, hair=hair)
@@ -180,7 +182,6 @@ def darker(share: float) -> tuple[fits.Fitted, float]:
     of = layers(n, observed, lit, found.f0.astype(float), found.roughness.astype(float))
     base = (found.correction * colour)[seen.vertex] * lit.shade
     shown = found.f0[seen.vertex, None] * of.mirror + of.rim + base
-    facing = (n[seen.vertex] * seen.wo).sum(1) > fits.FACING
     return found, shown[facing].sum() / max(dark[facing].sum(), 1e-9)
 
 
