@@ -15,12 +15,14 @@ import numpy.typing as npt
 from pipeline.artifacts import Camera, CameraSet, FittedFace, Located, MaskSet
 from pipeline.capture_artifacts import Capture
 from pipeline.fitted_cameras import cameras_of
+from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Mask, Mesh
 from pipeline.ray_casting import RayCaster
 from pipeline.transforms import inverse_rigid, matrix
 
 LIFT = 2e-3  # of the mesh's size: rays start this far above it, against self-occlusion of facets
 MIN_ALPHA = 0.5
+FEW = 0.1, 0.3  # cosines at which a view counts as none, and as a whole one
 KEPT = 200_000_000  # bytes of masks that stay in memory
 
 
@@ -90,12 +92,23 @@ def seen_weight(points: F64, normals: F64, views: Sequence[FittedPhoto], occlude
     return total
 
 
-def best_cosine(points: F64, normals: F64, views: Sequence[FittedPhoto], occluder: Occluder) -> F64:
-    """(N,) largest cosine towards a view that sees the point; 0 if none does. points, normals (N, 3)."""
-    best = np.zeros(len(points))
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """How N points are seen. cosine (N,): the largest towards a view that sees the point, 0 if none does; photos (N,):
+    number of views that see it, those between the cosines `FEW` in part."""
+
+    cosine: F64
+    photos: F64
+
+
+def sight_of(points: F64, normals: F64, views: Sequence[FittedPhoto], occluder: Occluder) -> Sight:
+    """points, normals (N, 3)."""
+    best, photos = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
-        np.maximum(best, view_cosines(view, points, normals, occluder)[0], out=best)
-    return best
+        cosine = view_cosines(view, points, normals, occluder)[0]
+        np.maximum(best, cosine, out=best)
+        photos += smoothstep(cosine, *FEW)
+    return Sight(best, photos)
 
 
 def view_cosines(view: FittedPhoto, points: F64, normals: F64, occluder: Occluder) -> tuple[F64, F64]:

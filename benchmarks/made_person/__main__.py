@@ -123,7 +123,7 @@ def develop_phone(folder: Path, out: Path, views: Views) -> None:
     for i in views:
         colour, _, albedo, number = layers(folder / f"{i}.exr")
         rng = np.random.default_rng(5000 + int(i))
-        write_photo(out / f"images/IMG_{i}.jpg", developed(METERED / np.median(brightness) * colour, rng))
+        write_photo(out / f"images/{i}.jpg", developed(METERED / np.median(brightness) * colour, rng))
         write_labels(out / "truth", i, number, albedo, number > 0)
     write_truth(folder, out, views)
 
@@ -163,7 +163,7 @@ def write_truth(folder: Path, out: Path, views: Views) -> None:
     (out / "truth/landmarks.json").write_text(json.dumps(marks))
     photos = [
         {
-            "name": f"IMG_{i}.jpg" if "head" in view else f"{i}.jpg",
+            "name": f"{i}.jpg",
             "K": view["K"],
             "width": view["size"][0],
             "height": view["size"][1],

@@ -15,7 +15,7 @@ from pipeline.errors import StageError
 from pipeline.fields.protocol import Field
 from pipeline.meshes import F32, F64, Charts, Indices, Mask, Mesh
 from pipeline.smoothing import continued
-from pipeline.visibility import FittedPhoto, Occluder, best_cosine
+from pipeline.visibility import FittedPhoto, Occluder
 from stages.bake import detail, detail_views
 from stages.bake.ambient import ambient
 from stages.bake.base_colour import CORRECTION
@@ -25,11 +25,12 @@ from stages.bake.detail import shade
 from stages.bake.dilate import HALO, nearest_rows
 from stages.bake.even_skin import Even
 from stages.bake.eyes import OPEN, Eyes, usual_behind_lids
+from stages.bake.filling import Filler
 from stages.bake.lit import Measured
 from stages.bake.lut import basis_lut
 from stages.bake.memmap_buffer import MemmapBuffer, blank
 from stages.bake.mouth import Inside
-from stages.bake.outline_depth import outline_depth
+from stages.bake.odd_colours import doubted
 from stages.bake.regions import Votes, areas, unanimous
 from stages.bake.relief import relief
 from stages.bake.sources import sources
@@ -37,7 +38,6 @@ from stages.bake.standard_fit import Fitted
 from stages.bake.standard_observe import field_normals, standard_material
 from stages.bake.statistics import Statistics, statistics_of
 from stages.bake.texels import Known, Samples, place, points, sample
-from stages.bake.unseen import CLEAR, LENGTH, LOOSE, region_colours, replaced_share
 
 log = logging.getLogger("neuface.bake")
 
@@ -123,13 +123,13 @@ class Baker:
         shape = relief(
             mesh, surface_normals(field, mesh), self._occluder, lambda done, total: step(done, total, "thickness")
         )
-        self._known = replace(
-            _known(field, mesh, views, self._occluder, mouth, region, around), eyes=eyes, relief=shape
-        )
+        fill = Filler.of(mesh, views, self._occluder, mouth, region)
+        self._known = replace(_known(field, fill, around), eyes=eyes, relief=shape)
         self._measured = measured
         self._found = _detail(field, mesh, charts, views, size, photos, step) if photos is not None and views else None
         self.detailed = self._found is not None
         self.material_figures: dict[str, float] = {}
+        standard: Fitted | None = None
         if fit_standard and self._found is not None:
             step(0, 1, "standard material")
             seen = self._known.unseen < 0.5
@@ -138,10 +138,13 @@ class Baker:
                 self._known.albedo, region, even,
             )  # fmt: skip
             if fitted.plausible:
-                fitted = fitted if eyes is None else _corrected_at_eyes(fitted, eyes, field, mesh, self._known)
-                self._known, self.material_figures = replace(self._known, standard=fitted), fitted.figures
+                standard, self.material_figures = fitted, fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
+        self._known, standard = _believed(self._known, field, fill, standard)
+        if standard is not None:
+            standard = standard if eyes is None else _corrected_at_eyes(standard, eyes, field, mesh, self._known)
+            self._known = replace(self._known, standard=standard)
         told = sources(self._known.unseen, self._known.replaced, self._known.standard)
         self._known = replace(self._known, sources=told)
 
@@ -204,28 +207,25 @@ def _per_tile(side: int, count: int) -> int:
     return int(np.ceil(side / np.sqrt(count)))
 
 
-def _known(
-    field: Field,
-    mesh: Mesh,
-    views: Sequence[FittedPhoto],
-    occluder: Occluder,
-    mouth: Inside | None,
-    region: Indices | None,
-    around: F32,
-) -> Known:
+def _known(field: Field, fill: Filler, around: F32) -> Known:
     """around (V,): ambient occlusion."""
-    points = mesh.vertices.astype(np.float64)
-    cosine = best_cosine(points, meshes.unit(mesh.normals), views, occluder)
-    region = np.zeros(len(points), np.int64) if region is None else region
-    replaced = replaced_share(cosine, region)
-    albedo, well = field.material(mesh.vertices).albedo.astype(np.float64), replaced == 0
-    if well.any():
-        depth = outline_depth(mesh, np.flatnonzero(np.isin(region, LOOSE)), views, occluder, CLEAR)
-        albedo = continued(mesh, albedo, well, region_colours(points, albedo, region, cosine, depth), LENGTH)
-    if mouth is not None:
-        albedo = mouth.in_place_of(albedo, cosine == 0)
-    unseen = (cosine == 0).astype(np.float32)
+    replaced, albedo = fill(field.material(fill.mesh.vertices).albedo.astype(np.float64))
+    unseen = (fill.sight.cosine == 0).astype(np.float32)
     return Known(around, unseen, replaced.astype(np.float32), albedo.astype(np.float32))
+
+
+def _believed(known: Known, field: Field, fill: Filler, fitted: Fitted | None) -> tuple[Known, Fitted | None]:
+    """Both with the colours that few photos show and no other place has (odd_colours.py) replaced."""
+    own = field.material(fill.mesh.vertices).albedo.astype(np.float64)
+    doubt = doubted(fill.mesh, own if fitted is None else own * fitted.correction, fill.region, fill.sight)
+    if not doubt.any():
+        return known, fitted
+    replaced, albedo = fill(own, doubt)
+    if fitted is not None:
+        right = (known.unseen < 0.5) & (doubt == 0)
+        correction = continued(fill.mesh, fitted.correction.astype(np.float64), right)
+        fitted = replace(fitted, correction=correction.astype(np.float32))
+    return replace(known, replaced=replaced.astype(np.float32), albedo=albedo.astype(np.float32)), fitted
 
 
 def _corrected_at_eyes(fitted: Fitted, eyes: Eyes, field: Field, mesh: Mesh, known: Known) -> Fitted:

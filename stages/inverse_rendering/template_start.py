@@ -27,6 +27,7 @@ from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.keep_silhouettes import bound_with_silhouettes
 from stages.inverse_rendering.ray_sampling import WHOLE, PhotoView
 from stages.inverse_rendering.stereo import distances, reduced
+from stages.inverse_rendering.unseen_rods import RADIUS, without_unseen_rods
 
 # Metres of the template: median distance of the landmarks from a surface that does not have the face. Measured: 1 to
 # 3 mm on surfaces that are right, 6 to 45 mm where the hull hides the face.
@@ -55,7 +56,8 @@ def carved_by_template(
     x, y, z = start.values.shape
     centres = np.stack([v.world_from_cam[:3, 3] for v in views])
     space = possible_space(template, head, centres, start.lo.astype(np.float64), start.cell, (x, y, z))
-    return _cut(start, space, head, views, check, THICK)
+    cut = _cut(start, space, head, views, check, THICK)
+    return without_unseen_rods(cut, views, RADIUS * head.scale, check)
 
 
 def without_cover(

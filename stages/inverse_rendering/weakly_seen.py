@@ -139,7 +139,7 @@ def information(grid: GridSdf, views: Sequence[PhotoView], x: F64, n: F64) -> F6
     """I (N,) at points x with unit normals n, (N, 3)."""
     total, mean = np.zeros(len(x)), np.zeros((len(x), 3))
     for view in views:
-        seen, cosine, toward = _seen(grid, view, x, n)
+        seen, cosine, toward = seen_by(grid, view, x, n)
         total[seen] += cosine
         mean[seen] += cosine[:, None] * toward
     return np.asarray(np.maximum(total - (mean**2).sum(1) / np.maximum(total, TINY), 0.0), np.float64)
@@ -193,7 +193,7 @@ def _directions(view: PhotoView, x: F64) -> tuple[F64, F64]:
     return away / np.maximum(distance, TINY)[:, None], distance
 
 
-def _seen(grid: GridSdf, view: PhotoView, x: F64, n: F64) -> tuple[npt.NDArray[np.int64], F64, F64]:
+def seen_by(grid: GridSdf, view: PhotoView, x: F64, n: F64) -> tuple[npt.NDArray[np.int64], F64, F64]:
     """Indices of the points that a view sees where it counts, their c and d."""
     toward, distance = _directions(view, x)
     cosine = (toward * n).sum(1)

@@ -13,6 +13,7 @@ from pipeline.meshes import Charts, Mesh, areas, triangles_of
 from pipeline.registration.head import Head
 from pipeline.visibility import Occluder
 from stages.bake.build import _known
+from stages.bake.filling import Filler
 from stages.bake.mouth import COLOURS, hidden_tiles, inside_of
 from tests.support.analytic_fields import AnalyticField, sphere
 from tests.support.ball_head import ball_quads, no_head
@@ -54,7 +55,7 @@ def test_the_bake_takes_them(tmp_path: Path) -> None:
     registered, mesh = head_and_mesh(tmp_path)
     field, inside = AnalyticField(sphere(0.08)), inside_of(registered, mesh)
     around = np.ones(len(mesh.vertices), np.float32)
-    known, plain = (_known(field, mesh, (), Occluder(mesh), m, None, around) for m in (inside, None))
+    known, plain = (_known(field, Filler.of(mesh, (), Occluder(mesh), m, None), around) for m in (inside, None))
     inner = np.setdiff1d(mesh.faces[128:160], mesh.faces[:128])
     assert known.albedo[inner].max() < 0.11 and np.abs(known.albedo - plain.albedo)[mesh.faces[:64]].min() == 0
     assert areas(mesh.vertices, mesh.faces).min() > 0

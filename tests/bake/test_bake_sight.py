@@ -12,7 +12,7 @@ from pipeline.contract import Context
 from pipeline.images import read_alpha, read_encoded, read_exr, write_png
 from pipeline.meshes import Charts, Mesh
 from pipeline.transforms import inverse_rigid, project
-from pipeline.visibility import FittedPhoto, Occluder, best_cosine, view_cosines
+from pipeline.visibility import FittedPhoto, Occluder, sight_of, view_cosines
 from stages.bake.build import Baked, Baker
 from stages.bake.confidence import sighted
 from stages.bake.regions import Poll, Votes
@@ -88,7 +88,7 @@ def test_pixels_that_do_not_count_in_the_fit_show_nothing(tmp_path: Path) -> Non
     mesh = surface_build(AnalyticField(sphere(0.08)), 32, quiet).mesh
     points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
     view = FittedPhoto(camera(0, 0.0), None, asked=tmp_path / "asked.png")
-    seen = best_cosine(points, normals, [view], Occluder(mesh)) > 0
+    seen = sight_of(points, normals, [view], Occluder(mesh)).cosine > 0
     assert seen.any() and points[seen][:, 0].min() > -1e-3
 
 
@@ -96,9 +96,9 @@ def test_the_best_cosine_is_that_of_the_view_straight_ahead(mesh_and_charts: tup
     mesh, _ = mesh_and_charts
     points, normals = mesh.vertices.astype(np.float64), mesh.normals.astype(np.float64)
     occluder = Occluder(mesh)
-    best = best_cosine(points, normals, VIEWS, occluder)
+    best = sight_of(points, normals, VIEWS, occluder).cosine
     np.testing.assert_array_equal(best, np.max([weight_of(v, points, normals, occluder) for v in VIEWS], axis=0))
-    assert (best_cosine(points, normals, (), occluder) == 0).all()
+    assert (sight_of(points, normals, (), occluder).cosine == 0).all()
 
 
 def test_confidence_map_grows_with_views(mesh_and_charts: tuple[Mesh, Charts]) -> None:

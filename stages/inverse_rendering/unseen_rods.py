@@ -1,0 +1,67 @@
+"""Rods and horns that no photo looks at are cut off the start.
+
+What is kept on the rays of silhouettes that the head template would leave empty (keep_silhouettes.py) lies between
+photos from one side: from behind, where no photo looks, it may stand out as a rod. No photo would remove that, and the
+fit does not. So what the eye would not expect behind a person goes:
+
+    removed = O - ((O eroded by r) dilated by r),  where no seen place of the surface is within r
+
+Symbols: O the start's solid; r radius of the thickest rod.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from stages.inverse_rendering.footprint import surface_of
+from stages.inverse_rendering.initial_geometry import Start
+from stages.inverse_rendering.ray_sampling import PhotoView, evenly_spaced
+from stages.inverse_rendering.stereo import distances
+from stages.inverse_rendering.weakly_seen import on_surface, seen_by
+
+F64 = npt.NDArray[np.float64]
+Bool = npt.NDArray[np.bool_]
+POINTS = 20_000  # of the surface: some 5 mm apart on a head
+VIEWS = 16  # evenly spaced over all
+RADIUS = 0.015  # metres of the template
+
+
+def without_unseen_rods(
+    start: Start, views: list[PhotoView], radius: float = RADIUS, check: Callable[[], None] = lambda: None
+) -> Start:
+    """The start without them; the same one if there are none. radius: r, world units."""
+    thin = _thin(start.values < 0, radius / start.cell)
+    if not thin.any():
+        return start
+    seen, node = _seen_places(start, views, check), np.argwhere(thin)
+    if len(seen):
+        node = node[cKDTree(seen).query(start.lo + start.cell * node, workers=-1)[0] > radius]
+    if not len(node):
+        return start
+    values = start.values.astype(np.float64)
+    values[tuple(node.T)] = 0.5 * start.cell
+    return Start(distances(values, start.lo, start.cell), start.lo, start.cell)
+
+
+def _thin(solid: Bool, radius: float) -> Bool:
+    """(X, Y, Z) voxels of a solid that a ball of this radius, in voxels, does not reach within it."""
+    core = ndimage.distance_transform_edt(np.pad(solid, 1))[1:-1, 1:-1, 1:-1] > radius
+    if not core.any():
+        return np.zeros(solid.shape, np.bool_)
+    return np.asarray(solid & (ndimage.distance_transform_edt(~core) > radius), np.bool_)
+
+
+def _seen_places(start: Start, views: list[PhotoView], check: Callable[[], None]) -> F64:
+    """(N, 3) places of the surface that a photo sees within its mask."""
+    grid = start.surface("cpu")
+    x, n = on_surface(grid, surface_of(start, POINTS)[0])
+    seen = np.zeros(len(x), np.bool_)
+    for i in evenly_spaced(len(views), min(VIEWS, len(views))):
+        check()
+        seen[seen_by(grid, views[i], x, n)[0]] = True
+    return x[seen]

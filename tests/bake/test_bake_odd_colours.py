@@ -1,0 +1,119 @@
+"""Colours that hardly any photo shows and no other place has: a strip of skin with an orange patch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.meshes import F64, Mesh
+from pipeline.visibility import Sight
+from stages.bake.filling import Filler
+from stages.bake.odd_colours import MOST, UNIFORM, WIDTH, WRONG, _kernels, doubted
+from tests.bake.test_bake_unseen import strip
+
+MESH: Mesh = strip(0.2, 0.001)
+X = MESH.vertices[:, 0].astype(np.float64)
+PATCH = (X > 0.09) & (X < 0.11)
+SKIN, ORANGE = np.array([0.10, 0.05, 0.03]), np.array([0.40, 0.10, 0.02])
+ONE = np.zeros(len(X), np.int64)
+
+
+def colours(patch: F64 = ORANGE) -> F64:
+    """Skin with a fine pattern of a tenth, and a patch."""
+    return np.where(PATCH[:, None], patch, SKIN * (1 + 0.1 * np.sin(X / 0.0007))[:, None])
+
+
+def sight(patch: float, elsewhere: float = 20.0) -> Sight:
+    return Sight(np.full(len(X), 0.9), np.where(PATCH, patch, elsewhere))
+
+
+def test_an_odd_colour_is_replaced_where_few_photos_show_it() -> None:
+    found = doubted(MESH, colours(), ONE, sight(1.0))
+    assert (found[PATCH] == 1).all() and (found[~PATCH] == 0).all()
+
+
+def test_many_photos_are_believed() -> None:
+    assert (doubted(MESH, colours(), ONE, sight(20.0)) == 0).all()
+    share = [doubted(MESH, colours(), ONE, sight(k))[PATCH].mean() for k in (1.0, 4.0, 8.0, 11.0, 20.0)]
+    assert (np.diff(share) <= 1e-12).all() and share[0] == 1 and share[-1] == 0
+
+
+def test_colours_that_occur_elsewhere_are_believed() -> None:
+    assert (doubted(MESH, colours(SKIN), ONE, sight(1.0)) == 0).all()
+    twice = colours()
+    twice[X < 0.02] = ORANGE  # a shirt, which many photos show
+    assert (doubted(MESH, twice, ONE, sight(1.0)) == 0).all()
+
+
+def test_a_region_has_its_own_colours() -> None:
+    """A shirt's colour on the neck is odd, although a tenth of all places have it, the less the more the shirt is of
+    another region: here 1 photo, of which half are wrong."""
+    twice, region = colours(), np.where(X < 0.02, 1, 0)
+    twice[X < 0.02] = ORANGE
+    f_all = _kernels(np.log(ORANGE)[None], np.log(twice))[0]
+    assert f_all > 0
+    own = doubted(MESH, twice, region, sight(0.3))[PATCH].mean()
+    whole = doubted(MESH, twice, ONE, sight(0.3))[PATCH].mean()
+    assert own >= whole
+
+
+def test_the_formula() -> None:
+    """Against a direct evaluation, at one vertex that few photos show, of a usual colour's tail."""
+    colour = np.tile(SKIN, (len(X), 1))
+    at = int(np.flatnonzero(PATCH)[5])
+    shift = 3.4
+    colour[at] = SKIN * np.exp(shift * WIDTH[0])
+    few = Sight(np.full(len(X), 0.9), np.where(np.arange(len(X)) == at, 1.0, 20.0))
+    f = np.exp(-0.5 * shift**2) / ((2 * np.pi) ** 1.5 * WIDTH.prod())
+    p = WRONG
+    doubt = p * UNIFORM / (p * UNIFORM + (1 - p) * f)
+    t = np.clip((doubt - MOST[1]) / (MOST[0] - MOST[1]), 0, 1)
+    assert 0.02 < t < 0.98
+    assert doubted(MESH, colour, ONE, few)[at] == pytest.approx(t * t * (3 - 2 * t), rel=1e-3)
+
+
+def test_kernels_are_a_density() -> None:
+    """Its integral over a box around the samples is 1."""
+    rng = np.random.default_rng(0)
+    samples = rng.normal(size=(20, 3)) * [0.3, 0.1, 0.1]
+    low, high = np.array([-3.0, -1.2, -1.2]), np.array([3.0, 1.2, 1.2])
+    axes = [np.arange(a, b, w / 2) for a, b, w in zip(low, high, WIDTH, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    assert _kernels(nodes, samples).sum() * (WIDTH / 2).prod() == pytest.approx(1, abs=1e-4)
+
+
+def test_few_cameras_count_more() -> None:
+    """Where usual places are in two photos, one of them that shows a mole is believed more than one of twenty."""
+    mole = colours(SKIN * [0.45, 0.35, 0.3])
+    few, many = (doubted(MESH, mole, ONE, sight(1.0, usual))[PATCH].mean() for usual in (2.0, 20.0))
+    assert few < 0.1 < 0.9 < many
+
+
+def test_a_patch_goes_as_a_whole() -> None:
+    """Spots of a usual colour in the middle of what few photos show wrongly."""
+    spotted = colours()
+    spots = PATCH & (np.round(X / 0.001) % 5 == 0)
+    spotted[spots] = SKIN
+    assert doubted(MESH, spotted, ONE, sight(1.0))[spots].min() > 0.9
+
+
+def test_extremes() -> None:
+    unseen = Sight(np.zeros(len(X)), np.zeros(len(X)))
+    assert (doubted(MESH, colours(), ONE, unseen) == 0).all()
+    for colour in (np.zeros((len(X), 3)), np.full((len(X), 3), 1e6)):
+        found = doubted(MESH, colour, ONE, sight(1.0))
+        assert np.isfinite(found).all() and found.min() >= 0 and found.max() <= 1
+    hardly = doubted(MESH, colours(), ONE, sight(1e-9))
+    assert np.isfinite(hardly).all() and (hardly[PATCH] == 1).all()
+
+
+def test_what_is_doubted_is_filled_by_what_is_not() -> None:
+    """The patch goes on in the colour of its surroundings."""
+    seen = sight(1.0)
+    fill = Filler(MESH, seen, ONE, np.zeros(len(X)))
+    plain, kept = fill(colours())
+    assert (plain == 0).all()
+    np.testing.assert_array_equal(kept, colours())
+    replaced, filled = fill(colours(), doubted(MESH, colours(), ONE, seen))
+    assert (replaced[PATCH] == 1).all() and (replaced[~PATCH] == 0).all()
+    np.testing.assert_allclose(filled[PATCH], np.tile(SKIN, (PATCH.sum(), 1)), rtol=0.15)
