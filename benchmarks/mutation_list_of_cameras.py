@@ -5,6 +5,7 @@ from __future__ import annotations
 from benchmarks.mutation import Mutation
 
 HELD_OUT, MERGE = "tests/poses/test_poses_held_out.py", "tests/poses/test_poses_merge.py"
+RODS, ODD = "tests/inverse_rendering/test_unseen_rods.py", "tests/bake/test_bake_odd_colours.py"
 WEAK, KEPT = "tests/inverse_rendering/test_weakly_seen.py", "tests/inverse_rendering/test_keep_silhouettes.py"
 ANOTHER, STEERING = "tests/workflows/test_another_time.py", "tests/workflows/test_steering.py"
 HDR, BRACKETS = "tests/capture/test_hdr.py", "tests/capture/test_brackets.py"
@@ -190,6 +191,22 @@ OF_CAMERAS = (
              f"{KEPT}::test_the_chosen_start_has_them"),
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "np.maximum(kept, hull.values)", "start.values",
              f"{KEPT}::test_a_start_fills_the_silhouettes_that_the_hull_fills"),
+    # ---------------------------------------------------------------- rods that no photo sees, colours that few show
+    Mutation("stages/inverse_rendering/unseen_rods.py", "workers=-1)[0] > radius]", "workers=-1)[0] >= 0]", RODS),
+    Mutation("stages/inverse_rendering/unseen_rods.py", "(~core) > radius", "(~core) > 0", RODS),
+    Mutation("stages/inverse_rendering/unseen_rods.py", "seen[seen_by(grid, views[i], x, n)[0]] = True", "pass", RODS),
+    Mutation("stages/bake/odd_colours.py", "k = sight.photos * max(1.0, USUAL / usual)", "k = sight.photos",
+             f"{ODD}::test_few_cameras_count_more"),
+    Mutation("stages/bake/odd_colours.py", "p = np.where(few, WRONG**k, 0.0)", "p = np.where(few, WRONG, 0.0)", ODD),
+    Mutation("stages/bake/odd_colours.py", "out[few] = np.maximum(out, nearby)[few]", "pass",
+             f"{ODD}::test_a_patch_goes_as_a_whole"),
+    Mutation("stages/bake/odd_colours.py", "well & (region == code)", "well",
+             f"{ODD}::test_a_region_has_its_own_colours"),
+    Mutation("stages/bake/odd_colours.py", "near.mean(1) / (", "near.sum(1) / (", f"{ODD}::test_kernels_are_a_density"),
+    Mutation("stages/bake/filling.py", "cosine = np.where(doubt > 0, 0.0, cosine)", "pass",
+             f"{ODD}::test_what_is_doubted_does_not_stand_for_its_region"),
+    Mutation("stages/bake/filling.py", "replaced = np.maximum(replaced, doubt)", "pass",
+             f"{ODD}::test_what_is_doubted_is_filled_by_what_is_not"),
     # ---------------------------------------------------------------- look-up in maps and tables
     Mutation("pipeline/map_lookup.py", "y = min(max((1.0 - uv[i, 1]) * h - 0.5", "y = min(max(uv[i, 1] * h - 0.5",
              f"{RENDER}::test_bilinear_on_texel_centres_borders_and_between"),

@@ -217,7 +217,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=9601,
+    version=53,
     inputs=Inputs,
     config=Config,
     output=FittedFace,
