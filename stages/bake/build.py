@@ -141,7 +141,8 @@ class Baker:
                 standard, self.material_figures = fitted, fitted.figures
             else:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
-        self._known, standard = _believed(self._known, field, fill, standard)
+        if region is not None:  # things may have any colour in one place
+            self._known, standard = _believed(self._known, field, fill, standard)
         if standard is not None:
             standard = standard if eyes is None else _corrected_at_eyes(standard, eyes, field, mesh, self._known)
             self._known = replace(self._known, standard=standard)

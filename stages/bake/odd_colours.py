@@ -2,7 +2,8 @@
 
 At the border of what photos see, under hair, behind a neck, a place is in one or two of them, and these may show
 something else there: the wall, hair in front, surface that lies elsewhere. The place then takes a colour that the
-person has nowhere. Places that many photos show, and colours that occur elsewhere, are believed.
+person has nowhere. Places that many photos show, and colours that occur elsewhere, are believed. Things without a head
+may have a colour in one place only, so that nothing of them is doubted.
 
     doubt = p U / (p U + (1 - p) f(x))        p = WRONG^k
 

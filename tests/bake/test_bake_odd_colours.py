@@ -5,11 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.meshes import F64, Mesh
-from pipeline.visibility import Sight
+from pipeline.fields.protocol import Material
+from pipeline.meshes import F32, F64, Indices, Mesh
+from pipeline.visibility import FittedPhoto, Sight
+from stages.bake.build import Baker, _believed, _known
 from stages.bake.filling import Filler
 from stages.bake.odd_colours import MOST, UNIFORM, WIDTH, WRONG, _kernels, doubted
+from stages.bake.standard_fit import Fitted
+from stages.surface.build import build as surface_build
+from stages.uv.config import Config
+from stages.uv.decimate import decimated
+from stages.uv.unwrap import unwrap
 from tests.bake.test_bake_unseen import strip
+from tests.support.analytic_fields import AnalyticField, sphere
+from tests.support.field_artifacts import camera
 
 MESH: Mesh = strip(0.2, 0.001)
 X = MESH.vertices[:, 0].astype(np.float64)
@@ -121,3 +130,45 @@ def test_what_is_doubted_does_not_stand_for_its_region() -> None:
     region = np.where((X < 0.05) | PATCH, 1, 0)
     _, filled = Filler(MESH, seen, region, np.zeros(len(X)))(colours(), np.where(PATCH, 1.0, 0.0))
     np.testing.assert_allclose(filled[X < 0.001], np.tile(SKIN, ((X < 0.001).sum(), 1)), rtol=0.15)
+
+
+class Patched(AnalyticField):
+    """A field whose albedo is that of the strip."""
+
+    def material(self, points: F32) -> Material:
+        found = super().material(points)
+        return Material(colours().astype(np.float32), found.rho, found.coefficients, found.inv_kappa)
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_the_correction_goes_with_the_colour(fitted: bool) -> None:
+    """What made the colour odd may be the correction of the albedo: it goes on from around, too."""
+    field, fill = Patched(sphere(0.08)), Filler(MESH, sight(1.0), ONE, np.zeros(len(X)))
+    known = _known(field, fill, np.ones(len(X), np.float32))
+    zero = np.zeros(len(X), np.float32)
+    correction = np.where(PATCH[:, None], 2.5, 1.1 * np.ones((len(X), 3))).astype(np.float32)
+    material = Fitted(correction, zero, zero, correction, {}) if fitted else None
+    found, standard = _believed(known, field, fill, material)
+    assert (known.replaced == 0).all() and (found.replaced[PATCH] == 1).all()
+    np.testing.assert_allclose(found.albedo[PATCH], np.tile(SKIN, (PATCH.sum(), 1)), rtol=0.15)
+    if fitted:
+        assert standard is not None
+        np.testing.assert_allclose(standard.correction, 1.1, rtol=1e-3)
+    else:
+        assert standard is None
+
+
+def test_things_without_a_head_are_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def all_of_it(mesh: Mesh, colour: F64, region: Indices, sight: Sight) -> F64:
+        asked.append(len(region))
+        return np.zeros(len(colour))
+
+    monkeypatch.setattr("stages.bake.build.doubted", all_of_it)
+    field = AnalyticField(sphere(0.08))
+    mesh = decimated(surface_build(field, 24, lambda *_: None).mesh, 400)
+    charts = unwrap(mesh, Config(texture_size=256, padding=4))
+    for region, times in ((None, 0), (np.zeros(len(mesh.vertices), np.int64), 1)):
+        Baker(field, mesh, charts, [FittedPhoto(camera(0, 0.0), None)], 64, lambda *_: None, region=region)
+        assert len(asked) == times
