@@ -191,6 +191,13 @@ OF_CAMERAS = (
              f"{KEPT}::test_the_chosen_start_has_them"),
     Mutation("stages/inverse_rendering/keep_silhouettes.py", "np.maximum(kept, hull.values)", "start.values",
              f"{KEPT}::test_a_start_fills_the_silhouettes_that_the_hull_fills"),
+    Mutation("stages/inverse_rendering/weakly_seen.py", "np.where(where(x), length, 0.0)", "length",
+             f"{WEAK}::test_a_part_alone_is_smoothed_and_by_its_own_noise"),
+    Mutation("stages/inverse_rendering/weakly_seen.py", "looked.pixel * noise / NOISE", "looked.pixel",
+             f"{WEAK}::test_a_part_alone_is_smoothed_and_by_its_own_noise"),
+    Mutation("pipeline/registration/head_regions.py", "tree.query(x)[0] > CLEAR_OF * head.scale",
+             "tree.query(x)[0] > 0",
+             "tests/bake/test_bake_unseen.py::test_plain_skin_of_the_face_keeps_clear_of_what_has_a_shape"),
     # ---------------------------------------------------------------- rods that no photo sees, colours that few show
     Mutation("stages/inverse_rendering/unseen_rods.py", "workers=-1)[0] > radius]", "workers=-1)[0] >= 0]", RODS),
     Mutation("stages/inverse_rendering/unseen_rods.py", "(~core) > radius", "(~core) > 0", RODS),

@@ -11,7 +11,7 @@ from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.template.model import Template
 
-Near = Callable[[F64], Mask]  # (N,) of points (N, 3): on the head, or as close as its regions reach
+Near = Callable[[F64], Mask]  # (N,) of points (N, 3): on a part of the head
 
 # Metres from the head template within which a vertex belongs to its region: hair is thick; so is a collar.
 NEAR = {"scalp": 0.04, "neck": 0.06, "ears": 0.02, "face": 0.02}
@@ -19,6 +19,8 @@ REGIONS = tuple(NEAR)
 NECK = REGIONS.index("neck")
 REST = len(REGIONS)
 HAIR = REST + 1  # a mesh of its own; under it the scalp goes on in the colour of the face
+PARTED = ("brows", "lids", "lips", "nose", "nostrils")  # what the face has besides cheeks, forehead and chin
+CLEAR_OF = 0.008  # metres of the template between these and plain skin
 FIRST_BAND, BANDS, BAND_HEIGHT = HAIR + 1, 32, 0.012  # codes of the neck's bands, the lowest first; metres of each
 
 
@@ -40,3 +42,16 @@ def region_of(vertices: F64, template: Template, head: PlacedHead) -> Indices:
 def near_head(template: Template, head: PlacedHead) -> Near:
     """The function that tells which points (N, 3) lie in any region of the placed template, as (N,)."""
     return lambda x: np.asarray(region_of(x, template, head) != REST, np.bool_)
+
+
+def plain_face(template: Template, head: PlacedHead) -> Near:
+    """The function that tells which points (N, 3) lie on cheeks, forehead or chin of the placed template, as (N,)."""
+    parted = np.unique(template.quads[np.concatenate([template.regions[n] for n in PARTED if n in template.regions])])
+    tree = cKDTree(head.vertices[parted])
+    face = REGIONS.index("face")
+
+    def of(x: F64) -> Mask:
+        far = tree.query(x)[0] > CLEAR_OF * head.scale
+        return np.asarray(far & (region_of(x, template, head) == face), np.bool_)
+
+    return of

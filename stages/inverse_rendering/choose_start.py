@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.directions import from_around
 from pipeline.errors import StageError
 from pipeline.meshes import F64
-from pipeline.registration.head_regions import Near, near_head
+from pipeline.registration.head_regions import Near, near_head, plain_face
 from pipeline.registration.identity_fit import placed_on_face
 from pipeline.template.load import load_template
 from stages.inverse_rendering.config import AUTO, PRIORS, Config
@@ -32,12 +32,14 @@ from stages.inverse_rendering.template_start import (
 @dataclass(frozen=True, slots=True)
 class ChosenStart:
     """start: after stereo; prior: before it, with which refined geometry is compared. facts: for the report, of the
-    geometry and of stereo. near_head: of the template that was placed on the face, if it was."""
+    geometry and of stereo. near_head: of the template that was placed on the face, if it was; plain_face: of the same,
+    where it cut the hull."""
 
     start: Start
     prior: Start
     facts: dict[str, Facts]
     near_head: Near | None = None
+    plain_face: Near | None = None
 
     @property
     def cut_by_template(self) -> bool:
@@ -102,7 +104,8 @@ def choose_start(
     start, stereo = _after_stereo(cut, views, settings, device, check, SWEEPS[-1:])
     known["landmarks_off_mm"] = round(1e3 * landmarks_off(start, landmarks, head.scale), 3)
     why = "setting" if settings.prior == "template" else "the hull's surface does not have the face"
-    return ChosenStart(start, cut, _facts("template", why, known, stereo), near_head(template, head))
+    facts = _facts("template", why, known, stereo)
+    return ChosenStart(start, cut, facts, near_head(template, head), plain_face(template, head))
 
 
 def _after_stereo(

@@ -49,7 +49,7 @@ from stages.inverse_rendering.skin_light import correct_light
 from stages.inverse_rendering.training_loop import TrainingLoop
 from stages.inverse_rendering.trial_loop import TrialLoop
 from stages.inverse_rendering.trials import LENGTH, SELECTION, SHADOWS, SKIN, SMOOTHING, Trials
-from stages.inverse_rendering.weakly_seen import RIPPLE, RIPPLES_AT, smooth_weakly_seen, smoothing_shares
+from stages.inverse_rendering.weakly_seen import FACE, RIPPLE, RIPPLES_AT, smooth_weakly_seen, smoothing_shares
 
 BAND_EVERY = 250  # steps after which the narrow band is found again
 SKIN_RAYS = 40_000  # surface points at which the reflectance is learned anew
@@ -82,6 +82,7 @@ class Trainer(TrialLoop):
     smoothings: int = 0  # of surface that the photos hardly determine
     smoothed: float = 0.0  # share of the surface that the last of them reached
     near_head: Near | None = None  # the placed head, where unlabelled skin may be
+    plain_face: Near | None = None  # its cheeks, forehead and chin, where its photos are an arc before it
     skin_asked: bool = False
     skin_tells: bool = False  # the light's low bands are those that the skin tells
     known_of_second: dict[str, str | float | bool] = field(default_factory=dict)  # of the second capture's light
@@ -227,6 +228,8 @@ class Trainer(TrialLoop):
             return
         if due > len(shares):
             smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest, RIPPLE)
+            if self.plain_face is not None:
+                smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest, *FACE, self.plain_face)
         elif self.trials.allows(self, SMOOTHING):
             self.smoothed = smooth_weakly_seen(self.grid, self.views, self.settings.image_side, longest)
         self.smoothings = due
@@ -243,9 +246,9 @@ class Trainer(TrialLoop):
         if self.settings.weigh_photos:
             self.robust.know_labels(labels, names)
 
-    def know_head(self, near: Near) -> None:
-        """Unlabelled skin near the placed head tells about the light as well."""
-        self.near_head = near
+    def know_head(self, near: Near, plain: Near | None) -> None:
+        """Unlabelled skin near the placed head tells about the light as well; plain skin gets no ripples."""
+        self.near_head, self.plain_face = near, plain
 
     def photo_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the photos were weighed."""

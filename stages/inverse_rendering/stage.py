@@ -145,7 +145,7 @@ def fit(inputs: Inputs, config: Config, context: Context, other: Other | None) -
     labels = read_labels(inputs.masks, usable) + (second.labels if second else [])
     trainer.know_labels(labels, names)
     if chosen.near_head is not None:
-        trainer.know_head(chosen.near_head)
+        trainer.know_head(chosen.near_head, chosen.plain_face)
     if settings.by_clock:
         held_cameras = [c for c in inputs.poses.artifact.cameras if c.index in held]
         reserve = seconds_to_predict(trainer.model, held_cameras, settings, context.device)
@@ -217,7 +217,7 @@ def calibrated(capture: Capture, usable: list[int], config: Config, exposures_di
 
 STAGE = Stage(
     name="inverse_rendering",
-    version=53,
+    version=9701,
     inputs=Inputs,
     config=Config,
     output=FittedFace,

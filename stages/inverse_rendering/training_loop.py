@@ -122,8 +122,8 @@ class TrainingLoop(ABC):
     def know_labels(self, labels: Sequence[U8 | None], names: Sequence[str]) -> None:  # noqa: B027
         """Take note of the photos' labels. labels: (H, W) codes of each view, or None; names: of the codes."""
 
-    def know_head(self, near: Near) -> None:  # noqa: B027
-        """Take note of the placed head."""
+    def know_head(self, near: Near, plain: Near | None) -> None:  # noqa: B027
+        """Take note of the placed head, and of its plain skin where the photos are an arc before it."""
 
     def photo_facts(self) -> dict[str, str | float | bool]:
         """For the report: how the photos were weighed."""

@@ -40,6 +40,7 @@ from scipy.spatial import cKDTree
 from pipeline import transforms
 from pipeline.fields.geometry import GridSdf
 from pipeline.maths.sdf import unit
+from pipeline.registration.head_regions import Near
 from stages.inverse_rendering.footprint import footprint, surface_of
 from stages.inverse_rendering.initial_geometry import Start
 from stages.inverse_rendering.observations import unoccluded
@@ -53,6 +54,7 @@ AGAIN_UNTIL, AGAIN_EACH, AGAIN = 0.9, 700, 8  # long fits make the noise anew: u
 RIPPLES_AT = 0.93  # the same for the last smoothing
 RIPPLE = 0.6  # cells: a ripple of 3.8 cells is halved, of 8 cells 4 % lower
 NOISE = 1.5  # pixels that noise may move the surface for I = 1
+FACE = 1.0, 4.0  # the same on plain skin of a face before an arc of photos: cells, and the noise in pixels
 POINTS = 30_000  # of the surface, some 4 mm apart on a head
 NEIGHBOURS, QUANTILE = 16, 1 / 3
 TANGENT, EDGE = 0.2, 2.0  # cosine of a surface that a ray grazes; pixels of the fit from the mask's edge
@@ -71,18 +73,20 @@ def smoothing_shares(steps: int) -> tuple[float, ...]:
 
 
 def smooth_weakly_seen(
-    grid: GridSdf, views: Sequence[PhotoView], side: int, longest: float, most: float = np.inf
-) -> float:
+    grid: GridSdf, views: Sequence[PhotoView], side: int, longest: float, most: float = np.inf, noise: float = NOISE,
+    where: Near | None = None,
+) -> float:  # fmt: skip
     """Smooth the zero set where the views hardly determine it, in place. side: pixels, of the photos in the fit;
-    longest: largest q, asset units; most: cells to which q is cut where it is longer than `LEAST`. Returns the share of
-    the surface that was smoothed."""
+    longest: largest q, asset units; most: cells to which q is cut where it is longer than `LEAST`; noise: NOISE; where:
+    the part that is smoothed, None for all. Returns the share of the surface that was smoothed."""
     start = Start(grid.values.detach().cpu().numpy(), grid.lo.cpu().numpy(), grid.cell)
     x, n = on_surface(grid, surface_of(start, POINTS)[0])
     looked = footprint(start, list(views), side)
     if not len(x) or looked is None:
         return 0.0
     longest = min(longest, MOST * grid.cell)
-    length = lengths(information(grid, views, x, n), x, looked.pixel, longest) / grid.cell
+    length = lengths(information(grid, views, x, n), x, looked.pixel * noise / NOISE, longest) / grid.cell
+    length = length if where is None else np.where(where(x), length, 0.0)
     node = np.argwhere(band(start.values, grid.cell))
     nearest = cKDTree(x).query(start.lo + grid.cell * node, workers=-1)[1]
     weak = length[nearest] >= LEAST

@@ -10,7 +10,18 @@ import pytest
 
 from pipeline.images import write_png
 from pipeline.meshes import Mesh
-from pipeline.registration.head_regions import BAND_HEIGHT, FIRST_BAND, HAIR, REGIONS, REST, near_head, region_of
+from pipeline.registration.head_regions import (
+    BAND_HEIGHT,
+    CLEAR_OF,
+    FIRST_BAND,
+    HAIR,
+    PARTED,
+    REGIONS,
+    REST,
+    near_head,
+    plain_face,
+    region_of,
+)
 from pipeline.registration.identity_fit import PlacedHead
 from pipeline.smoothing import continued
 from pipeline.template.load import load_template
@@ -96,6 +107,19 @@ def test_regions_are_those_of_the_placed_template(scale: float) -> None:
     ears = TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions["ears"]]].mean(1) * scale
     near = near_head(TEMPLATE, placed(scale))
     assert near(ears).all() and not near(far).any() and near(ears[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_plain_skin_of_the_face_keeps_clear_of_what_has_a_shape(scale: float) -> None:
+    plain = plain_face(TEMPLATE, placed(scale))
+    for name in (*PARTED, "ears", "scalp", "neck"):
+        assert not plain(TEMPLATE.vertices[TEMPLATE.quads[TEMPLATE.regions[name]]].mean(1) * scale).any()
+    face = TEMPLATE.vertices[np.unique(TEMPLATE.quads[TEMPLATE.regions["face"]])]
+    parted = TEMPLATE.vertices[np.unique(np.concatenate([TEMPLATE.quads[TEMPLATE.regions[n]] for n in PARTED]))]
+    away = np.linalg.norm(face[:, None] - parted[None], axis=-1).min(1)
+    found = plain(face * scale)
+    assert not found[away < 0.999 * CLEAR_OF].any() and found[away > 0.015].mean() > 0.8
+    assert not plain(np.array([[0.0, -0.5, 0.0]]) * scale).any() and plain(face[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])

@@ -56,13 +56,14 @@ def test_a_hull_that_hides_the_face_is_cut_by_the_template() -> None:
     assert landmarks_off(found.start, marks(), 1.0) < 0.004
     assert box().values[found.start.values < 0].max() < CELL  # the hull stays the outer limit
     assert found.prior is not box() and np.array_equal(found.prior.values, found.start.values)
-    assert found.cut_by_template
+    assert found.cut_by_template and found.plain_face is not None
 
 
 def test_a_hull_with_the_face_stays() -> None:
     hull = head()
     found = chosen(hull, marks())
     assert found.start is hull and found.facts["geometry"]["prior"] == PRIORS["hull"] and not found.cut_by_template
+    assert found.near_head is not None and found.plain_face is None
     assert float(found.facts["geometry"]["landmarks_off_hull_mm"]) < 1e3 * FAR
 
 

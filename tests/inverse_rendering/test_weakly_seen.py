@@ -14,6 +14,7 @@ from stages.inverse_rendering import fit
 from stages.inverse_rendering.fit import Trainer
 from stages.inverse_rendering.ray_sampling import PhotoView
 from stages.inverse_rendering.weakly_seen import (
+    FACE,
     NOISE,
     RIPPLE,
     RIPPLES_AT,
@@ -242,6 +243,20 @@ def test_at_last_only_ripples_of_a_few_cells_go(count: int, least: float, most: 
     assert least < float(radii(grid, back, 0.1).std() / before.std()) < most
 
 
+def test_a_part_alone_is_smoothed_and_by_its_own_noise() -> None:
+    """A quarter of a ball: as much as its noise asks for; the surface elsewhere stays, also where nobody looks."""
+    views = around(list(np.linspace(-50, 50, 40)), 0.6)
+    front, elsewhere = torch.linspace(0.1, 0.5, 200), torch.linspace(3.3, 6.1, 400)
+    left = []
+    for noise in (0.01, 1.5, 6.0):
+        grid = ball(0.1, 0.002, count=40)
+        before, rest = radii(grid, front, 0.1), radii(grid, elsewhere, 0.1)
+        smooth_weakly_seen(grid, views, SIDE, 0.02, 1.0, noise, lambda x: x[:, 1] > 0)
+        left.append(float(radii(grid, front, 0.1).std() / before.std()))
+        assert float((radii(grid, elsewhere, 0.1) - rest).abs().max()) < 1e-3
+    assert left[0] > 0.99 and left[2] < 0.7 and left[2] < left[1] <= left[0]
+
+
 def test_without_views_nothing_changes() -> None:
     grid = ball(0.1, 0.003)
     before = grid.values.detach().clone()
@@ -258,15 +273,21 @@ def test_long_fits_are_smoothed_again() -> None:
         assert np.diff(shares[1:]).min() * steps > 699
 
 
-def test_the_last_smoothing_of_a_fit_is_of_ripples_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    t, asked = trainer(SMALL), list[float]()
+@pytest.mark.parametrize("arc", [False, True])
+def test_the_last_smoothing_of_a_fit_is_of_ripples_alone(monkeypatch: pytest.MonkeyPatch, arc: bool) -> None:
+    """And of a face before an arc of photos, of longer ripples of its plain skin."""
+    t, asked = trainer(SMALL), list[tuple[object, ...]]()
 
-    def smoothed(grid: GridSdf, views: object, side: int, longest: float, most: float = np.inf) -> float:
-        asked.append(most)
+    def plain(x: F64) -> npt.NDArray[np.bool_]:
+        return np.ones(len(x), np.bool_)
+
+    def smoothed(grid: GridSdf, views: object, side: int, longest: float, *more: object) -> float:
+        asked.append(more)
         return 0.5
 
+    t.know_head(plain, plain if arc else None)
     monkeypatch.setattr(fit, "smooth_weakly_seen", smoothed)
     for share in (0.2, 0.36, 0.37, 0.6, 0.92, 0.94, 0.99):
         monkeypatch.setattr(Trainer, "share", lambda _, now=share: now)
         t.smooth()
-    assert asked == [np.inf, np.inf, RIPPLE]
+    assert asked == [(), (), (RIPPLE,), *([(*FACE, plain)] if arc else [])]
