@@ -25,6 +25,11 @@ of the masks by more than `EDGE` pixels, and the smoothing is repeated.
 The fit goes on then, and its noise makes ripples of two or three cells in the same places, which no photo contradicts:
 bumps on a jaw that photos from the front show at grazing angles. Shortly before its end they are smoothed once more,
 with q of at most `RIPPLE` cells, which moves no outline.
+
+Photos of an arc before a face, held in a hand, are off by more than that: the head moves against the room that the
+cameras were solved from. Cheeks and forehead, which have hardly any texture, get wrinkles. Where the head template cut
+the hull, plain skin of the face is smoothed for the noise `FACE` at last, and not where lids, nose and lips have their
+shape (head_regions.plain_face).
 """
 
 from __future__ import annotations
