@@ -1,12 +1,12 @@
 """Rods and horns that no photo looks at are cut off the start.
 
 What is kept on the rays of silhouettes that the head template would leave empty (keep_silhouettes.py) lies between
-photos from one side: from behind, where no photo looks, it may stand out as a rod. No photo would remove that, and the
-fit does not. So what the eye would not expect behind a person goes:
+photos from one side: behind, where no photo looks, it may stand out as a rod. Nothing in the fit removes that. So
+what is thin and far from all seen surface goes:
 
     removed = O - ((O eroded by r) dilated by r),  where no seen place of the surface is within r
 
-Symbols: O the start's solid; r radius of the thickest rod.
+Symbols: O the start's solid; r radius of the thickest rod that goes.
 """
 
 from __future__ import annotations
