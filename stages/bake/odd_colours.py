@@ -37,6 +37,7 @@ SAMPLES, ENOUGH = 400, 50  # vertices that stand for a region; with fewer it has
 MOST = 0.7, 0.3  # doubt from which a colour is replaced, and up to which it is kept
 LEAST = 1e-3  # linear: darker colours count as that
 NEAR = 0.005  # metres: standard deviation of the mean
+BLOCK = 4096  # vertices at once: 13 MB
 BELIEVED = 12.0  # k from which the doubt is left out: p is .0002
 
 
@@ -83,7 +84,8 @@ def _some(of: Mask) -> Indices:
 
 def _kernels(at: F64, x: F64) -> F64:
     """(N,) kernel density at (N, 3) of samples (M, 3), 0 without any."""
-    if not len(x):
-        return np.zeros(len(at))
-    near = np.exp(-0.5 * cdist(at / WIDTH, x / WIDTH, "sqeuclidean"))
-    return np.asarray(near.mean(1) / ((2 * np.pi) ** 1.5 * WIDTH.prod()), np.float64)
+    out = np.zeros(len(at))
+    for first in range(0, len(at) if len(x) else 0, BLOCK):
+        near = np.exp(-0.5 * cdist(at[first : first + BLOCK] / WIDTH, x / WIDTH, "sqeuclidean"))
+        out[first : first + BLOCK] = near.mean(1) / ((2 * np.pi) ** 1.5 * WIDTH.prod())
+    return out
