@@ -143,11 +143,10 @@ class Baker:
                 self.material_figures = {"standard_refused_f0": fitted.figures["gloss_rest_refused_f0"]}
         if region is not None:  # things may have any colour in one place
             self._known, standard = _believed(self._known, field, fill, standard)
-        if standard is not None:
-            standard = standard if eyes is None else _corrected_at_eyes(standard, eyes, field, mesh, self._known)
-            self._known = replace(self._known, standard=standard)
-        told = sources(self._known.unseen, self._known.replaced, self._known.standard)
-        self._known = replace(self._known, sources=told)
+        if standard is not None and eyes is not None:
+            standard = _corrected_at_eyes(standard, eyes, field, mesh, self._known)
+        told = sources(self._known.unseen, self._known.replaced, standard)
+        self._known = replace(self._known, standard=standard, sources=told)
 
     @property
     def standard_fitted(self) -> bool:

@@ -19,8 +19,9 @@ import numpy as np
 from pipeline.maths.smoothstep import smoothstep
 from pipeline.meshes import F64, Indices, Mask
 from pipeline.registration.head_regions import FIRST_BAND, HAIR, REGIONS
+from pipeline.visibility import FEW
 
-GRAZING, CLEAR = 0.1, 0.3  # cosines: up to the first the albedo is replaced, from the second on it is kept
+GRAZING, CLEAR = FEW  # cosines: up to the first the albedo is replaced, from the second on it is kept
 HAIR_GRAZING, HAIR_CLEAR = 0.3, 0.5  # the same for hair
 LENGTH = 0.015  # metres over which a region's colour replaces that of the seen rim
 BEST = 1 / 3  # of the well seen vertices

@@ -32,7 +32,7 @@ RADIUS = 0.015  # metres of the template
 
 
 def without_unseen_rods(
-    start: Start, views: list[PhotoView], radius: float = RADIUS, check: Callable[[], None] = lambda: None
+    start: Start, views: list[PhotoView], radius: float, check: Callable[[], None] = lambda: None
 ) -> Start:
     """The start without them; the same one if there are none. radius: r, world units."""
     thin = _thin(start.values < 0, radius / start.cell)
