@@ -1,8 +1,8 @@
-"""Rods and horns that no photo looks at are cut off the start.
+"""Thin parts that no photo looks at are cut off the start.
 
-What is kept on the rays of silhouettes that the head template would leave empty (keep_silhouettes.py) lies between
-photos from one side: behind, where no photo looks, it may stand out as a rod. Nothing in the fit removes that. So
-what is thin and far from all seen surface goes:
+Where the head template would leave silhouettes empty, something is kept on their rays (keep_silhouettes.py). Photos
+from one side bound it in front. Behind, where no photo looks, it may stand out as a rod, and nothing in the fit removes
+that. So what is thin and far from all seen surface goes:
 
     removed = O - ((O eroded by r) dilated by r),  where no seen place of the surface is within r
 
