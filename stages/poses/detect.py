@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from stages.poses.config import Config
 from stages.poses.features import Effort, Features, detect, grey8
-from stages.poses.matching import Pair, Verified, match, promising_pairs, verify
+from stages.poses.matching import MIN_INLIERS, Pair, Verified, match, promising_pairs, verify
 
 WORKERS = 2  # the result does not depend on it: each photo, and each pair, is a separate task
 CHUNK = 64  # pairs between two checks for cancellation
@@ -86,15 +86,15 @@ def match_all(
 
 def match_pairs(
     photos: Sequence[Photo], features: Sequence[Features], pairs: Sequence[Pair], config: Config, effort: Effort,
-    progress: Progress,
+    progress: Progress, least: int = MIN_INLIERS,
 ) -> dict[Pair, Verified]:  # fmt: skip
-    """Verified matches of the given pairs."""
+    """Verified matches of the given pairs. least: fewest that fit one fundamental matrix."""
 
     def one(pair: Pair) -> Verified | None:
         i, j = pair
         matches = match(features[i].descriptors, features[j].descriptors, effort.ratio)
         edge = max(photos[i].width, photos[i].height, photos[j].width, photos[j].height)
-        return verify(features[i], features[j], matches, edge, config.seed)
+        return verify(features[i], features[j], matches, edge, config.seed, least)
 
     found = {}
     with _single_threaded_cv2(), ThreadPoolExecutor(WORKERS) as pool:

@@ -22,6 +22,7 @@ NEIGHBOURS = 14  # most promising partners per photo
 EXHAUSTIVE_UP_TO = 20  # photos; up to here every pair gets a full match
 MIN_INLIERS = 15
 EPIPOLAR_LIMIT = 1.5 / 1024  # of the photo's longest edge
+REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends count as one
 RANSAC_CONFIDENCE, RANSAC_TRIALS = 0.999, 3000
 
 
@@ -41,9 +42,14 @@ def match(a: F32, b: F32, ratio: float) -> U32:
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.uint32)
-    similarity = a @ b.T
+    return unambiguous(a @ b.T, ratio)
+
+
+def unambiguous(similarity: F32, ratio: float) -> U32:
+    """(M, 2) rows and columns of cosines (N, K) of unit descriptors: mutual nearest, by Lowe's ratio test. Cosines of
+    -1 are no candidates. `similarity` is overwritten."""
     best = similarity.argmax(1)
-    every = np.arange(len(a))
+    every = np.arange(len(similarity))
     top = similarity[every, best]
     mutual = top >= similarity.max(0)[best]
     similarity[every, best] = -1
@@ -96,12 +102,14 @@ def _distinct(top: F32, second: F32, ratio: float) -> npt.NDArray[np.bool_]:
     return np.asarray((nearest < ratio * next_nearest) & (nearest < FARTHEST))
 
 
-def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Verified | None:
-    """The matches that fit one fundamental matrix (MAGSAC), or None if there are fewer than MIN_INLIERS.
+def verify(
+    a: Features, b: Features, matches: U32, edge: int, seed: int, least: int = MIN_INLIERS
+) -> Verified | None:  # fmt: skip
+    """The matches that fit one fundamental matrix (MAGSAC), or None if there are fewer than `least`.
 
     matches: (M, 2). edge: longest edge of the photos in pixels. Deterministic: the sampler is seeded.
     """
-    if len(matches) < MIN_INLIERS:
+    if len(matches) < least:
         return None
     parameters = cv2.UsacParams()
     parameters.confidence, parameters.maxIterations = RANSAC_CONFIDENCE, RANSAC_TRIALS
@@ -116,7 +124,7 @@ def verify(a: Features, b: Features, matches: U32, edge: int, seed: int) -> Veri
         F, inliers = cv2.findFundamentalMat(uv_a, uv_b, parameters)
     except cv2.error:  # USAC's polisher asserts on some degenerate samples: such a pair is not used
         return None
-    if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < MIN_INLIERS:
+    if F is None or F.shape != (3, 3) or inliers is None or int(inliers.sum()) < least:
         return None
     return Verified(np.asarray(F, np.float64), matches[inliers.ravel() > 0])
 

@@ -18,43 +18,39 @@ from pipeline.errors import StageError
 from pipeline.sharpness import detail
 from stages.poses.bundle_adjustment import Refine
 from stages.poses.config import Config
-from stages.poses.detect import Photo, Progress, detect_all, match_all, match_pairs
-from stages.poses.features import ASIFT, DENOISED, MORE_ASIFT, PLAIN, Effort, Features, grey8
+from stages.poses.detect import Photo, Progress, detect_all, match_all
+from stages.poses.feature_sets import FeatureSet
+from stages.poses.features import DENOISED, PLAIN, Features, grey8
 from stages.poses.mapper import MIN_POINTS, Lens, Mapper, Model, reconstruct
 from stages.poses.matching import (
-    MIN_INLIERS,
     Pair,
     Verified,
     homography_share,
-    joined,
-    promising_pairs,
-    without_repeats,
 )
+from stages.poses.oblique import with_oblique
 from stages.poses.quality import GOOD_SCORE, better, quality, score
+from stages.poses.search import GLOBAL_FROM, Search
 from stages.poses.triangulate import triangulate
 from stages.poses.unregistered import disjoint, linked, reasons
 
 SEEDS = 2  # further seeds for the mapper if the first solution has a trust below 1
 POOR_SCORE = 0.75  # below this score, a separate lens for each photo is tried
-REPEAT = 2 / 640  # of the longest edge: matches nearer than this at both ends count as one
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
 DETAIL_EDGE = 1000  # pixels, longest edge at which the photos' sharpness is compared
-GLOBAL_FROM = 200  # photos: from here on the global mapper, which takes minutes instead of hours
 BETTER_BY = 1.05  # a solution with a lens for each photo has more freedom, so its score must be better by this factor
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
     """The best model, None if no two photos fit together. left_out: reasons by index of each photo without a camera.
-    groups: of photos that fit together; the first is the model's, the others follow by size. features: of every photo,
-    from which the model was made; effort: with which they were detected.
+    groups: of photos that fit together; the first is the model's, the others follow by size. sets: features of every
+    photo, from which the model was made.
     """
 
     model: Model | None
     left_out: dict[int, str]
     groups: tuple[tuple[int, ...], ...]
-    features: tuple[Features, ...]
-    effort: Effort
+    sets: tuple[FeatureSet, ...]
 
 
 def solve(
@@ -66,29 +62,23 @@ def solve(
     Raises:
         StageError: the photos were taken from one spot.
     """
-    best: Model | None = None
-    used: tuple[list[Features], Effort] = ([], PLAIN)  # of the best model
-    counts = [0] * len(photos)
+    own = Search(photos, config, scratch, progress)
     for effort in (PLAIN, DENOISED)[: config.attempts]:
-        features = detect_all(photos, config, effort, progress)
-        counts = counts if any(counts) else [len(f.uv) for f in features]
-        verified = match_all(photos, features, config, effort, progress, in_order)
-        before, best = best, better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
-        used = (features, effort) if best is not before else used
-        if score(best, photos) >= GOOD_SCORE:
+        of = own.features(effort)
+        verified = match_all(photos, of.features, config, effort, progress, in_order)
+        own.consider(_place(photos, of.features, verified, config, True, scratch, progress), of)
+        if own.complete():
             break
-    if config.attempts >= 3 and score(best, photos) < GOOD_SCORE:
-        lost = [i for i in range(len(photos)) if best is None or i not in best.poses]
-        features, verified = _oblique(photos, features, verified, config, progress, lost)
-        before, best = best, better(best, _place(photos, features, verified, config, True, scratch, progress), photos)
-        used = (features, effort) if best is not before else used
-    if score(best, photos) < POOR_SCORE:
-        separate = _place(photos, features, verified, config, False, scratch, progress)
-        if best is None or score(separate, photos) >= BETTER_BY * score(best, photos):
-            best, used = separate, (features, effort)
+    if config.attempts >= 3 and not own.complete():
+        of, verified = with_oblique(photos, of, verified, config, progress, own.missing())
+        own.consider(_place(photos, of.features, verified, config, True, scratch, progress), of)
+    if score(own.best, photos) < POOR_SCORE:
+        own.consider(_place(photos, of.features, verified, config, False, scratch, progress), of, BETTER_BY)
+    best = own.best
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
-        _not_from_one_spot(photos, features, verified, config.seed)
-    return Solution(best, *_explained(best, photos, counts, verified), tuple(used[0]), used[1])
+        _not_from_one_spot(photos, of.features, verified, config.seed)
+    counts = [len(f.uv) for f in own.features(PLAIN).features]
+    return Solution(best, *_explained(best, photos, counts, verified), own.used)
 
 
 def _explained(
@@ -123,32 +113,6 @@ def triangulate_given(
         return triangulate(folder, cameras, features, verified, refine=refine, deviation=deviation, seed=config.seed)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _oblique(
-    photos: Sequence[Photo], features: list[Features], verified: dict[Pair, Verified], config: Config,
-    progress: Progress, lost: Sequence[int],
-) -> tuple[list[Features], dict[Pair, Verified]]:  # fmt: skip
-    """The features and matches so far, plus ASIFT features and matches of the `lost` photos and their most similar
-    neighbours; the other photos have a camera already."""
-    more = config.changed(max_features=MORE_ASIFT * config.max_features)
-    near = promising_pairs(features, ASIFT.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
-    pairs = [p for p in near if set(p) & set(lost)]
-    wanted = sorted({i for p in pairs for i in p})
-    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
-    oblique = [nothing] * len(photos)
-    for i, f in zip(wanted, detect_all([photos[i] for i in wanted], more, ASIFT, progress), strict=True):
-        oblique[i] = f
-    found = match_pairs(photos, oblique, pairs, more, ASIFT, progress)
-    single = {}
-    for (i, j), pair in found.items():
-        cell = REPEAT * max(photos[i].width, photos[i].height)
-        kept = without_repeats(pair, oblique[i], oblique[j], cell)
-        if len(kept.matches) >= MIN_INLIERS:
-            single[i, j] = kept
-    both = [Features(np.concatenate([f.uv, g.uv]), np.concatenate([f.descriptors, g.descriptors]))
-            for f, g in zip(features, oblique, strict=True)]  # fmt: skip
-    return both, joined(verified, single, [len(f.uv) for f in features])
 
 
 def _hardly_moved(model: Model) -> bool:

@@ -10,12 +10,13 @@ from pipeline.contract import Context
 from pipeline.errors import StageError
 from pipeline.faces.landmarks3d import head_frame
 from stages.poses.config import Config
-from stages.poses.held_out import Registered, register_all
+from stages.poses.held_out import register_all
 from stages.poses.judge import groups, mirrored
 from stages.poses.mirrored import find_mirrored
 from stages.poses.normalise import normalise
 from stages.poses.photos import StoredPhoto, photos_of
 from stages.poses.progress import progress_of
+from stages.poses.register import Registered
 from stages.poses.scale import eyes_of
 from stages.poses.scale_source import find_faces, known_scale, landmarks_of, size_of_head
 from stages.poses.sfm import Solution, solve
@@ -78,7 +79,7 @@ def _held_out(
     assert solution.model is not None
     held = [i for i in range(len(photos)) if i not in set(own)]
     found = register_all(
-        [photos[i] for i in own], [photos[i] for i in held], solution.model, solution.features, solution.effort, config,
+        [photos[i] for i in own], [photos[i] for i in held], solution.model, solution.sets, config,
         progress_of(context),
     )  # fmt: skip
     return dict(zip(held, found, strict=True))

@@ -15,10 +15,9 @@ from pipeline.transforms import F64, inverse_rigid, matrix, project, rows
 from stages.poses import sfm_result
 from stages.poses.config import Config
 from stages.poses.epipolar_check import check_cameras, features_of, near_pairs
-from stages.poses.features import Features
-from stages.poses.held_out import Lens, lens_of, register, sightings
 from stages.poses.mapper import DEFAULT_FOCAL, Model, Pose
 from stages.poses.matching import Verified
+from stages.poses.register import Lens, lens_of, register, sightings
 from stages.poses.scale_source import known_scale
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
@@ -75,6 +74,8 @@ def test_what_fits_no_camera_gets_none() -> None:
     assert register(seen()[:30], POINTS[:30], lens, SIZE, 0) is not None
     assert register(chance, POINTS, lens, SIZE, 0) is None
     assert register(np.concatenate([seen()[:40], chance[40:]]), POINTS, lens, SIZE, 0) is None
+    assert register(np.concatenate([seen()[:40], chance[40:]]), POINTS, lens, SIZE, 0, share=0.15) is not None
+    assert register(seen()[:12], POINTS[:12], lens, SIZE, 0, least=12) is not None
     assert register(np.zeros((0, 2)), np.zeros((0, 3)), lens, SIZE, 0) is None
     assert register(seen(), np.zeros_like(POINTS), lens, SIZE, 0) is None
 
@@ -116,17 +117,16 @@ def test_matches_with_observations_of_points_are_sightings() -> None:
     model = Model(*(getattr(model, n) for n in ("poses", "points", "error_px", "track", "reprojection_error_px",
                                                  "view_error_px")),
                   seen={0: np.array([[1, 7], [3, 9]]), 1: np.array([[5, 5]]), 2: np.array([[0, 7]])})  # fmt: skip
-    own = Features(np.arange(20, dtype=np.float32).reshape(10, 2), np.zeros((10, 128), np.float32))
     verified = {
         (0, 4): Verified(np.eye(3), np.array([[1, 6], [2, 8], [3, 2]], np.uint32)),
         (2, 4): Verified(np.eye(3), np.array([[0, 6]], np.uint32)),
         (1, 3): Verified(np.eye(3), np.array([[5, 1]], np.uint32)),
     }
-    uv, xyz = sightings(1, 3, own, model, verified)
-    np.testing.assert_array_equal(uv, own.uv[[2, 6]])
-    np.testing.assert_array_equal(xyz, POINTS[[9, 7]])
-    uv, xyz = sightings(2, 3, own, model, verified)
-    assert uv.shape == (0, 2) and xyz.shape == (0, 3)
+    np.testing.assert_array_equal(sightings(4, model, verified), [[2, 9], [6, 7]])
+    assert sightings(5, model, verified).shape == (0, 2)
+    # a photo without a camera may come first in a pair, and observations of photos that have none do not count
+    turned = {(0, 2): Verified(np.eye(3), np.array([[4, 0]], np.uint32)), (0, 7): verified[0, 4]}
+    np.testing.assert_array_equal(sightings(0, model, turned), [[4, 7]])
 
 
 # ------------------------------------------------------------------ the stage

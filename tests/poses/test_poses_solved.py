@@ -13,11 +13,12 @@ from pipeline.errors import Cancelled, StageError
 from pipeline.transforms import F64, matrix
 from stages.poses.config import Config
 from stages.poses.detect import detect_all, match_all
+from stages.poses.feature_sets import FeatureSet
 from stages.poses.features import ASIFT, DENOISED, PLAIN, detect, grey8
 from stages.poses.mapper import opencv_distortion
 from stages.poses.matching import Verified, joined, match, promising_pairs, verify, without_repeats
+from stages.poses.oblique import with_oblique
 from stages.poses.photos import photos_of
-from stages.poses.sfm import _oblique
 from tests.support.textured_ball import camera_on_orbit, photograph, write_facescape
 
 SIZE = (320, 280)
@@ -218,7 +219,9 @@ def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -
     config = Config(max_image_size=200, neighbours=4).changed(max_features=150)  # fewer than a user may set
     plain = detect_all(photos, config, PLAIN, lambda *_: None)
     verified = match_all(photos, plain, config, PLAIN, lambda *_: None)
-    both, joint = _oblique(photos, plain, verified, config, lambda *_: None, [0])
+    of = FeatureSet(PLAIN, tuple(plain), 150)
+    found, joint = with_oblique(photos, of, verified, config, lambda *_: None, [0])
+    both = found.features
     first, second = joint[0, 1].matches.T
     assert len(both[0].uv) > len(plain[0].uv) and first.max() < len(both[0].uv) and second.max() < len(both[1].uv)
     new = joint[0, 1].matches[first >= len(plain[0].uv)]

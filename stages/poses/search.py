@@ -1,0 +1,75 @@
+"""The best solution of several attempts: each is checked, and what it lacks is tried once more by its own cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from stages.poses.config import Config
+from stages.poses.detect import Photo, Progress, detect_all
+from stages.poses.feature_sets import FeatureSet, concatenated
+from stages.poses.features import ASIFT, DENOISED, PLAIN, Effort
+from stages.poses.grow import checked, grown
+from stages.poses.mapper import Model
+from stages.poses.oblique import oblique_set
+from stages.poses.quality import GOOD_SCORE, better, score
+
+GLOBAL_FROM = 200  # photos: from here on the global mapper, and no second try of single photos, which take hours
+
+
+ENOUGH = 0.75  # score of a solution that was grown: no mapper starts anew for the rest of the photos
+
+
+@dataclass(slots=True)
+class Search:
+    """best: the best solution so far; used: features that its `seen` refers to. sets: features by effort."""
+
+    photos: Sequence[Photo]
+    config: Config
+    scratch: Path
+    progress: Progress
+    best: Model | None = None
+    used: tuple[FeatureSet, ...] = ()
+    sets: dict[Effort, FeatureSet] = field(default_factory=dict)
+
+    def features(self, effort: Effort) -> FeatureSet:
+        """Of every photo, detected once."""
+        if effort not in self.sets:
+            found = detect_all(self.photos, self.config, effort, self.progress)
+            self.sets[effort] = FeatureSet(effort, tuple(found), self.config.max_features)
+        return self.sets[effort]
+
+    def complete(self) -> bool:
+        """Whether further attempts are not worth their time."""
+        return score(self.best, self.photos) >= ENOUGH
+
+    def missing(self) -> list[int]:
+        """Photos without a camera."""
+        return [i for i in range(len(self.photos)) if self.best is None or i not in self.best.poses]
+
+    def consider(self, found: Model | None, of: FeatureSet, by: float = 1.0) -> None:
+        """Take a solution, without the photos that contradict it, if its score is better by this factor; then try to
+        place the photos that have no camera. of: the features that `found` was made from."""
+        if found is None:
+            return
+        own = checked(found, self.photos, (of,), self.progress)
+        if self.best is not None and (
+            better(self.best, own, self.photos) is self.best
+            or score(own, self.photos) < by * score(self.best, self.photos)
+        ):
+            return
+        self.best, self.used = own, (of,)
+        if len(self.photos) >= GLOBAL_FROM or not self.missing():
+            return
+        self._grow(tuple(self.features(effort) for effort in (PLAIN, DENOISED)[: self.config.attempts]))
+        if self.config.attempts >= 3 and score(self.best, self.photos) < GOOD_SCORE:
+            used = [s for s in self.used if s.effort != ASIFT]
+            more = oblique_set(self.photos, concatenated(used), self.config, self.progress, self.missing())
+            self._grow((*used, more))
+
+    def _grow(self, sets: tuple[FeatureSet, ...]) -> None:
+        assert self.best is not None
+        more = grown(self.best, self.photos, sets, self.config, self.scratch, self.progress)
+        if more is not None and better(self.best, more, self.photos) is more:
+            self.best, self.used = more, sets
