@@ -18,7 +18,7 @@ from stages.poses.quality import GOOD_SCORE, better, score
 GLOBAL_FROM = 200  # photos: from here on the global mapper, and no second try of single photos, which take hours
 
 
-ENOUGH = 0.75  # score of a solution that was grown: no mapper starts anew for the rest of the photos
+ENOUGH = 0.75  # score: no mapper starts anew for the rest of the photos, nor with a separate lens for each photo
 
 
 @dataclass(slots=True)

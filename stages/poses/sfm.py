@@ -34,7 +34,6 @@ from stages.poses.triangulate import triangulate
 from stages.poses.unregistered import disjoint, linked, reasons
 
 SEEDS = 2  # further seeds for the mapper if the first solution has a trust below 1
-POOR_SCORE = 0.75  # below this score, a separate lens for each photo is tried
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
 DETAIL_EDGE = 1000  # pixels, longest edge at which the photos' sharpness is compared
 BETTER_BY = 1.05  # a solution with a lens for each photo has more freedom, so its score must be better by this factor
@@ -72,7 +71,7 @@ def solve(
     if config.attempts >= 3 and not own.complete():
         of, verified = with_oblique(photos, of, verified, config, progress, own.missing())
         own.consider(_place(photos, of.features, verified, config, True, scratch, progress), of)
-    if score(own.best, photos) < POOR_SCORE:
+    if not own.complete():
         own.consider(_place(photos, of.features, verified, config, False, scratch, progress), of, BETTER_BY)
     best = own.best
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
