@@ -23,7 +23,7 @@ from stages.poses.features import Features
 from stages.poses.guided import PARTNERS, guided_pairs, near_pairs
 from stages.poses.mapper import Model, Pose
 from stages.poses.matching import Pair, Verified, promising_pairs
-from stages.poses.place import KEPT, place
+from stages.poses.place import ACCEPTED, ACCEPTED_OBLIQUE, KEPT, place
 from stages.poses.register import lens_of, sightings
 from stages.poses.rematch import reconstructed
 
@@ -135,13 +135,14 @@ def grown(
     own = Growth(photos, sets, config, scratch, progress, features)
     missing = [i for i in range(len(photos)) if i not in model.poses]
     links = matched(sets, lambda s: _links(own, s, missing))
+    accepted = ACCEPTED_OBLIQUE if any(s.effort.tilts for s in sets) else ACCEPTED
     before, model = len(model.poses), own.rematched(model)
     for _ in range(ROUNDS):
         points, found = Points(model, features), dict[int, Pose]()
         for i in (i for i in missing if i not in model.poses):
             own.tick("placing more photos")
             placed = place(judged(i, photos, features), points, sightings(i, model, links),
-                           lens_of(photos[i], photos, model), config.seed)  # fmt: skip
+                           lens_of(photos[i], photos, model), config.seed, accepted)  # fmt: skip
             if placed is not None:
                 found[i] = placed.pose
         if not found:

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.poses import search
+from stages.poses import grow, search
 from stages.poses.agreement import SHIFTS, Agreement, Judged, Points, _mutual, _within
 from stages.poses.config import Config
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
-from stages.poses.features import DENOISED, PLAIN, Features
+from stages.poses.features import ASIFT, DENOISED, PLAIN, Features
 from stages.poses.grow import FEWEST_PHOTOS, checked, grown, only_of_three
 from stages.poses.mapper import Model, Pose
 from stages.poses.matching import Verified
-from stages.poses.place import ACCEPTED, KEPT, LEAST, place
+from stages.poses.place import ACCEPTED, ACCEPTED_OBLIQUE, KEPT, LEAST, place
 from stages.poses.register import Lens, register, sightings
 from tests.support.posed_points import BENT, SIZE, K, World, apart, moved, world
 
@@ -186,6 +186,15 @@ def test_growing_can_be_stopped_and_leaves_nothing(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
+def test_a_photo_with_oblique_features_must_agree_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, asked = world(ANGLES, share=0.5), list[float]()
+    monkeypatch.setattr(grow, "place", lambda *args: asked.append(args[-1]))
+    for effort, limit in ((PLAIN, ACCEPTED), (ASIFT, ACCEPTED_OBLIQUE)):
+        sets = (own.set_of(), FeatureSet(effort, tuple(EMPTY for _ in own.features), 9))
+        assert grown(own.model([0, 1, 2, 3]), own.photos(), sets, Config(), tmp_path, quiet) is None
+        assert asked.pop() == limit and not asked
+
+
 def test_where_no_photo_can_be_placed_the_solution_stays(tmp_path: Path) -> None:
     own = world(ANGLES, share=0.5)
     own.features[4] = EMPTY
@@ -256,4 +265,4 @@ def test_growth_that_is_worse_is_not_taken(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_limits_are_in_order() -> None:
-    assert 0 < KEPT < ACCEPTED and LEAST < 30
+    assert 0 < KEPT < ACCEPTED < ACCEPTED_OBLIQUE and LEAST < 30
