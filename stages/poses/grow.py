@@ -20,10 +20,10 @@ from stages.poses.config import Config
 from stages.poses.detect import Photo, Progress, match_pairs
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
 from stages.poses.features import Features
-from stages.poses.guided import PARTNERS, guided_pairs, near_pairs
+from stages.poses.guided import guided_pairs, near_pairs
 from stages.poses.mapper import Model, Pose
 from stages.poses.matching import Pair, Verified, promising_pairs
-from stages.poses.place import ACCEPTED, ACCEPTED_OBLIQUE, KEPT, place
+from stages.poses.place import KEPT, place
 from stages.poses.register import lens_of, sightings
 from stages.poses.rematch import reconstructed
 
@@ -32,7 +32,6 @@ SMALL = 0.1  # of the median score; the lowest of right cameras was .29 of it (a
 CANDIDATES = 20  # photos that one without a camera is compared with
 WEAK = 10  # matches of such a pair that fit one fundamental matrix
 ROUNDS = 8  # of new photos
-FEW_PARTNERS = 6  # that each photo is matched with by features of oblique views, which are many
 LAST_ROUNDS = 2  # of triangulation and bundle adjustment in the end
 
 
@@ -61,8 +60,7 @@ class Growth:
 
     def _guided(self, model: Model, of: FeatureSet) -> dict[Pair, Verified]:
         """Of pairs that have no matches yet."""
-        partners = FEW_PARTNERS if of.effort.tilts else PARTNERS
-        missing = [p for p in near_pairs(model.poses, partners) if p not in self.matches]
+        missing = [p for p in near_pairs(model.poses) if p not in self.matches]
         return guided_pairs(model.poses, self.photos, of.features, missing, self.tick)
 
     def tick(self, message: str = "matching by cameras") -> None:
@@ -135,14 +133,13 @@ def grown(
     own = Growth(photos, sets, config, scratch, progress, features)
     missing = [i for i in range(len(photos)) if i not in model.poses]
     links = matched(sets, lambda s: _links(own, s, missing))
-    accepted = ACCEPTED_OBLIQUE if any(s.effort.tilts for s in sets) else ACCEPTED
     before, model = len(model.poses), own.rematched(model)
     for _ in range(ROUNDS):
         points, found = Points(model, features), dict[int, Pose]()
         for i in (i for i in missing if i not in model.poses):
             own.tick("placing more photos")
             placed = place(judged(i, photos, features), points, sightings(i, model, links),
-                           lens_of(photos[i], photos, model), config.seed, accepted)  # fmt: skip
+                           lens_of(photos[i], photos, model), config.seed)  # fmt: skip
             if placed is not None:
                 found[i] = placed.pose
         if not found:

@@ -7,7 +7,6 @@ from stages.poses.agreement import I64, Agreement, Judged, Points
 from stages.poses.register import Lens, Registered, register
 
 ACCEPTED, KEPT = 5.0, 3.0  # scores of `agreement` for a new photo, and for one that has a camera
-ACCEPTED_OBLIQUE = 7.0  # for a new photo with features of oblique views, which are many: wrong poses had 5 to 7
 LEAST = 25  # matched places of a new photo
 FEW, SMALL_SHARE = 8, 0.05  # matches that fit a first pose, and their share
 WITHIN = (12 / 856, 8 / 856, 6 / 856)  # of the longest edge: matches by which the pose is refined, and
@@ -15,11 +14,9 @@ REFINED_SHARE = 0.2  # the share of them that must fit it
 SEEDS = 3  # first poses that are tried
 
 
-def place(
-    photo: Judged, points: Points, sightings: I64, lens: Lens, seed: int, accepted: float = ACCEPTED
-) -> Registered | None:
+def place(photo: Judged, points: Points, sightings: I64, lens: Lens, seed: int) -> Registered | None:
     """The camera of a photo in a model; None where none agrees with it. sightings: (L, 2) its features and the points
-    that they may show. accepted: least score of `agreement`."""
+    that they may show."""
     best: tuple[Agreement, Registered] | None = None
     for n in range(SEEDS):
         first = _camera(photo, points, sightings, lens, seed + n, SMALL_SHARE)
@@ -29,7 +26,7 @@ def place(
         found = points.agreement(photo, refined.pose)
         if best is None or found.score > best[0].score:
             best = found, refined
-    if best is None or best[0].score < accepted or best[0].matches < LEAST:
+    if best is None or best[0].score < ACCEPTED or best[0].matches < LEAST:
         return None
     return best[1]
 

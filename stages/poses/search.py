@@ -8,17 +8,13 @@ from pathlib import Path
 
 from stages.poses.config import Config
 from stages.poses.detect import Photo, Progress, detect_all
-from stages.poses.feature_sets import FeatureSet, concatenated
-from stages.poses.features import ASIFT, DENOISED, PLAIN, Effort
+from stages.poses.feature_sets import FeatureSet
+from stages.poses.features import DENOISED, PLAIN, Effort
 from stages.poses.grow import checked, grown
 from stages.poses.mapper import Model
-from stages.poses.oblique import oblique_set
 from stages.poses.quality import GOOD_SCORE, better, score
 
 GLOBAL_FROM = 200  # photos: from here on the global mapper, and no second try of single photos, which take hours
-
-
-ENOUGH = 0.75  # score: no mapper starts anew for the rest of the photos, nor with a separate lens for each photo
 
 
 @dataclass(slots=True)
@@ -42,15 +38,16 @@ class Search:
 
     def complete(self) -> bool:
         """Whether further attempts are not worth their time."""
-        return score(self.best, self.photos) >= ENOUGH
+        return score(self.best, self.photos) >= GOOD_SCORE
 
     def missing(self) -> list[int]:
         """Photos without a camera."""
         return [i for i in range(len(self.photos)) if self.best is None or i not in self.best.poses]
 
     def consider(self, found: Model | None, of: FeatureSet, by: float = 1.0) -> None:
-        """Take a solution, without the photos that contradict it, if its score is better by this factor; then try to
-        place the photos that have no camera. of: the features that `found` was made from."""
+        """Take a solution, without the photos that contradict it, if its score is better by this factor. If it is not
+        good, it is grown, which counts if it makes it good: else another attempt is a better start. of: the features
+        that `found` was made from."""
         if found is None:
             return
         own = checked(found, self.photos, (of,), self.progress)
@@ -60,16 +57,15 @@ class Search:
         ):
             return
         self.best, self.used = own, (of,)
-        if len(self.photos) >= GLOBAL_FROM or not self.missing():
-            return
-        self._grow(tuple(self.features(effort) for effort in (PLAIN, DENOISED)[: self.config.attempts]))
-        if self.config.attempts >= 3 and score(self.best, self.photos) < GOOD_SCORE:
-            used = [s for s in self.used if s.effort != ASIFT]
-            more = oblique_set(self.photos, concatenated(used), self.config, self.progress, self.missing())
-            self._grow((*used, more))
+        if not self.complete():
+            self.grow(GOOD_SCORE)
 
-    def _grow(self, sets: tuple[FeatureSet, ...]) -> None:
-        assert self.best is not None
+    def grow(self, least: float = 0.0) -> None:
+        """Place the photos that have no camera, as far as they agree with the solution. Taken if the score is better,
+        and at least `least`."""
+        if self.best is None or len(self.photos) >= GLOBAL_FROM or not self.missing():
+            return
+        sets = tuple(self.features(effort) for effort in (PLAIN, DENOISED)[: self.config.attempts])
         more = grown(self.best, self.photos, sets, self.config, self.scratch, self.progress)
-        if more is not None and better(self.best, more, self.photos) is more:
+        if more is not None and better(self.best, more, self.photos) is more and score(more, self.photos) >= least:
             self.best, self.used = more, sets

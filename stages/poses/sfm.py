@@ -33,6 +33,7 @@ from stages.poses.search import GLOBAL_FROM, Search
 from stages.poses.triangulate import triangulate
 from stages.poses.unregistered import disjoint, linked, reasons
 
+POOR_SCORE = 0.75  # below this score, a separate lens for each photo is tried
 SEEDS = 2  # further seeds for the mapper if the first solution has a trust below 1
 ONE_SPOT_SHARE, HARDLY = 0.9, 0.1
 DETAIL_EDGE = 1000  # pixels, longest edge at which the photos' sharpness is compared
@@ -71,8 +72,9 @@ def solve(
     if config.attempts >= 3 and not own.complete():
         of, verified = with_oblique(photos, of, verified, config, progress, own.missing())
         own.consider(_place(photos, of.features, verified, config, True, scratch, progress), of)
-    if not own.complete():
+    if score(own.best, photos) < POOR_SCORE:
         own.consider(_place(photos, of.features, verified, config, False, scratch, progress), of, BETTER_BY)
+    own.grow()
     best = own.best
     if best is None or len(best.poses) < 0.5 * len(photos) or _hardly_moved(best):
         _not_from_one_spot(photos, of.features, verified, config.seed)

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stages.poses import grow, search
+from stages.poses import search
 from stages.poses.agreement import SHIFTS, Agreement, Judged, Points, _mutual, _within
 from stages.poses.config import Config
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
-from stages.poses.features import ASIFT, DENOISED, PLAIN, Features
+from stages.poses.features import DENOISED, PLAIN, Features
 from stages.poses.grow import FEWEST_PHOTOS, checked, grown, only_of_three
 from stages.poses.mapper import Model, Pose
 from stages.poses.matching import Verified
-from stages.poses.place import ACCEPTED, ACCEPTED_OBLIQUE, KEPT, LEAST, place
+from stages.poses.place import ACCEPTED, KEPT, LEAST, place
 from stages.poses.register import Lens, register, sightings
 from tests.support.posed_points import BENT, SIZE, K, World, apart, moved, world
 
@@ -186,15 +186,6 @@ def test_growing_can_be_stopped_and_leaves_nothing(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_photo_with_oblique_features_must_agree_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    own, asked = world(ANGLES, share=0.5), list[float]()
-    monkeypatch.setattr(grow, "place", lambda *args: asked.append(args[-1]))
-    for effort, limit in ((PLAIN, ACCEPTED), (ASIFT, ACCEPTED_OBLIQUE)):
-        sets = (own.set_of(), FeatureSet(effort, tuple(EMPTY for _ in own.features), 9))
-        assert grown(own.model([0, 1, 2, 3]), own.photos(), sets, Config(), tmp_path, quiet) is None
-        assert asked.pop() == limit and not asked
-
-
 def test_where_no_photo_can_be_placed_the_solution_stays(tmp_path: Path) -> None:
     own = world(ANGLES, share=0.5)
     own.features[4] = EMPTY
@@ -235,23 +226,27 @@ def test_a_better_solution_is_taken_and_grown(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(search, "checked", lambda model, *_: replace(model, points=model.points))
     monkeypatch.setattr(search, "grown", grow)
     monkeypatch.setattr(search, "detect_all", lambda photos, *_: [EMPTY] * len(photos))
-    monkeypatch.setattr(search, "oblique_set", lambda photos, *_: FeatureSet(search.ASIFT, (EMPTY,) * len(photos), 9))
     photos = world([0.0] * 10).photos()
     own = search.Search(photos, Config(), tmp_path, quiet)
     of = own.features(PLAIN)
     own.consider(None, of)
     assert own.best is None and own.missing() == list(range(10)) and not own.complete()
-    own.consider(model_of(6), of)
-    assert calls == ["6 by 2", "7 by 3"] and own.missing() == [8, 9] and own.complete() and len(own.used) == 3
-    own.consider(model_of(7), of)
-    assert len(calls) == 2 and len(own.best.poses) == 8
-    own.consider(model_of(9), of, by=1.2)  # better, but not by so much
-    assert len(calls) == 2
+    own.consider(model_of(6), of)  # 7 of 10 after growing are not good: the ungrown one stays, for other attempts
+    assert calls == ["6 by 2"] and len(own.best.poses) == 6 and own.used == (of,) and not own.complete()
+    own.consider(model_of(5), of)
+    assert len(calls) == 1 and len(own.best.poses) == 6
+    own.consider(model_of(7), of, by=1.2)  # better, but not by so much
+    assert len(calls) == 1
+    own.consider(model_of(8), of)
+    assert calls[1:] == ["8 by 2"] and own.missing() == [9] and own.complete() and len(own.used) == 2
     own.consider(model_of(10), of)
-    assert len(calls) == 2 and own.missing() == [] and own.used == (of,)  # complete: nothing to grow
+    assert len(calls) == 2 and own.missing() == [] and own.used == (of,)
+    own.grow()  # nothing is missing
+    assert len(calls) == 2
     fewer = search.Search(photos, Config(attempts=1), tmp_path, quiet)
     fewer.consider(model_of(6), of)
-    assert calls[2:] == ["6 by 1"]  # neither denoised nor oblique features
+    fewer.grow()
+    assert calls[2:] == ["6 by 1", "6 by 1"] and len(fewer.best.poses) == 7  # without denoised features; in the end any
 
 
 def test_growth_that_is_worse_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,8 +256,9 @@ def test_growth_that_is_worse_is_not_taken(tmp_path: Path, monkeypatch: pytest.M
     own = search.Search(world([0.0] * 10).photos(), Config(attempts=2), tmp_path, quiet)
     first = model_of(6)
     own.consider(first, own.features(PLAIN))
+    own.grow()
     assert own.best is first and own.used == (own.features(PLAIN),)
 
 
 def test_limits_are_in_order() -> None:
-    assert 0 < KEPT < ACCEPTED < ACCEPTED_OBLIQUE and LEAST < 30
+    assert 0 < KEPT < ACCEPTED and LEAST < 30
