@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.align_solved_cameras import solved_cameras
-from pipeline.transforms import F64, inverse_rigid, matrix, rescale_camera
+from pipeline.registration.procrustes import weighted
+from pipeline.transforms import F64, apply, inverse_rigid, matrix, rescale_camera
 
 ROUNDS = 20
 FLOOR = 1e-3  # metres: nearer centres have the same weight
@@ -26,16 +27,9 @@ FAR = 0.03  # metres
 def aligned(solved: F64, known: F64) -> F64:
     """Solved cameras (N, 4, 4) in the world of the known ones."""
     a, b, weights = solved[:, :3, 3], known[:, :3, 3], np.ones(len(solved))
-    similarity = np.eye(4)
     for _ in range(ROUNDS):
-        mean_a, mean_b = (np.average(x, axis=0, weights=weights) for x in (a, b))
-        u, s, vt = np.linalg.svd((weights[:, None] * (b - mean_b)).T @ (a - mean_a))
-        signs = np.array([1, 1, np.linalg.det(u @ vt)])
-        scale = (s * signs).sum() / (weights * ((a - mean_a) ** 2).sum(1)).sum()
-        similarity[:3, :3] = scale * (u * signs) @ vt
-        similarity[:3, 3] = mean_b - similarity[:3, :3] @ mean_a
-        apart = np.linalg.norm(a @ similarity[:3, :3].T + similarity[:3, 3] - b, axis=1)
-        weights = 1 / np.maximum(apart, FLOOR)
+        similarity = weighted(a, b, weights, scaled=True)
+        weights = 1 / np.maximum(np.linalg.norm(apply(similarity, a) - b, axis=1), FLOOR)
     return np.stack([rescale_camera(similarity, m) for m in solved])
 
 

@@ -6,7 +6,7 @@ that no limit depends on how many features, or how much texture, a capture has:
 
     score = (n - m) / sqrt(m + 1)        n: matches at the pose, m: mean of the displaced ones
 
-On three captures wrong poses had -1 to 3, right ones 4 to 40 (docs/stages/poses.md).
+What right and wrong poses had on real and made-up captures: docs/stages/poses.md.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from pipeline.transforms import F64, inverse_rigid, project
+from stages.poses.detect import Photo
 from stages.poses.features import Features
 from stages.poses.mapper import Model, Pose
 
@@ -55,6 +56,11 @@ class Judged:
     def uv(self, matches: I64) -> F64:
         """(L, 2) pixels of the features in the first column of `matches`."""
         return np.asarray(self.features.uv[matches[:, 0]], np.float64)
+
+
+def judged(number: int, photos: Sequence[Photo], features: Sequence[Features]) -> Judged:
+    """The photo with this number."""
+    return Judged(features[number], (photos[number].width, photos[number].height), number)
 
 
 class Points:

@@ -17,11 +17,10 @@ from stages.poses.matching import Pair, Verified, joined
 
 @dataclass(frozen=True, slots=True)
 class FeatureSet:
-    """Features of every photo, detected with one effort. most: largest number of them in a photo."""
+    """Features of every photo, detected with one effort."""
 
     effort: Effort
     features: tuple[Features, ...]
-    most: int
 
 
 def concatenated(sets: Sequence[FeatureSet]) -> tuple[Features, ...]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from stages.poses.agreement import Judged, Points
+from stages.poses.agreement import Points, judged
 from stages.poses.config import Config
 from stages.poses.detect import Photo, Progress, match_pairs
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
@@ -25,6 +25,7 @@ from stages.poses.mapper import Model, Pose
 from stages.poses.matching import Pair, Verified, promising_pairs
 from stages.poses.place import KEPT, place
 from stages.poses.register import lens_of, sightings
+from stages.poses.rematch import ROUNDS as LAST_ROUNDS
 from stages.poses.rematch import reconstructed
 
 FEWEST_PHOTOS = 3  # of a model
@@ -32,7 +33,6 @@ SMALL = 0.1  # of the median score; the lowest of right cameras was .29 of it (a
 CANDIDATES = 20  # photos that one without a camera is compared with
 WEAK = 10  # matches of such a pair that fit one fundamental matrix
 ROUNDS = 8  # of new photos
-LAST_ROUNDS = 2  # of triangulation and bundle adjustment in the end
 
 
 @dataclass(slots=True)
@@ -49,19 +49,17 @@ class Growth:
 
     def rematched(self, model: Model, rounds: int = 1) -> Model:
         """The model from guided matches of its photos; as it was if these give no points, or lose a photo."""
-        wanted = set(near_pairs(model.poses))
-        self.matches |= matched(self.sets, lambda s: self._guided(model, s))
+        wanted = near_pairs(model.poses)
+        missing = [p for p in wanted if p not in self.matches]
+        self.matches |= matched(
+            self.sets, lambda s: guided_pairs(model.poses, self.photos, s.features, missing, self.tick)
+        )
         self.tick("refining cameras")
         found = reconstructed(
-            model, self.photos, self.features, {p: m for p, m in self.matches.items() if p in wanted},
+            model, self.photos, self.features, {p: self.matches[p] for p in wanted if p in self.matches},
             self.config.camera_model, self.scratch / "rematch", self.config.seed, rounds,
         )  # fmt: skip
         return model if found is None or set(found.poses) != set(model.poses) else found
-
-    def _guided(self, model: Model, of: FeatureSet) -> dict[Pair, Verified]:
-        """Of pairs that have no matches yet."""
-        missing = [p for p in near_pairs(model.poses) if p not in self.matches]
-        return guided_pairs(model.poses, self.photos, of.features, missing, self.tick)
 
     def tick(self, message: str = "matching by cameras") -> None:
         """Show progress; raises to stop."""
@@ -85,11 +83,6 @@ def checked(model: Model, photos: Sequence[Photo], sets: Sequence[FeatureSet], p
             break
         model = _without(model, worst)
     return model
-
-
-def judged(number: int, photos: Sequence[Photo], features: Sequence[Features]) -> Judged:
-    """The photo with this number."""
-    return Judged(features[number], (photos[number].width, photos[number].height), number)
 
 
 def _without(model: Model, photo: int) -> Model:

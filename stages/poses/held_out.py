@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from stages.poses.agreement import Judged, Points
+from stages.poses.agreement import Points, judged
 from stages.poses.config import Config
 from stages.poses.detect import Photo, Progress, detect_all, match_pairs
 from stages.poses.feature_sets import FeatureSet, concatenated, matched
@@ -31,24 +31,18 @@ def register_all(
     if not held:
         return []
     photos = [*fitted, *held]
-    every = [_with_own(s, held, config, progress) for s in sets]
+    every = [FeatureSet(s.effort, (*s.features, *detect_all(held, config, s.effort, progress))) for s in sets]
     verified = matched(every, lambda s: _matches(photos, s, len(fitted), model, config, progress))
     features = concatenated(every)
     points, found = Points(model, features), []
     for number in range(len(fitted), len(photos)):
-        photo = photos[number]
-        judged = Judged(features[number], (photo.width, photo.height), number)
-        lens, seen = lens_of(photo, fitted, model), sightings(number, model, verified)
-        own = register(judged.uv(seen), model.points[seen[:, 1]], lens, judged.size, config.seed)
-        if own is None or points.agreement(judged, own.pose).score < KEPT:
-            own = place(judged, points, seen, lens, config.seed)
+        photo = judged(number, photos, features)
+        lens, seen = lens_of(photos[number], fitted, model), sightings(number, model, verified)
+        own = register(photo.uv(seen), model.points[seen[:, 1]], lens, photo.size, config.seed)
+        if own is None or points.agreement(photo, own.pose).score < KEPT:
+            own = place(photo, points, seen, lens, config.seed)
         found.append(own)
     return found
-
-
-def _with_own(of: FeatureSet, held: Sequence[Photo], config: Config, progress: Progress) -> FeatureSet:
-    found = detect_all(held, config.changed(max_features=of.most), of.effort, progress)
-    return FeatureSet(of.effort, (*of.features, *found), of.most)
 
 
 def _matches(

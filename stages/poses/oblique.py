@@ -22,41 +22,24 @@ from stages.poses.matching import (
 )
 
 
-def oblique_set(
-    photos: Sequence[Photo], features: Sequence[Features], config: Config, progress: Progress, lost: Sequence[int]
-) -> FeatureSet:
-    """ASIFT features of the `lost` photos and their most similar neighbours; the others have none.
-
-    features: other ones of every photo, by which neighbours are found.
-    """
-    most = MORE_ASIFT * config.max_features
-    wanted = sorted({i for p in _pairs(features, config, progress, lost) for i in p})
-    found = detect_all([photos[i] for i in wanted], config.changed(max_features=most), ASIFT, progress)
-    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
-    every = [nothing] * len(photos)
-    for i, own in zip(wanted, found, strict=True):
-        every[i] = own
-    return FeatureSet(ASIFT, tuple(every), most)
-
-
 def with_oblique(
     photos: Sequence[Photo], of: FeatureSet, verified: dict[Pair, Verified], config: Config, progress: Progress,
     lost: Sequence[int],
 ) -> tuple[FeatureSet, dict[Pair, Verified]]:  # fmt: skip
-    """The features and matches so far, with ASIFT features and matches of the `lost` photos."""
-    more = oblique_set(photos, of.features, config, progress, lost)
-    pairs = _pairs(of.features, config, progress, lost)
-    found = match_pairs(photos, more.features, pairs, config, ASIFT, progress)
+    """The features and matches so far, with ASIFT features and matches of the `lost` photos and their most similar
+    neighbours; the others get none."""
+    near = promising_pairs(of.features, ASIFT.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
+    pairs = [p for p in near if set(p) & set(lost)]
+    wanted = sorted({i for p in pairs for i in p})
+    many = config.changed(max_features=MORE_ASIFT * config.max_features)
+    found = dict(zip(wanted, detect_all([photos[i] for i in wanted], many, ASIFT, progress), strict=True))
+    nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.float32))
+    more = FeatureSet(ASIFT, tuple(found.get(i, nothing) for i in range(len(photos))))
     single = {}
-    for (i, j), pair in found.items():
+    for (i, j), pair in match_pairs(photos, more.features, pairs, config, ASIFT, progress).items():
         cell = REPEAT * max(photos[i].width, photos[i].height)
         kept = without_repeats(pair, more.features[i], more.features[j], cell)
         if len(kept.matches) >= MIN_INLIERS:
             single[i, j] = kept
-    both = FeatureSet(of.effort, concatenated((of, more)), of.most)
+    both = FeatureSet(of.effort, concatenated((of, more)))
     return both, joined(verified, single, [len(f.uv) for f in of.features])
-
-
-def _pairs(features: Sequence[Features], config: Config, progress: Progress, lost: Sequence[int]) -> list[Pair]:
-    near = promising_pairs(features, ASIFT.ratio, config.neighbours, lambda: progress(0, 1, "comparing photos"))
-    return [p for p in near if set(p) & set(lost)]

@@ -19,7 +19,8 @@ GLOBAL_FROM = 200  # photos: from here on the global mapper, and no second try o
 
 @dataclass(slots=True)
 class Search:
-    """best: the best solution so far; used: features that its `seen` refers to. sets: features by effort."""
+    """best: the best solution so far; used: features that its `seen` refers to. sets: features by effort. tried: the
+    solution that was grown last, and what came of it."""
 
     photos: Sequence[Photo]
     config: Config
@@ -28,12 +29,13 @@ class Search:
     best: Model | None = None
     used: tuple[FeatureSet, ...] = ()
     sets: dict[Effort, FeatureSet] = field(default_factory=dict)
+    tried: tuple[Model | None, Model | None] = (None, None)
 
     def features(self, effort: Effort) -> FeatureSet:
         """Of every photo, detected once."""
         if effort not in self.sets:
             found = detect_all(self.photos, self.config, effort, self.progress)
-            self.sets[effort] = FeatureSet(effort, tuple(found), self.config.max_features)
+            self.sets[effort] = FeatureSet(effort, tuple(found))
         return self.sets[effort]
 
     def complete(self) -> bool:
@@ -66,6 +68,8 @@ class Search:
         if self.best is None or len(self.photos) >= GLOBAL_FROM or not self.missing():
             return
         sets = tuple(self.features(effort) for effort in (PLAIN, DENOISED)[: self.config.attempts])
-        more = grown(self.best, self.photos, sets, self.config, self.scratch, self.progress)
+        if self.tried[0] is not self.best:
+            self.tried = self.best, grown(self.best, self.photos, sets, self.config, self.scratch, self.progress)
+        more = self.tried[1]
         if more is not None and better(self.best, more, self.photos) is more and score(more, self.photos) >= least:
             self.best, self.used = more, sets

@@ -219,7 +219,7 @@ def test_features_seen_askew_come_on_top_of_the_others(ball: Path, capture_of) -
     config = Config(max_image_size=200, neighbours=4).changed(max_features=150)  # fewer than a user may set
     plain = detect_all(photos, config, PLAIN, lambda *_: None)
     verified = match_all(photos, plain, config, PLAIN, lambda *_: None)
-    of = FeatureSet(PLAIN, tuple(plain), 150)
+    of = FeatureSet(PLAIN, tuple(plain))
     found, joint = with_oblique(photos, of, verified, config, lambda *_: None, [0])
     both = found.features
     first, second = joint[0, 1].matches.T

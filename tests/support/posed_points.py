@@ -34,7 +34,7 @@ class World:
         return [SimpleNamespace(width=SIZE[0], height=SIZE[1], group="a", focal=None) for _ in self.poses]
 
     def set_of(self) -> FeatureSet:
-        return FeatureSet(PLAIN, tuple(self.features), 1500)
+        return FeatureSet(PLAIN, tuple(self.features))
 
     def model(self, placed: list[int], poses: dict[int, Pose] | None = None) -> Model:
         """The model of these photos: all points that two of them see. poses: instead of the true ones."""
